@@ -19,7 +19,7 @@ from magshell_fenicsx.runs.modes import frequencies_after
 from magshell_fenicsx.runs.running import run as run_problem
 from magshell_fenicsx.runs.summary import Result
 from magshell_fenicsx.simulate.follow import follow as follow_scene
-from magshell_fenicsx.simulate.follow import warned
+from magshell_fenicsx.simulate.follow import warn_of
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene as SceneOfProblem
 
@@ -110,7 +110,7 @@ class Scene(SceneOfProblem):
 
 
 def follow(
-    given: SceneOfProblem | Given, *, search: bool = True, remark: Callable[[str], None] = warned
+    given: SceneOfProblem | Given, *, search: bool = True, remark: Callable[[str], None] = warn_of
 ) -> Iterator[Record]:
     """Compute the history of a scene, or of a problem or what makes one; yields every accepted
     point.

@@ -27,7 +27,7 @@ from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
 from magshell_fenicsx.simulate.gradients.gradient import derivative
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, LostResult, instabilities
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end
-from magshell_fenicsx.simulate.numbers import ELSEWHERE, number_of, on_mesh_of, size_of
+from magshell_fenicsx.simulate.perturbation import KEYS_WITHOUT_GRADIENT, number_at_key, problem_on_mesh_of, scale_at_key
 from magshell_fenicsx.simulate.record import Record
 
 STEP, LONG = (
@@ -113,7 +113,7 @@ def keys_of(case: Case) -> list[str]:
     sections = {
         name: section
         for name, section in context.sections.items()
-        if name not in ("imperfections", *ELSEWHERE)
+        if name not in ("imperfections", *KEYS_WITHOUT_GRADIENT)
     }
     return list(
         dict.fromkeys(key for name, section in sections.items() for key in numbers(section, name))
@@ -141,7 +141,7 @@ def compared(compare: Compared, keys: Sequence[str] = ()) -> Iterator[Line]:
     adjoints = {of: ran.adjoint(of) for of in compare.results}
     for key in keys or keys_of(case):
         try:
-            value, size = number_of(context, key), size_of(context, key)
+            value, size = number_at_key(context, key), scale_at_key(context, key)
             found = {of: derivative(each, key) for of, each in adjoints.items()}
         except CaseError as e:
             yield Line(key, refused=str(e))
@@ -171,7 +171,7 @@ def _differences(
     except CaseError as e:
         yield Line(key, refused=f"{key}: no other value is allowed: {str(e).rpartition(': ')[-1]}")
         return
-    ends = [Ran.of(on_mesh_of(ran.scene, other)) for other in others]
+    ends = [Ran.of(problem_on_mesh_of(ran.scene, other)) for other in others]
     for of, gradient in found.items():
         low, high = (end.value(of) for end in ends)
         yield Line(key, of, float(gradient), (high - low) / (2 * step * size), scales[of])

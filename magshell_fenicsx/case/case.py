@@ -50,7 +50,7 @@ from magshell_fenicsx.parts.magnetism.remanent import RemanentSection
 from magshell_fenicsx.parts.magnetism.sensors import Sensors
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.natural.section import NaturalSection
-from magshell_fenicsx.parts.registered import PARTS, Origin, WithParts
+from magshell_fenicsx.parts.registered import PART_CLASSES, Origin, WithParts
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.problem.mesh_sizes import MeshSection, SolidSection
@@ -79,7 +79,7 @@ SECTIONS_WITH_SHELL_UNITS = (
     "bodies",
     "joints",
     "loading",
-    *PARTS,
+    *PART_CLASSES,
 )
 """Sections whose numbers have units where the shell's lengths have."""
 

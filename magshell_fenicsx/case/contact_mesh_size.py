@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.parts.contact.contact_section import WHOLE_SHELL
-from magshell_fenicsx.parts.step_control import Fit
+from magshell_fenicsx.parts.step_course import SizingContext
 from magshell_fenicsx.shape.outline import Outline
 
 Array = NDArray[np.float64]
@@ -33,11 +33,11 @@ class ContactPlace:
 
     place: Array
 
-    def features(self, outline: Outline, mesh_hint: Fit, growth: float) -> list[Feature]:
+    def features(self, outline: Outline, sizing: SizingContext, growth: float) -> list[Feature]:
         """Return the element sizes that resolve the ring of a contact."""
         x, y = map(float, self.place)
-        length = sqrt(mesh_hint.h)
-        size = CONTACT_CELL_SIZE * length / mesh_hint.refinement
+        length = sqrt(sizing.h)
+        size = CONTACT_CELL_SIZE * length / sizing.refinement
         return [DiscFeature((x, y), CONTACT_REGION * length, size, growth)]
 
 

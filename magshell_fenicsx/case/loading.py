@@ -7,9 +7,9 @@ from pydantic import Discriminator, Field, Tag
 
 from magshell_fenicsx.input.section import ChosenByKey
 from magshell_fenicsx.parts.ability import Context
-from magshell_fenicsx.parts.registered import FIRST, STEPS
+from magshell_fenicsx.parts.registered import KINDS_BEFORE_LOAD, STEPS
 from magshell_fenicsx.parts.step import LEAST_TARGET, ProgrammeStep, Step
-from magshell_fenicsx.parts.step_control import Gas
+from magshell_fenicsx.parts.step_course import Gas
 from magshell_fenicsx.shape.shell_sections import MeshSurface, ShellSection, Surface
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def programme(loading: Step | Sequence[Step] | None, context: Context) -> tuple[
     """Return the steps of a case: those of a list, or what comes before one load, and then that."""
     before: list[tuple[str, Step]] = []
     if not isinstance(loading, Sequence):
-        before = [pair for kind in FIRST for pair in STEPS[kind].before(context, loading)]
+        before = [pair for kind in KINDS_BEFORE_LOAD for pair in STEPS[kind].steps_before_load(context, loading)]
     keyed = [*before, *loads_by_key(loading).items()]
     loads, places_of = [load for _, load in keyed], dict[str, list[Any]]()
     steps = []
@@ -62,13 +62,13 @@ def refuse_unfit_steps(context: Context) -> None:
     for step in context.steps:
         load, key = step.load, step.key
         load.refuse_unfit(step, context)
-        goal = load.target or load.bound
+        goal = load.target or load.limit_target
         if step.name not in context.driven_before(step.number) and goal and goal[1] == 0:
             raise ValueError(
                 f"{key}: the target must not be zero (at least {LEAST_TARGET:g} in size): the "
                 "first step of a load begins there"
             )
-        earlier_steps = context.before(step.number)
+        earlier_steps = context.steps_before(step.number)
         if earlier_steps and not earlier_steps[-1].load.rests and not load.in_time:
             kind = earlier_steps[-1].kind
             raise ValueError(
@@ -92,7 +92,7 @@ def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> N
         holds_conjugate = how == "conjugate"
         if name == step.name and not (to_limit and holds_conjugate):
             raise ValueError(f"{key}: this step drives {name}; allowed: {allowed}")
-        if name == step.name and step.load.bound:
+        if name == step.name and step.load.limit_target:
             raise ValueError(
                 f"{key}: conjugate: the way to the instability has no end: leave out the target"
             )

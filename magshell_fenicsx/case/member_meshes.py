@@ -113,7 +113,7 @@ class MemberMeshes:
 
         with part.naming():
             problem = make_problem(
-                part.case, plane=plane, met=self._contact_places_of_shells[part.name]
+                part.case, plane=plane, contact_places=self._contact_places_of_shells[part.name]
             )
             patch = problem.triangulated()
         place = self._several.place(part)
@@ -160,7 +160,9 @@ class MemberMeshes:
 
     def _mirror_of_shell(self, part: "MemberCase", plane: Mirror, loosely: bool) -> Mirror | None:
         """Return the plane in the frame of a shell that is its own image in it; else None."""
-        from magshell_fenicsx.case.planner import own_mirror  # the solver takes long to import
+        from magshell_fenicsx.case.modelled_part import (
+            own_mirror,
+        )  # the solver takes long to import
 
         with part.naming():
             return own_mirror(part.case, self._plane_of_shell(part, plane), loosely=loosely)

@@ -16,7 +16,7 @@ from pydantic_core import core_schema
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.messages import meaning
-from magshell_fenicsx.parts.registered import PARTS
+from magshell_fenicsx.parts.registered import PART_CLASSES
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import AMPLITUDES, IN_TIME, OF_EVERY_RUN, QUANTITIES
 
@@ -88,7 +88,7 @@ def schema() -> dict[str, Any]:
         _with_definitions(Case.model_json_schema(schema_generator=_WithMeanings))
     )
     # parts come last
-    properties = sorted(of_case["properties"].items(), key=lambda item: item[0] in PARTS)
+    properties = sorted(of_case["properties"].items(), key=lambda item: item[0] in PART_CLASSES)
     of_case["properties"] = dict(properties)
     of_case["anyOf"] = [{"required": of_case.pop("required")}, {"required": ["shells"]}]
     return {**head, **of_case}

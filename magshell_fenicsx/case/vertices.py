@@ -16,7 +16,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import Grading
 from magshell_fenicsx.mesh.grid import Grid, RimmedGrid
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
-from magshell_fenicsx.mesh.shapes import DiscShape, Shape, StripShape
+from magshell_fenicsx.mesh.shapes import DiscShape, PlaneShape, StripShape
 from magshell_fenicsx.mesh.vertex_spacing import (
     MIN_VERTEX_DISTANCE,
     SAME_PLACE_TOLERANCE,
@@ -208,7 +208,9 @@ class Vertices:
                     MIN_VERTEX_DISTANCE,
                 )
 
-    def _refuse_beside_edges(self, name: str, shape: Grid | Shape, plane: Mirror | None) -> None:
+    def _refuse_beside_edges(
+        self, name: str, shape: Grid | PlaneShape, plane: Mirror | None
+    ) -> None:
         """Refuse a point beside an edge or a plane of symmetry, neither on it nor away from it."""
         chart = self.points[name]
         factor = MIN_VERTEX_DISTANCE if isinstance(shape, Grid) else EDGE_DISTANCE
@@ -228,7 +230,7 @@ class Vertices:
                     name, self._place(on), f"the edge {edge} at [{{}}]", "put it there", factor
                 )
 
-    def _size_of_elements(self, chart: Array, shape: Grid | Shape) -> float:
+    def _size_of_elements(self, chart: Array, shape: Grid | PlaneShape) -> float:
         """Return the size of the elements at a place (2,): none is wider than the shape."""
         if isinstance(shape, Grid):
             return min(

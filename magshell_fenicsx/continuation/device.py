@@ -44,7 +44,7 @@ class Device:
 
     Parameters
     ----------
-    held_conjugates
+    held_conjugates_of_step
         Amplitude that becomes unknown -> its conjugate: a value of -dPi/dmu, a function q(mu) that
         does not rise, or the name of a further amplitude of the device, whose value it is.
     scale
@@ -59,17 +59,17 @@ class Device:
     def __init__(
         self,
         system: System,
-        held_conjugates: Mapping[str, HeldConjugate],
+        held_conjugates_of_step: Mapping[str, HeldConjugate],
         scale: Mapping[str, float],
     ) -> None:
         self.comm, self.length, self.coordinates = system.comm, system.length, system.coordinates
-        self._system, self.names = system, list(held_conjugates)
+        self._system, self.names = system, list(held_conjugates_of_step)
         self._conjugates = [
             q if callable(q) or isinstance(q, str) else constant(q)
-            for q in held_conjugates.values()
+            for q in held_conjugates_of_step.values()
         ]
-        self._units = np.array([scale[name] / system.length for name in held_conjugates])
-        self.size = system.size + len(held_conjugates) * (self.comm.rank == self.comm.size - 1)
+        self._units = np.array([scale[name] / system.length for name in held_conjugates_of_step])
+        self.size = system.size + len(held_conjugates_of_step) * (self.comm.rank == self.comm.size - 1)
 
     def for_system(self, system: System) -> "Device":
         """Return the same device on another system."""
@@ -118,12 +118,12 @@ class Device:
         -------
         (k,) numbers in units of y.
         """
-        held_conjugates = [
+        held_conjugates_of_step = [
             mu[q] if isinstance(q, str) else q(mu[name])[0]
             for name, q in zip(self.names, self._conjugates, strict=True)
         ]
         rows = (
-            np.array([self._system.potential(u, mu, name) for name in self.names]) + held_conjugates
+            np.array([self._system.potential(u, mu, name) for name in self.names]) + held_conjugates_of_step
         )
         return np.asarray(rows * self._units)
 

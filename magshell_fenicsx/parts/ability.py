@@ -1,4 +1,8 @@
-"""The base of parts: sections of a case that add energies."""
+"""The base of parts and of all other abilities: what a section of a case adds to a problem.
+
+An ability reads its section and what is around it in the case (`Context`), and gives fields of the
+model's `Loads`, the symmetry that it preserves, its formulas, and its lines for `magshell check`.
+"""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -43,15 +47,14 @@ class Scales:
 
 @dataclass(frozen=True)
 class Context:
-    """What is around a part in its case: it takes from this what it needs, and each room knows its
-    own section.
+    """The rest of a case around a part, which takes from this what it needs.
 
     Attributes
     ----------
     points
         Name -> place (3,) in the shell's length.
     sections
-        Key of the case -> what stands there.
+        Key of the case -> its section.
     steps
         The programme.
     whole
@@ -67,21 +70,21 @@ class Context:
     whole: bool = True
     solid: bool = False
 
-    def of(self, kind: type[Kind]) -> Kind | None:
-        """The section of a class; None without one."""
+    def section_of(self, kind: type[Kind]) -> Kind | None:
+        """Return the section of a class; None without one."""
         return next(
             (section for section in self.sections.values() if isinstance(section, kind)), None
         )
 
     @property
     def abilities(self) -> "list[Ability]":
-        """All that adds something to the problem."""
+        """All abilities of the case."""
         from magshell_fenicsx.parts.registered import abilities_of  # knows all parts
 
         return abilities_of(self)
 
     @property
-    def withdrawn(self) -> "dict[Offer, str]":
+    def missing_offers(self) -> "dict[Offer, str]":
         """What abilities may need and the case has not -> what to do about that."""
         missing = dict[Offer, str]()
         for ability in self.abilities:
@@ -103,22 +106,22 @@ class Context:
         ValueError
             With the first of the offers that is not there.
         """
-        withdrawn = self.withdrawn
+        missing = self.missing_offers
         for offer in offers:
-            if offer in withdrawn:
-                raise ValueError(f"{key}: needs {offer}; {hint or withdrawn[offer]}")
+            if offer in missing:
+                raise ValueError(f"{key}: needs {offer}; {hint or missing[offer]}")
 
     def loads(self, kind: "type[AnyStep]") -> "dict[str, AnyStep]":
-        """Amplitude -> its last step, of the steps of a kind."""
+        """Return amplitude -> its last step, of the steps of a kind."""
         return {step.name: step.load for step in self.steps if isinstance(step.load, kind)}
 
-    def before(self, number: int) -> "Sequence[ProgrammeStep]":
-        """The steps before one of the programme."""
+    def steps_before(self, number: int) -> "Sequence[ProgrammeStep]":
+        """Return the steps of the programme before one with a number, from 1."""
         return self.steps[: number - 1]
 
     def driven_before(self, number: int) -> set[str]:
-        """The amplitudes that steps before one have driven."""
-        return {name for step in self.before(number) for name in (step.name, *step.load.drives)}
+        """Return the amplitudes that steps before one have driven."""
+        return {name for step in self.steps_before(number) for name in (step.name, *step.load.drives)}
 
     def has_modulus(self, what: str) -> None:
         """See that there is a modulus, which something needs.
@@ -160,7 +163,7 @@ class Context:
 
     @property
     def scales(self) -> Scales:
-        """What forces and stiffnesses are over; there is a modulus where something needs it."""
+        """The scales of the case, in which there is a modulus where something needs it."""
         shell = self.shell
         assert shell.modulus is not None
         return Scales(
@@ -169,8 +172,7 @@ class Context:
 
     @property
     def time_unit(self) -> float | None:
-        """R √(ρ/E), that times are over: in seconds where the case has units; None without a
-        density.
+        """R √(ρ/E), the unit of times: in seconds where the case has units; None without a density.
         """
         density, modulus = self.shell.density, self.shell.youngs_modulus
         return (
@@ -212,7 +214,7 @@ class Modelled:
     plane: Mirror | None
     axisymmetric: bool
     vertices: Mapping[str, str]
-    within: "Mapping[str, Inside]"
+    within: "Mapping[str, InsideRim]"
     deviations: "Mapping[str, Deviation]"
 
 
@@ -244,7 +246,7 @@ class Formulas:
 
 @dataclass(frozen=True)
 class Account:
-    """What a room has in a model, and what is left out, in words."""
+    """The lines of `magshell check` on one ability: what is in the model, and what is left out."""
 
     included: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)
@@ -261,10 +263,12 @@ Offer = Literal[
 
 @dataclass(frozen=True)
 class InTime:
-    """A load that may be a function of time, though no step drives it: its name in `history`.
+    """A load that may be a function of time, though no step drives it.
 
     Attributes
     ----------
+    name
+        In `history`.
     refused
         Why it may not be one here; empty if it may.
     """
@@ -274,17 +278,16 @@ class InTime:
 
 
 class Ability:
-    """What adds something to a problem, mostly a section of the case file; by default it adds
-    nothing.
+    """The base of what adds something to a problem, mostly a section of the case file.
 
-    One that is no section finds itself in a case (`of`). All stand in `ABILITIES` of
-    `registered.py`.
+    By default it adds nothing. One that is no section finds itself in a case (`from_context`). All
+    stand in `ABILITIES` of `registered.py`.
     """
 
     @classmethod
-    def of(cls, context: Context) -> Self | None:
-        """That of a case; None without."""
-        return context.of(cls)
+    def from_context(cls, context: Context) -> Self | None:
+        """Return the ability of a case; None without."""
+        return context.section_of(cls)
 
     def refuse_unfit(self, context: Context) -> None:
         """See that it goes with all else in the case.
@@ -296,31 +299,33 @@ class Ability:
         """
 
     def withdraws(self, context: Context) -> "dict[Offer, str]":
-        """What abilities may need and a case with this one has not -> what takes it away, and what
-        to do.
-        """
+        """Return what other abilities may need and a case with this one has not -> what to do."""
         return {}
 
     def in_time(self, context: Context, driven: Collection[str]) -> InTime | None:
-        """Its load that may be a function of time, after steps that have driven amplitudes; None
-        without.
+        """Return its load that may be a function of time; None without.
+
+        Parameters
+        ----------
+        driven
+            The amplitudes that steps before have driven.
         """
         return None
 
     def patches(self) -> dict[str, Iterable[str]]:
-        """Its keys with values by patch -> the names of these."""
+        """Return its keys with values by patch -> the names of these."""
         return {}
 
     def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
-        """The symmetry that it leaves of a shell."""
+        """Return the symmetry that it preserves of a shell."""
         return []
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
-        """What varies with the undeformed place."""
+        """Return its formulas of the undeformed place."""
         return []
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
-        """Fields of the model's `Loads`, to which those of other parts are added."""
+        """Return fields of the model's `Loads`, to which those of other abilities are added."""
         return {}
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:
@@ -333,33 +338,33 @@ class Ability:
         """
 
     def warning(self, context: Context, places: Array) -> str | None:
-        """What is unphysical in it at these places; None if nothing is."""
+        """Return what is unphysical in it at these places; None if nothing is."""
         return None
 
     def numbers(self, context: Context) -> list[str]:
-        """Lines of `magshell check` with its numbers on the undeformed shell."""
+        """Return lines of `magshell check` with its numbers on the undeformed shell."""
         return []
 
     def units(self, context: Context, units: CaseSizes) -> CaseSizes:
-        """The sizes of units, with those that it gives."""
+        """Return the sizes of units, with those that it gives."""
         return units
 
 
 @dataclass(frozen=True)
 class KeyAbility(Ability, Generic[Kind]):
-    """One whose key has a list or a mapping, of which none is empty.
+    """An ability whose key has a list or a mapping, which is not empty.
 
     Attributes
     ----------
     given
-        What stands at the key.
+        The value of the key.
     """
 
     key: ClassVar[str]
     given: Kind
 
     @classmethod
-    def of(cls, context: Context) -> Self | None:
+    def from_context(cls, context: Context) -> Self | None:
         given = context.sections.get(cls.key)
         return cls(given) if given else None
 
@@ -393,9 +398,9 @@ class Part(Section, Ability):
         )
 
     def terms(self, scales: Scales) -> Sequence[OwnTerm]:
-        """The energies, with the values of their amplitudes."""
+        """Return the energies, with the values of their amplitudes."""
         raise NotImplementedError
 
     def account(self, scales: Scales) -> str:
-        """The line of `magshell check` for a case with the part."""
+        """Return the line of `magshell check` for a case with the part."""
         raise NotImplementedError

@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import Section, or_number
-from magshell_fenicsx.parts.step_control import Course, Target
+from magshell_fenicsx.parts.step_course import StepCourse, Target
 from magshell_fenicsx.parts.ability import Account, Context, KeyAbility, Modelled
 from magshell_fenicsx.parts.path_step import FactorStep
-from magshell_fenicsx.parts.observables import Seen
+from magshell_fenicsx.parts.observables import Observables
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
@@ -208,14 +208,14 @@ class FoldStep(FactorStep):
         if not self.asked_for(context):
             raise ValueError(f"{step.key}.kind: fold: needs a joint with an angle")
 
-    def unstable_alone(self, value: float, course: Course, what: str) -> str:
+    def unstable_alone(self, value: float, course: StepCourse, what: str) -> str:
         return (
             f"the springs of joints alone make the shells unstable at {value:.9g} of their angles "
             f"({what}): to go on, take these as a load, kind: fold"
         )
 
 
-class FoldSeen(Seen):
+class FoldObservables(Observables):
     """How far the angles have grown."""
 
     def named(self, loads: "Loads") -> Sequence[str]:

@@ -185,7 +185,7 @@ class Laminated(Ability):
     section: LaminateSection
 
     @classmethod
-    def of(cls, context: Context) -> "Laminated | None":
+    def from_context(cls, context: Context) -> "Laminated | None":
         return cls(context.shell.laminate) if context.shell.laminate else None
 
     def refuse_unfit(self, context: Context) -> None:

@@ -25,7 +25,7 @@ Array = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Sight:
+class ModelView:
     """A model, and the units in which it is reported.
 
     Attributes
@@ -125,7 +125,7 @@ class MapGrid:
         return np.asarray(self.corner + shares @ self.sides)
 
 
-class Seen:
+class Observables:
     """What a room sees; by default nothing.
 
     Attributes
@@ -180,7 +180,7 @@ class Seen:
         """
         return {}
 
-    def observe(self, sight: Sight, state: "State") -> dict[str, float]:
+    def observe(self, view: ModelView, state: "State") -> dict[str, float]:
         """Column -> value."""
         return {}
 
@@ -188,7 +188,7 @@ class Seen:
         """Names of the grids in space on which it sees something."""
         return ()
 
-    def on_grids(self, sight: Sight, state: "State") -> Sequence[MapGrid]:
+    def on_grids(self, view: ModelView, state: "State") -> Sequence[MapGrid]:
         """These grids with what it sees there; collective."""
         return ()
 
@@ -196,18 +196,18 @@ class Seen:
         """Its columns that have a `slope`."""
         return ()
 
-    def slope(self, sight: Sight, state: "State", column: str) -> Slope | None:
+    def slope(self, view: ModelView, state: "State", column: str) -> Slope | None:
         """A column with its derivatives; None if it is another room's; collective."""
         return None
 
-    def left_out(self, sight: Sight) -> Sequence[str]:
+    def left_out(self, view: ModelView) -> Sequence[str]:
         """What the model lacks of it, for people."""
         return ()
 
-    def summary(self, sight: Sight, state: "State") -> dict[str, Any]:
+    def summary(self, view: ModelView, state: "State") -> dict[str, Any]:
         """What summary.json says of the end of a path; collective."""
         return {}
 
-    def conjugate_unit(self, sight: Sight, name: str) -> float | None:
+    def conjugate_unit(self, view: ModelView, name: str) -> float | None:
         """-dPi/dmu of one unit of what is conjugate to an amplitude; None if it is another room's."""
         return None

@@ -10,12 +10,12 @@ import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
 from magshell_fenicsx.input.section import is_over_unit, over_unit
-from magshell_fenicsx.parts.step_control import (
+from magshell_fenicsx.parts.step_course import (
     Control,
-    Course,
+    StepCourse,
     Drive,
-    Here,
-    Now,
+    StepStart,
+    LoadStart,
     Prescribed,
     SnapSection,
     Target,
@@ -170,7 +170,7 @@ class PathStep(Step):
 
     @property
     def target(self) -> tuple[Target, float] | None:
-        if self.bound:
+        if self.limit_target:
             return None
         for key, value in self._given.items():
             return self.targets[key], value
@@ -179,14 +179,14 @@ class PathStep(Step):
         return next(iter(self.targets.values())), self._end
 
     @property
-    def bound(self) -> tuple[Target, float] | None:
+    def limit_target(self) -> tuple[Target, float] | None:
         """With `until: limit`: where the way ends at the latest, and its direction; None
         without."""
         if self.until != "limit":
             return None
         return next(((self.targets[key], value) for key, value in self._given.items()), None)
 
-    def first(self, change: float, now: Now, *, by_load: bool) -> float:
+    def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
         """Change of the amplitude in the first step, by default one of equal parts; its sign is
         that of `change`.
 
@@ -199,43 +199,43 @@ class PathStep(Step):
         """
         return change / self.points
 
-    def step(self, change: float | None, now: Now) -> float | None:
+    def step(self, change: float | None, load_start: LoadStart) -> float | None:
         """The first step of a prescribed conjugate; None: it follows from `first`."""
         return None
 
-    def drive(self, now: Now) -> Drive:
+    def drive(self, load_start: LoadStart) -> Drive:
         """How the step drives its amplitude from here.
 
         Targets are equal parts of the way: from zero if the amplitude is driven for the first time,
         without those that earlier steps have passed.
         """
-        goal = self.target or self.bound
+        goal = self.target or self.limit_target
         quantity: Prescribed = goal[0].quantity if goal else "load"
         by_load = quantity == "load"
-        begin_value = now.value if by_load else now.conjugate
-        end = None if goal is None else goal[1] * (now.size if by_load else now.unit)
-        change = now.size if end is None else end - begin_value
+        begin_value = load_start.value if by_load else load_start.conjugate
+        end = None if goal is None else goal[1] * (load_start.size if by_load else load_start.unit)
+        change = load_start.size if end is None else end - begin_value
         targets: list[float] = []
-        if end is not None and (self.until == "target" or self.bound):
-            begin = begin_value if now.driven else self.begin(begin_value)
+        if end is not None and (self.until == "target" or self.limit_target):
+            begin = begin_value if load_start.is_driven else self.begin(begin_value)
             targets = [float(t) for t in np.linspace(begin, end, self.points + 1)[1:]]
             targets = [t for t in targets if (t - begin_value) * change > 0]
         if self.until == "zero":
             targets = [0.0]
         first, step = (
-            self.first(change, now, by_load=by_load),
-            self.step(None if goal is None else change, now),
+            self.first_change(change, load_start, by_load=by_load),
+            self.step(None if goal is None else change, load_start),
         )
-        return Drive(self.prescribed, quantity, end, targets, first, self.scale(now), step)
+        return Drive(self.prescribed, quantity, end, targets, first, self.scale(load_start), step)
 
-    def course(self, here: Here) -> Course:
+    def course(self, step_start: StepStart) -> StepCourse:
         until = "target" if self.until == "zero" else self.until
         steps = self.points if until == "points" else None
-        return Course(self.drive(self.now(here)), until, steps, self.curves(here))
+        return StepCourse(self.drive(self.load_start(step_start)), until, steps, self.curves(step_start))
 
-    def now(self, here: Here) -> Now:
+    def load_start(self, step_start: StepStart) -> LoadStart:
         """Its amplitude where it begins."""
-        return here.now()
+        return step_start.load_start()
 
     @property
     def branch_points(self) -> int:
@@ -251,11 +251,11 @@ class PathStep(Step):
             goal is not None and goal[0].quantity == "conjugate"
         )
 
-    def begin(self, here: float) -> float:
+    def begin(self, step_start: float) -> float:
         """Where the equal parts of the first way to a target begin."""
         return 0.0
 
-    def scale(self, now: Now) -> float:
+    def scale(self, load_start: LoadStart) -> float:
         """An amplitude that counts as of order one in the arc length."""
         return 1.0
 
@@ -273,12 +273,12 @@ class LoadStep(PathStep):
 class BodyForceStep(LoadStep):
     """The base of forces by the shell's own mass: in E/R, such of the order of h² bend it."""
 
-    def first(self, change: float, now: Now, *, by_load: bool) -> float:
-        return change / self.points if self.target or self.bound else now.h**2
+    def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
+        return change / self.points if self.target or self.limit_target else load_start.h**2
 
-    def scale(self, now: Now) -> float:
-        goal = self.target or self.bound
-        return abs(goal[1]) or now.h**2 if goal else now.h**2
+    def scale(self, load_start: LoadStart) -> float:
+        goal = self.target or self.limit_target
+        return abs(goal[1]) or load_start.h**2 if goal else load_start.h**2
 
 
 class FactorStep(LoadStep):
@@ -292,7 +292,7 @@ class FactorStep(LoadStep):
     section
         Key of the case that asks for it.
     label
-        Of its points before the load, see `Course`.
+        Of its points before the load, see `StepCourse`.
     """
 
     section: ClassVar[str]
@@ -309,7 +309,7 @@ class FactorStep(LoadStep):
         raise NotImplementedError
 
     @classmethod
-    def before(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
+    def steps_before_load(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
         driven = loading is not None and cls.amplitude in (loading.amplitude, *loading.drives)
         if driven or not cls.asked_for(context):
             return []
@@ -318,16 +318,16 @@ class FactorStep(LoadStep):
         step._alone = True
         return [(cls.section, step)]
 
-    def drive(self, now: Now) -> Drive:
-        size = now.size
+    def drive(self, load_start: LoadStart) -> Drive:
+        size = load_start.size
         return (
             Drive("arc", "load", size, [size], size / 2, size)
             if self._alone
-            else super().drive(now)
+            else super().drive(load_start)
         )
 
-    def course(self, here: Here) -> Course:
-        course = super().course(here)
+    def course(self, step_start: StepStart) -> StepCourse:
+        course = super().course(step_start)
         if not self._alone:
             return course
 
@@ -336,6 +336,6 @@ class FactorStep(LoadStep):
 
         return replace(course, until="limit", forbidden=forbidden, label=self.label)
 
-    def unstable_alone(self, value: float, course: Course, what: str) -> str:
+    def unstable_alone(self, value: float, course: StepCourse, what: str) -> str:
         """What is said of an instability before the load, at a value of the amplitude."""
         raise NotImplementedError

@@ -15,7 +15,7 @@ from pydantic import Field, PrivateAttr, create_model
 from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.parts.ability import Ability, Account, Context, Part
-from magshell_fenicsx.parts.observables import Seen
+from magshell_fenicsx.parts.observables import Observables
 from magshell_fenicsx.parts.step import Step
 
 REGISTERED: dict[str, str] = {
@@ -41,7 +41,7 @@ KINDS_OF_STEPS: dict[str, str] = {
     "interaction": "magnetism.interaction.InteractionStep",
     "fold": "joints.FoldStep",
 }
-FIRST = (
+KINDS_BEFORE_LOAD = (
     "natural",
     "fold",
     "interaction",
@@ -62,21 +62,21 @@ ABILITIES = (  # module here and class in it, of those without a key and a line 
     "contact.contact_section.ShellContact",
     "joints.Joined",
 )
-WHAT_IS_SEEN = (  # module here and class in it, in the order of columns
-    "natural.section.NaturalSeen",
-    "imperfections.growth.GrowingSeen",
-    "pressure.pressure.PressureSeen",
-    "forces.dead_load_step.ForcesSeen",
-    "supports.reacting.ReactionsSeen",
-    "magnetism.readings.FieldSeen",
-    "magnetism.source_step.SourcesSeen",
-    "magnetism.readings.SoftSeen",
-    "magnetism.interaction.InteractionSeen",
-    "magnetism.readings.SensorsSeen",
-    "magnetism.field_maps.FieldMapsSeen",
-    "bodies.contact_step.BodiesSeen",
+OBSERVABLE_CLASSES = (  # module here and class in it, in the order of columns
+    "natural.section.NaturalObservables",
+    "imperfections.growth.GrowingObservables",
+    "pressure.pressure.PressureObservables",
+    "forces.dead_load_step.ForcesObservables",
+    "supports.reacting.ReactionsObservables",
+    "magnetism.readings.FieldObservables",
+    "magnetism.source_step.SourcesObservables",
+    "magnetism.readings.SoftObservables",
+    "magnetism.interaction.InteractionObservables",
+    "magnetism.readings.SensorsObservables",
+    "magnetism.field_maps.FieldMapsObservables",
+    "bodies.contact_step.BodiesObservables",
     "contact.contact_observables.ContactObservables",
-    "joints.FoldSeen",
+    "joints.FoldObservables",
 )
 ACCOUNTS = (  # modules here with a function `account`, in the order of `magshell check`
     "magnetism.magnetisation",
@@ -163,12 +163,12 @@ class WithOwnTerms(Section):
 
 def parts_of(context: Context) -> dict[str, Part]:
     """The registered parts that a problem has, by key."""
-    return {key: part for key in PARTS if (part := context.sections.get(key)) is not None}
+    return {key: part for key in PART_CLASSES if (part := context.sections.get(key)) is not None}
 
 
 def abilities_of(context: Context) -> list[Ability]:
     """All that add something to a problem."""
-    listed = (ability.of(context) for ability in KNOWN)
+    listed = (ability.from_context(context) for ability in ABILITY_CLASSES)
     return [*parts_of(context).values(), *(ability for ability in listed if ability is not None)]
 
 
@@ -183,12 +183,12 @@ def _named(path: str) -> Any:
     return getattr(import_module(f"{__package__}.{module}"), name)
 
 
-PARTS: dict[str, type[Part]] = {
+PART_CLASSES: dict[str, type[Part]] = {
     key: getattr(import_module(f"{__package__}.{key}"), name) for key, name in REGISTERED.items()
 }
 STEPS: dict[str, type[Step]] = {kind: _named(path) for kind, path in KINDS_OF_STEPS.items()}
-KNOWN: tuple[type[Ability], ...] = tuple(map(_named, ABILITIES))
-SEEN: tuple[Seen, ...] = tuple(_named(path)() for path in WHAT_IS_SEEN)
+ABILITY_CLASSES: tuple[type[Ability], ...] = tuple(map(_named, ABILITIES))
+OBSERVABLES: tuple[Observables, ...] = tuple(_named(path)() for path in OBSERVABLE_CLASSES)
 
 
 def _meaning(part: type[Part]) -> str:
@@ -206,6 +206,6 @@ else:  # an optional key for each part
         __base__=WithOwnTerms,
         **{
             key: (part | None, Field(default=None, description=_meaning(part)))
-            for key, part in PARTS.items()
+            for key, part in PART_CLASSES.items()
         },
     )

@@ -67,7 +67,7 @@ class Rubber(Ability):
     law: str
 
     @classmethod
-    def of(cls, context: Context) -> "Rubber | None":
+    def from_context(cls, context: Context) -> "Rubber | None":
         """The first of several shells that is of rubber."""
         laws = (law for law in laws_of(context) if law not in ("koiter", "laminate"))
         return next((cls(law) for law in laws), None)

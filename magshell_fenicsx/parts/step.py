@@ -11,19 +11,19 @@ from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.mesh.grading import Feature
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.parts.step_control import (
-    Ahead,
-    Course,
+from magshell_fenicsx.parts.step_course import (
+    ExpectedEnd,
+    StepCourse,
     Curves,
-    Fit,
-    Here,
+    SizingContext,
+    StepStart,
     Hold,
     SearchSection,
     SnapSection,
     Target,
     Until,
 )
-from magshell_fenicsx.parts.step_control import (
+from magshell_fenicsx.parts.step_course import (
     ProgrammeStep as ProgrammeStep,
 )
 from magshell_fenicsx.parts.ability import Context, Formulas, Modelled
@@ -99,7 +99,7 @@ class Step(Section):
         return None
 
     @property
-    def bound(self) -> tuple[Target, float] | None:
+    def limit_target(self) -> tuple[Target, float] | None:
         """Where a way to the first instability ends at the latest, as `target`; None without."""
         return None
 
@@ -161,17 +161,17 @@ class Step(Section):
         """The value of a history at an amplitude."""
         return amplitude
 
-    def course(self, here: Here) -> Course:
+    def course(self, step_start: StepStart) -> StepCourse:
         """How it goes on."""
         raise NotImplementedError
 
-    def curves(self, here: Here) -> tuple[Curves, float] | None:
-        """See `Course`, from any state of the step."""
+    def curves(self, step_start: StepStart) -> tuple[Curves, float] | None:
+        """See `StepCourse`, from any state of the step."""
         return None
 
-    def ahead(
+    def expected_end(
         self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float
-    ) -> Ahead | None:
+    ) -> ExpectedEnd | None:
         """Its end, if its target does not say it."""
         return None
 
@@ -200,7 +200,7 @@ class Step(Section):
         return None
 
     @classmethod
-    def before(cls, context: Context, loading: "Step | None") -> list[tuple[str, "Step"]]:
+    def steps_before_load(cls, context: Context, loading: "Step | None") -> list[tuple[str, "Step"]]:
         """The steps of this kind that come before the only load of a case, each with the key that
         asks for it.
         """
@@ -275,19 +275,19 @@ class Step(Section):
         return []
 
     @classmethod
-    def around(cls, loads: Sequence[Self], place: Array, fit: "Fit") -> list[Feature]:
+    def mesh_features(cls, loads: Sequence[Self], place: Array, sizing: "SizingContext") -> list[Feature]:
         """Small elements around a place in the chart with these loads of the kind."""
         return []
 
-    def growth(self, fit: "Fit") -> float:
+    def growth(self, sizing: "SizingContext") -> float:
         """How fast elements may grow away from small ones."""
         return 0.4
 
-    def rim(self, fit: "Fit") -> float:
+    def rim(self, sizing: "SizingContext") -> float:
         """Size of elements along the edge of a curved surface, over sqrt(Rh)."""
         return 1.4
 
-    def largest(self, fit: "Fit") -> float | None:
+    def largest(self, sizing: "SizingContext") -> float | None:
         """Largest size of elements on a curved disc, over R; None: as without it."""
         return None
 

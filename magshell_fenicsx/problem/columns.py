@@ -13,7 +13,7 @@ from magshell_fenicsx.input.section import case_sizes
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.ability import Context
-from magshell_fenicsx.parts.registered import SEEN
+from magshell_fenicsx.parts.registered import OBSERVABLES
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.quantity import DISTANCE, TURN, Unit
 from magshell_fenicsx.quantities.registry import IN_TIME, OF_EVERY_RUN, Sizes
@@ -21,12 +21,12 @@ from magshell_fenicsx.quantities.registry import IN_TIME, OF_EVERY_RUN, Sizes
 
 def sizes_in_units(problem: Problem) -> Sizes:
     """Return the sizes of the case's units, with those of prescribed motions."""
-    moments = {column for registered in SEEN for column in registered.moments(problem.loads)}
+    moments = {column for registered in OBSERVABLES for column in registered.moments(problem.loads)}
     sizes = sizes_of(problem.context, moments)
     if sizes.case is None or isnan(sizes.case.R):
         return sizes
     lengths, angles = dict[str, tuple[Unit, float]](), dict[str, tuple[Unit, float]]()
-    for registered in SEEN:
+    for registered in OBSERVABLES:
         for name, (is_rotation, amount) in registered.ways(problem.loads).items():
             if amount and is_rotation:
                 angles[name] = (TURN, float(np.degrees(amount)))
@@ -40,7 +40,7 @@ def own_amplitudes(loads: Loads) -> dict[str, float]:
 
     They are those of parts, of the user's energies, and of their parameters.
     """
-    of_parts = {name: 0.0 for registered in SEEN for name in registered.named(loads)}
+    of_parts = {name: 0.0 for registered in OBSERVABLES for name in registered.named(loads)}
     terms = [term for term in loads.own if term.density]
     return (
         of_parts
@@ -56,7 +56,7 @@ def extra_columns(problem: Problem) -> tuple[str, ...]:
     observed = [column for term in loads.own for column in term.observed]
     reported = problem.supports if problem.reactions else ()
     before_points, after_points = list[str](), list[str]()
-    for registered in SEEN:
+    for registered in OBSERVABLES:
         columns = before_points if registered.before_points else after_points
         columns += registered.columns(loads, reported)
     is_in_time = any(step.load.in_time or step.load.released_by for step in problem.programme)
@@ -76,7 +76,7 @@ def refuse_duplicate_names(problem: Problem) -> None:
         With the name and the key that gives it.
     """
     loads = problem.loads
-    of_parts = [name for registered in SEEN for name in registered.amplitudes(loads)]
+    of_parts = [name for registered in OBSERVABLES for name in registered.amplitudes(loads)]
     amplitudes = [*own_amplitudes(loads), *of_parts]
     columns = [*(q.name for q in OF_EVERY_RUN), *extra_columns(problem)]
     for names, what in ((amplitudes, "amplitude"), (columns, "column of path.csv")):

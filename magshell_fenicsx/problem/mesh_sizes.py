@@ -14,7 +14,7 @@ from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import Section, or_number
 from magshell_fenicsx.mesh.grading import Feature, Grading, LineFeature, RingFeature
-from magshell_fenicsx.parts.step_control import Fit
+from magshell_fenicsx.parts.step_course import SizingContext
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.step import Step
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
@@ -88,7 +88,7 @@ class SolidSection(Section):
 
 def mesh_section(context: Context) -> MeshSection:
     """Return the elements that a case requests."""
-    return context.of(MeshSection) or MeshSection()
+    return context.section_of(MeshSection) or MeshSection()
 
 
 def degree_of(context: Context) -> int:
@@ -99,7 +99,7 @@ def degree_of(context: Context) -> int:
 class Refined(Protocol):
     """A part of a case that needs small elements somewhere."""
 
-    def features(self, outline: "Outline", fit: Fit, growth: float) -> list[Feature]:
+    def features(self, outline: "Outline", sizing: SizingContext, growth: float) -> list[Feature]:
         """Return where elements are small, with sizes that grow by `growth` per distance."""
 
 
@@ -136,19 +136,19 @@ def grading(
         default = min(UNIFORM_SIZE * sqrt(h), MAX_SIZE)
         size = mesh.size / context.shell.reference if mesh.size else default
         return Grading([], size / mesh.refinement)
-    fit = Fit(h, mesh.refinement, context.solid, local)
-    growth = _growth(context, fit)
-    features = _edge_features(context, outline, fit)
+    sizing = SizingContext(h, mesh.refinement, context.solid, local)
+    growth = _growth(context, sizing)
+    features = _edge_features(context, outline, sizing)
     for part in refined:
-        features += part.features(outline, fit, growth)
+        features += part.features(outline, sizing, growth)
     for place, loads in loaded:
         for kind in {type(load): None for load in loads}:
-            features += kind.around([load for load in loads if type(load) is kind], place, fit)
+            features += kind.mesh_features([load for load in loads if type(load) is kind], place, sizing)
     features += varying
-    return Grading(features, min(_largest_size(context, outline, fit), largest) / mesh.refinement)
+    return Grading(features, min(_largest_size(context, outline, sizing), largest) / mesh.refinement)
 
 
-def _largest_size(context: Context, outline: "Outline", sizing: Fit) -> float:
+def _largest_size(context: Context, outline: "Outline", sizing: SizingContext) -> float:
     """Return the element size where nothing needs smaller ones."""
     if outline.grid:
         return min(UNIFORM_SIZE * sqrt(sizing.h), MAX_SIZE)
@@ -159,15 +159,15 @@ def _largest_size(context: Context, outline: "Outline", sizing: Fit) -> float:
     return min((size for size in sizes if size is not None), default=MAX_SIZE)
 
 
-def _growth(context: Context, sizing: Fit) -> float:
+def _growth(context: Context, sizing: SizingContext) -> float:
     return max((step.load.growth(sizing) for step in context.steps), default=GROWTH)
 
 
-def _edge_features(context: Context, outline: "Outline", sizing: Fit) -> list[Feature]:
+def _edge_features(context: Context, outline: "Outline", sizing: SizingContext) -> list[Feature]:
     """Return smaller elements along held edges of a grid, and along the rim of a curved disc."""
     h, growth = sizing.h, _growth(context, sizing)
     if grid := outline.grid:
-        boundary = context.of(BoundarySection)
+        boundary = context.section_of(BoundarySection)
         size = GRID_EDGE_SIZE * sqrt(h) / sizing.refinement
         conditions = boundary.conditions() if boundary else {}
         features = list[Feature]()

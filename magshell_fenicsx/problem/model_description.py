@@ -8,7 +8,7 @@ from magshell_fenicsx.parts.imperfections.symmetry import MAX_RIMS
 from magshell_fenicsx.parts.laminate import laminate_account
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.ability import Context
-from magshell_fenicsx.parts.registered import PARTS, accounts, parts_of
+from magshell_fenicsx.parts.registered import PART_CLASSES, accounts, parts_of
 from magshell_fenicsx.parts.rubber import law_account, laws_of
 from magshell_fenicsx.problem.problem import SolidBody, solid_body_of
 from magshell_fenicsx.shape.shell_sections import MeshSurface
@@ -42,7 +42,7 @@ def describe_model(
         if text := step.load.account(step, context):
             included.append(text)
     parts = parts_of(context)
-    for key, part in PARTS.items():
+    for key, part in PART_CLASSES.items():
         if key in parts:
             included.append(parts[key].account(context.scales))
         else:

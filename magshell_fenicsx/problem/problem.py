@@ -82,7 +82,7 @@ def layer_bounds(context: Context) -> list[float]:
     Magnetised layers end where elements do, and so does the inner half then: nodes lie in the
     middle.
     """
-    count, magnetic = _solid_section(context).layers, context.of(MagneticSection)
+    count, magnetic = _solid_section(context).layers, context.section_of(MagneticSection)
     remanent = magnetic and magnetic.remanent
     magnetised = (remanent and remanent.layers) or []
     if not magnetised:
@@ -99,7 +99,7 @@ def layer_bounds(context: Context) -> list[float]:
 
 
 def _solid_section(context: Context) -> SolidSection:
-    return context.of(SolidSection) or SolidSection()
+    return context.section_of(SolidSection) or SolidSection()
 
 
 @dataclass(frozen=True)

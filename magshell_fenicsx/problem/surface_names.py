@@ -16,7 +16,7 @@ from magshell_fenicsx.models.shell.thickness import Thickness, patch_of
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.pressure.openings import moving, without_potential
-from magshell_fenicsx.parts.registered import SEEN, parts_of
+from magshell_fenicsx.parts.registered import OBSERVABLES, parts_of
 from magshell_fenicsx.parts.supports.supports import refuse_unknown
 from magshell_fenicsx.quantities.registry import RESERVED_NAMES
 
@@ -88,7 +88,7 @@ def refuse_unfit(
     """
     refuse_unknown(patch.edges, patch.points, patch.patches, conditions, loads)
     _refuse_ambiguous(patch.edges, patch.points, conditions)
-    for registered in SEEN:
+    for registered in OBSERVABLES:
         registered.refuse_unfit(loads, patch)
     for name in (thickness and thickness.patches) or {}:
         patch_of(patch.patches, name, "shell.thickness_factor")

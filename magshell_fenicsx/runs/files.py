@@ -50,7 +50,7 @@ from magshell_fenicsx.output.store.manifest import (
 from magshell_fenicsx.output.store.manifest import NAME as MANIFEST
 from magshell_fenicsx.output.store.stored_results import SUMMARY, read_summary
 from magshell_fenicsx.output.store.table import PathTable, Row, read_lines
-from magshell_fenicsx.parts.registered import SEEN
+from magshell_fenicsx.parts.registered import OBSERVABLES
 from magshell_fenicsx.problem.problem import Document
 from magshell_fenicsx.simulate.scene import Scene
 
@@ -313,7 +313,7 @@ class RunFiles:
         outlines_file = ""
         if outlines(problem.loads, self._scene.unloaded().mu, shell_data.h):
             outlines_file = FILE_OF_POINT if moves else FILE_OF_ALL_POINTS
-        grids = [grid for observables in SEEN for grid in observables.grids(problem.loads)]
+        grids = [grid for observables in OBSERVABLES for grid in observables.grids(problem.loads)]
         rows = self._table.complete_rows
         self._fields = FieldSeries(self._folder / "fields", shell_data, outlines_file, rows, grids)
         sync_folder(self._folder)
@@ -335,7 +335,7 @@ class RunFiles:
         if scene is not self._scene:
             self._scene, self._gatherer = scene, gatherer(scene.model, self._comm)
         surface, mirror = self._gatherer.gather(state.u, state.mu), scene.problem.mirror
-        grids = [grid for observables in SEEN for grid in observables.on_grids(scene.sight, state)]
+        grids = [grid for observables in OBSERVABLES for grid in observables.on_grids(scene.view, state)]
 
         def write() -> None:
             assert surface is not None

@@ -20,7 +20,7 @@ from magshell_fenicsx.output.fields.vtu import ShellData, vtu_content
 from magshell_fenicsx.output.store.durable import write_whole
 from magshell_fenicsx.output.store.folder import access_disk
 from magshell_fenicsx.runs.summary import Result
-from magshell_fenicsx.simulate.follow import BEYOND
+from magshell_fenicsx.simulate.follow import BEYOND_INSTABILITY
 from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
 from magshell_fenicsx.simulate.gradients.fields import density
 from magshell_fenicsx.simulate.gradients.gradient import Gradient, derivative
@@ -31,7 +31,7 @@ from magshell_fenicsx.simulate.gradients.instabilities import (
     refuse_moving,
 )
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end, refuse_no_result
-from magshell_fenicsx.simulate.numbers import refuse_unknown_parameters
+from magshell_fenicsx.simulate.perturbation import refuse_unknown_parameters
 from magshell_fenicsx.simulate.scene import Scene
 
 Say = Callable[[str], None]
@@ -163,7 +163,9 @@ def _adjoint(result: Result, name: str) -> tuple[str, Adjoint]:
     scene, history = result.scene, result.path_history
     if name in FOLDS:
         return instabilities(scene, history.located, name, 1, history.begins)[0]
-    reason = next((remark for remark in result.remarks if remark.startswith(BEYOND)), None)
+    reason = next(
+        (remark for remark in result.remarks if remark.startswith(BEYOND_INSTABILITY)), None
+    )
     if result.stopped or reason or history.end is None:
         raise LostResult(result.stopped or reason or "the path has no end")
     refuse_moving(scene, history.end, name)

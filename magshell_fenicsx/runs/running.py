@@ -313,7 +313,7 @@ def _unloaded_result(problem: Problem, folder: Path | None, output: RunOutput) -
     except (CaseError, MeshError) as e:
         raise type(e)(problem.document.placed(str(e))) from None
     if mesh and mesh.branch:
-        scene.meshed = mesh.branch.choice.applied
+        scene.remesh = mesh.branch.choice.applied
     return Result(scene, scene.unloaded(), adapted=mesh)
 
 
@@ -345,7 +345,7 @@ def _say_what_is_solved(scene: Scene, comm: MPI.Comm, say: Say) -> None:
     """Say what the model includes and how large it is, and warn of what makes it slow."""
     included = ", ".join(scene.problem.included)
     say(f"{included}: {scene.cells} cells, {scene.model.system.dofs} unknowns")
-    for warning in (*scene.warnings, *scene.unshown):
+    for warning in (*scene.warnings, *scene.unresolved):
         say(f"warning: {warning}")
     if fast_blas() is None:
         say("warning: PETSc uses the reference BLAS; install OpenBLAS to factor seven times faster")

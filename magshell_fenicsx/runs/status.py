@@ -9,7 +9,7 @@ import numpy as np
 
 from magshell_fenicsx.continuation.point import Point
 from magshell_fenicsx.output.store.table import SOLUTION, Row
-from magshell_fenicsx.parts.registered import SEEN
+from magshell_fenicsx.parts.registered import OBSERVABLES
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import format_number
 from magshell_fenicsx.quantities.registry import Sizes, amplitude, quantity, shown_quantity
@@ -81,7 +81,7 @@ class PathEnd:
 def path_end(scene: Scene, step: ProgrammeStep) -> PathEnd:
     """Return the end of a step of the programme."""
     load, varied_amplitude = step.load, amplitude(step.name)
-    if planned_end := load.ahead(
+    if planned_end := load.expected_end(
         step, scene.problem.context, scene.problem.loads, scene.problem.azimuth
     ):
         return PathEnd(
@@ -94,7 +94,7 @@ def path_end(scene: Scene, step: ProgrammeStep) -> PathEnd:
     target, value = load.target
     if target.quantity == "load":
         return PathEnd(varied_amplitude.column, value * load.size(scene.problem.context))
-    for observables in SEEN:
+    for observables in OBSERVABLES:
         if column := observables.conjugates(scene.problem.loads).get(step.name):
             return PathEnd(column, value)
     own_column = f"w_{step.name}_over_h"

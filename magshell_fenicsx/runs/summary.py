@@ -15,7 +15,7 @@ from magshell_fenicsx.output.fields.mode_fields import hertz
 from magshell_fenicsx.output.report.verdict import place_in_units
 from magshell_fenicsx.output.store.checkpoint import CASE_FILE
 from magshell_fenicsx.output.store.table import LOCATED, Row
-from magshell_fenicsx.parts.registered import SEEN
+from magshell_fenicsx.parts.registered import OBSERVABLES
 from magshell_fenicsx.platform.environment import code_version, fast_blas, versions
 from magshell_fenicsx.quantities.registry import Sizes, amplitude
 from magshell_fenicsx.runs.rows import Table, table
@@ -274,8 +274,8 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
     if result.adapted:
         tolerance = {"tolerance": result.adapted.account(result.value, result.branch_error)}
     observed = dict[str, Any]()
-    for observables in SEEN:
-        observed |= observables.summary(result.scene_of(result.end).sight, result.last)
+    for observables in OBSERVABLES:
+        observed |= observables.summary(result.scene_of(result.end).view, result.last)
     excluded = (int(row["excluded_pivots"]) for row in result.rows)
     return {
         "case": requested.document.data,
@@ -295,7 +295,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         "model": {
             "included": scene.problem.included,
             "left_out": scene.left_out,
-            **({"not_shown": scene.unshown} if scene.unshown else {}),
+            **({"not_shown": scene.unresolved} if scene.unresolved else {}),
             "kernels": model.kernels.names,
             "forms": len(model.kernels.names),
             "penalty": model.sigma,

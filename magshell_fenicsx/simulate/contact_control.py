@@ -65,7 +65,7 @@ def state_at_first_contact(scene: Scene, step: ProgrammeStep, state: State) -> S
     Stopped
         If the body never meets the shell, or the first contact has no equilibrium.
     """
-    goal, name, h = step.load.target or step.load.bound, step.name, scene.problem.material.h
+    goal, name, h = step.load.target or step.load.limit_target, step.name, scene.problem.material.h
     end = goal[1] if goal and goal[0].quantity == "load" else inf  # of the approach
     region = scene.model.region(state, name)
     if region.penetration > GAP_TOLERANCE * h or end <= state.mu[name]:

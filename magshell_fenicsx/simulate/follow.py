@@ -68,7 +68,7 @@ def follow(
         _refuse_not_numbers(scene, state, run.place)
         try:
             yield from run.path(state)
-            if step.load.bound and not run.is_unstable:
+            if step.load.limit_target and not run.is_unstable:
                 remark(
                     f"{run.place}there is no instability up to the target, where until: limit ends "
                     "too"

@@ -29,14 +29,16 @@ from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.steps import LOCATED
-from magshell_fenicsx.simulate.transfer import all_of_shells, nodes_of_shells
+from magshell_fenicsx.simulate.transfer import all_nodes_of_shells, nodes_of_shells
 
 if TYPE_CHECKING:  # one of them is built
     from magshell_fenicsx.shells.meridian import MeridianModel
     from magshell_fenicsx.shells.shell import ShellModel
 
 Array = NDArray[np.float64]
-STILL = 1e-6  # of the largest displacement: a shell that moves less is not moved by the mode
+MIN_DISPLACEMENT = (
+    1e-6  # of the largest displacement: a shell that moves less is not moved by the mode
+)
 _known: dict[str, tuple[Mode, ...]] = {}  # a sweep has many cases with one perfect shell
 
 
@@ -100,7 +102,7 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
         inside = [of[order] for of in nodes_of_shells(scene)]
     else:
         assert model.thin
-        (x, w), inside = _at_nodes(scene, model, mode), all_of_shells(scene)
+        (x, w), inside = _at_nodes(scene, model, mode), all_nodes_of_shells(scene)
         mirror = model.mirror if model.multiplicity > 1 else None
     own, sign = len(x), -1.0 if mode.label == "antisymmetric" else 1.0
     if mirror:
@@ -112,15 +114,17 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
             return on_meridian(x[of], w[of], int(mode.label.removeprefix("m = ") or 0))
         if not mirror:
             return on_surface(x[of], w[of], x[of])
-        both = np.concatenate([of, own + of])
-        whole = on_surface(x[both], w[both], x[of])
-        return in_frame(Mirrored(whole, mirror, sign), -scene.problem.azimuth)
+        nodes_and_images = np.concatenate([of, own + of])
+        function = on_surface(x[nodes_and_images], w[nodes_and_images], x[of])
+        return in_frame(Mirrored(function, mirror, sign), -scene.problem.azimuth)
 
     of_each = [np.flatnonzero(of) for of in inside]
     if len(of_each) < 2:
         return part(of_each[0])
-    named = zip(scene.problem.context.sections["shells"], of_each, strict=True)
-    return OfShells({name: part(of) for name, of in named if np.abs(w[of]).max() > STILL})
+    names_and_nodes = zip(scene.problem.context.sections["shells"], of_each, strict=True)
+    return OfShells(
+        {name: part(of) for name, of in names_and_nodes if np.abs(w[of]).max() > MIN_DISPLACEMENT}
+    )
 
 
 def _along_meridian(model: "MeridianModel", mode: ShellMode) -> tuple[Array, Array]:
@@ -131,10 +135,12 @@ def _along_meridian(model: "MeridianModel", mode: ShellMode) -> tuple[Array, Arr
     V = model.waves.V if mode.label else model.V
     order, own = (np.argsort(space.tabulate_dof_coordinates()[:, 0]) for space in (V, model.V))
     values = mode.vector.reshape(len(order), -1)[order]
-    along = np.column_stack([values[:, 0] - values[:, 1], values[:, 2]]) if mode.label else values
+    in_plane = (
+        np.column_stack([values[:, 0] - values[:, 1], values[:, 2]]) if mode.label else values
+    )
     normal = nodal_normals(model.r0)[own][:, [0, 2]]
     rho, z = model.r0.x.array.reshape(-1, 2)[own].T
-    return np.column_stack([rho, 0 * z, z]), -np.einsum("ij,ij->i", along, normal)
+    return np.column_stack([rho, 0 * z, z]), -np.einsum("ij,ij->i", in_plane, normal)
 
 
 def _at_nodes(scene: Scene, model: "ShellModel", mode: ShellMode) -> tuple[Array, Array]:
@@ -148,8 +154,8 @@ def _at_nodes(scene: Scene, model: "ShellModel", mode: ShellMode) -> tuple[Array
     )
     _, r_1, r_2 = np.matmul(table[:, None], r0)
     parts = comm.allgather((numbers, *(a.reshape(-1, 3) for a in (r0, v, np.cross(r_1, r_2)))))
-    where, x, v, n = (np.concatenate(part) for part in zip(*parts, strict=True))
-    total = np.column_stack([np.bincount(where, c) for c in n.T])
+    node_numbers, x, v, n = (np.concatenate(part) for part in zip(*parts, strict=True))
+    total = np.column_stack([np.bincount(node_numbers, c) for c in n.T])
     n0 = total / np.linalg.norm(total, axis=1)[:, None]
-    first = np.unique(where, return_index=True)[1]
+    first = np.unique(node_numbers, return_index=True)[1]
     return x[first], -np.einsum("ij,ij->i", v[first], n0)

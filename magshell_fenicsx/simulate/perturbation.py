@@ -1,4 +1,4 @@
-"""A scene with another number of its problem, on the same mesh: for derivatives by differences.
+"""Perturbation of a number of a problem: its scene on the same mesh, for differences.
 
 The problem is the one that a file with this number would give: lengths with units stay, those over
 h or in the unit of a dimple's width change with these.
@@ -49,7 +49,7 @@ KEYS_WITHOUT_GRADIENT = (*KEYS_OUTSIDE_THE_MODEL, "loading", "points", "boundary
 
 
 def number_at_key(context: Context, key: str) -> float:
-    """The number at a key such as "magnetic.remanent.polar".
+    """Return the number at a key such as "magnetic.remanent.polar".
 
     Raises
     ------
@@ -68,51 +68,47 @@ def number_at_key(context: Context, key: str) -> float:
         )
     if key.startswith("shell.laminate.plies.") and key.endswith(".fraction"):
         raise CaseError(f"{key}: the fractions of the plies add up to 1: one alone has no gradient")
-    own_key = (
-        key.split(".", 2)[2] if key.startswith("shells.") else key
-    )  # of one of several shells, in its own section
-    section, _, rest = own_key.partition(".")
-    geometry = section == "shell" and rest.split(".")[0] not in (*MATERIAL_KEYS, *DEVIATION_KEYS)
-    if section in KEYS_WITHOUT_GRADIENT or geometry:
+    # of one of several shells, in its own section
+    own_key = key.split(".", 2)[2] if key.startswith("shells.") else key
+    section_key, _, rest = own_key.partition(".")
+    differentiable_keys = (*MATERIAL_KEYS, *DEVIATION_KEYS)
+    is_geometry = section_key == "shell" and rest.split(".")[0] not in differentiable_keys
+    if section_key in KEYS_WITHOUT_GRADIENT or is_geometry:
         raise CaseError(
-            f"{key}: a number of the mesh, of the shape, of a target or of the output has no gradient here"
+            f"{key}: a number of the mesh, of the shape, of a target or of the output has no "
+            "gradient here"
         )
-    flaws = [*(context.sections.get("imperfections") or {}).values()]
-    flaws += [
-        flaw
-        for section in (context.sections.get("shells") or {}).values()
-        for flaw in section.shell.imperfections
-    ]
-    if any(flaw.of_perfect_shell for flaw in flaws) and ".imperfections." not in key:
+    imperfections = [*(context.sections.get("imperfections") or {}).values()]
+    for section in (context.sections.get("shells") or {}).values():
+        imperfections += section.shell.imperfections
+    has_modes = any(imperfection.of_perfect_shell for imperfection in imperfections)
+    if has_modes and ".imperfections." not in key:
         raise CaseError(
-            f"{key}: the modes of the perfect shell, which the case has as imperfections, change with it: give their "
-            "file (kind: modes, file)"
+            f"{key}: the modes of the perfect shell, which the case has as imperfections, change "
+            "with it: give their file (kind: modes, file)"
         )
     return float(part)
 
 
 def scale_at_key(context: Context, key: str) -> float:
-    """What a change of the number at a key is small against.
+    """Return the scale of the number at a key, which changes are small against.
 
-    The number itself; of a zero the largest number of its list, of a zero length R in the case's
-    unit, else one.
+    It is the number itself; of a zero the largest number of its list, of a zero length R in the
+    case's unit, else one.
     """
-    value, is_a_length = _value_and_kind(context, key)
+    value, is_length_key = _value_and_kind(context, key)
+    if value:
+        return abs(value)
     neighbours, _ = _value_and_kind(context, key.rpartition(".")[0])
-    numbers = (
-        [v for v in neighbours if isinstance(v, float | int)]
-        if isinstance(neighbours, list)
-        else []
-    )
-    return (
-        abs(value)
-        or max(map(abs, numbers), default=0.0)
-        or (context.shell.reference if is_a_length else 1.0)
-    )
+    if isinstance(neighbours, list):
+        sizes = [abs(v) for v in neighbours if isinstance(v, float | int)]
+        if largest := max(sizes, default=0.0):
+            return largest
+    return context.shell.reference if is_length_key else 1.0
 
 
 def _value_and_kind(context: Context, key: str) -> tuple[Any, bool]:
-    """What stands at a key, and whether it is a length by the type of its section.
+    """Return the value at a key, and whether it is a length by the type of its section.
 
     Raises
     ------
@@ -122,7 +118,7 @@ def _value_and_kind(context: Context, key: str) -> tuple[Any, bool]:
     part: Any = {
         name: section for name, section in context.sections.items() if name != "imperfections"
     }
-    a_length = False
+    is_length_key = False
     for name in key.split("."):
         try:
             if isinstance(part, list):
@@ -131,14 +127,15 @@ def _value_and_kind(context: Context, key: str) -> tuple[Any, bool]:
                 part = part[name]
             else:
                 field = type(part).model_fields[name]
-                part, a_length = getattr(part, name), is_length(field.annotation, field.metadata)
+                is_length_key = is_length(field.annotation, field.metadata)
+                part = getattr(part, name)
         except (LookupError, ValueError, AttributeError):
             raise CaseError(f"{key}: the case has no such key ({name})") from None
-    return part, a_length
+    return part, is_length_key
 
 
 def refuse_unknown_parameters(context: Context, names: Iterable[str], start: State) -> None:
-    """See that gradients can be taken by fields, amplitudes and numbers with these names.
+    """Check that gradients can be taken by fields, amplitudes and numbers with these names.
 
     Raises
     ------
@@ -154,7 +151,7 @@ def refuse_unknown_parameters(context: Context, names: Iterable[str], start: Sta
 
 
 def perturbed_scene(scene: Scene, key: str, value: float) -> Scene:
-    """The scene with another number, on the same mesh; collective.
+    """Return the scene with another number, on the same mesh; collective.
 
     Raises
     ------
@@ -169,14 +166,14 @@ def perturbed_scene(scene: Scene, key: str, value: float) -> Scene:
         )
     if new.patched and _rims(new) != _rims(old):
         raise CaseError(
-            f"{key}: moves the rim of a dimple, which is the edge of a patch in the mesh; a width with a unit "
-            "depends on no other number"
+            f"{key}: moves the rim of a dimple, which is the edge of a patch in the mesh; a width "
+            "with a unit depends on no other number"
         )
     return Scene(problem_on_mesh_of(scene, new), scene.comm)
 
 
 def _rims(problem: Problem) -> list[object]:
-    """Where the rims of patches are."""
+    """Return half-width and place of each rim of a patch."""
     shell = problem.context.shell
     local = [
         section for section in problem.imperfections.values() if isinstance(section, LocalSection)
@@ -189,15 +186,9 @@ def _rims(problem: Problem) -> list[object]:
 
 
 def problem_on_mesh_of(scene: Scene, new: Problem) -> Problem:
-    """What a problem changes beside the mesh, for the mesh of a scene in its chart; imperfections
-    change too.
-    """
-    old, model, meridian, shape = (
-        scene.problem,
-        scene.model,
-        scene.problem.meridian,
-        scene.problem.shape,
-    )
+    """Return a problem on the mesh of a scene in its chart; imperfections may differ."""
+    old, model = scene.problem, scene.model
+    meridian, shape = old.meridian, old.shape
     if model.midsurface:
         shape = model.midsurface.with_embedding(new.embedding)
     elif model.axisymmetric:
@@ -218,28 +209,29 @@ def problem_on_mesh_of(scene: Scene, new: Problem) -> Problem:
 
 
 def state_with_new_loads(
-    old: Scene, new: Scene, state: State, own_key: Collection[str] = (), steps: int | None = None
+    old: Scene,
+    new: Scene,
+    state: State,
+    dependent_names: Collection[str] = (),
+    steps: int | None = None,
 ) -> State:
-    """The state with the loads of the new scene: where its targets are other numbers, amplitudes
-    are in proportion.
+    """Return the state with the loads of the new scene.
+
+    Where its targets are other numbers, amplitudes are in proportion.
 
     Parameters
     ----------
-    own
+    dependent_names
         Amplitudes that are results, or follow from what is held.
     steps
         How many steps of the programme led to the state; None: all.
     """
-    ratios, fields = (
-        target_ratios(old, new, "load", steps),
-        [name for name in state.mu if name.startswith("lambda_")],
-    )
+    ratios = target_ratios(old, new, "load", steps)
+    field_names = [name for name in state.mu if name.startswith("lambda_")]
     for contact, other in zip(old.problem.loads.contacts, new.problem.loads.contacts, strict=True):
         ratios[contact.setting] = other.stiffness / contact.stiffness
-    old_values, new_values = (
-        old.unloaded().mu,
-        new.unloaded().mu,
-    )  # stiffnesses of parts are amplitudes too
+    # stiffnesses of parts are amplitudes too
+    old_values, new_values = old.unloaded().mu, new.unloaded().mu
     ratios |= {
         name: new_values[name] / value
         for name, value in old_values.items()
@@ -250,41 +242,36 @@ def state_with_new_loads(
             raise CaseError(
                 "magnetic: a field of zero has no derivative by a number: take by: lambda_m"
             )
-        ratios |= dict.fromkeys(fields, new.problem.lambda_m / old.problem.lambda_m)
-    return State(
-        state.u,
-        {
-            name: value * (1.0 if name in own_key else ratios.get(name, 1.0))
-            for name, value in state.mu.items()
-        },
-    )
+        ratios |= dict.fromkeys(field_names, new.problem.lambda_m / old.problem.lambda_m)
+    mu = {
+        name: value * (1.0 if name in dependent_names else ratios.get(name, 1.0))
+        for name, value in state.mu.items()
+    }
+    return State(state.u, mu)
 
 
 def target_ratios(
     old: Scene, new: Scene, quantity: str, steps: int | None = None
 ) -> dict[str, float]:
-    """Amplitude -> target of the new scene over that of the old one, where they differ: those that
-    have units.
+    """Return amplitude -> target of the new scene over that of the old one, where they differ.
+
+    These are targets with units.
     """
-    targets = dict[str, float]()
+    ratios = dict[str, float]()
     for step, new_step in zip(
         old.problem.programme[:steps], new.problem.programme[:steps], strict=True
     ):
         old_target, new_target = step.load.target, new_step.load.target
-        if (
-            old_target
-            and new_target
-            and old_target[0].quantity == quantity
-            and old_target[1]
-            and old_target[1] != new_target[1]
-        ):
-            targets[step.name] = new_target[1] / old_target[1]
-    return targets
+        if not (old_target and new_target) or old_target[0].quantity != quantity:
+            continue
+        if old_target[1] and old_target[1] != new_target[1]:
+            ratios[step.name] = new_target[1] / old_target[1]
+    return ratios
 
 
-def same_chart_bounds(old_target: object, new_target: object) -> bool:
-    """Whether two shapes have the same bounds of their charts, as far as these are known."""
-    a, b = chart_bounds(old_target), chart_bounds(new_target)
+def same_chart_bounds(shape: object, other: object) -> bool:
+    """Return whether two shapes have the same bounds of their charts, as far as these are known."""
+    a, b = chart_bounds(shape), chart_bounds(other)
     return (
         a is None
         or b is None
@@ -293,7 +280,7 @@ def same_chart_bounds(old_target: object, new_target: object) -> bool:
 
 
 def chart_bounds(shape: object) -> tuple[Array, Array] | None:
-    """Bounds of the chart of a shape; None if they are not known."""
+    """Return the bounds of the chart of a shape; None if they are not known."""
     if isinstance(shape, Grid):
         return np.array(shape.low), np.array(shape.high)
     box: tuple[Array, Array] | None = getattr(shape, "box", None)

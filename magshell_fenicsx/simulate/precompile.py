@@ -52,11 +52,11 @@ OCTANT: dict[str, Any] = {  # symmetric in three planes, each a kernel of its ow
 }
 
 
-def precompile(degree: int, made: Callable[[Source], Problem]) -> float:
+def precompile(degree: int, make_problem: Callable[[Source], Problem]) -> float:
     """Compile the kernels of shells of a degree and of solids; return the time in seconds."""
     start = time.perf_counter()
     for data in _cases(degree):
-        scene = Scene(made(Source("precompile", data)), MPI.COMM_WORLD)
+        scene = Scene(make_problem(Source("precompile", data)), MPI.COMM_WORLD)
         scene.model.symmetry_breaking_modes  # noqa: B018  (compiles theirs)
     return time.perf_counter() - start
 

@@ -1,5 +1,4 @@
-"""Numbers of a state that can be differentiated, with their derivatives by the state; the energy
-barrier of a run.
+"""Functionals of a state, with their derivatives by it; and the energy barrier of a run.
 
 The barrier is what a probing force passes: its work from zero, over its largest value, back to
 zero.
@@ -21,7 +20,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.models.shell.spatial_fields import PlacementField
 from magshell_fenicsx.parts.observables import Slope
-from magshell_fenicsx.parts.registered import SEEN
+from magshell_fenicsx.parts.registered import OBSERVABLES
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.supports.reactions import weights
 from magshell_fenicsx.quantities.registry import amplitude, quantity
@@ -35,7 +34,7 @@ Target = Callable[[Array], Array]  # undeformed places (n, 3) over R -> wanted p
 
 @dataclass(frozen=True)
 class Functional:
-    """A number J(u, mu; p) of a state.
+    """A number J(u, mu; p) of a state, with what its derivatives need.
 
     Attributes
     ----------
@@ -48,12 +47,12 @@ class Functional:
     reaction
         e at supports: J is e . R of the residual of all nodes.
     forms
-        What else of J depends on the placement: energies, and what they are multiplied by.
+        Other energies in J that depend on the placement, and their factors.
     deflections
-        Name of a point -> what u . n0 there is multiplied by in J.
+        Name of a point -> the factor of u . n0 there in J.
     slope
-        What J is of a room, with its derivatives by a field; then J is no amplitude itself,
-        whatever `by_mu` is.
+        The observable of a part that J is, with its derivatives by a field; then J is no amplitude
+        itself, whatever `by_mu` is.
     """
 
     value: float
@@ -67,9 +66,10 @@ class Functional:
     deflections: Mapping[str, float] = field(default_factory=dict)
 
 
-def functional(scene: Scene, state: State, of: str | Target) -> Functional:
-    """A column of path.csv, or the mean square distance to a target over the area, in R^2;
-    collective.
+def functional(scene: Scene, state: State, result: str | Target) -> Functional:
+    """Return a column of path.csv, or the distance to a target, as a functional; collective.
+
+    The latter is the mean square over the area, in R^2.
 
     Raises
     ------
@@ -78,24 +78,24 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
         have one.
     """
     model, system = scene.model, scene.model.system
-    if callable(of):
-        return _misfit(scene, state, of)
-    still: Vector = np.zeros(system.size)
-    if of == "energy":
+    if callable(result):
+        return _misfit(scene, state, result)
+    zero: Vector = np.zeros(system.size)
+    if result == "energy":
         by_u = model.multiplicity * system.residual(state.u, state.mu)
         return Functional(scene.observe(state)["energy"], by_u, energy=model.multiplicity)
     points = _displacements(scene)
-    if of in points:
-        point, i = points[of]
-        by_u = scene.problem.length * (_turned(scene) @ model.probe(point))[i]
-        return Functional(scene.observe(state)[of], system.zero_at_supports(by_u))
-    if of in (of_loads := conjugates(scene)):
-        name, unit = of_loads[of]
+    if result in points:
+        point, i = points[result]
+        by_u = scene.problem.length * (_to_case_frame(scene) @ model.probe(point))[i]
+        return Functional(scene.observe(state)[result], system.zero_at_supports(by_u))
+    if result in (conjugate_columns := conjugates(scene)):
+        name, unit = conjugate_columns[result]
         by_u = np.asarray(-system.load(state.u, state.mu, name) / unit)
         value = -system.potential(state.u, state.mu, name) / unit
         forms = [(term, -value / model.load_size[name]) for term in model.size_terms(name)]
         return Functional(value, by_u, potentials={name: -1 / unit}, forms=forms)
-    if of in AT_POLE and "pole" in model.normals:
+    if result in AT_POLE and "pole" in model.normals:
         by_u = np.asarray(-(model.normals["pole"] @ model.probe("pole")) / scene.problem.material.h)
         by_normal = {"pole": -1 / scene.problem.material.h}
         return Functional(
@@ -103,23 +103,23 @@ def functional(scene: Scene, state: State, of: str | Target) -> Functional:
             system.zero_at_supports(by_u),
             deflections=by_normal,
         )
-    if of in (forces := _forces(scene)):
-        return _reaction(scene, state, *forces[of], of)
-    for room in SEEN:
-        if slope := room.slope(scene.sight, state, of):
+    if result in (forces := _forces(scene)):
+        return _reaction(scene, state, *forces[result], result)
+    for room in OBSERVABLES:
+        if slope := room.slope(scene.view, state, result):
             return Functional(slope.value, slope.by_u, slope.by_mu, slope=slope)
-    name = next((name for name in state.mu if of in (name, amplitude(name).column)), "")
+    name = next((name for name in state.mu if result in (name, amplitude(name).column)), "")
     if name:
-        return Functional(state.mu[name], still, {name: 1.0})
+        return Functional(state.mu[name], zero, {name: 1.0})
     raise CaseError(
-        f"{of}: has no gradient here; allowed are {', '.join(differentiable(scene, state))}"
+        f"{result}: has no gradient here; allowed are {', '.join(differentiable(scene, state))}"
     )
 
 
 def differentiable(scene: Scene, state: State) -> list[str]:
-    """The columns of path.csv that `functional` takes, and those of them in units."""
+    """Return the columns of path.csv that `functional` takes, and those of them in units."""
     at_pole = AT_POLE if "pole" in scene.model.normals else ()
-    rooms = (column for room in SEEN for column in room.differentiable(scene.problem.loads))
+    rooms = (column for room in OBSERVABLES for column in room.differentiable(scene.problem.loads))
     amplitudes = (
         amplitude(name).column for name in state.mu if name not in scene.model.system.history
     )
@@ -137,18 +137,19 @@ def differentiable(scene: Scene, state: State) -> list[str]:
     return [*columns, *scene.sizes.columns(columns)]
 
 
-def in_units(scene: Scene, state: State, of: str) -> tuple[str, str]:
-    """The dimensionless column of a column in units, and the scale of its unit; else the column
-    itself, and "".
+def in_units(scene: Scene, state: State, column: str) -> tuple[str, str]:
+    """Return the dimensionless column of a column in units, and the scale of its unit.
+
+    Of another column these are the column itself, and "".
     """
     for name in differentiable(scene, state):
-        if (of_unit := scene.sizes.column(name)) and of_unit.name == of:
+        if (in_unit := scene.sizes.column(name)) and in_unit.name == column:
             return name, quantity(name).scale
-    return of, ""
+    return column, ""
 
 
 def _displacements(scene: Scene) -> dict[str, tuple[str, int]]:
-    """Columns of named points -> the point and the axis."""
+    """Return columns of named points -> the point and the axis."""
     return {
         f"{point}_u{axis}": (point, i)
         for point in scene.problem.context.points
@@ -157,25 +158,25 @@ def _displacements(scene: Scene) -> dict[str, tuple[str, int]]:
 
 
 def force_unit(scene: Scene) -> float:
-    """E h R^2 over R in the case's unit of force."""
+    """Return E h R^2 over R in the case's unit of force."""
     return scene.problem.modulus * scene.problem.material.h * scene.problem.length**2
 
 
 def _forces(scene: Scene) -> dict[str, tuple[str, int]]:
-    """Column of a force of a support -> the support and the axis."""
+    """Return column of a force of a support -> the support and the axis."""
     supports = scene.problem.supports if scene.problem.reactions else ()
     return {f"{name}_f{axis}": (name, i) for name in supports for i, axis in enumerate("xyz")}
 
 
-def _reaction(scene: Scene, state: State, name: str, axis: int, of: str) -> Functional:
-    """A force of a support."""
+def _reaction(scene: Scene, state: State, name: str, axis: int, result: str) -> Functional:
+    """Return a force of a support along an axis; `result` is its column."""
     system, problem = scene.model.system, scene.problem
     if scene.model.without_potential and problem.loads.pressure:
         raise CaseError(
-            f"{of}: has no gradient under a pressure at a free edge, which has no potential"
+            f"{result}: has no gradient under a pressure at a free edge, which has no potential"
         )
-    way = rotation(problem.azimuth)[:, axis]
-    e = force_unit(scene) * weights(scene.model, name, way, problem.mirror)
+    axis_direction = rotation(problem.azimuth)[:, axis]
+    e = force_unit(scene) * weights(scene.model, name, axis_direction, problem.mirror)
     value = dot(system.comm, e, system.forces(state.u, state.mu))
     return Functional(
         value, system.zero_at_supports(system.at_state(state).stiffness_along(e)), reaction=e
@@ -183,10 +184,12 @@ def _reaction(scene: Scene, state: State, name: str, axis: int, of: str) -> Func
 
 
 def conjugates(scene: Scene) -> dict[str, tuple[str, float]]:
-    """Column -> the amplitude whose conjugate it is, and the conjugate's unit."""
+    """Return column -> the amplitude whose conjugate it is, and the conjugate's unit."""
     model, loads = scene.model, scene.problem.loads
     amplitudes = {"volume_change": "pressure"} if loads.pressure else {}
-    amplitudes |= {column: name for room in SEEN for name, column in room.conjugates(loads).items()}
+    amplitudes |= {
+        column: name for room in OBSERVABLES for name, column in room.conjugates(loads).items()
+    }
     with_units = {column: (name, scene.conjugate_unit(name)) for column, name in amplitudes.items()}
     for name in (*loads.forces, *loads.dead):
         if size := model.force_unit if name in loads.forces else model.load_size.get(name, 0.0):
@@ -195,60 +198,66 @@ def conjugates(scene: Scene) -> dict[str, tuple[str, float]]:
     return with_units
 
 
-def _turned(scene: Scene) -> Array:
-    """From the model's frame to the case's."""
+def _to_case_frame(scene: Scene) -> Array:
+    """Return the rotation (3, 3) from the model's frame to that of the case."""
     return rotation(scene.problem.azimuth).T
 
 
 def offset(scene: Scene, target: Target) -> fem.Function:
-    """The displacement that reaches the target, at the nodes of the model."""
+    """Return the displacement that reaches the target, at the nodes of the model."""
     axes, Q = scene.model.axes, rotation(scene.problem.azimuth)
 
-    def of(r0: fem.Function) -> PlacementField:
-        offsets = PlacementField(r0.function_space, "offset", of)
+    def offset_from(r0: fem.Function) -> PlacementField:
+        offsets = PlacementField(r0.function_space, "offset", offset_from)
         places = np.zeros((np.size(r0.x.array) // len(axes), 3))
         places[:, axes] = np.reshape(r0.x.array, (-1, len(axes)))
-        wanted = target(places @ Q) @ Q.T
-        offsets.x.array[:] = (wanted - places)[:, axes].ravel()
+        target_places = target(places @ Q) @ Q.T
+        offsets.x.array[:] = (target_places - places)[:, axes].ravel()
         return offsets
 
-    return of(scene.model.r0)
+    return offset_from(scene.model.r0)
 
 
 def distances(scene: Scene, state: State, target: Target) -> tuple[float, float]:
-    """Root mean square and largest distance to a target at the nodes, over R; collective."""
-    system, away = scene.model.system, offset(scene, target)
+    """Return root mean square and largest distance to a target, over R; collective.
+
+    The largest distance is that of the nodes.
+    """
+    system, offset_to_target = scene.model.system, offset(scene, target)
     u = system.with_ghosts(state.u, state.mu)
-    gaps = np.linalg.norm((u - away.x.array).reshape(-1, scene.model.V.dofmap.bs), axis=1)
+    gaps = np.linalg.norm(
+        (u - offset_to_target.x.array).reshape(-1, scene.model.V.dofmap.bs), axis=1
+    )
     largest = system.comm.allreduce(float(gaps.max(initial=0.0)), MPI.MAX)
     return float(np.sqrt(_misfit(scene, state, target).value)), largest
 
 
 def _misfit(scene: Scene, state: State, target: Target) -> Functional:
+    """Return the mean square distance to a target over the area, in R^2."""
     model, system = scene.model, scene.model.system
-    over, away = model.over_area(), offset(scene, target)
-    gap, log = system.u - away, model.kernels
+    over_area, offset_to_target = model.over_area(), offset(scene, target)
+    gap, log = system.u - offset_to_target, model.kernels
     one = fem.Constant(model.V.mesh, 1.0)
-    square = FormTerm("misfit", over(ufl.dot(gap, gap)), system.u, log)
-    whole = FormTerm("area", over(one), system.u, log)
-    at = system.at_state(state)
-    area = at.integral(whole.energy_form)
-    slope = log.compile("misfit slope", over(2 * ufl.dot(gap, ufl.TestFunction(model.V))))
-    value = at.integral(square.energy_form) / area
-    forms = [(square, 1 / area), (whole, -value / area)]
-    return Functional(value, np.asarray(at.gradient([slope]) / area), forms=forms)
+    square = FormTerm("misfit", over_area(ufl.dot(gap, gap)), system.u, log)
+    area_form = FormTerm("area", over_area(one), system.u, log)
+    evaluation = system.at_state(state)
+    area = evaluation.integral(area_form.energy_form)
+    slope = log.compile("misfit slope", over_area(2 * ufl.dot(gap, ufl.TestFunction(model.V))))
+    value = evaluation.integral(square.energy_form) / area
+    forms = [(square, 1 / area), (area_form, -value / area)]
+    return Functional(value, np.asarray(evaluation.gradient([slope]) / area), forms=forms)
 
 
 def barrier(scene: Scene, step: ProgrammeStep, begin: State, end: State) -> float:
-    """The work of a step's load between two states without this load, over E h R^2; collective.
+    """Return the work of a step's load between two states without it, over E h R^2; collective.
 
     It is the change of the energy under the other loads as they are held: that of Pi, plus the
     integral of q dmu for each amplitude whose conjugate q is held.
     """
-    held = held_conjugates_of_step(scene, step, begin)
-    before, after = (sum(scene.energies(state).values()) for state in (begin, end))
-    change = after - before
-    for name, q in held.items():
+    held_conjugates = held_conjugates_of_step(scene, step, begin)
+    energy_before, energy_after = (sum(scene.energies(state).values()) for state in (begin, end))
+    change = energy_after - energy_before
+    for name, q in held_conjugates.items():
         a, b = begin.mu[name], end.mu[name]
         work = (
             scipy.integrate.quad(lambda mu, q=q: q(mu)[0], a, b)[0] if callable(q) else q * (b - a)

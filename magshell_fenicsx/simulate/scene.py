@@ -1,4 +1,4 @@
-"""A scene: the model of a problem, of its mid-surface, its meridian or its body, and the solver."""
+"""Scene: the model of a problem, of its mid-surface, its meridian or its body, and the solver."""
 
 import time
 from collections import defaultdict
@@ -30,8 +30,8 @@ from magshell_fenicsx.models.shell.thickness import Thickness, refuse_unfit
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.magnetism.fields import strength
 from magshell_fenicsx.parts.magnetism.source_step import source_columns
-from magshell_fenicsx.parts.observables import Sight
-from magshell_fenicsx.parts.registered import SEEN
+from magshell_fenicsx.parts.observables import ModelView
+from magshell_fenicsx.parts.registered import OBSERVABLES
 from magshell_fenicsx.parts.supports.motion import UNHELD_CONDITIONS
 from magshell_fenicsx.platform.compiler import check_compiler
 from magshell_fenicsx.platform.processes import on_first_rank
@@ -52,7 +52,7 @@ NOT_COUNTED = "boundary: the shell moves freely: its unstable directions are not
 
 
 def build_model(problem: Problem, comm: MPI.Comm) -> "ShellModel":
-    """The whole shell, half of it or a sector, on all ranks together."""
+    """Return the model of a shell, of half of it or a sector, on all ranks together."""
     from magshell_fenicsx.shells.shell import ShellModel  # a meridian does without
 
     surface = build_midsurface(problem, comm)
@@ -71,7 +71,13 @@ def build_model(problem: Problem, comm: MPI.Comm) -> "ShellModel":
 
 
 def build_meridian_model(problem: Problem, *, assembled: bool = True) -> MeridianModel:
-    """The meridian, whole on every rank; `assembled` as of the model."""
+    """Return the model of a meridian, which is whole on every rank.
+
+    Parameters
+    ----------
+    assembled
+        See `MeridianModel`.
+    """
     return MeridianModel(
         build_meridian(problem),
         problem.material,
@@ -85,26 +91,32 @@ def build_meridian_model(problem: Problem, *, assembled: bool = True) -> Meridia
 
 
 def build_meridian(problem: Problem) -> Meridian:
-    """Its mesh, on every rank."""
-    span = problem.meridian
-    assert span
-    named = {
-        name: next(of for of, at in problem.points.items() if at is x)
-        for name, x in problem.points.items()
-    }
-    points = {name: span.locate_named(named[name], x) for name, x in problem.points.items()}
-    pieces = [(piece.name, piece.ends) for piece in span.shell_meridians]
-    held = [
+    """Return the mesh of the meridian of a problem, on every rank."""
+    chart = problem.meridian
+    assert chart
+    points = {}
+    for name, x in problem.points.items():
+        # of names for one point, the first
+        first_name = next(other for other, place in problem.points.items() if place is x)
+        points[name] = chart.locate_named(first_name, x)
+    shells = [(shell.name, shell.ends) for shell in chart.shell_meridians]
+    held_names = [
         name for name, condition in problem.conditions.items() if condition not in UNHELD_CONDITIONS
     ]
-    vertices = meridian_vertices(problem)
     return make_meridian(
-        span.embedding, vertices, span.names, points, span.curvature, pieces, held, span.joints
+        chart.embedding,
+        meridian_vertices(problem),
+        chart.names,
+        points,
+        chart.curvature,
+        shells,
+        held_names,
+        chart.joints,
     )
 
 
 def build_solid_model(problem: Problem, comm: MPI.Comm) -> "SolidModel":
-    """The whole body or half of it, on all ranks together."""
+    """Return the model of a body or half of it, on all ranks together."""
     from magshell_fenicsx.shells.solid import SolidModel
 
     def factor(x: Array) -> Array:
@@ -132,7 +144,7 @@ def build_solid_model(problem: Problem, comm: MPI.Comm) -> "SolidModel":
 
 
 def build_midsurface(problem: Problem, comm: MPI.Comm) -> Midsurface:
-    """Triangulate on rank 0, distribute to all."""
+    """Return the mid-surface of a problem, triangulated on rank 0 and distributed to all."""
     return distribute(on_first_rank(comm, problem.triangulated), comm)
 
 
@@ -151,12 +163,12 @@ class Scene:
     journal, progress
         The record of the solver's results for an interrupted run, and the listener to its status.
         The caller that runs the scene sets both.
-    meshed
-        Changes the mesh of a larger model to which a mode hands over; by default that of the case
-        stays.
+    remesh
+        Changes the mesh of a larger model that has a mode which this one excludes; by default that
+        of the case stays.
     warnings
-        What is unphysical, or may be too large.
-    loose
+        Warnings of what is unphysical, or may be too large.
+    allows_rigid_motion
         Whether rigid motions may be left free: see `Problem.at_rest`.
     free_in_time
         Whether rigid motions are left free in a motion: see `Problem.moves_freely`.
@@ -168,13 +180,13 @@ class Scene:
         start = time.perf_counter()
         if problem.pending_modes:
             raise CaseError(
-                "shell.imperfections: kind: modes: compute them first, by simulate.perfect.with_modes(problem, comm)"
+                "shell.imperfections: kind: modes: compute them first, by "
+                "simulate.perfect.with_modes(problem, comm)"
             )
         self.problem, self.comm = problem, comm
         on_first_rank(comm, check_compiler)
-        self.warnings = [
-            said for said in (*self.problem.warnings, _beyond_memory(self.problem, comm)) if said
-        ]
+        warnings = (*self.problem.warnings, _beyond_memory(self.problem, comm))
+        self.warnings = [warning for warning in warnings if warning]
         self.model: ShellModel | MeridianModel | SolidModel
         if self.problem.axisymmetric:
             self.model = build_meridian_model(self.problem)
@@ -183,30 +195,27 @@ class Scene:
         else:
             self.model = build_model(self.problem, comm)
         surface = self.model.midsurface
-        several = (
-            surface is not None and surface.from_mesh_file
-        )  # a file may have pieces, of which each must be held
-        unsure = self.model.axisymmetric or several or not self.problem.fixed
-        self.allows_rigid_motion = unsure and self.problem.at_rest
-        motion = (
-            self.model.free_motion(self.unloaded().mu)
-            if unsure and not self.allows_rigid_motion
-            else ""
-        )
+        # a file may have several pieces, of which each must be held
+        is_from_file = surface is not None and surface.from_mesh_file
+        may_be_free = self.model.axisymmetric or is_from_file or not self.problem.fixed
+        self.allows_rigid_motion = may_be_free and self.problem.at_rest
+        motion = ""
+        if may_be_free and not self.allows_rigid_motion:
+            motion = self.model.free_motion(self.unloaded().mu)
         if motion and not self.problem.moves_freely:
             raise MeshError(f"mesh: {flat}" if (flat := self.flat_triangle) else motion)
         self.free_in_time = bool(motion)
         if motion:
             self.warnings.append(NOT_COUNTED)
-        # a body's penetration changes over far less than h: factors of a state near by are no
-        # tangent's, and the first matrices only find what touches
-        faces = {each.pair.setting: each.pair.stiffness for each in self.model.shell_contacts}
-        stiff = self.model.contacts or faces
-        options = (
-            NewtonOptions(reuse_distance=0.0, patience=7, stiffnesses=faces, allows_kinks=True)
-            if stiff
-            else None
-        )
+        pairs = [contact.pair for contact in self.model.shell_contacts]
+        stiffnesses = {pair.setting: pair.stiffness for pair in pairs}
+        options = None
+        if self.model.contacts or stiffnesses:
+            # a body's penetration changes over far less than h: factors of a state near by are no
+            # tangent's, and the first matrices only find what touches
+            options = NewtonOptions(
+                reuse_distance=0.0, patience=7, stiffnesses=stiffnesses, allows_kinks=True
+            )
         self.newton = BorderedNewton(self.model.system, options)
         self.journal: SolverJournal = NoJournal()
         self.progress: Progress = NoProgress()
@@ -214,22 +223,25 @@ class Scene:
         self.setup_s = time.perf_counter() - start - self.model.kernels.seconds
 
     def with_field_strength(self, context: Context) -> "Scene":
-        """The same model and solver for what differs by the strength of the field alone."""
-        return self._with(
+        """Return the scene of a case that differs by the strength of the field alone.
+
+        It has the same model and solver.
+        """
+        return self._copy(
             problem=replace(self.problem, context=context, lambda_m=strength(context))
         )
 
-    def renumbered(self, problem: Problem, model: MeridianModel) -> "Scene":
-        """The same for a problem that differs in numbers, with the model that has these."""
-        return self._with(
+    def with_model(self, problem: Problem, model: MeridianModel) -> "Scene":
+        """Return the scene of a problem that differs in numbers, with the model that has these."""
+        return self._copy(
             problem=problem, model=model, newton=BorderedNewton(model.system, self.newton.options)
         )
 
-    def _with(self, **others: Any) -> "Scene":
+    def _copy(self, **changes: Any) -> "Scene":
+        """Return a copy with changed attributes; cached properties are computed anew."""
         other = object.__new__(Scene)
-        # what is cached is computed anew
-        attributes = {name: of for name, of in vars(self).items() if name not in vars(Scene)}
-        vars(other).update(attributes | others)
+        attributes = {name: v for name, v in vars(self).items() if name not in vars(Scene)}
+        vars(other).update(attributes | changes)
         return other
 
     @property
@@ -240,20 +252,21 @@ class Scene:
 
     @property
     def flat_triangle(self) -> str:
-        """Where a triangle is too flat for the penalty, in words; empty if none is."""
+        """Words for a triangle that is too flat for the penalty; empty if none is."""
         surface = self.model.midsurface
-        return (
-            self.problem.flat_triangle(surface.patch) if surface and not self.problem.body else ""
-        )
+        if surface is None or self.problem.body:
+            return ""
+        return self.problem.flat_triangle(surface.patch)
 
     @property
     def cells(self) -> int:
+        """Number of cells of the mesh, on all ranks."""
         topology = self.model.V.mesh.topology
         return int(topology.index_map(topology.dim).size_global)
 
     @cached_property
     def stability_monitor(self) -> StabilityMonitor:
-        """The watch over the modes that the model excludes.
+        """Monitor of the modes that the model excludes.
 
         Its first use compiles their kernels.
         """
@@ -261,7 +274,7 @@ class Scene:
 
     @cached_property
     def unresolved(self) -> list[str]:
-        """What the mesh misses of the problem's formulas, in words; collective."""
+        """Details of the problem's formulas that the mesh misses, in words; collective."""
         model, formulas = self.model, case_formulas(self.problem.context)
         if not formulas:
             return []
@@ -270,67 +283,68 @@ class Scene:
         )
 
     def lost_field_text(self) -> str:
-        """Where a step since the beginning of a walk has found no field, in words after a message;
-        collective.
+        """Return the end of a message on a path that has found no field somewhere; collective.
+
+        It is empty if fields were found everywhere since the begin of the path.
         """
         lost_here = [field.lost for field in self.model.fields if field.lost]
-        said = [each for part in self.model.system.comm.allgather(lost_here) for each in part]
-        return f"; on this way a step has found no field: {said[0]}" if said else ""
+        places = [place for lost in self.model.system.comm.allgather(lost_here) for place in lost]
+        return f"; on this way a step has found no field: {places[0]}" if places else ""
 
     @property
     def left_out(self) -> list[str]:
-        """What the model lacks, for people."""
-        return [
-            *self.problem.left_out,
-            *(said for room in SEEN for said in room.left_out(self.sight)),
-        ]
+        """Phrases for what the model lacks."""
+        lacks_of_parts = (observables.left_out(self.view) for observables in OBSERVABLES)
+        return [*self.problem.left_out, *(phrase for lacks in lacks_of_parts for phrase in lacks)]
 
     def unloaded(self) -> State:
-        """The undeformed shell; amplitudes are zero, except user-defined ones with a value."""
+        """Return the undeformed shell.
+
+        Amplitudes are zero, except user-defined ones with a value.
+        """
         field = self.problem.loads.magnetic
         turns = (motion.name for motion in field.turns) if field else ()
-        own = {
+        values = self._own_amplitudes
+        names = {
             *self.motions,
             *self.sources,
             *turns,
             *self.model.contacts,
             *self.model.system.parameters,
+            *(term.amplitude for term in self.model.system.terms if term.amplitude),
+            *values,
         }
-        amplitudes = {t.amplitude for t in self.model.system.terms if t.amplitude} | own
-        given = self._own_amplitudes
-        return State(
-            self.model.zero(),
-            {name: given.get(name, 0.0) for name in sorted({*amplitudes, *given})},
-        )
+        return State(self.model.zero(), {name: values.get(name, 0.0) for name in sorted(names)})
 
     def displacement(self, state: State) -> fem.Function:
-        """See `Record.u`; collective."""
-        self.refuse_foreign(state, more=True)
+        """Return the displacement of a state as a dolfinx function, see `Record.u`; collective."""
+        self.refuse_foreign(state, allows_more=True)
         model, surface = self.model, self.model.midsurface
         displacement = fem.Function(model.u.function_space, name="u")
         displacement.x.array[:] = model.system.at_state(state).evaluate(
             lambda: model.u.x.array.copy()
         )
-        given = self.problem.mesh_file
-        if not (surface and given and given.user_mesh):
+        mesh_file = self.problem.mesh_file
+        user_mesh = mesh_file.user_mesh if mesh_file else None
+        if not (surface and mesh_file and user_mesh):
             return displacement
         if self.problem.is_half:
             raise ValueError(
                 "u: symmetry: half: half of the mesh is not modelled: take symmetry: none"
             )
-        if MPI.Comm.Compare(self.comm, given.user_mesh.comm) not in (MPI.IDENT, MPI.CONGRUENT):
+        if MPI.Comm.Compare(self.comm, user_mesh.comm) not in (MPI.IDENT, MPI.CONGRUENT):
             raise ValueError(
-                f"u: {self.comm.size} processes solve the scene and the mesh belongs to {given.user_mesh.comm.size}: "
-                "make the scene with those of the mesh, ms.Scene(problem)"
+                f"u: {self.comm.size} processes solve the scene and the mesh belongs to "
+                f"{user_mesh.comm.size}: make the scene with those of the mesh, ms.Scene(problem)"
             )
-        return given.user_mesh.displacement(displacement, surface.source_triangles, given.scale)
+        return user_mesh.displacement(displacement, surface.source_triangles, mesh_file.scale)
 
-    def refuse_foreign(self, state: State, *, more: bool = False) -> None:
+    def refuse_foreign(self, state: State, *, allows_more: bool = False) -> None:
         """Refuse a state of another scene, as far as it shows.
 
         Parameters
         ----------
-        more
+        allows_more
             Whether the state may have amplitudes that this scene has not.
 
         Raises
@@ -338,70 +352,76 @@ class Scene:
         ValueError
             If it has another number of unknowns or other amplitudes.
         """
-        own = self.unloaded()
-        if state.u.shape != own.u.shape:
+        unloaded = self.unloaded()
+        if state.u.shape != unloaded.u.shape:
             raise ValueError(
-                f"this state is of another scene: it has {state.u.size} unknowns on this rank, this scene has "
-                f"{own.u.size}; take records of follow or trace of the same scene"
+                f"this state is of another scene: it has {state.u.size} unknowns on this rank, "
+                f"this scene has {unloaded.u.size}; take records of follow or trace of the same "
+                "scene"
             )
-        others = state.mu.keys() - own.mu.keys() - {*self.model.system.history}
-        if own.mu.keys() - state.mu.keys() or (others and not more):
-            theirs, ours = (", ".join(sorted(mu)) or "none" for mu in (state.mu, own.mu))
+        others = state.mu.keys() - unloaded.mu.keys() - {*self.model.system.history}
+        missing = unloaded.mu.keys() - state.mu.keys()
+        if missing or (others and not allows_more):
+            theirs, ours = (", ".join(sorted(mu)) or "none" for mu in (state.mu, unloaded.mu))
             raise ValueError(
-                f"this state is of another scene: its amplitudes are {theirs}, those of this scene {ours}"
+                f"this state is of another scene: its amplitudes are {theirs}, those of this scene "
+                f"{ours}"
             )
 
     def observe(self, state: State) -> dict[str, float]:
-        """The physical columns of a table row: loads, displacements over h, volume, energies over E
-        h R^2.
+        """Return the physical columns of a table row.
+
+        They are loads, displacements over h, volume, and energies over E h R^2.
         """
-        self.refuse_foreign(state, more=True)
-        model, h, loads, sight = self.model, self.problem.material.h, self.model.loads, self.sight
+        self.refuse_foreign(state, allows_more=True)
+        model, h, loads = self.model, self.problem.material.h, self.model.loads
         force = loads.forces.get("force")
         energies = self.energies(state)
         pole = model.deflection(state.u, "pole") / h
-        columns = defaultdict[str, float](float)
-        for t in {t.group: t for t in model.system.terms}.values():
-            columns[t.column] += energies[t.group]
-        split = "stretching" in columns  # a solid has no such split
-        return {
+        deflection = pole
+        if loads.displaced:
+            deflection = model.loaded_deflection(state.u, loads.displaced) / h
+        energy_of_column = defaultdict[str, float](float)
+        for group, column in {term.group: term.column for term in model.system.terms}.items():
+            energy_of_column[column] += energies[group]
+        is_split = "stretching" in energy_of_column  # that of a solid is not
+        columns = {
             "p_over_pc": state.mu.get("pressure", 0.0),
             "force": 0.0,
-            "w_over_h": model.loaded_deflection(state.u, loads.displaced) / h
-            if loads.displaced
-            else pole,
+            "w_over_h": deflection,
             "w_pole_over_h": pole,
             "w_point_over_h": model.deflection(state.u, force.point) / h if force else pole,
             "volume_change": model.volume_change(state.u, state.mu),
             "energy": sum(energies.values()),
-            "stretching": columns["stretching"] if split else nan,
-            "bending": columns["bending"] if split else nan,
-            "magnetic": columns["magnetic"],
+            "stretching": energy_of_column["stretching"] if is_split else nan,
+            "bending": energy_of_column["bending"] if is_split else nan,
+            "magnetic": energy_of_column["magnetic"],
             **{name: energies[name] for name in ("U1", "Uq", "Utau")},
             **self._observe_points(state),
             **{name: state.mu[name] for name in self._own_amplitudes},
-            **{
-                column: value
-                for room in SEEN
-                for column, value in room.observe(sight, state).items()
-            },
-            **{
-                column: (state.mu[term.name] if term.density else 1.0)
-                * model.multiplicity
-                * model.system.at_state(state).integral(model.observed[column])
-                for term in self.problem.loads.own
-                for column in term.observed
-            },
         }
+        view = self.view
+        for observables in OBSERVABLES:
+            columns |= observables.observe(view, state)
+        return columns | self._observe_own_terms(state)
+
+    def _observe_own_terms(self, state: State) -> dict[str, float]:
+        """Return the integrals that user-defined energies observe."""
+        model, columns = self.model, dict[str, float]()
+        for term in self.problem.loads.own:
+            factor = state.mu[term.name] if term.density else 1.0
+            for column in term.observed:
+                integral = model.system.at_state(state).integral(model.observed[column])
+                columns[column] = factor * model.multiplicity * integral
+        return columns
 
     def energies(self, state: State) -> dict[str, float]:
-        """The energy of each term, over E h R^2; all parts of one field together."""
+        """Return the energy of each term, over E h R^2; all parts of one field together."""
         model, by_group = self.model, defaultdict[str, float](float)
         potentials = model.system.energies(state.u, state.mu)
-        for t in model.system.terms:
-            by_group[t.group] += (
-                model.multiplicity * factor_of(t.amplitude, state.mu) * potentials[t.name]
-            )
+        for term in model.system.terms:
+            factor = factor_of(term.amplitude, state.mu)
+            by_group[term.group] += model.multiplicity * factor * potentials[term.name]
         return by_group
 
     @property
@@ -418,7 +438,7 @@ class Scene:
 
     @property
     def sources(self) -> dict[str, str]:
-        """See `source_columns`."""
+        """Amplitudes of moving sources and their columns, see `source_columns`."""
         return source_columns(self.problem.loads)
 
     @cached_property
@@ -434,26 +454,35 @@ class Scene:
         return extra_columns(self.problem)
 
     def energy_of_shell(self, state: State, energy: float) -> float:
-        """The energy of the shell itself: without the potentials of the loads."""
-        system, of = self.model.system, self.model.multiplicity
-        loads = (name for name in state.mu if name not in system.coordinates)
-        return energy - of * sum(
-            state.mu[name] * system.potential(state.u, state.mu, name) for name in loads
+        """Return the energy of the shell itself: without the potentials of the loads.
+
+        Parameters
+        ----------
+        energy
+            The energy of the state with these.
+        """
+        system = self.model.system
+        potentials = sum(
+            mu * system.potential(state.u, state.mu, name)
+            for name, mu in state.mu.items()
+            if name not in system.coordinates
         )
+        return energy - self.model.multiplicity * potentials
 
     @property
-    def sight(self) -> Sight:
-        """What rooms of parts see of it."""
+    def view(self) -> ModelView:
+        """View of the model that observables of parts are read from."""
         problem = self.problem
         sense = copysign(1.0, problem.lambda_m)
         place = problem.mirror, problem.azimuth
-        return Sight(self.model, problem.length, problem.modulus, *place, problem.reactions, sense)
+        return ModelView(
+            self.model, problem.length, problem.modulus, *place, problem.reactions, sense
+        )
 
     def to_magpylib(self, record: "Record", parts: int = 8) -> Any:
-        """The magnetised shell of a record as a source of magpylib, of charged triangles;
-        collective.
+        """Return the magnetised shell of a record as a source of magpylib; collective.
 
-        In m and T; of a case without units over R and |Br|. Each side of a cell is divided into
+        It is of charged triangles, in m and T; of a case without units over R and |Br|. Each side of a cell is divided into
         `parts`.
 
         Raises
@@ -463,24 +492,22 @@ class Scene:
         """
         from magshell_fenicsx.parts.magnetism.self_field import to_magpylib  # of few runs
 
-        return to_magpylib(self.sight, record.point.state, parts)
+        return to_magpylib(self.view, record.point.state, parts)
 
     def conjugate_unit(self, name: str) -> float:
-        """-dPi/dmu of one unit of a target: ΔV/R³ of a pressure, w/h of a force, the shell's length
-        of dead loads.
+        """Return -dPi/dmu of one unit of a target.
+
+        The unit is ΔV/R³ of a pressure, w/h of a force, and the shell's length of dead loads.
         """
-        units = (room.conjugate_unit(self.sight, name) for room in SEEN)
+        units = (observables.conjugate_unit(self.view, name) for observables in OBSERVABLES)
         return next((unit for unit in units if unit is not None), 0.0)
 
     def _observe_points(self, state: State) -> dict[str, float]:
-        """The displacements of named points in the unit of the shell's lengths."""
+        """Return the displacements of named points in the unit of the shell's lengths."""
         displacements: dict[str, float] = {}
         for point in self.problem.context.points:
-            u = (
-                self.problem.length
-                * self.model.displacement(state.u, point)
-                @ rotation(self.problem.azimuth)
-            )
+            u = self.problem.length * self.model.displacement(state.u, point)
+            u = u @ rotation(self.problem.azimuth)
             displacements |= {
                 f"{point}_u{axis}": float(c) for axis, c in zip("xyz", u, strict=True)
             }
@@ -488,21 +515,22 @@ class Scene:
 
 
 def _beyond_memory(problem: Problem, comm: MPI.Comm) -> str | None:
-    """See `refuse_beyond_memory`; every rank asks its own machine, and the first refusal is that of
-    all.
+    """Return a warning of a problem near the machine's memory, see `refuse_beyond_memory`.
+
+    Every rank asks its own machine, and the first refusal is that of all.
     """
     if comm.size == 1:
         return refuse_beyond_memory(problem)
     machine = comm.Split_type(MPI.COMM_TYPE_SHARED)
     ranks_of_machine = machine.size
     machine.Free()
-    said: str | CaseError | None
+    outcome: str | CaseError | None
     try:
-        said = refuse_beyond_memory(problem, comm.size, ranks_of_machine)
+        outcome = refuse_beyond_memory(problem, comm.size, ranks_of_machine)
     except CaseError as e:
-        said = e
-    every = comm.allgather(said)
-    for each in every:
-        if isinstance(each, CaseError):
-            raise each
-    return next((each for each in every if each), None)
+        outcome = e
+    outcomes = comm.allgather(outcome)
+    for error in outcomes:
+        if isinstance(error, CaseError):
+            raise error
+    return next((warning for warning in outcomes if warning), None)

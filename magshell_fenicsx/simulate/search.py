@@ -26,7 +26,7 @@ from magshell_fenicsx.continuation.search import (
 )
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.step import ProgrammeStep
-from magshell_fenicsx.parts.step_control import SearchSection
+from magshell_fenicsx.parts.step_course import SearchSection
 from magshell_fenicsx.simulate.contact_control import before_passing, passes, with_own_contact
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
@@ -36,11 +36,13 @@ from magshell_fenicsx.simulate.transfer import nodes_of_shells
 
 Array = NDArray[np.float64]
 DEPTHS = 0.9, 0.03, 0.8, 0.2  # of the dents, over the height of the shell above its supports
-WIDTH = 0.2  # of half a fold, over sqrt(2 h H)
-CLEAR = 3.0  # such widths between a fold and the supports
-LEAST = 2.0  # shells of a smaller height, over h, are flat
+FOLD_WIDTH = 0.2  # of half a fold, over sqrt(2 h H)
+SUPPORT_DISTANCE = 3.0  # such widths between a fold and the supports
+MIN_HEIGHT = 2.0  # shells of a smaller height, over h, are flat
 ROUNDING = 1e-9
-THIN = 1e-6  # a smaller mean square distance from a plane or a line, over the largest, is zero
+FLATNESS_TOLERANCE = (
+    1e-6  # a smaller mean square distance from a plane or a line, over the largest, is zero
+)
 
 
 def dented_states(scene: Scene, state: State) -> Iterator[State]:
@@ -51,7 +53,7 @@ def dented_states(scene: Scene, state: State) -> Iterator[State]:
     system = scene.model.system
     x = (scene.model.r0.x.array[: system.size] + state.u).reshape(-1, scene.model.V.dofmap.bs)
     parts = [CurvedShell.of(scene, x, inside) for inside in nodes_of_shells(scene)]
-    curved = [part for part in parts if part.top > LEAST * scene.problem.material.h]
+    curved = [part for part in parts if part.top > MIN_HEIGHT * scene.problem.material.h]
     for depth in DEPTHS:
         dents = [part.dent(depth, scene.problem.material.h) for part in curved]
         for dent in [*dents, np.sum(dents, axis=0)] if len(dents) > 1 else dents:
@@ -91,9 +93,11 @@ class CurvedShell:
 
     def dent(self, depth: float, h: float) -> Array:
         """The displacement (n, 2 or 3) of a dent of this part of its height; h is the thickness."""
-        width = WIDTH * np.sqrt(2 * h * depth * self.top)
-        above = self.height - max((1 - depth) * self.top, min(CLEAR * width, self.top / 2))
-        dent = np.where(self.inside, -2 * width * np.logaddexp(0.0, above / width), 0.0)
+        width = FOLD_WIDTH * np.sqrt(2 * h * depth * self.top)
+        height_above = self.height - max(
+            (1 - depth) * self.top, min(SUPPORT_DISTANCE * width, self.top / 2)
+        )
+        dent = np.where(self.inside, -2 * width * np.logaddexp(0.0, height_above / width), 0.0)
         return np.outer(dent, self.normal)
 
 
@@ -108,19 +112,21 @@ def _plane(scene: Scene, x: Array, inside: NDArray[np.bool_]) -> tuple[Array, fl
     inside
         (n,) which are the shell's own.
     """
-    held = np.zeros(len(x), dtype=bool)
+    is_held = np.zeros(len(x), dtype=bool)
     for support in scene.model.supports.values():
-        held[support.dofs[support.dofs < x.size] // x.shape[1]] = True
-    held &= inside
+        is_held[support.dofs[support.dofs < x.size] // x.shape[1]] = True
+    is_held &= inside
     if scene.model.axisymmetric:
-        return np.array([0.0, 1.0]), float(x[held, 1].mean()) if held.any() else 0.0
-    level, spread = _moments(scene, x[held])
+        return np.array([0.0, 1.0]), float(x[is_held, 1].mean()) if is_held.any() else 0.0
+    level, spread = _moments(scene, x[is_held])
     size, axes = np.linalg.eigh(spread)
-    if size[1] <= THIN * size[2]:  # on one line: the plane through it that is nearest to the shell
+    if (
+        size[1] <= FLATNESS_TOLERANCE * size[2]
+    ):  # on one line: the plane through it that is nearest to the shell
         _, spread = _moments(scene, x[inside])
-        along = np.outer(axes[:, 2], axes[:, 2]) if size[2] > 0 else np.zeros((3, 3))
-        across = np.eye(3) - along
-        size, axes = np.linalg.eigh(across @ spread @ across + along * np.trace(spread))
+        direction = np.outer(axes[:, 2], axes[:, 2]) if size[2] > 0 else np.zeros((3, 3))
+        projection = np.eye(3) - direction
+        size, axes = np.linalg.eigh(projection @ spread @ projection + direction * np.trace(spread))
     normal = np.where(np.abs(axes[:, 0]) < ROUNDING, 0.0, axes[:, 0])
     normal /= np.linalg.norm(normal) * np.sign(normal[np.argmax(np.abs(normal))])
     return normal, float(level @ normal)
@@ -149,9 +155,9 @@ def search_at_end_of_step(
         The states at both ends of the step.
     """
     if step.load.search:
-        held = held_conjugates_of_step(scene, step, begin)
+        is_held = held_conjugates_of_step(scene, step, begin)
         name = step.name if step.name in end.mu else "lambda_m"  # of a turning field
-        for record in _solutions(make_stage(scene, end, held), name, end, step.load.search):
+        for record in _solutions(make_stage(scene, end, is_held), name, end, step.load.search):
             yield replace(record, amplitude=step.name)
 
 
@@ -204,14 +210,14 @@ def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> 
         return bool(scene.comm.bcast(late))
 
     path = stage.path(name, "load", StepOptions(1.0, 1.0, 1.0))
-    made = [partial(dents.settled, number) for number in range(dents.count)]
+    guesses = [partial(dents.settled, number) for number in range(dents.count)]
     limits = SearchLimits(search.solutions, search.guesses, over)
     excluded = scene.model.symmetry_breaking_modes
     descend = dents.descended if search.stable else None
-    found = further_solutions(
-        path, stage.enter(state), made, limits, stage.displaced, descend, _rules(stage)
+    solutions_found = further_solutions(
+        path, stage.enter(state), guesses, limits, stage.displaced, descend, _rules(stage)
     )
-    for number, solution in enumerate(found, 1):
+    for number, solution in enumerate(solutions_found, 1):
         point = stage.point(solution)
         unstable = sum(excluded.counts(point.state)) if excluded else 0
         yield Record("solution", name, point, branch=number, excluded_pivots=unstable)

@@ -40,24 +40,23 @@ from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.outline import reference_shell_of
 from magshell_fenicsx.shells.energy_factory import EnergyFactory
-from magshell_fenicsx.simulate.numbers import number_of, scene_with, size_of
+from magshell_fenicsx.simulate.perturbation import number_at_key, perturbed_scene, scale_at_key
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.stage import Stage, plain
-from magshell_fenicsx.simulate.steps import stage_of
+from magshell_fenicsx.simulate.stage import Stage, load_stage
+from magshell_fenicsx.simulate.steps import stage_of_step
 from magshell_fenicsx.simulate.transfer import same_mesh, transfer
 
-SOME_FIELD = 1e-3  # a lambda_m that is not zero; nothing is solved in it
+NONZERO_FIELD = 1e-3  # a lambda_m that is not zero; nothing is solved in it
 Array = NDArray[np.float64]
 Imperfections: TypeAlias = Mapping[str, ImperfectionSection]
-STEP, TINY = (
-    1e-3,
-    1e-6,
-)  # of h, of a width or of the angle of a half-width: for the residual, and for dr0/dp
+# steps of differences, of h, of a width or of the angle of a half-width
+RESIDUAL_STEP = 1e-3  # for the residual
+DEVIATION_STEP = 1e-6  # for dr0/dp
 
 
 def fold_at(scene: Scene, record: Record) -> Fold:
-    """The fold of a record with the label "fold", with its null vector; collective.
+    """Return the fold of a record with the label "fold", with its null vector; collective.
 
     Raises
     ------
@@ -69,19 +68,19 @@ def fold_at(scene: Scene, record: Record) -> Fold:
     if record.label != "fold":
         raise ValueError(f"this record is no fold, but a {record.label}")
     scene.refuse_foreign(record.point.state)
-    stage = stage_at(scene, record)
+    stage = stage_of_record(scene, record)
     return find_fold(stage.newton, FoldGuess(stage.enter(record.point.state)), record.amplitude)
 
 
-def stage_at(scene: Scene, record: Record) -> Stage:
-    """The solver of a record's step, which holds what the step holds."""
+def stage_of_record(scene: Scene, record: Record) -> Stage:
+    """Return the stage of a record's step, which holds what the step holds."""
     if not record.step:
-        return plain(scene)
-    return stage_of(scene, scene.problem.programme[record.step - 1], record.point.state)
+        return load_stage(scene)
+    return stage_of_step(scene, scene.problem.programme[record.step - 1], record.point.state)
 
 
 def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dict[str, float]:
-    """Derivatives of a fold's amplitude (p/p_c for pressure, so d k_d); collective.
+    """Return derivatives of a fold's amplitude (p/p_c for pressure, so d k_d); collective.
 
     Parameters
     ----------
@@ -95,11 +94,10 @@ def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dic
     - every other amplitude of the scene ("lambda_m", "force", that of a user-defined term, ...);
     - "defect.amplitude", "imperfections.0.width", ...: numbers of imperfections;
     - "remanence dimple", "remanence rest": a relative change of the remanence of one patch, within
-      a
-      dimple's rim or outside all ("remanence" where there is no dimple). Their sum is lambda_m
+      a dimple's rim or outside all ("remanence" where there is no dimple). Their sum is lambda_m
       times the derivative in lambda_m.
     """
-    stage = stage_at(scene, record) if record else plain(scene)
+    stage = stage_of_record(scene, record) if record else load_stage(scene)
     system, state, history = stage.newton.system, fold.state, scene.model.system.history
     columns = {
         name: system.load(state.u, state.mu, name)
@@ -112,60 +110,67 @@ def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dic
         for name, column in (by_patch | _field_column(scene, state)).items()
     }
     by_column = {name: sensitivity(system, fold, column) for name, column in columns.items()}
-    return by_column | to_imperfections(stage, fold) | to_shells(stage, fold)
-
-
-def _field_column(scene: Scene, state: State) -> dict[str, Vector]:
-    """The load column of lambda_m for a problem whose field is zero: the slope of the magnetic
-    energy in it.
-
-    Empty without a section magnetic, and where the field leaves less symmetry than the model has.
-    """
-    problem = scene.problem
-    if problem.context.of(MagneticSection) is None or "lambda_m" in state.mu:
-        return {}
-    none = dict.fromkeys(("magnetic.remanent.flux_density", "magnetic.applied.flux_density"))
-    with_field = problem.with_values({"magnetic.lambda_m": SOME_FIELD, **none})
-    whole = not problem.axisymmetric and problem.mirror is None
-    alike = (with_field.axisymmetric, with_field.mirror) == (problem.axisymmetric, problem.mirror)
-    assert with_field.loads.magnetic
-    size = scene.model.system.size
-    own = State(state.u[:size], state.mu)
     return (
-        {"lambda_m": _magnetic_column(scene, own, with_field.loads.magnetic)}
-        if whole or alike
-        else {}
+        by_column
+        | imperfection_sensitivities(stage, fold)
+        | member_shell_sensitivities(stage, fold)
     )
 
 
+def _field_column(scene: Scene, state: State) -> dict[str, Vector]:
+    """Return the load column of lambda_m for a problem whose field is zero.
+
+    It is the slope of the magnetic energy in lambda_m. Empty without a section magnetic, and where
+    the field preserves less symmetry than the model has.
+    """
+    problem = scene.problem
+    if problem.context.section_of(MagneticSection) is None or "lambda_m" in state.mu:
+        return {}
+    without_field = dict.fromkeys(
+        ("magnetic.remanent.flux_density", "magnetic.applied.flux_density")
+    )
+    with_field = problem.with_values({"magnetic.lambda_m": NONZERO_FIELD, **without_field})
+    is_whole = not problem.axisymmetric and problem.mirror is None
+    symmetries = [(each.axisymmetric, each.mirror) for each in (problem, with_field)]
+    assert with_field.loads.magnetic
+    if not is_whole and symmetries[0] != symmetries[1]:
+        return {}
+    model_state = State(state.u[: scene.model.system.size], state.mu)
+    return {"lambda_m": _magnetic_column(scene, model_state, with_field.loads.magnetic)}
+
+
 @dataclass(frozen=True)
-class _Within:
+class _RemanenceWithin:
     """A remanence in one patch, zero elsewhere."""
 
-    whole: Array | Pattern
+    remanence: Array | Pattern
     patch: WithinRims
 
     def __call__(self, r0: Array, n0: Array) -> Array:
-        vectors = self.whole(r0, n0) if callable(self.whole) else self.whole
+        vectors = self.remanence(r0, n0) if callable(self.remanence) else self.remanence
         return np.asarray(vectors * self.patch(r0, n0))
 
 
 def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
-    """mu_i dPi_i/du of the magnetic terms, with the remanence of one patch only."""
+    """Return mu_i dPi_i/du of the magnetic terms, with the remanence of one patch only."""
     field = scene.model.loads.magnetic
     if field is None or (field.soft and field.soft.alone) or scene.model.loads.interaction:
         return {}
-    within, one = scene.problem.within, np.ones(3)
+    rims_by_patch, one = scene.problem.within, np.ones(3)
     if field.patches and scene.problem.context.sections.get("shells"):
-        return _of_shells(scene, fold.state, field, field.patches)
-    if not within:
+        return _remanence_columns_of_shells(scene, fold.state, field, field.patches)
+    if not rims_by_patch:
         return {"remanence": _magnetic_column(scene, fold.state, field)}
 
-    def only(patch: str) -> WithinRims:
-        rims = tuple((inside, one if name == patch else 0 * one) for name, inside in within.items())
+    def factor_of(patch: str) -> WithinRims:
+        """Return the factor that is 1 within a patch, and 0 elsewhere."""
+        rims = tuple(
+            (rim, one if name == patch else 0 * one) for name, rim in rims_by_patch.items()
+        )
         return WithinRims(rims, one if patch == "rest" else 0 * one)
 
-    alone = {patch: _Within(field.remanent, only(patch)) for patch in (*within, "rest")}
+    patches = (*rims_by_patch, "rest")
+    alone = {patch: _RemanenceWithin(field.remanent, factor_of(patch)) for patch in patches}
     return {
         f"remanence {patch}": _magnetic_column(
             scene, fold.state, replace(field, remanent=remanence)
@@ -174,30 +179,30 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
     }
 
 
-def _of_shells(
+def _remanence_columns_of_shells(
     scene: Scene, state: State, field: Magnetisation, patches: Mapping[str, Array | Pattern]
 ) -> dict[str, Vector]:
-    """That of each of several shells."""
+    """Return the columns of `_remanence_columns` for each of several shells."""
     model = scene.model
-    own: Mapping[str, NDArray[np.bool_]]
+    patches_of_cells: Mapping[str, NDArray[np.bool_]]
     if model.midsurface:
         cells = model.midsurface.mesh.topology.index_map(2)
-        own, count = model.midsurface.patches, cells.size_local + cells.num_ghosts
+        patches_of_cells, count = model.midsurface.patches, cells.size_local + cells.num_ghosts
     else:
         assert model.axisymmetric
-        own, count = model.meridian.patches, len(model.meridian.order)
-    none = dict.fromkeys(patches, np.zeros(3))
+        patches_of_cells, count = model.meridian.patches, len(model.meridian.order)
+    without_field = dict.fromkeys(patches, np.zeros(3))
     alone = {
-        name: replace(field, patches={**none, name: of}).on(own, count)
-        for name, of in patches.items()
+        name: replace(field, patches={**without_field, name: remanence}).on(patches_of_cells, count)
+        for name, remanence in patches.items()
     }
     return {
-        f"remanence {name}": _magnetic_column(scene, state, each) for name, each in alone.items()
+        f"remanence {name}": _magnetic_column(scene, state, field) for name, field in alone.items()
     }
 
 
 def _magnetic_column(scene: Scene, state: State, field: Magnetisation) -> Vector:
-    """lambda_m dPi/du of a field; dPi/du where the problem has none."""
+    """Return lambda_m dPi/du of a field; dPi/du where the problem has none."""
     model, system = scene.model, scene.model.system
     column, terms = fem.Function(model.V), magnetic_terms(scene, state, field)
 
@@ -208,22 +213,25 @@ def _magnetic_column(scene: Scene, state: State, field: Magnetisation) -> Vector
 
     system.at_state(state).evaluate(add)
     column.x.scatter_reverse(InsertMode.add)
-    for held in system.clamped:
-        held.set(column.x.array)
+    for support in system.clamped:
+        support.set(column.x.array)
     return np.array(column.x.array[: model.system.size])
 
 
 def magnetic_terms(scene: Scene, state: State, field: Magnetisation) -> Sequence[FormTerm]:
-    """The model's terms of a remanence with another one, in the fields of a state; none of what is
-    soft alone.
+    """Return the model's terms of a remanence with another one, in the fields of a state.
+
+    There are none of what is soft alone.
     """
-    terms, fields = _made(scene, field)
+    terms, fields = _magnetic_terms_and_fields(scene, field)
     for applied in fields:
         applied.mu.update({name: state.mu.get(name, 0.0) for name in applied.names})
     return terms
 
 
-def _made(scene: Scene, field: Magnetisation) -> tuple[Sequence[FormTerm], Sequence[AppliedField]]:
+def _magnetic_terms_and_fields(
+    scene: Scene, field: Magnetisation
+) -> tuple[Sequence[FormTerm], Sequence[AppliedField]]:
     model, log, fields = scene.model, KernelLog(), list[AppliedField]()
     factory = replace(model.factory, log=log, fields=fields)
     if field.soft and field.soft.alone:
@@ -234,8 +242,10 @@ def _made(scene: Scene, field: Magnetisation) -> tuple[Sequence[FormTerm], Seque
     return factory.magnetic(field), fields
 
 
-def to_imperfections(stage: Stage, fold: Fold) -> dict[str, float]:
-    """Derivatives by the key of each number below `shell`, angles in degrees; collective.
+def imperfection_sensitivities(stage: Stage, fold: Fold) -> dict[str, float]:
+    """Return derivatives by numbers of imperfections, angles in degrees; collective.
+
+    The keys of the numbers are those below `shell`.
 
     A number of a rim that separates patches of a remanence or of a natural shape is left out: the
     mesh has no place for a rim that moves. What a half or a meridian excludes by symmetry is zero.
@@ -265,86 +275,88 @@ def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
         return 0.0
     problem = scene.problem
     unit = _unit(problem, key, name)
-    step, tiny = STEP * unit, TINY * unit
-    further, back = (
-        _deviation(scene, changed(problem.imperfections, key, name, c), key) for c in (tiny, -tiny)
+    step, tiny = RESIDUAL_STEP * unit, DEVIATION_STEP * unit
+    forward, backward = (
+        _deviation(scene, with_changed_number(problem.imperfections, key, name, c), key)
+        for c in (tiny, -tiny)
     )
 
-    def out_of_balance(change: float) -> float:
-        return _in_other(stage, fold, reshaped(scene, Along(further, back, change / (2 * tiny))))
+    def load_change(change: float) -> float:
+        difference = DeviationDifference(forward, backward, change / (2 * tiny))
+        return _load_change(stage, fold, with_deviation(scene, difference))
 
-    grown = [
-        fold.state.mu[of]
-        for of, keys in grown_by(scene.problem.programme, problem.imperfections).items()
-        if key in keys
-    ]
-    return (grown or [1.0])[0] * (out_of_balance(step) - out_of_balance(-step)) / (2 * step)
+    growing = grown_by(scene.problem.programme, problem.imperfections)
+    factors = [fold.state.mu[amplitude] for amplitude, keys in growing.items() if key in keys]
+    return (factors or [1.0])[0] * (load_change(step) - load_change(-step)) / (2 * step)
 
 
-def _in_other(stage: Stage, fold: Fold, other: Scene) -> float:
-    """-(left . R)/(left . R_mu) of the same state in a scene with a slightly different shell on the
-    same mesh.
+def _load_change(stage: Stage, fold: Fold, other: Scene) -> float:
+    """Return -(left . R)/(left . R_mu) of a fold's state in a scene with a slightly different shell.
 
-    What touches there is what touches in the state, see `expand`.
+    Both scenes have the same mesh. What touches there is what touches in the state, see
+    `expand_contact`.
     """
     scene, size = stage.scene, stage.scene.model.system.size
     assert same_mesh(scene, other)
-    u, left = (
+    u, left_null_vector = (
         np.concatenate([transfer(scene, other, v[:size]), v[size:]])
         for v in (fold.state.u, fold.left_null_vector)
     )
-    expand(scene, other, stage.leave(fold.state))
-    moved, system = (
-        replace(fold, state=State(u, fold.state.mu), left_null_vector=left),
-        stage.on(other).newton.system,
-    )
-    return sensitivity(system, moved, system.residual(u, fold.state.mu))
+    expand_contact(scene, other, stage.leave(fold.state))
+    system = stage.on(other).newton.system
+    other_fold = replace(fold, state=State(u, fold.state.mu), left_null_vector=left_null_vector)
+    return sensitivity(system, other_fold, system.residual(u, fold.state.mu))
 
 
-def expand(scene: Scene, other: Scene, state: State) -> None:
-    """Take the penalties of contact in another scene on the same mesh as polynomials about a state
-    of the first one.
+def expand_contact(scene: Scene, other: Scene, state: State) -> None:
+    """Expand the penalties of contact in another scene into polynomials about a state of the first.
+
+    Both scenes have the same mesh.
     """
-    touch_as_in(scene, other, state)
-    at = scene.model.system.at_state(state)
+    expand_shell_contact(scene, other, state)
+    evaluation = scene.model.system.at_state(state)
     for name, (pressing, _) in scene.model.contacts.items():
-        other.model.contacts[name][0].expand_about(at.evaluate(partial(getattr, pressing, "gap")))
+        other.model.contacts[name][0].expand_about(
+            evaluation.evaluate(partial(getattr, pressing, "gap"))
+        )
 
 
-def touch_as_in(scene: Scene, other: Scene, state: State) -> None:
-    """Take contact between shells in another scene on the same mesh as polynomials about a state of
-    the first one.
+def expand_shell_contact(scene: Scene, other: Scene, state: State) -> None:
+    """Expand contact between shells in another scene into polynomials about a state of the first.
+
+    Both scenes have the same mesh.
     """
-    at = scene.model.system.at_state(state)
+    evaluation = scene.model.system.at_state(state)
     of_one: Sequence[Any] = scene.model.shell_contacts
     of_other: Sequence[Any] = other.model.shell_contacts
-    for touching, same in zip(of_one, of_other, strict=True):
-        if touching.held:
-            same.hold(touching.held)
+    for shell_contact, other_contact in zip(of_one, of_other, strict=True):
+        if shell_contact.held:
+            other_contact.hold(shell_contact.held)
         else:
-            same.expand_about(at.evaluate(touching.pressed))
+            other_contact.expand_about(evaluation.evaluate(shell_contact.freeze))
 
 
-def to_shells(stage: Stage, fold: Fold) -> dict[str, float]:
-    """Derivatives by the numbers of imperfections of several shells, each by its key; collective."""
-    context, found = stage.scene.problem.context, dict[str, float]()
+def member_shell_sensitivities(stage: Stage, fold: Fold) -> dict[str, float]:
+    """Return derivatives by numbers of imperfections of several shells, by key; collective."""
+    context, derivatives = stage.scene.problem.context, dict[str, float]()
     for name, member in (context.sections.get("shells") or {}).items():
         for i, section in enumerate(member.shell.imperfections):
             for number in section.parameters:
                 key = f"shells.{name}.shell.imperfections.{i}.{number}"
                 if not number.startswith("at."):
-                    found[key] = _by_number(stage, fold, key)
-    return found
+                    derivatives[key] = _derivative_by_number(stage, fold, key)
+    return derivatives
 
 
-def _by_number(stage: Stage, fold: Fold, key: str) -> float:
-    """The derivative by a number of the case, as a central difference of the residual."""
+def _derivative_by_number(stage: Stage, fold: Fold, key: str) -> float:
+    """Return the derivative by a number of the case, as a central difference of the residual."""
     scene, context = stage.scene, stage.scene.problem.context
-    value, step = number_of(context, key), STEP * size_of(context, key)
-    ahead, back = (
-        _in_other(stage, fold, scene_with(scene, key, value + change)) for change in (step, -step)
+    value, step = number_at_key(context, key), RESIDUAL_STEP * scale_at_key(context, key)
+    forward, backward = (
+        _load_change(stage, fold, perturbed_scene(scene, key, value + change))
+        for change in (step, -step)
     )
-    return (ahead - back) / (2 * step)
+    return (forward - backward) / (2 * step)
 
 
 def _unit(problem: Problem, key: str, name: str) -> float:
@@ -357,13 +369,15 @@ def _unit(problem: Problem, key: str, name: str) -> float:
     return 1.0
 
 
-def changed(sections: Imperfections, key: str, name: str, change: float) -> Imperfections:
-    """Imperfections of which one has another number, such as "at.polar" of "imperfections.0"."""
+def with_changed_number(
+    sections: Imperfections, key: str, name: str, change: float
+) -> Imperfections:
+    """Return imperfections with one changed number, such as "at.polar" of "imperfections.0"."""
     return {**sections, key: _changed(sections[key], name, change)}
 
 
 def _changed(part: Any, path: str, change: float) -> Any:
-    """A number, or a section or a list with another number somewhere in it."""
+    """Return a number, or a section or a list with another number somewhere in it."""
     if not path:
         return part + change
     first, _, rest = path.partition(".")
@@ -375,20 +389,20 @@ def _changed(part: Any, path: str, change: float) -> Any:
 
 
 @dataclass(frozen=True)
-class Along:
+class DeviationDifference:
     """A deviation along the derivative of another one, by the difference of two of its values."""
 
-    further: Deviation
-    back: Deviation
+    forward: Deviation
+    backward: Deviation
     factor: float
 
     def __call__(self, places: Array) -> Array:
-        return np.asarray(self.factor * (self.further(places) - self.back(places)))
+        return np.asarray(self.factor * (self.forward(places) - self.backward(places)))
 
 
 @dataclass(frozen=True)
 class _Mirrored:
-    """The mean of a deviation and its image: what half of a shell sees of it."""
+    """The mean of a deviation and its image: its part that half of a shell has."""
 
     deviation: Deviation
     mirror: Mirror
@@ -398,26 +412,26 @@ class _Mirrored:
 
 
 def _deviation(scene: Scene, sections: Imperfections, key: str) -> Deviation:
-    """The deviation of one of other imperfections, in the frame of the scene's model."""
+    """Return the deviation of one of some imperfections, in the frame of the scene's model."""
     problem, number = scene.problem, list(sections).index(key)
-    flaw = list(flaws(sections, reference_shell_of(problem.context.shell)).values())[
-        number
-    ]  # that has random dimples one by one
-    turned = in_frame(flaw.deviation, problem.azimuth)
-    return _Mirrored(turned, problem.mirror) if problem.mirror else turned
+    # by number: the geometries have random dimples one by one
+    geometries = flaws(sections, reference_shell_of(problem.context.shell))
+    geometry = list(geometries.values())[number]
+    turned_deviation = in_frame(geometry.deviation, problem.azimuth)
+    return _Mirrored(turned_deviation, problem.mirror) if problem.mirror else turned_deviation
 
 
-def reshaped(scene: Scene, deviation: Deviation) -> Scene:
-    """The scene on the same mesh in the chart, with one more deviation."""
+def with_deviation(scene: Scene, deviation: Deviation) -> Scene:
+    """Return the scene on the same mesh in the chart, with one more deviation."""
     problem, model = scene.problem, scene.model
 
-    def moved(embedding: object) -> DeviatedEmbedding:
+    def deviated(embedding: object) -> DeviatedEmbedding:
         assert isinstance(embedding, DeviatedEmbedding)
         return replace(embedding, deviations=(*embedding.deviations, deviation))
 
-    embedding = moved(problem.embedding)
+    embedding = deviated(problem.embedding)
     meridian = problem.meridian and replace(
-        problem.meridian, embedding=moved(problem.meridian.embedding)
+        problem.meridian, embedding=deviated(problem.meridian.embedding)
     )
     shape = model.midsurface.with_embedding(embedding) if model.midsurface else problem.shape
     return Scene(replace(problem, embedding=embedding, meridian=meridian, shape=shape), scene.comm)

@@ -10,7 +10,7 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.bodies.contact_step import finer as along_contact
 from magshell_fenicsx.parts.pressure.pressure import Enclosed
 from magshell_fenicsx.parts.step import ProgrammeStep
-from magshell_fenicsx.parts.step_control import Course, Drive, Gas, GasSection, Here
+from magshell_fenicsx.parts.step_course import Drive, Gas, GasSection, StepCourse, StepStart
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.simulate.contact_control import state_at_first_contact, support_motion_limit
 from magshell_fenicsx.simulate.path_records import Records, RecordStream, follow_path, off_path
@@ -52,7 +52,7 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
     stage = make_stage(scene, state, held, course.curves and (step.name, *course.curves))
     path, start = stage.begin(step.name, drive.control, state, drive.first, drive.scale)
     path = _with_step_options(scene, path, course, drive)
-    is_to_target = course.until == "target" or load.bound
+    is_to_target = course.until == "target" or load.limit_target
     if drive.end is not None and not drive.targets and is_to_target:  # it is there
         yield Record("target", step.name, stage.point(start))
         return state
@@ -106,7 +106,7 @@ def _within_support_limits(
     return replace(drive, targets=targets, end=targets[-1]), reason
 
 
-def _with_step_options(scene: Scene, path: Path, course: Course, drive: Drive) -> Path:
+def _with_step_options(scene: Scene, path: Path, course: StepCourse, drive: Drive) -> Path:
     """Return a path with the lengths of steps that its course and contact between shells ask for."""
     if drive.step is not None:
         path = path.with_step_options(StepOptions(drive.step, 2 * drive.step, 1e-4 * drive.step))
@@ -213,14 +213,14 @@ def _drive(scene: Scene, step: ProgrammeStep, state: State) -> Drive:
     return step.load.course(_step_start(scene, step, state)).drive
 
 
-def _step_start(scene: Scene, step: ProgrammeStep, state: State) -> Here:
+def _step_start(scene: Scene, step: ProgrammeStep, state: State) -> StepStart:
     """Return the begin of a step at a state, in the model's terms."""
     model, problem = scene.model, scene.problem
 
     def potential(name: str) -> float:
         return model.system.potential(state.u, state.mu, name)
 
-    return Here(
+    return StepStart(
         step,
         problem.context,
         problem.loads,

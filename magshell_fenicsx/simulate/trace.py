@@ -19,15 +19,15 @@ from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.input.section import in_units
 from magshell_fenicsx.quantities.registry import amplitude, quantity
+from magshell_fenicsx.simulate.path_records import follow_path
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.stage import plain
-from magshell_fenicsx.simulate.walked import followed
+from magshell_fenicsx.simulate.stage import load_stage
 
 Amount = float | str
 
 
-def goals(
+def target_values(
     scene: Scene, name: str, key: str, amounts: Sequence[Amount] | Amount, *, of_load: bool
 ) -> list[float]:
     """Amounts of an amplitude, or of its conjugate -Pi_i(u), as numbers; one alone is a list of
@@ -47,31 +47,33 @@ def goals(
     """
     alone = isinstance(amounts, str | Real) or amounts is None
     several: Sequence[Any] = [amounts] if alone else cast(Sequence[Any], amounts)
-    return [_number(scene, name, f"trace: {key}: {each!r}", each, of_load) for each in several]
+    return [
+        _number(scene, name, f"trace: {key}: {amount!r}", amount, of_load) for amount in several
+    ]
 
 
-def _number(scene: Scene, name: str, where: str, amount: Any, of_load: bool) -> float:
+def _number(scene: Scene, name: str, place: str, amount: Any, of_load: bool) -> float:
     if isinstance(amount, Real):
         return float(amount)
     if not isinstance(amount, str):
-        raise ValueError(f'{where}: must be a number, or text with a unit such as "100 Pa"')
-    varied = amplitude(name)
-    column = varied.column if of_load else varied.conjugate
+        raise ValueError(f'{place}: must be a number, or text with a unit such as "100 Pa"')
+    amplitude_varied = amplitude(name)
+    column = amplitude_varied.column if of_load else amplitude_varied.conjugate
     unit, scale = scene.sizes.unit(column), quantity(column).scale
     sized = (
         of_load or name == "pressure" or name in (*scene.model.loads.forces, *scene.model.contacts)
     )
-    text = unit.text if unit else next((each.text for each in quantity(column).units), "")
+    text = unit.text if unit else next((amount.text for amount in quantity(column).units), "")
     if not (text and sized):
         of = name if of_load else f"the conjugate of {name}"
-        raise ValueError(f"{where}: {of} has no unit here: give a number")
+        raise ValueError(f"{place}: {of} has no unit here: give a number")
     if unit is None:
         needed = "youngs_modulus and lengths of the shell with units"
-        raise ValueError(f"{where}: has a unit: that needs {needed}; a number is in {scale}")
+        raise ValueError(f"{place}: has a unit: that needs {needed}; a number is in {scale}")
     try:
         number = in_units(text)(amount) / scene.sizes.by_unit[unit.key]
     except ValueError as e:
-        raise ValueError(f"{where}: {e}") from None
+        raise ValueError(f"{place}: {e}") from None
     return number if of_load else number * scene.conjugate_unit(name)
 
 
@@ -135,8 +137,8 @@ def trace(
             f"trace: {name}: the scene has no such amplitude, only {', '.join(state.mu) or 'none'}"
         )
     of_load = control == "load" or (control == "arc" and quantity == "load")
-    targets = goals(scene, name, "targets", targets, of_load=of_load)
-    first = None if first is None else goals(scene, name, "first", first, of_load=True)[0]
+    targets = target_values(scene, name, "targets", targets, of_load=of_load)
+    first = None if first is None else target_values(scene, name, "first", first, of_load=True)[0]
     if until == "target" and not targets:
         raise ValueError("trace: until='target' needs targets")
     if first is None and targets and of_load:
@@ -151,21 +153,26 @@ def trace(
     if not rest.converged:
         raise Stopped(f"there is no equilibrium to start from near the given state: {rest.reason}")
     if control == "conjugate":
-        moved = scene.newton.response(rest.state, name, PrescribedLoad(name, 0.0), exact=True).du
+        displacement = scene.newton.response(
+            rest.state, name, PrescribedLoad(name, 0.0), exact=True
+        ).du
         if (
-            max_abs(scene.newton.system.comm, moved) * abs(first)
+            max_abs(scene.newton.system.comm, displacement) * abs(first)
             < ZERO_DISPLACEMENT * scene.newton.system.length
         ):
             raise Stopped(
                 f"{name} moves nothing at the start, so nothing is conjugate to it: follow it by arc length"
             )
-    path, first_point = plain(scene).begin(name, control, rest.state, first, 10 * first)
+    path, first_point = load_stage(scene).begin(name, control, rest.state, first, 10 * first)
     if targets and control == "conjugate":
         step = abs(targets[-1] - first_point.s) / 10
         path = path.with_step_options(StepOptions(step, 2 * step, 1e-5 * step))
     sense = float(np.copysign(1.0, first * first_point.dmu))
-    records_of_path = followed(
-        plain(scene), path, first_point, ContinuationGoal(until, targets, quantity, steps, sense)
+    records_of_path = follow_path(
+        load_stage(scene),
+        path,
+        first_point,
+        ContinuationGoal(until, targets, quantity, steps, sense),
     )
     records = chain([Record("start", "", first_point)], records_of_path)
     yield from _marked(
@@ -180,8 +187,8 @@ def _marked(records: Iterator[Record], name: str, targets: Sequence[float]) -> I
         yield last
         last, missed = record, missed - (record.label == "target")
     if missed > 0:
-        where = f"{last.label}{f' ({last.mode})' if last.mode else ''} at {name} = {last.point.state.mu[name]:.6g}"
+        place = f"{last.label}{f' ({last.mode})' if last.mode else ''} at {name} = {last.point.state.mu[name]:.6g}"
         warnings.warn(
-            f"trace: {name}: ends at a {where}, before its target {targets[-1]:.6g}", stacklevel=2
+            f"trace: {name}: ends at a {place}, before its target {targets[-1]:.6g}", stacklevel=2
         )
     yield replace(last, reached=missed <= 0)

@@ -41,20 +41,21 @@ def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
     matching = _matching(source, target)
     if matching is not None:
         return np.asarray(values[matching].ravel())
-    nodes, wanted, stretch = _all_nodes(source), chart(target), _stretch(source, target)
+    nodes, chart_places, stretch = _all_nodes(source), chart(target), _stretch(source, target)
     if stretch:
-        moved = stretch.turn(
-            _interpolated(nodes, values, stretch.place(wanted), stretch.source_rim), wanted
+        displacement = stretch.turn(
+            _interpolated(nodes, values, stretch.place(chart_places), stretch.source_rim),
+            chart_places,
         )
     else:
         scale = system.length / source.model.system.length
-        moved = np.zeros((len(wanted), values.shape[1]))
-        for inside, own in of_shells(source, target):
-            if own.any():
-                moved[own] = scale * _interpolated(
-                    nodes[inside], values[inside], wanted[own], np.inf
+        displacement = np.zeros((len(chart_places), values.shape[1]))
+        for inside, owned in nodes_by_shell(source, target):
+            if owned.any():
+                displacement[owned] = scale * _interpolated(
+                    nodes[inside], values[inside], chart_places[owned], np.inf
                 )
-    return system.zero_at_supports(moved.ravel())
+    return system.zero_at_supports(displacement.ravel())
 
 
 def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
@@ -63,8 +64,8 @@ def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
     from_pole, polar = np.linalg.norm(nodes, axis=1), np.linalg.norm(x, axis=1)
     inside = from_pole < rim * (1 + ROUNDING), polar < rim * (1 + ROUNDING)
     outside = from_pole > rim * (1 - ROUNDING), polar > rim * (1 - ROUNDING)
-    for side, wanted in (inside, outside):
-        if wanted.any():
+    for side, chart_places in (inside, outside):
+        if chart_places.any():
             dim = nodes.shape[1]
             kernel, degree = (
                 ("quintic", 3) if dim < 3 else ("linear", 0)
@@ -72,7 +73,7 @@ def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
             field = scipy.interpolate.RBFInterpolator(
                 nodes[side], values[side], neighbors=NEIGHBOURS[dim], kernel=kernel, degree=degree
             )
-            values_at[wanted] = field(x[wanted])
+            values_at[chart_places] = field(x[chart_places])
     return values_at
 
 
@@ -89,14 +90,14 @@ def _matching(source: Scene, target: Scene) -> NDArray[np.int64] | None:
 
 
 def matching(
-    nodes: Array, wanted: Array, comm: MPI.Comm = MPI.COMM_SELF
+    nodes: Array, chart_places: Array, comm: MPI.Comm = MPI.COMM_SELF
 ) -> NDArray[np.int64] | None:
-    """The number of each of this rank's places `wanted` among all `nodes`; None on all ranks if
+    """The number of each of this rank's places `chart_places` among all `nodes`; None on all ranks if
     they differ.
     """
-    distance, number = scipy.spatial.cKDTree(nodes).query(wanted)
+    distance, number = scipy.spatial.cKDTree(nodes).query(chart_places)
     equal = (
-        comm.allreduce(len(wanted)) == len(nodes)
+        comm.allreduce(len(chart_places)) == len(nodes)
         and comm.allreduce(distance.max(initial=0.0), MPI.MAX) < ROUNDING
     )
     return np.asarray(number) if equal else None
@@ -126,25 +127,30 @@ class _Stretch:
         polar = np.linalg.norm(x, axis=1, keepdims=True)
         azimuth = x / np.maximum(polar, TINY) if x.shape[1] == 2 else np.ones_like(polar)
         from_frame, to_frame = _frame(self._polar(polar), azimuth), _frame(polar, azimuth)
-        across, along = (np.sum(u * e, axis=1, keepdims=True) for e in from_frame)
-        sideways = u - across * from_frame[0] - along * from_frame[1]
+        normal_part, meridian_part = (np.sum(u * e, axis=1, keepdims=True) for e in from_frame)
+        sideways = u - normal_part * from_frame[0] - meridian_part * from_frame[1]
         ratio = self.rim / self.source_rim
         return np.asarray(
             ratio**2
-            * (across * to_frame[0] + (along * to_frame[1] + sideways) / self._slope(polar))
+            * (
+                normal_part * to_frame[0]
+                + (meridian_part * to_frame[1] + sideways) / self._slope(polar)
+            )
         )
 
     def _polar(self, polar: Array) -> Array:
-        t = self._beyond(polar)
+        t = self._part_beyond_rim(polar)
         ratio = self.source_rim / self.rim
         return np.asarray(np.clip(ratio * polar + (1 - ratio) * self.edge * t**2, 0, self.edge))
 
     def _slope(self, polar: Array) -> Array:
         ratio = self.source_rim / self.rim
-        slope = ratio + (1 - ratio) * self.edge * 2 * self._beyond(polar) / (self.edge - self.rim)
+        slope = ratio + (1 - ratio) * self.edge * 2 * self._part_beyond_rim(polar) / (
+            self.edge - self.rim
+        )
         return np.asarray(np.maximum(slope, 0.5))
 
-    def _beyond(self, polar: Array) -> Array:
+    def _part_beyond_rim(self, polar: Array) -> Array:
         """Grows linearly from 0 at the rim to 1 at the edge."""
         return np.asarray(np.maximum((polar - self.rim) / (self.edge - self.rim), 0.0))
 
@@ -178,7 +184,7 @@ def _stretch(source: Scene, target: Scene) -> _Stretch | None:
     return _Stretch(rims[0], rims[1], edges[0]) if abs(edges[0] - edges[1]) < ROUNDING else None
 
 
-def of_shells(
+def nodes_by_shell(
     source: Scene, target: Scene
 ) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
     """Of each shell, which of all nodes of a scene are its own, and which of this rank's nodes of
@@ -186,10 +192,10 @@ def of_shells(
 
     Shells that touch are near each other, and move in different ways. Collective.
     """
-    return zip(all_of_shells(source), nodes_of_shells(target), strict=True)
+    return zip(all_nodes_of_shells(source), nodes_of_shells(target), strict=True)
 
 
-def all_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
+def all_nodes_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
     """Which of the nodes of all ranks are of each shell; collective."""
     comm = scene.model.system.comm
     return [np.concatenate(comm.allgather(inside)) for inside in nodes_of_shells(scene)]

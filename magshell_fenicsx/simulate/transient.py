@@ -22,7 +22,7 @@ from magshell_fenicsx.input.section import in_units
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.motion.motion_step import EventSection, PushSection, TimeSection
-from magshell_fenicsx.parts.step_control import SnapSection
+from magshell_fenicsx.parts.step_course import SnapSection
 from magshell_fenicsx.shape.meridian_chart import vector_function
 from magshell_fenicsx.shells.mass import SupportInertia, mass, mass_with_supports
 from magshell_fenicsx.shells.modes import ShellModes

@@ -33,11 +33,11 @@ from magshell_fenicsx.problem.memory import refuse_beyond_memory
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.follow import follow_alone
-from magshell_fenicsx.simulate.numbers import BESIDE
 from magshell_fenicsx.simulate.perfect import with_modes
+from magshell_fenicsx.simulate.perturbation import KEYS_OUTSIDE_THE_MODEL
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.varied import WAVES, Varied, instability
+from magshell_fenicsx.simulate.scene_family import WAVES, SceneFamily, first_instability
 from magshell_fenicsx.studies.boundary_journal import Journal, text_of, vector_of
 from magshell_fenicsx.studies.boundary_picture import draw_boundary
 from magshell_fenicsx.studies.boundary_start import Start, start_from
@@ -122,7 +122,7 @@ def parse_range(text: str) -> Range:
         raise CaseError(f"--over {text}: first and last must be two different finite numbers")
     if not 1 <= steps <= MOST_STEPS:
         raise CaseError(f"--over {text}: steps is {steps}; allowed 1 to {MOST_STEPS}")
-    if key.split(".")[0] in BESIDE:
+    if key.split(".")[0] in KEYS_OUTSIDE_THE_MODEL:
         raise CaseError(
             f"--over {text}: {key.split('.')[0]} is no part of the shell or of its loads, so has "
             "no boundary"
@@ -222,7 +222,7 @@ def boundary(
                 lambda: _begin(source, span, value, make_case, journal("whole"), say, half_source),
             )
         if not begin["label"]:
-            instability([])
+            first_instability([])
         name_of_mode = name_of_mode if begin["label"] == "bifurcation" else begin["mode"]
         begin = {**begin, "name_of_mode": name_of_mode, "is_first": not begun_at.text}
         once(
@@ -363,7 +363,9 @@ def _followed(
     point = Point(State(u, begin["mu"]), 0.0, 0.0 * u, 0.0, 0, 0)
     record = Record(begin["label"], begin["amplitude"], point, begin["mode"], step=begin["step"])
     try:
-        family = Varied(scene, record, partial(_problem, source, span, make_case), value, span.ends)
+        family = SceneFamily(
+            scene, record, partial(_problem, source, span, make_case), value, span.ends
+        )
     except (CaseError, NoSystem) as e:
         raise CaseError(f"--over {span.key}: {e}") from None
     scales = (abs(begin["value"]) or 1.0, span.ends[1] - span.ends[0])
@@ -406,12 +408,12 @@ def _followed(
     except (BoundaryLost, NoSystem) as e:
         if not rows:
             raise Stopped(str(e)) from None
-        return {"rows": rows, "stopped": f"{span.key}: {e}", "alone": family.alone}
-    return {"rows": rows, "stopped": "", "alone": family.alone}
+        return {"rows": rows, "stopped": f"{span.key}: {e}", "alone": family.has_one_scene}
+    return {"rows": rows, "stopped": "", "alone": family.has_one_scene}
 
 
 def _row(
-    family: Varied, label: Label, locus: BoundaryPoint, mode: Boundary, name_of_mode: str
+    family: SceneFamily, label: Label, locus: BoundaryPoint, mode: Boundary, name_of_mode: str
 ) -> dict[str, Any]:
     """A row of boundary.csv; the model's own mode has its name in path.csv of the case, also on the
     whole."""

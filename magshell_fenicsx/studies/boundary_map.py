@@ -11,9 +11,9 @@ from magshell_fenicsx.output.store.durable import write_object
 from magshell_fenicsx.output.store.folder import access_disk, user_folder
 from magshell_fenicsx.output.store.table import write_csv
 from magshell_fenicsx.platform.terminal import print_line
-from magshell_fenicsx.simulate.numbers import BESIDE
+from magshell_fenicsx.simulate.perturbation import KEYS_OUTSIDE_THE_MODEL
 from magshell_fenicsx.simulate.record import Stopped
-from magshell_fenicsx.simulate.varied import Excluded, NoInstability
+from magshell_fenicsx.simulate.scene_family import ExcludedInstability, NoInstability
 from magshell_fenicsx.studies.boundary import COLUMNS, StabilityBoundary, boundary, parse_range
 from magshell_fenicsx.studies.boundary_picture import draw_map
 from magshell_fenicsx.studies.points import Axis, parse_axis
@@ -40,7 +40,7 @@ def second_axis(text: str, first: str) -> Axis:
         len(axis.keys) > 1
         or axis.numbers is None
         or axis.name == first
-        or axis.name.split(".")[0] in BESIDE
+        or axis.name.split(".")[0] in KEYS_OUTSIDE_THE_MODEL
     ):
         raise CaseError(
             f"--over {text}: the second key of a map is another number of the shell or its loads, "
@@ -120,7 +120,7 @@ def boundary_map(
                     say,
                     make_case=make_case,
                 )
-            except (Excluded, NoInstability, Stopped) as e:
+            except (ExcludedInstability, NoInstability, Stopped) as e:
                 without[value] = str(e)
                 once(f"{axis.name} = {value}: no boundary: {e}")
                 continue

@@ -13,7 +13,7 @@ from magshell_fenicsx.output.store.stored_results import case_in
 from magshell_fenicsx.output.store.table import LOCATED, read_rows
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.record import Record
-from magshell_fenicsx.simulate.varied import NoInstability, instability
+from magshell_fenicsx.simulate.scene_family import NoInstability, first_instability
 
 LOAD_TOLERANCE = 1e-3  # of a load: the run and its repetition, on another processor
 FORM = (
@@ -53,7 +53,7 @@ class Start:
             If it is not there.
         """
         if not self.text:
-            return instability(records)
+            return first_instability(records)
         candidates = [
             r
             for r in records

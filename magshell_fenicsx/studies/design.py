@@ -33,7 +33,7 @@ from magshell_fenicsx.simulate.gradients.fields import MASS, mass
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, SCALES, LostResult
 from magshell_fenicsx.simulate.gradients.results import BARRIER, vibration_at_end
 from magshell_fenicsx.simulate.results import Target, distances
-from magshell_fenicsx.simulate.standing import Standing
+from magshell_fenicsx.simulate.scene_reuse import SceneReuse
 from magshell_fenicsx.studies.design_evaluation import DISTANCE, DesignEvaluation, evaluate
 from magshell_fenicsx.studies.design_picture import ReachedShape, draw_design, reached_shape
 from magshell_fenicsx.studies.design_variables import Variables, variables
@@ -91,7 +91,7 @@ class Design:
     tried: list[tuple[Array, DesignEvaluation]] = field(default_factory=list)
     stage: int = 0
     seconds: list[float] = field(default_factory=list)
-    _scene: Standing = field(default_factory=Standing)
+    _scene: SceneReuse = field(default_factory=SceneReuse)
 
     def __call__(self, x: Array) -> DesignEvaluation:
         """The evaluation of a vector, known or new; collective."""

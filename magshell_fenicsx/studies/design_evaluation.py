@@ -79,7 +79,7 @@ def evaluate(
     `known` is of the case before.
     """
     try:
-        scene = scene_cache.of(case.problem(variables.smooth), comm)
+        scene = scene_cache.scene_for(case.problem(variables.smooth), comm)
         _refuse_missing_results(scene, variables, results, targets)
         path = _follow_until_enough(scene, results)
     except MeshError as e:

@@ -24,8 +24,8 @@ from magshell_fenicsx.quantities.registry import QUANTITIES, endings
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, SCALES, refuse_unitless
 from magshell_fenicsx.simulate.gradients.results import NamesOnlyScene, refuse_no_result
 from magshell_fenicsx.simulate.gradients.vibration import NAMES
-from magshell_fenicsx.simulate.numbers import number_of
-from magshell_fenicsx.simulate.readings import Places, Reading
+from magshell_fenicsx.simulate.perturbation import number_at_key
+from magshell_fenicsx.simulate.readings import PrescribedQuantity, Reading
 from magshell_fenicsx.simulate.results import differentiable
 from magshell_fenicsx.studies.design_blocks import NumberVariable
 from magshell_fenicsx.studies.identify_sections import Amount, CandidateSection, IdentifySection
@@ -122,7 +122,7 @@ class ResultNames:
     def __init__(self, case: Case) -> None:
         self.scene = NamesOnlyScene(case.problem())
         try:
-            self.places: Places | None = Places(self.scene)
+            self.places: PrescribedQuantity | None = PrescribedQuantity(self.scene)
         except CaseError:
             self.places = None
 
@@ -186,7 +186,7 @@ class ResultNames:
     @property
     def _bare(self) -> list[str]:
         scene = self.scene
-        place_names = [self.places.bare] if self.places else []
+        place_names = [self.places.dimensionless_column] if self.places else []
         return [
             *place_names,
             *(name for name in differentiable(scene, scene.unloaded()) if name not in place_names),
@@ -278,7 +278,7 @@ def parameters_of(source: Source, case: Case, section: IdentifySection) -> tuple
     for key, parameter_section in section.parameters.items():
         location = f"identify.parameters.{key}"
         try:
-            number_of(case.context, key)
+            number_at_key(case.context, key)
             start, unit = _number_as_written(source, case, key)
             mean, deviation = (
                 _in_unit_of(unit, amount, key)
@@ -299,7 +299,7 @@ def _number_as_written(source: Source, case: Case, key: str) -> tuple[float, str
     """A number of the case as it is written, and its unit."""
     text = value_at(source.data, key.split("."))
     number, unit = number_and_unit(str(text))
-    return (float(number), unit) if number else (number_of(case.context, key), "")
+    return (float(number), unit) if number else (number_at_key(case.context, key), "")
 
 
 def _in_unit_of(unit: str, amount: Amount | None, key: str) -> float:

@@ -19,7 +19,7 @@ from magshell_fenicsx.output.store.folder import access_disk
 from magshell_fenicsx.platform.environment import code_version
 from magshell_fenicsx.platform.processes import on_first_rank
 from magshell_fenicsx.simulate.gradients.instabilities import LostResult
-from magshell_fenicsx.simulate.readings import NotRead, Outside, Reading, read
+from magshell_fenicsx.simulate.readings import PlaceOutsidePath, Reading, UnreadPlace, read
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.studies.design_blocks import NumberVariable
 from magshell_fenicsx.studies.identify_data import Parameter
@@ -131,7 +131,8 @@ class Predictor:
                 message_parts = [self._row_of(e, settings), ", ".join(settings), str(e)]
                 note = ": ".join(filter(None, message_parts))
                 return PredictedReadings(
-                    note=note, invalid=not isinstance(e, LostResult) or isinstance(e, Outside)
+                    note=note,
+                    invalid=not isinstance(e, LostResult) or isinstance(e, PlaceOutsidePath),
                 )
             prediction.values += [float(v) for v in readings.values]
             # the number of a key needs no scene
@@ -147,7 +148,7 @@ class Predictor:
 
     def _row_of(self, error: Exception, settings: Settings) -> str:
         """Return file and line of the datum whose place is not reached; empty for another error."""
-        if not isinstance(error, NotRead):
+        if not isinstance(error, UnreadPlace):
             return ""
         rows = zip(self.rows.get(settings, ()), self.readings[settings], strict=False)
         return next((row for row, reading in rows if reading.at == error.place), "")

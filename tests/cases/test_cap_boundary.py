@@ -8,7 +8,7 @@ from conftest import CASES
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.varied import moved
+from magshell_fenicsx.simulate.scene_family import problem_on_moved_mesh
 from magshell_fenicsx.studies.boundary_picture import _regions
 
 
@@ -29,7 +29,7 @@ def test_deeper_caps_buckle_before_they_snap(tmp_path: Path) -> None:
         problem = ms.Case.load(file, [f"shell.polar={row['key']!r}"]).problem()
         of_run = next(
             r
-            for r in ms.follow(Scene(moved(first, problem), first.comm))
+            for r in ms.follow(Scene(problem_on_moved_mesh(first, problem), first.comm))
             if r.label in ("fold", "bifurcation")
         )
         assert (of_run.label, of_run.mode) == (row["kind"], row["mode"])

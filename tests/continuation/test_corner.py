@@ -59,8 +59,8 @@ def rows_of_stops(places: list[float]) -> Toy:
     return Toy(gradient, hessian, 2)
 
 
-def way_to_touch(here: State, guess: State) -> StepEvent:
-    """As shells have it in `simulate.onset`."""
+def first_contact(here: State, guess: State) -> StepEvent:
+    """As shells have it in `simulate.contact_onset`."""
     gap, way = X - here.u[1], guess.u[1] - here.u[1]
     behind = gap < 4 * DEEP
     part = (gap + (DEEP if behind else -DEEP)) / way if way and gap > 0 else 1.0
@@ -72,7 +72,7 @@ def walked(load: float, first: float) -> list[tuple[Label, Point]]:
         stop(), NewtonOptions(reuse_distance=0.0, patience=7, stiffnesses={"stop": 1.0})
     )
     path = Path(
-        newton, "load", "arc", StepOptions(first, 4 * first, 1e-5 * first), step_event=way_to_touch
+        newton, "load", "arc", StepOptions(first, 4 * first, 1e-5 * first), step_event=first_contact
     )
     return list(
         ContinuationRun(

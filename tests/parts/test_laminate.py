@@ -12,7 +12,7 @@ from magshell_fenicsx.case.case_variants import case_with_values
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.laminate import LaminateSection
-from magshell_fenicsx.simulate.numbers import number_of
+from magshell_fenicsx.simulate.perturbation import number_at_key
 
 
 def case(**sections: Any) -> ms.Case:
@@ -206,7 +206,7 @@ def test_what_is_refused() -> None:
     with pytest.raises(
         CaseError, match="the fractions of the plies add up to 1: one alone has no gradient"
     ):
-        number_of(pressed({"plies": plies(0, 90)}).context, "shell.laminate.plies.0.fraction")
+        number_at_key(pressed({"plies": plies(0, 90)}).context, "shell.laminate.plies.0.fraction")
     for size, said in ((1e10, "1e\\+10"), (1e-10, "1e-10")):
         with pytest.raises(
             CaseError,

@@ -14,7 +14,7 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.output.pictures.plot import draw
 from magshell_fenicsx.public import run
 from magshell_fenicsx.simulate.adapt.choice import Adapted, AdaptiveRound, Choice
-from magshell_fenicsx.simulate.follow import BEYOND, follow
+from magshell_fenicsx.simulate.follow import BEYOND_INSTABILITY, follow
 
 MESH = {"degree": 3, "refinement": 0.7}
 
@@ -77,7 +77,7 @@ def test_path_that_is_lost_beyond_the_first_instability(
     assert "Beyond the first instability the path stopped: " in headline
     summary = json.loads((tmp_path / "limit" / "summary.json").read_text(encoding="utf-8"))
     assert summary["stopped"] is None
-    assert [remark.startswith(BEYOND) for remark in summary["remarks"]] == [True]
+    assert [remark.startswith(BEYOND_INSTABILITY) for remark in summary["remarks"]] == [True]
     first = next(row for row in read_path(tmp_path / "limit") if row["label"] == "bifurcation")
     number = int(first["point"])
     assert number < summary["points"] - 3
@@ -97,7 +97,7 @@ def test_path_that_is_lost_beyond_the_first_instability(
 
 def test_python_hears_what_is_beyond(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("magshell_fenicsx.simulate.steps.MAX_STEPS", 9)
-    with pytest.warns(UserWarning, match=BEYOND):
+    with pytest.warns(UserWarning, match=BEYOND_INSTABILITY):
         labels = [record.label for record in follow(Scene(Case.from_source(PERFECT)))]
     assert "bifurcation" in labels
 

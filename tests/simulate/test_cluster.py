@@ -13,8 +13,8 @@ from magshell_fenicsx.continuation.newton import BorderedNewton
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.simulate.path_records import cluster_remark
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.walked import words_of_cluster
 
 WITHOUT_UNITS = cast("Scene", SimpleNamespace(sizes=SimpleNamespace(column=lambda name: None)))
 
@@ -29,7 +29,7 @@ def test_one_sentence_names_directions_and_controls(count: int) -> None:
         path, path.start(State(u, {"load": 0.9})), ContinuationGoal("target", [1.1])
     )
     sentences = [
-        (point, said) for _, point in walk if (said := words_of_cluster(WITHOUT_UNITS, walk, point))
+        (point, said) for _, point in walk if (said := cluster_remark(WITHOUT_UNITS, walk, point))
     ]
     ((point, said),) = sentences
     first, last = (end.state.mu["load"] for end in walk.clusters[0])

@@ -17,7 +17,7 @@ from magshell_fenicsx.assembly.field_gradient import FieldGradient
 from magshell_fenicsx.continuation.control import PrescribedLoad
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.gradient import gradient
-from magshell_fenicsx.simulate.numbers import on_mesh_of
+from magshell_fenicsx.simulate.perturbation import problem_on_mesh_of
 from magshell_fenicsx.simulate.results import functional
 
 Array = NDArray[np.float64]
@@ -88,7 +88,7 @@ def test_new_cases(data: dict[str, Any], way: str, load: str, results: list[str]
     *_, last = follow(scene)
     state, values = last.point.state, list[list[float]]()
     for c in (-2, -1, 1, 2):
-        other = Scene(on_mesh_of(scene, further(data, way, c * STEP).problem()))
+        other = Scene(problem_on_mesh_of(scene, further(data, way, c * STEP).problem()))
         solution = other.newton.solve(state, load, PrescribedLoad(load, state.mu[load]))
         assert solution.converged
         values.append([functional(other, solution.state, of).value for of in results])

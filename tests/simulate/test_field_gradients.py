@@ -26,7 +26,7 @@ from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.gradients.gradient import gradient
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import functional
-from magshell_fenicsx.simulate.sensitivity import fold_at, reshaped
+from magshell_fenicsx.simulate.sensitivity import fold_at, with_deviation
 
 Array = NDArray[np.float64]
 FIELDS = ("thickness", "curvature", "deviation")
@@ -68,7 +68,7 @@ def changed(scene: Scene, name: str, along: Direction, c: float) -> Scene:
     """The scene with another field, on the same mesh."""
     problem = scene.problem
     if name == "deviation":
-        return reshaped(scene, lambda x: c * along(x) * problem.material.h)
+        return with_deviation(scene, lambda x: c * along(x) * problem.material.h)
     if name == "thickness":
         one = Thickness(lambda x, y, z: 1 + c * along(np.stack([x, y, z], axis=-1)))
         return Scene(replace(problem, thickness=one))

@@ -10,15 +10,15 @@ import pytest
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.continuation.continuation_run import ContinuationGoal
 from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.simulate.contact_control import before_passing, passes
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.handover import _mirrored
-from magshell_fenicsx.simulate.numbers import on_mesh_of
+from magshell_fenicsx.simulate.path_records import checked_run
+from magshell_fenicsx.simulate.perturbation import problem_on_mesh_of
 from magshell_fenicsx.simulate.record import Record
-from magshell_fenicsx.simulate.search import dented
+from magshell_fenicsx.simulate.search import dented_states
 from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
-from magshell_fenicsx.simulate.stage import plain
-from magshell_fenicsx.simulate.touch import before_passing, passes
-from magshell_fenicsx.simulate.walked import _walk
+from magshell_fenicsx.simulate.stage import load_stage
+from magshell_fenicsx.simulate.symmetry_switch import _mirrored
 
 h = 0.036
 CAP = {"geometry": "cap", "radius": 1, "polar": 20, "thickness": h, "poisson_ratio": 0.3}
@@ -52,9 +52,9 @@ def test_search() -> None:
         )
     )
     _, start, *found = (record.point.state for record in follow(scene))
-    stage = plain(scene)
+    stage = load_stage(scene)
     path, here = stage.begin("load", "arc", start, 1e-5, 1e-4)
-    way = _walk(stage, path, here, ContinuationGoal("points", [start.mu["load"]], "load", steps=50))
+    way = checked_run(stage, path, here, ContinuationGoal("points", [start.mu["load"]], "load", steps=50))
     reached = [
         point.state
         for _, (_, point) in zip(found, (it for it in way if it[0] == "target"), strict=False)
@@ -63,7 +63,9 @@ def test_search() -> None:
     for one, other in zip(found, reached, strict=True):
         assert np.abs(one.u - other.u).max() < 1e-8 * h
     assert scene.observe(found[1])["contact_force"] > 0.01
-    for guess in dented(scene, start):  # those of the upper dome end before it is in the lower one
+    for guess in dented_states(
+        scene, start
+    ):  # those of the upper dome end before it is in the lower one
         assert not passes(stage, start, before_passing(stage, start, guess))
     below = State(np.array(start.u), start.mu)
     below.u.reshape(-1, 2)[
@@ -74,7 +76,7 @@ def test_search() -> None:
 
 def fold_of(data: dict[str, Any], base: Scene | None = None) -> tuple[Scene, Record]:
     problem = Case.from_source(data).problem()
-    scene = Scene(on_mesh_of(base, problem) if base else problem)
+    scene = Scene(problem_on_mesh_of(base, problem) if base else problem)
     *_, last = follow(scene)
     return scene, last
 

@@ -13,7 +13,7 @@ from magshell_fenicsx.continuation.step_control import StepEvent
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.simulate.onset import way_to_touch
+from magshell_fenicsx.simulate.contact_onset import first_contact
 
 h = 0.01
 MOVES = [{"supports": ["upper.left"], "translation": [0, 0, h]}]
@@ -57,13 +57,13 @@ def test_another_pair_meets_where_one_lets_go(stack: Scene) -> None:
     else alike.
     """
     here, guess = lifted(stack, upper=-1.001), lifted(stack, lower=2)
-    ahead = way_to_touch(stack, lambda state: state, here, guess)
+    ahead = first_contact(stack, lambda state: state, here, guess)
     assert ahead.loses_forces
     assert not ahead.ends_behind
     assert ahead.fraction == pytest.approx(0.499, abs=1e-3)
-    alone = way_to_touch(stack, lambda state: state, lifted(stack), guess)
+    alone = first_contact(stack, lambda state: state, lifted(stack), guess)
     assert (alone.fraction, alone.loses_forces) == (ahead.fraction, False)
-    assert way_to_touch(stack, lambda state: state, here, lifted(stack)) == StepEvent(
+    assert first_contact(stack, lambda state: state, here, lifted(stack)) == StepEvent(
         loses_forces=True
     )
 

@@ -18,7 +18,7 @@ from magshell_fenicsx.parts.imperfections.modes import ModesSection, Round
 from magshell_fenicsx.public import Scene, run
 from magshell_fenicsx.shape.outline import outline, reference_shell_of
 from magshell_fenicsx.simulate.perfect import perfect_modes, with_modes
-from magshell_fenicsx.simulate.sensitivity import changed
+from magshell_fenicsx.simulate.sensitivity import with_changed_number
 
 Array = NDArray[np.float64]
 HEMISPHERE = {"geometry": "hemisphere", "radius_to_thickness": 12, "poisson_ratio": 0.3}
@@ -188,9 +188,9 @@ def test_modes_of_shells_that_are_joined() -> None:
 
 
 def test_amplitudes_are_parameters() -> None:
-    found = changed(case(0.1, 0.2).imperfections, "imperfections.0", "amplitudes.1", 0.05)[
-        "imperfections.0"
-    ]
+    found = with_changed_number(
+        case(0.1, 0.2).imperfections, "imperfections.0", "amplitudes.1", 0.05
+    )["imperfections.0"]
     assert isinstance(found, ModesSection)
     assert found.amplitudes == [0.1, 0.25]
     assert found.parameters == ("amplitudes.0", "amplitudes.1")

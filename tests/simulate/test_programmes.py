@@ -19,7 +19,7 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.steps import stage_of
+from magshell_fenicsx.simulate.steps import stage_of_step
 
 FIELD = {"kind": "field", "until": "target", "points": 2}
 PRESSURE = {"kind": "pressure", "control": "load", "until": "target", "pressure": 0.3, "points": 3}
@@ -77,7 +77,7 @@ def test_the_work_of_all_loads_is_the_change_of_the_energy() -> None:
         mu = [p.state.mu[name] for p in part]
         rates = [-system.load(p.state.u, p.state.mu, name) @ p.du for p in part[1:]]
         slopes = [p.dmu / rate for p, rate in zip(part[1:], rates, strict=True)]
-        stage = stage_of(scene, scene.problem.programme[step - 1], part[0].state)
+        stage = stage_of_step(scene, scene.problem.programme[step - 1], part[0].state)
         start = stage.point(stage.begin(name, "load", part[0].state, 1.0)[1])
         begin = 1 / (-system.load(start.state.u, start.state.mu, name) @ start.du)
         work += scipy.interpolate.CubicHermiteSpline(q, mu, [begin, *slopes]).integrate(q[0], q[-1])
@@ -120,7 +120,7 @@ def test_stability_under_a_held_volume() -> None:
                 update={"hold": {"pressure": "conjugate"}}
             )
             step = type(scene.problem.programme[1])(2, "force", "loading.1", sealed)
-            stage = stage_of(scene, step, record.point.state)
+            stage = stage_of_step(scene, step, record.point.state)
             assert (
                 stage.newton.factor_at(stage.enter(record.point.state)).negative_pivots == expected
             )

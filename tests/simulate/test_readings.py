@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.simulate.numbers import scene_with
-from magshell_fenicsx.simulate.readings import Outside, Places, Reading, read
+from magshell_fenicsx.simulate.perturbation import perturbed_scene
+from magshell_fenicsx.simulate.readings import PlaceOutsidePath, PrescribedQuantity, Reading, read
 
 
 def case_of(text: str, folder: Path, *settings: str) -> ms.Case:
@@ -33,7 +33,7 @@ def differences(case: ms.Case, wanted: list[Reading], key: str, step: float) -> 
     at, found = value[key], []
     assert at
     for way in (-1, 1):
-        other = scene_with(ms.Scene(case), key, at * (1 + way * step))  # on the same mesh
+        other = perturbed_scene(ms.Scene(case), key, at * (1 + way * step))  # on the same mesh
         found.append(read(other, wanted, [key], slopes=False).values)
     return np.asarray((found[1] - found[0]) / (2 * at * step))
 
@@ -85,7 +85,10 @@ def test_a_place_is_where_the_path_passes_it(tmp_path: Path) -> None:
     """The row of a run with this target."""
     case = case_of(STRIP, tmp_path)
     scene = ms.Scene(case)
-    assert (Places(scene).column, Places(scene).by_conjugate) == ("applied_mT", False)
+    assert (PrescribedQuantity(scene).column, PrescribedQuantity(scene).by_conjugate) == (
+        "applied_mT",
+        False,
+    )
     (row,) = (row for row in ms.run(case).rows if float(row["applied_mT"]) == pytest.approx(15.0))
     assert read(scene, [Reading("tip_uz_mm", 15.0)], []).values == pytest.approx(
         [float(row["tip_uz_mm"])], rel=1e-8
@@ -95,7 +98,7 @@ def test_a_place_is_where_the_path_passes_it(tmp_path: Path) -> None:
 def test_what_is_not_on_the_path(tmp_path: Path) -> None:
     scene = ms.Scene(case_of(STRIP, tmp_path))
     with pytest.raises(
-        Outside, match="applied_mT = 25 is outside the path, which goes from 0 to 20"
+        PlaceOutsidePath, match="applied_mT = 25 is outside the path, which goes from 0 to 20"
     ):
         read(scene, [Reading("tip_uz_mm", 25.0)], [])
     bare = case_of(
@@ -108,4 +111,4 @@ def test_what_is_not_on_the_path(tmp_path: Path) -> None:
     data = yaml.safe_load(STRIP)
     del data["loading"], data["magnetic"]
     with pytest.raises(CaseError, match="no last step that prescribes"):
-        Places(ms.Scene(ms.Case.model_validate(data)))
+        PrescribedQuantity(ms.Scene(ms.Case.model_validate(data)))

@@ -7,9 +7,9 @@ import pytest
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.simulate.renumbered import Renumbered
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.varied import moved
+from magshell_fenicsx.simulate.scene_family import problem_on_moved_mesh
+from magshell_fenicsx.simulate.shared_forms import SharedForms
 
 CASE: dict[str, Any] = {
     "shell": {
@@ -51,11 +51,13 @@ def test_scenes_that_share_forms_are_those_of_their_numbers() -> None:
             foundation_stiffness=2e-3,
         ),
     )
-    problems = {float(i): moved(first, case.problem()) for i, case in enumerate(cases)}
+    problems = {
+        float(i): problem_on_moved_mesh(first, case.problem()) for i, case in enumerate(cases)
+    }
     alone = {value: Scene(problem) for value, problem in problems.items()}
-    shared = Renumbered.of(first)
+    shared = SharedForms.of_scene(first)
     assert shared
-    scenes = {value: shared.at(value, problem) for value, problem in problems.items()}
+    scenes = {value: shared.scene_at(value, problem) for value, problem in problems.items()}
     u = 1e-3 * np.sin(np.arange(first.model.system.size))
     for value in (0.0, 1.0, 0.0):
         scene, own = scenes[value], alone[value]
@@ -80,4 +82,4 @@ def test_scenes_that_share_forms_are_those_of_their_numbers() -> None:
 def test_what_is_more_than_numbers_is_not_shared() -> None:
     """The force at a pole is known by its form."""
     data = {**CASE, "loading": {"kind": "indentation", "depth": 1}}
-    assert Renumbered.of(ms.Scene(ms.Case.model_validate(data))) is None
+    assert SharedForms.of_scene(ms.Scene(ms.Case.model_validate(data))) is None

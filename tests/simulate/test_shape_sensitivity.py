@@ -9,12 +9,12 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.sensitivity import (
-    Along,
+    DeviationDifference,
     _deviation,
-    changed,
     fold_at,
-    reshaped,
     sensitivities,
+    with_changed_number,
+    with_deviation,
 )
 from magshell_fenicsx.simulate.transfer import transfer
 
@@ -74,8 +74,10 @@ def test_beside_the_pole() -> None:
     ):
 
         def value(change: float, number: str = number) -> float:
-            sections = changed(scene.problem.imperfections, key, number, change)
-            other = reshaped(scene, Along(_deviation(scene, sections, key), old, 1.0))
+            sections = with_changed_number(scene.problem.imperfections, key, number, change)
+            other = with_deviation(
+                scene, DeviationDifference(_deviation(scene, sections, key), old, 1.0)
+            )
             u, phi = (transfer(scene, other, v) for v in (fold.state.u, fold.phi))
             return find_fold(
                 other.newton, FoldGuess(State(u, fold.state.mu), phi), "pressure"

@@ -17,8 +17,8 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.output.pictures.plot import plot
 from magshell_fenicsx.output.store.table import read_rows
 from magshell_fenicsx.runs.summary import solutions
-from magshell_fenicsx.simulate.search import dented
-from magshell_fenicsx.simulate.stage import plain
+from magshell_fenicsx.simulate.search import dented_states
+from magshell_fenicsx.simulate.stage import load_stage
 
 ROOF = [
     "mesh.degree=3",
@@ -44,7 +44,7 @@ def crossings(
     """The first states on a path by arc length at which an amplitude, or its conjugate, is as at
     the start again.
     """
-    path, here = plain(scene).begin(name, "arc", start, first, 10 * first)
+    path, here = load_stage(scene).begin(name, "arc", start, first, 10 * first)
     walk = ContinuationRun(
         path, here, ContinuationGoal("points", [path.value(quantity, start)], quantity)
     )
@@ -170,7 +170,10 @@ def test_dents_are_mirror_images() -> None:
     depths = []
     for scene in (half, meridian):
         size = scene.model.V.dofmap.bs
-        r0, dents = scene.model.r0.x.array.reshape(-1, size), list(dented(scene, scene.unloaded()))
+        r0, dents = (
+            scene.model.r0.x.array.reshape(-1, size),
+            list(dented_states(scene, scene.unloaded())),
+        )
         for guess in dents:
             u = guess.u.reshape(-1, size)
             assert not u[:, :-1].any()  # along e3

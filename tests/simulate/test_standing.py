@@ -12,7 +12,7 @@ from magshell_fenicsx.input.tables import write_vectors
 from magshell_fenicsx.problem.problem import Document
 from magshell_fenicsx.public import Scene
 from magshell_fenicsx.simulate.follow import follow
-from magshell_fenicsx.simulate.standing import Standing, refilled
+from magshell_fenicsx.simulate.scene_reuse import SceneReuse, update_fields
 
 STRIP = """
 shell: {geometry: strip, radius_to_thickness: 100, width: 0.1, poisson_ratio: 0.2, thickness_factor: "1"}
@@ -61,7 +61,7 @@ def agree(first: Case, second: Case) -> None:
     *_, there = follow(scene)
     *_, other = follow(Scene(second))
     for case, expected in ((second, other), (first, there)):
-        assert refilled(scene, case.problem())
+        assert update_fields(scene, case.problem())
         *_, last = follow(scene)
         assert last.label == expected.label
         assert last.point.state.mu == pytest.approx(expected.point.state.mu, rel=1e-10)
@@ -74,12 +74,12 @@ def agree(first: Case, second: Case) -> None:
 def test_another_case_is_another_scene() -> None:
     """What is not a field in the terms, or changes more, makes a new scene."""
     case = Case.load(CASES / "dimple_buckling.yaml", BUCKLING)
-    known = Standing()
-    scene = known.of(case.problem(), Scene(case).comm)
-    assert known.of(case.problem(), scene.comm) is scene
+    known = SceneReuse()
+    scene = known.scene_for(case.problem(), Scene(case).comm)
+    assert known.scene_for(case.problem(), scene.comm) is scene
     for setting in ("shell.poisson_ratio=0.3", "symmetry=half", "mesh.degree=3"):
-        assert not refilled(
+        assert not update_fields(
             scene, Case.load(CASES / "dimple_buckling.yaml", [*BUCKLING, setting]).problem()
         )
     bare = replace(case.problem(), document=Document())
-    assert not refilled(Scene(bare), bare)
+    assert not update_fields(Scene(bare), bare)

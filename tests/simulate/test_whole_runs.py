@@ -19,7 +19,7 @@ from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
 from magshell_fenicsx.simulate.gradients.gradient import derivative
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, instabilities
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end
-from magshell_fenicsx.simulate.numbers import number_of, on_mesh_of
+from magshell_fenicsx.simulate.perturbation import number_at_key, problem_on_mesh_of
 from magshell_fenicsx.simulate.record import Record
 
 CAP = """
@@ -156,7 +156,8 @@ def test_numbers(name: str) -> None:
     """
     (scene, *_), found = given(name)
     values = {
-        key: 1.0 if key == FIELD else number_of(scene.problem.context, key) for key in KEYS[name]
+        key: 1.0 if key == FIELD else number_at_key(scene.problem.context, key)
+        for key in KEYS[name]
     }
     parts = dict(zip(values, (1.0, -0.7, 0.5, 1.3), strict=False))
     results = dict[int, dict[str, float]]()
@@ -168,7 +169,7 @@ def test_numbers(name: str) -> None:
             settings.append(
                 f'{key}="{number!r}{" " * bool(unit)}{unit}"' if quoted else f"{key}={number!r}"
             )
-        ran = run(Scene(on_mesh_of(scene, case_of(name, settings).problem()), scene.comm))
+        ran = run(Scene(problem_on_mesh_of(scene, case_of(name, settings).problem()), scene.comm))
         results[way] = {of: adjoint(ran, of).value_in_unit for of in found}
     for of, each in found.items():
         total = 0.0
@@ -215,4 +216,4 @@ def test_modes_of_the_perfect_shell_change() -> None:
     """They are found again in every run."""
     case = case_of("buckled", ["shell.imperfections=[{kind: modes, amplitudes: [0.1]}]"])
     with pytest.raises(CaseError, match=r"shell\.poisson_ratio: the modes of the perfect shell"):
-        number_of(case.context, "shell.poisson_ratio")
+        number_at_key(case.context, "shell.poisson_ratio")

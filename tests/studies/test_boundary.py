@@ -21,7 +21,7 @@ from scipy.special import jv, jvp
 import magshell_fenicsx as ms
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.varied import moved
+from magshell_fenicsx.simulate.scene_family import problem_on_moved_mesh
 from magshell_fenicsx.studies.boundary_picture import _regions, draw_map
 
 
@@ -437,7 +437,7 @@ def test_the_number_of_waves_changes_along_a_boundary(tmp_path: Path) -> None:
         stretched.
         """
         start = ms.Scene(ms.Case.load(case))
-        scene = Scene(moved(start, ms.Case.load(case, [f"{key}={depth!r}"]).problem()), start.comm)
+        scene = Scene(problem_on_moved_mesh(start, ms.Case.load(case, [f"{key}={depth!r}"]).problem()), start.comm)
         return {
             r.mode: r.point.state.mu["pressure"]
             for r in ms.follow(scene)

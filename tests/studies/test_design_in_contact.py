@@ -14,7 +14,7 @@ from sheets import Sheet, write
 
 from magshell_fenicsx import Case
 from magshell_fenicsx.input.source import read_source
-from magshell_fenicsx.simulate.standing import Standing
+from magshell_fenicsx.simulate.scene_reuse import SceneReuse
 from magshell_fenicsx.studies.design_evaluation import DesignEvaluation, evaluate
 from magshell_fenicsx.studies.design_variables import variables
 
@@ -101,7 +101,7 @@ def test_fields_of_unlike_shells(
     source = read_source(tmp_path / "strips.yaml")
     made = Case.from_source(source)
     assert made.design
-    vary, standing = variables(source, made, made.design, Case.from_source), Standing()
+    vary, standing = variables(source, made, made.design, Case.from_source), SceneReuse()
     start = vary.start_values + change
     way, results = (
         np.random.default_rng(0).standard_normal(len(start)),

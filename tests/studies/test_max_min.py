@@ -14,7 +14,7 @@ from magshell_fenicsx.studies.design_evaluation import DesignEvaluation
 from magshell_fenicsx.studies.max_min import raise_lowest
 
 Array = NDArray[np.float64]
-SEEN = 3  # of the values the lowest ones
+OBSERVABLES = 3  # of the values the lowest ones
 
 
 @dataclass
@@ -49,9 +49,9 @@ class Eigenvalues:
             if len(tried) == 2:
                 return DesignEvaluation()
             values, vectors = np.linalg.eigh(self.of(x))
-            slopes = [[float(v @ A @ v) for A in self.A[1:]] for v in vectors.T[:SEEN]]
+            slopes = [[float(v @ A @ v) for A in self.A[1:]] for v in vectors.T[:OBSERVABLES]]
             beside = [
-                (float(value), slope) for value, slope in zip(values[:SEEN], slopes, strict=True)
+                (float(value), slope) for value, slope in zip(values[:OBSERVABLES], slopes, strict=True)
             ]
             return DesignEvaluation({"left": self.most - float(x.sum())}, beside={"all": beside})
 

@@ -15,7 +15,7 @@ from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.parts.bodies.body import BodySection, place_body
 from magshell_fenicsx.parts.bodies.body_contact import Contact
 from magshell_fenicsx.parts.bodies.contact_step import ContactSection
-from magshell_fenicsx.parts.step_control import Fit
+from magshell_fenicsx.parts.step_course import SizingContext
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.ability import Account, Context
 from magshell_fenicsx.parts.step import Step
@@ -125,16 +125,16 @@ class Pressed:
         reach = min(1.1 * sqrt(2 * (pressed(loads) or 10.0) * h) + 0.5 * sqrt(h), size + sqrt(h))
         return cls(ground.imperfect.inverse(contact.front), reach, size)
 
-    def features(self, outline: Outline, fit: Fit, growth: float) -> list[Feature]:
+    def features(self, outline: Outline, sizing: SizingContext, growth: float) -> list[Feature]:
         """Elements that show the ring of a contact, and a small body."""
         x, y = map(float, self.place)
-        finer, size = sqrt(fit.h), self.size
+        finer, size = sqrt(sizing.h), self.size
         small = (
-            [DiscFeature((x, y), 1.5 * size, max(size / 3, 0.1 * fit.h), 0.4)]
+            [DiscFeature((x, y), 1.5 * size, max(size / 3, 0.1 * sizing.h), 0.4)]
             if size < finer
             else []
         )
-        return [DiscFeature((x, y), self.reach, RING * finer / fit.refinement, growth), *small]
+        return [DiscFeature((x, y), self.reach, RING * finer / sizing.refinement, growth), *small]
 
 
 def pressed(loads: Iterable[Step]) -> float:

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from magshell_fenicsx.input.section import Name, over_size
-from magshell_fenicsx.parts.step_control import Control, Course, Here, Now, Target, Until
+from magshell_fenicsx.parts.step_course import Control, StepCourse, StepStart, LoadStart, Target, Until
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.path_step import Count, PathStep
-from magshell_fenicsx.parts.observables import Seen, Sight
+from magshell_fenicsx.parts.observables import Observables, ModelView
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.quantities.quantity import PLACE, POINT_FORCE, THICKNESS, Amplitude, Quantity
 
@@ -27,7 +27,7 @@ EASY, HARD = (
     4,
     8,
 )  # matrices of a step along a contact, whose rim moves from point to point before it settles
-FIRST = 0.1  # of h: the first step of the approach towards a force
+FIRST_APPROACH = 0.1  # of h: the first step of the approach towards a force
 
 
 class ContactSection(PathStep):
@@ -81,11 +81,11 @@ class ContactSection(PathStep):
     def prescribed(self) -> Control:
         return "load" if self.control == "approach" else super().prescribed
 
-    def course(self, here: Here) -> Course:
-        return replace(super().course(here), finer=finer)
+    def course(self, step_start: StepStart) -> StepCourse:
+        return replace(super().course(step_start), finer=finer)
 
-    def first(self, change: float, now: Now, *, by_load: bool) -> float:
-        return change / self.points if by_load else copysign(FIRST, -change)
+    def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
+        return change / self.points if by_load else copysign(FIRST_APPROACH, -change)
 
 
 def finer(options: "StepOptions") -> "StepOptions":
@@ -107,7 +107,7 @@ def approaches(bodies: Collection[str], loads: Sequence[Step]) -> dict[str, str]
     return {name: "approach" if alone else f"approach_{name}" for name in bodies}
 
 
-class BodiesSeen(Seen):
+class BodiesObservables(Observables):
     """Approach, force, penetration and radii of each body."""
 
     quantities = (
@@ -181,24 +181,24 @@ class BodiesSeen(Seen):
         )
         return tuple(column for column in names if column != "force")
 
-    def observe(self, sight: Sight, state: "State") -> dict[str, float]:
-        model, h, values = sight.model, sight.h, dict[str, float]()
+    def observe(self, view: ModelView, state: "State") -> dict[str, float]:
+        model, h, values = view.model, view.h, dict[str, float]()
         for name in model.contacts:
-            at, force = model.region(state, name), sight.potential(state, name)
-            numbers = (state.mu[name], -force / self._unit(sight), at.penetration / h)
-            radii = (sight.length * radius for radius in (at.radius, at.inner, at.outer))
+            at, force = model.region(state, name), view.potential(state, name)
+            numbers = (state.mu[name], -force / self._unit(view), at.penetration / h)
+            radii = (view.length * radius for radius in (at.radius, at.inner, at.outer))
             k = float(model.contacts[name][0].stiffness.value)
             values |= dict(zip(contact_columns(name), (*numbers, *radii, k), strict=True))
         return values
 
-    def conjugate_unit(self, sight: Sight, name: str) -> float | None:
-        return self._unit(sight) if name in sight.model.contacts else None
+    def conjugate_unit(self, view: ModelView, name: str) -> float | None:
+        return self._unit(view) if name in view.model.contacts else None
 
-    def _unit(self, sight: Sight) -> float:
-        return -sight.model.force_unit * sight.h
+    def _unit(self, view: ModelView) -> float:
+        return -view.model.force_unit * view.h
 
 
 def contact_columns(approach: str) -> tuple[str, ...]:
     """The columns of a body: its approach, the force on it, and the rest."""
-    first, *others = (q.name for q in BodiesSeen.quantities)
+    first, *others = (q.name for q in BodiesObservables.quantities)
     return tuple(column + approach.removeprefix("approach") for column in (first, "force", *others))

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.contact.contact_section import WHOLE_SHELL
-from magshell_fenicsx.parts.observables import Seen, Sight
+from magshell_fenicsx.parts.observables import Observables, ModelView
 from magshell_fenicsx.quantities.quantity import POINT_FORCE, THICKNESS, Quantity
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
 
 
-class ContactObservables(Seen):
+class ContactObservables(Observables):
     """The columns of each pair that may touch."""
 
     quantities = (
@@ -80,12 +80,12 @@ class ContactObservables(Seen):
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
         return tuple(column for pair in loads.pairs for column in _columns(pair))
 
-    def observe(self, sight: Sight, state: "State") -> dict[str, float]:
-        model, values = sight.model, dict[str, float]()
+    def observe(self, view: ModelView, state: "State") -> dict[str, float]:
+        model, values = view.model, dict[str, float]()
         for each in model.shell_contacts:
             at = model.system.at_state(state)
             force, gap = at.evaluate(each.force), at.evaluate(each.least_gap)
-            numbers = force / model.force_unit, gap / sight.h, each.stiffness.value
+            numbers = force / model.force_unit, gap / view.h, each.stiffness.value
             values |= dict(zip(_columns(each.pair), numbers, strict=True))
         return values
 

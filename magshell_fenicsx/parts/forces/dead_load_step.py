@@ -14,10 +14,10 @@ from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm, symbolic_functions
-from magshell_fenicsx.parts.step_control import Fit, Now, Target, Until
+from magshell_fenicsx.parts.step_course import SizingContext, LoadStart, Target, Until
 from magshell_fenicsx.parts.ability import Context, Formulas, Modelled, Scales
 from magshell_fenicsx.parts.path_step import Count, PathStep
-from magshell_fenicsx.parts.observables import Seen, Sight
+from magshell_fenicsx.parts.observables import Observables, ModelView
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import amplitude
@@ -219,10 +219,10 @@ class DeadSection(PathStep):
             "one) and is the same everywhere: kind: pressure"
         )
 
-    def first(self, change: float, now: Now, *, by_load: bool) -> float:
+    def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
         return change / self.points if by_load else copysign(1e-3, change)
 
-    def step(self, change: float | None, now: Now) -> float | None:
+    def step(self, change: float | None, load_start: LoadStart) -> float | None:
         return abs(change) / self.points if self.control == "displacement" and change else None
 
     def leaves(
@@ -272,12 +272,12 @@ class DeadSection(PathStep):
         return [load.at for load in self.loads if load.at]
 
     @classmethod
-    def around(cls, loads: Sequence[Self], place: Array, fit: Fit) -> list[Feature]:
+    def mesh_features(cls, loads: Sequence[Self], place: Array, sizing: SizingContext) -> list[Feature]:
         x, y = map(float, place)
-        return [DiscFeature((x, y), 0.0, fit.h, loads[0].growth(fit))]
+        return [DiscFeature((x, y), 0.0, sizing.h, loads[0].growth(sizing))]
 
-    def largest(self, fit: Fit) -> float | None:
-        size = 2 * sqrt(fit.h)
+    def largest(self, sizing: SizingContext) -> float | None:
+        size = 2 * sqrt(sizing.h)
         return size if size < 0.35 else None
 
     def formulas(self, key: str, context: Context) -> Iterable[Formulas]:
@@ -384,7 +384,7 @@ def also_displaced(loads: "Loads") -> tuple[str, ...]:
     return tuple(name for name in (*loads.forces, *loads.dead) if name != loads.displaced)
 
 
-class ForcesSeen(Seen):
+class ForcesObservables(Observables):
     """Factors of forces and dead loads, and displacements along them."""
 
     quantities = (
@@ -399,12 +399,12 @@ class ForcesSeen(Seen):
         factors = (amplitude(name).column for name in self.amplitudes(loads) if name != "force")
         return (*factors, *(f"w_{name}_over_h" for name in also_displaced(loads)))
 
-    def observe(self, sight: Sight, state: "State") -> dict[str, float]:
-        model, loads = sight.model, sight.loads
+    def observe(self, view: ModelView, state: "State") -> dict[str, float]:
+        model, loads = view.model, view.loads
         factors = {amplitude(name).column: state.mu[name] for name in self.amplitudes(loads)}
         along = also_displaced(loads)
         return factors | {
-            f"w_{name}_over_h": model.loaded_deflection(state.u, name) / sight.h for name in along
+            f"w_{name}_over_h": model.loaded_deflection(state.u, name) / view.h for name in along
         }
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
@@ -417,12 +417,12 @@ class ForcesSeen(Seen):
             if isinstance(load, AreaForce) and load.patch is not None:
                 patch_of(surface.patches, load.patch)
 
-    def conjugate_unit(self, sight: Sight, name: str) -> float | None:
+    def conjugate_unit(self, view: ModelView, name: str) -> float | None:
         """w/h of a force, the shell's length of dead loads."""
-        if name in sight.loads.forces:
-            return sight.model.force_unit * sight.h
+        if name in view.loads.forces:
+            return view.model.force_unit * view.h
         return (
-            sight.model.load_size.get(name, 0.0) / sight.length
-            if name in sight.loads.dead
+            view.model.load_size.get(name, 0.0) / view.length
+            if name in view.loads.dead
             else None
         )

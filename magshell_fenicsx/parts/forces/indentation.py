@@ -12,7 +12,7 @@ from magshell_fenicsx.input.section import Direction, over_size
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.mesh.mirror import ROUNDING
-from magshell_fenicsx.parts.step_control import Fit, Now, Target, Until
+from magshell_fenicsx.parts.step_course import SizingContext, LoadStart, Target, Until
 from magshell_fenicsx.parts.ability import Context, Modelled
 from magshell_fenicsx.parts.path_step import Count, PathStep
 from magshell_fenicsx.parts.step import ProgrammeStep
@@ -136,25 +136,25 @@ class IndentationSection(PathStep):
             )
 
     @classmethod
-    def around(cls, loads: Sequence[Self], place: Array, fit: Fit) -> list[Feature]:
+    def mesh_features(cls, loads: Sequence[Self], place: Array, sizing: SizingContext) -> list[Feature]:
         """The dent too: by mirror buckling the radius of its ridge is about sqrt(2 R w)."""
-        h, (x, y) = fit.h, map(float, place)
+        h, (x, y) = sizing.h, map(float, place)
         patch = min(load.patch for load in loads)
         depth = max(abs(load.depth) if load.depth else 10.0 for load in loads)
-        dent = (1.0 if fit.solid else 0.85) * sqrt(2 * depth * h) + 0.5 * sqrt(h)
-        growth = loads[0].growth(fit)
+        dent = (1.0 if sizing.solid else 0.85) * sqrt(2 * depth * h) + 0.5 * sqrt(h)
+        growth = loads[0].growth(sizing)
         # finer than h the point force's logarithmic stretch would be resolved, which has no limit
         return [
-            DiscFeature((x, y), dent, sqrt(h) / fit.refinement, growth),
+            DiscFeature((x, y), dent, sqrt(h) / sizing.refinement, growth),
             DiscFeature((x, y), patch * h, max(patch * h / 2, h), growth),
         ]
 
-    def growth(self, fit: Fit) -> float:
-        return 0.5 if fit.solid else 0.6  # far from the ridge degree 2 needs more than degree 4
+    def growth(self, sizing: SizingContext) -> float:
+        return 0.5 if sizing.solid else 0.6  # far from the ridge degree 2 needs more than degree 4
 
-    def rim(self, fit: Fit) -> float:
+    def rim(self, sizing: SizingContext) -> float:
         """Of a hemisphere the edge is far from a dent."""
-        return 2.0 if fit.solid else 2.8
+        return 2.0 if sizing.solid else 2.8
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
         from magshell_fenicsx.models.shell.parameters import (
@@ -167,10 +167,10 @@ class IndentationSection(PathStep):
             }
         }
 
-    def first(self, change: float, now: Now, *, by_load: bool) -> float:
+    def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
         if self.until == "zero":
             return LEAST_HUMP
         return change / self.points if self.control == "load" else copysign(1.0, change)
 
-    def step(self, change: float | None, now: Now) -> float | None:
-        return now.unit if self.control == "displacement" else None
+    def step(self, change: float | None, load_start: LoadStart) -> float | None:
+        return load_start.unit if self.control == "displacement" else None

@@ -5,10 +5,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.parts.step_control import Target
+from magshell_fenicsx.parts.step_course import Target
 from magshell_fenicsx.parts.ability import Context, Modelled
 from magshell_fenicsx.parts.path_step import LoadStep
-from magshell_fenicsx.parts.observables import Seen
+from magshell_fenicsx.parts.observables import Observables
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
 
@@ -72,7 +72,7 @@ class ImperfectionStep(LoadStep):
             )
 
 
-class GrowingSeen(Seen):
+class GrowingObservables(Observables):
     """The amplitudes of imperfections that grow."""
 
     quantities = (

@@ -16,7 +16,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import Deviation
-from magshell_fenicsx.parts.step_control import Fit
+from magshell_fenicsx.parts.step_course import SizingContext
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry, Local
 from magshell_fenicsx.shape.meridian_chart import ANGLES
 from magshell_fenicsx.shape.outline import Outline
@@ -250,9 +250,9 @@ class LocalImperfection:
     jumps: bool = False
     rim: Array | None = None
 
-    def features(self, outline: Outline, fit: Fit, growth: float) -> list[Feature]:
+    def features(self, outline: Outline, sizing: SizingContext, growth: float) -> list[Feature]:
         """Return mesh sizes: small elements on it and a little around, which grow away from it."""
-        radius, size = self.radius + 0.7 * sqrt(fit.h), self.size / fit.refinement
+        radius, size = self.radius + 0.7 * sqrt(sizing.h), self.size / sizing.refinement
         return [
             DiscFeature((float(x), float(y)), radius, size, growth)
             for x, y in images(self, outline)

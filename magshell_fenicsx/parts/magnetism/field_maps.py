@@ -20,7 +20,7 @@ from magshell_fenicsx.parts.magnetism.sensors import (
     units,
 )
 from magshell_fenicsx.parts.ability import Context, KeyAbility
-from magshell_fenicsx.parts.observables import MapGrid, Seen, Sight
+from magshell_fenicsx.parts.observables import MapGrid, Observables, ModelView
 from magshell_fenicsx.shape.reference_shell import Coordinates
 
 if TYPE_CHECKING:
@@ -125,7 +125,7 @@ def field_maps(context: Context, turn: float) -> tuple[FieldMap, ...]:
 
 def unit_of_readings(context: Context) -> str:
     """Return the unit of readings: T, or what they are over."""
-    magnetic, E = context.of(MagneticSection), context.shell.youngs_modulus
+    magnetic, E = context.section_of(MagneticSection), context.shell.youngs_modulus
     if magnetic and magnetic.remanent is None:
         return "T" if E and magnetic.lambda_m is None else "sqrt(mu0 E)"
     return "T" if magnetic and magnetic.remanent and magnetic.remanent.flux_density else "|Br|"
@@ -160,13 +160,13 @@ class FieldMapping(KeyAbility[Mapping[str, FieldMapSection]]):
         ]
 
 
-class FieldMapsSeen(Seen):
+class FieldMapsObservables(Observables):
     """Grids of the magnetic field, as observables."""
 
     def grids(self, loads: "Loads") -> Sequence[str]:
         return [field_map.grid.name for field_map in loads.field_maps]
 
-    def on_grids(self, sight: Sight, state: "State") -> list[MapGrid]:
+    def on_grids(self, view: ModelView, state: "State") -> list[MapGrid]:
         from magshell_fenicsx.parts.magnetism.readings import (
             field_at,
         )  # the solver takes long to import
@@ -175,12 +175,12 @@ class FieldMapsSeen(Seen):
             replace(
                 field_map.grid,
                 values=field_at(
-                    sight,
+                    view,
                     state,
                     field_map.places,
                     field_map.own,
                     field_map.applied if field_map.total else 0.0,
                 ),
             )
-            for field_map in sight.loads.field_maps
+            for field_map in view.loads.field_maps
         ]

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from magshell_fenicsx.input.section import Direction, in_units
-from magshell_fenicsx.parts.step_control import Ahead, Course, Curves, Drive, Here, Now, Target
+from magshell_fenicsx.parts.step_course import ExpectedEnd, StepCourse, Curves, Drive, StepStart, LoadStart, Target
 from magshell_fenicsx.parts.magnetism.fields import ANGLE, MagneticSection, strength
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.path_step import FactorStep
@@ -39,46 +39,46 @@ class FieldSection(FactorStep):
     factor: float | None = Field(default=None, ge=-1e3, le=1e3)
     """Target over the field of `magnetic`; 1 by default, 0 switches the field off"""
 
-    def scale(self, now: Now) -> float:
-        return now.size
+    def scale(self, load_start: LoadStart) -> float:
+        return load_start.size
 
     def size(self, context: Context) -> float:
         return strength(context)
 
     @classmethod
     def level(cls, text: str, context: Context) -> float:
-        magnetic = context.of(MagneticSection)
+        magnetic = context.section_of(MagneticSection)
         if magnetic is None or not magnetic.applied.flux_density:
             raise ValueError("needs magnetic.applied.flux_density")
         return float(in_units("tesla")(text)) / magnetic.applied.flux_density
 
-    def curves(self, here: Here) -> tuple[Curves, float] | None:
+    def curves(self, step_start: StepStart) -> tuple[Curves, float] | None:
         from magshell_fenicsx.parts.magnetism.direction import (
             straight,
         )  # the solver takes long to import
 
-        direction, value = self._direction_and_value(here)
+        direction, value = self._direction_and_value(step_start)
         return (straight(direction), value) if direction[1:].any() else None
 
-    def _direction_and_value(self, here: Here) -> tuple[Array, float]:
+    def _direction_and_value(self, step_start: StepStart) -> tuple[Array, float]:
         """The direction by the amplitudes of the field's components, and the field along it."""
         from magshell_fenicsx.parts.magnetism.direction import components, directions, field_at
 
-        field = here.loads.magnetic
+        field = step_start.loads.magnetic
         direction = components(
-            directions(here.context.steps, field, here.turn)[here.step.number - 1], field
+            directions(step_start.context.steps, field, step_start.turn)[step_start.step.number - 1], field
         )
-        return direction, float(direction @ field_at(here.mu))
+        return direction, float(direction @ field_at(step_start.mu))
 
-    def now(self, here: Here) -> Now:
+    def load_start(self, step_start: StepStart) -> LoadStart:
         """The field has no conjugate."""
-        return Now(
-            self._direction_and_value(here)[1],
+        return LoadStart(
+            self._direction_and_value(step_start)[1],
             0.0,
             0.0,
-            here.driven,
-            self.size(here.context),
-            here.h,
+            step_start.is_driven,
+            self.size(step_start.context),
+            step_start.h,
         )
 
     @classmethod
@@ -92,7 +92,7 @@ class FieldSection(FactorStep):
                 "direction"
             )
 
-    def unstable_alone(self, value: float, course: Course, what: str) -> str:
+    def unstable_alone(self, value: float, course: StepCourse, what: str) -> str:
         return (
             f"the field alone makes the shell unstable: critical field lambda_m = {value:.9g} of "
             f"{course.drive.end or 0.0:g} ({what})"
@@ -142,17 +142,17 @@ class RotationSection(Step):
     def changes(self, name: str, mu: Iterable[str]) -> set[str]:
         return {name} | {other for other in mu if other.startswith("lambda_")}
 
-    def course(self, here: Here) -> Course:
+    def course(self, step_start: StepStart) -> StepCourse:
         from magshell_fenicsx.parts.magnetism import direction  # the solver takes long to import
 
-        field, number = here.loads.magnetic, here.step.number
-        ends = direction.directions(here.context.steps, field, here.turn)[number - 1 : number + 1]
+        field, number = step_start.loads.magnetic, step_start.step.number
+        ends = direction.directions(step_start.context.steps, field, step_start.turn)[number - 1 : number + 1]
         start, end = (direction.components(end, field) for end in ends)
-        size, total = float(start @ direction.field_at(here.mu)), acos(float(ends[0] @ ends[1]))
+        size, total = float(start @ direction.field_at(step_start.mu)), acos(float(ends[0] @ ends[1]))
         targets = [float(t) for t in np.linspace(0.0, total, self.points + 1)[1:]]
         drive = Drive("arc", "load", total, targets, total / self.points, total / self.points)
         if size == 0:
-            return Course(drive, "limit", impossible="the field is zero and cannot turn")
+            return StepCourse(drive, "limit", impossible="the field is zero and cannot turn")
 
         def forbidden(mu: Mapping[str, float], what: str) -> str:
             angle = direction.field_angle(mu, field) % 360
@@ -160,13 +160,13 @@ class RotationSection(Step):
 
         rotates_as_whole = field and field.turns
         curves = (
-            direction.as_a_whole(turn_name(here.step), total)
+            direction.as_a_whole(turn_name(step_start.step), total)
             if rotates_as_whole
             else direction.circle(size, start, end)
         )
-        return Course(drive, "limit", curves=(curves, 0.0), forbidden=forbidden, at_once=True)
+        return StepCourse(drive, "limit", curves=(curves, 0.0), forbidden=forbidden, at_once=True)
 
-    def ahead(self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float) -> Ahead:
+    def expected_end(self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float) -> ExpectedEnd:
         from magshell_fenicsx.parts.magnetism.direction import (
             directions,
         )  # the solver takes long to import
@@ -174,7 +174,7 @@ class RotationSection(Step):
         all_directions = directions(context.steps, loads.magnetic, turn)
         first, start, end = (all_directions[i] for i in (0, step.number - 1, step.number))
         angle = degrees(acos(float(np.clip(end @ first, -1, 1))))
-        return Ahead(
+        return ExpectedEnd(
             "its last direction", angle if start @ first > 1 - EQUALITY_TOLERANCE else None
         )
 
@@ -189,9 +189,9 @@ def turn_name(step: ProgrammeStep) -> str:
 def direction_before(number: int, context: Context) -> NDArray[np.float64] | None:
     """The unit vector (3,) of the field where a step begins; None without a field."""
     rotated_to = [
-        step.load.to for step in context.before(number) if isinstance(step.load, RotationSection)
+        step.load.to for step in context.steps_before(number) if isinstance(step.load, RotationSection)
     ]
     if rotated_to:
         return rotated_to[-1].vector()
-    magnetic = context.of(MagneticSection)
+    magnetic = context.section_of(MagneticSection)
     return magnetic.applied.vector() if magnetic else None

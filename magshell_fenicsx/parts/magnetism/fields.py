@@ -503,5 +503,5 @@ class MagneticSection(Section, Ability):
 
 def strength(context: Context) -> float:
     """lambda_m of a case; 0 without a field."""
-    magnetic = context.of(MagneticSection)
+    magnetic = context.section_of(MagneticSection)
     return magnetic.amplitude(context.shell.youngs_modulus) if magnetic else 0.0

@@ -36,7 +36,7 @@ from magshell_fenicsx.parts.magnetism.pairs import NO_IMAGES, Copies, Stiffness
 from magshell_fenicsx.parts.magnetism.self_field import self_field
 from magshell_fenicsx.parts.magnetism.singular_pairs import SingularPairs
 from magshell_fenicsx.parts.magnetism.turned import Turning
-from magshell_fenicsx.parts.observables import Sight
+from magshell_fenicsx.parts.observables import ModelView
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shells.model_base import ModelBase
@@ -463,6 +463,6 @@ class InteractionTerm:
         return np.asarray(np.unique(part_of_corner[corners[:, 0]], return_inverse=True)[1])
 
     @property
-    def _view(self) -> Sight:
+    def _view(self) -> ModelView:
         mirror = self._model.mirror if self._model.multiplicity > 1 else None  # type: ignore[attr-defined]  # of shells
-        return Sight(self._model, 1.0, 1.0, mirror, 0.0, False)
+        return ModelView(self._model, 1.0, 1.0, mirror, 0.0, False)

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from pydantic import Field
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.step_control import Course, Target
+from magshell_fenicsx.parts.step_course import StepCourse, Target
 from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.path_step import FactorStep
-from magshell_fenicsx.parts.observables import Seen
+from magshell_fenicsx.parts.observables import Observables
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.shape.shell_sections import MeshSurface
@@ -71,7 +71,7 @@ class InteractionStep(FactorStep):
                 f"{step.key}.kind: interaction needs magnetic.interaction: others or all"
             )
 
-    def unstable_alone(self, value: float, course: Course, what: str) -> str:
+    def unstable_alone(self, value: float, course: StepCourse, what: str) -> str:
         return (
             f"the interaction alone makes the shell unstable at {value:.9g} of it ({what}): to go "
             "on, take it as a load, kind: interaction"
@@ -80,13 +80,13 @@ class InteractionStep(FactorStep):
 
 def acts(context: Context) -> bool:
     """Return whether magnetised parts act on each other."""
-    magnetic = context.of(MagneticSection)
+    magnetic = context.section_of(MagneticSection)
     return magnetic is not None and magnetic.interaction != "none"
 
 
 def interaction(context: Context) -> Interaction | None:
     """Return the interaction of a case; None without one."""
-    magnetic, E = context.of(MagneticSection), context.shell.youngs_modulus
+    magnetic, E = context.section_of(MagneticSection), context.shell.youngs_modulus
     if magnetic is None or not acts(context):
         return None
     assert magnetic.remanent
@@ -105,7 +105,7 @@ def refuse_unfit_interaction(context: Context) -> None:
     CaseError
         With the key and what is allowed.
     """
-    magnetic = context.of(MagneticSection)
+    magnetic = context.section_of(MagneticSection)
     if magnetic is None or not acts(context):
         return
     if not (context.shell.youngs_modulus and magnetic.remanent and magnetic.remanent.flux_density):
@@ -130,7 +130,7 @@ def refuse_unfit_interaction(context: Context) -> None:
         )
 
 
-class InteractionSeen(Seen):
+class InteractionObservables(Observables):
     """The factor of the interaction."""
 
     def named(self, loads: "Loads") -> Sequence[str]:

@@ -140,7 +140,7 @@ def soft_magnet(
 
     None without a susceptibility. `patch_rims` has the rims of patches by name, see `Problem`.
     """
-    magnetic = context.of(MagneticSection)
+    magnetic = context.section_of(MagneticSection)
     if magnetic is None or magnetic.susceptibility is None:
         return None
     chi, E, remanent = magnetic.susceptibility, context.shell.youngs_modulus, magnetic.remanent
@@ -209,7 +209,7 @@ def _remanence(
 
 def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
     """Remanence and applied field must both be symmetric to a plane, or both antisymmetric."""
-    magnetic = context.of(MagneticSection)
+    magnetic = context.section_of(MagneticSection)
     assert magnetic
     formulas = magnetic.applied.components if magnetic.applied.beside else None
     without_uniform_field = formulas or not magnetic.applied.beside or not strength(context)
@@ -344,7 +344,7 @@ def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
     """The field that a step drives; else the remanence alone, where a reduced model shows it as it
     is.
     """
-    magnetic, turn, patch_rims = context.of(MagneticSection), modelled.turn, modelled.within
+    magnetic, turn, patch_rims = context.section_of(MagneticSection), modelled.turn, modelled.within
     assert magnetic
     driven_amplitudes = {name for step in context.steps for name in (step.name, *step.load.drives)}
     observed: dict[str, Any] = {
@@ -370,7 +370,7 @@ def _rotations(context: Context) -> list[RotationSection]:
 
 def account(context: Context, loads: Loads) -> Account:
     """Describe the energy of the field, and its sources."""
-    magnetic, field, words = context.of(MagneticSection), loads.magnetic, list[str]()
+    magnetic, field, words = context.section_of(MagneticSection), loads.magnetic, list[str]()
     if loads.interaction:
         words = [
             "magnetised parts in each other's field, |Br|²/(mu_0 E) = "

@@ -14,7 +14,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.magnetism.fields import MU_0
 from magshell_fenicsx.parts.magnetism.sensors import Sensor
-from magshell_fenicsx.parts.observables import Seen, Sight, Slope
+from magshell_fenicsx.parts.observables import Observables, ModelView, Slope
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import register
 
@@ -39,30 +39,30 @@ register(
 )
 
 
-class FieldSeen(Seen):
+class FieldObservables(Observables):
     """Strength and angle of the field, columns of every run, and the magnetic moment."""
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
         return ()
 
-    def observe(self, sight: Sight, state: "State") -> dict[str, float]:
+    def observe(self, view: ModelView, state: "State") -> dict[str, float]:
         from magshell_fenicsx.parts.magnetism.direction import (  # the solver takes long to import
             field_angle,
             field_size,
         )
 
-        angle = field_angle(state.mu, sight.loads.magnetic, sight.sense)
-        return {"lambda_m": field_size(state.mu, sight.sense), "field_angle": angle}
+        angle = field_angle(state.mu, view.loads.magnetic, view.sense)
+        return {"lambda_m": field_size(state.mu, view.sense), "field_angle": angle}
 
-    def summary(self, sight: Sight, state: "State") -> dict[str, Any]:
+    def summary(self, view: ModelView, state: "State") -> dict[str, Any]:
         from magshell_fenicsx.parts.magnetism.self_field import magnetic_moment, magnetisation_of
 
-        magnetisation = magnetisation_of(sight.loads)
+        magnetisation = magnetisation_of(view.loads)
         if magnetisation is None or magnetisation.absent:
             return {}
-        at_state = sight.model.system.at_state(state)
-        moment = at_state.evaluate(lambda: magnetic_moment(sight, state.mu)) @ rotation(
-            sight.azimuth
+        at_state = view.model.system.at_state(state)
+        moment = at_state.evaluate(lambda: magnetic_moment(view, state.mu)) @ rotation(
+            view.azimuth
         )
         size = magnetisation.tesla * magnetisation.metres**3 / MU_0 if magnetisation.metres else 1.0
         unit = "√(E/μ0) R³" if magnetisation.soft and magnetisation.soft.alone else "|Br| R³/μ0"
@@ -74,7 +74,7 @@ class FieldSeen(Seen):
         }
 
 
-class SoftSeen(Seen):
+class SoftObservables(Observables):
     """Mean polarisation that the field induces."""
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
@@ -89,25 +89,25 @@ class SoftSeen(Seen):
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
         return INDUCED if loads.magnetic and loads.magnetic.soft else ()
 
-    def observe(self, sight: Sight, state: "State") -> dict[str, float]:
-        field = sight.loads.magnetic
+    def observe(self, view: ModelView, state: "State") -> dict[str, float]:
+        field = view.loads.magnetic
         if field is None or field.soft is None:
             return {}
-        at_state, forms = sight.model.system.at_state(state), sight.model.observed
+        at_state, forms = view.model.system.at_state(state), view.model.observed
         J = np.array(
             [at_state.integral(forms[f"induced {axis}"]) for axis in "xyz"]
         ) / at_state.integral(forms["induced volume"])
-        if 1 not in sight.model.axes:  # of a meridian, with which they turn
+        if 1 not in view.model.axes:  # of a meridian, with which they turn
             J[:2] = 0.0
-        if sight.mirror:
-            sign = field.sign_of_images(state.mu, sight.model.r0, sight.mirror)
-            J = sight.mirror.sum_over_images(J, sign) / sight.mirror.copies
+        if view.mirror:
+            sign = field.sign_of_images(state.mu, view.model.r0, view.mirror)
+            J = view.mirror.sum_over_images(J, sign) / view.mirror.copies
         return dict(
-            zip(INDUCED, map(float, field.soft.tesla * J @ rotation(sight.azimuth)), strict=True)
+            zip(INDUCED, map(float, field.soft.tesla * J @ rotation(view.azimuth)), strict=True)
         )
 
 
-class SensorsSeen(Seen):
+class SensorsObservables(Observables):
     """Readings of sensors."""
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
@@ -131,14 +131,14 @@ class SensorsSeen(Seen):
     def differentiable(self, loads: "Loads") -> Sequence[str]:
         return self.columns(loads, ())
 
-    def observe(self, sight: Sight, state: "State") -> dict[str, float]:
-        if not sight.loads.sensors:
+    def observe(self, view: ModelView, state: "State") -> dict[str, float]:
+        if not view.loads.sensors:
             return {}
-        readings = self._readings(sight, state, sight.loads.sensors)
-        columns = [column for each in sight.loads.sensors for column in each.columns]
+        readings = self._readings(view, state, view.loads.sensors)
+        columns = [column for each in view.loads.sensors for column in each.columns]
         return dict(zip(columns, map(float, readings.ravel()), strict=True))
 
-    def slope(self, sight: Sight, state: "State", column: str) -> Slope | None:
+    def slope(self, view: ModelView, state: "State", column: str) -> Slope | None:
         from magshell_fenicsx.continuation.system import State
         from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES
         from magshell_fenicsx.parts.magnetism.self_field import (
@@ -149,16 +149,16 @@ class SensorsSeen(Seen):
 
         matching = [
             (sensor_of_columns, i)
-            for sensor_of_columns in sight.loads.sensors
+            for sensor_of_columns in view.loads.sensors
             for i, name in enumerate(sensor_of_columns.columns)
             if name == column
         ]
         if not matching:
             return None
-        (sensor, i), self_field_of_model = matching[0], self_field(sight)
-        e = sensor.own * rotation(sight.azimuth)[:, i]
-        system = sight.model.system
-        at_state, nodes = system.at_state(state), sight.model.r0.function_space.dofmap.list
+        (sensor, i), self_field_of_model = matching[0], self_field(view)
+        e = sensor.own * rotation(view.azimuth)[:, i]
+        system = view.model.system
+        at_state, nodes = system.at_state(state), view.model.r0.function_space.dofmap.list
 
         def nodal_derivatives() -> tuple[Array, Array]:
             derivatives, by_u = (
@@ -171,7 +171,7 @@ class SensorsSeen(Seen):
 
         by_u, by_remanence = at_state.evaluate(nodal_derivatives)
         by_mu = dict[str, float]()
-        applied = sight.loads.magnetic
+        applied = view.loads.magnetic
         if applied and (sensor.total or applied.soft):
             names = {
                 "lambda_m",
@@ -185,16 +185,16 @@ class SensorsSeen(Seen):
                     for steps, _ in DIFFERENCE_WEIGHTS
                 )
                 values = {
-                    steps: self._readings(sight, moved_state, [sensor])[0][i]
+                    steps: self._readings(view, moved_state, [sensor])[0][i]
                     for steps, moved_state in moved_states
                 }
                 by_mu[name] = float(
                     sum(w / size * values[steps] for steps, w in DIFFERENCE_WEIGHTS)
                 )
-        value = float(self._readings(sight, state, [sensor])[0][i])
+        value = float(self._readings(view, state, [sensor])[0][i])
         return Slope(value, at_state.summed(by_u), by_mu, self_field_of_model.Br, by_remanence)
 
-    def _readings(self, sight: Sight, state: "State", sensors: Sequence[Sensor]) -> Array:
+    def _readings(self, view: ModelView, state: "State", sensors: Sequence[Sensor]) -> Array:
         """Return the readings (sensors, 3) in the frame of the case."""
         places, reads_total = (
             np.array([sensor.place for sensor in sensors]),
@@ -205,12 +205,12 @@ class SensorsSeen(Seen):
             for name in ("own", "applied")
         )
         return field_at(
-            sight, state, places, own_units, np.where(reads_total[:, None], applied_units, 0.0)
+            view, state, places, own_units, np.where(reads_total[:, None], applied_units, 0.0)
         )
 
 
 def field_at(
-    sight: Sight,
+    view: ModelView,
     state: "State",
     places: Array,
     own_factor: Array | float,
@@ -230,15 +230,15 @@ def field_at(
     from magshell_fenicsx.parts.magnetism.self_field import magnetisation_of, self_field
 
     def own_field_there() -> Array:
-        if magnetisation_of(sight.loads) is None:
+        if magnetisation_of(view.loads) is None:
             return np.zeros_like(places)
-        field_of_model = self_field(sight)
+        field_of_model = self_field(view)
         return own_factor * field_of_model.B(field_of_model.families(state.mu)[1], state.mu, places)
 
     B, applied_field = (
-        sight.model.system.at_state(state).evaluate(own_field_there),
-        sight.loads.magnetic,
+        view.model.system.at_state(state).evaluate(own_field_there),
+        view.loads.magnetic,
     )
     if applied_field and np.any(applied_factor):
         B = B + applied_factor * applied_field.at(state.mu, places)
-    return np.asarray(B @ rotation(sight.azimuth))
+    return np.asarray(B @ rotation(view.azimuth))

@@ -31,7 +31,7 @@ from magshell_fenicsx.parts.magnetism.charges import (
 from magshell_fenicsx.parts.magnetism.fields import MU_0
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.magnetism.magnetised_cells import MagnetisedShell, NodalDerivatives
-from magshell_fenicsx.parts.observables import Sight
+from magshell_fenicsx.parts.observables import ModelView
 
 Array = NDArray[np.float64]
 JUMP_TOLERANCE = 1e-6  # of the remanence between two cells, over the largest
@@ -50,7 +50,7 @@ class SelfField:
 
     Parameters
     ----------
-    sight
+    view
         The model; its system has the displacement and the amplitudes that are asked about.
 
     Attributes
@@ -63,11 +63,11 @@ class SelfField:
         Cells of this rank and their local edges that are charged, or may be at some state.
     """
 
-    def __init__(self, sight: Sight) -> None:
-        magnetisation = magnetisation_of(sight.loads)
+    def __init__(self, view: ModelView) -> None:
+        magnetisation = magnetisation_of(view.loads)
         assert magnetisation
-        self._sight, self._model, self.magnetisation = sight, sight.model, magnetisation
-        V = sight.model.r0.function_space
+        self._sight, self._model, self.magnetisation = view, view.model, magnetisation
+        V = view.model.r0.function_space
         topology = V.mesh.topology
         self._dim = topology.dim
         self._owned = topology.index_map(self._dim).size_local
@@ -390,31 +390,31 @@ class SelfField:
         )
 
 
-def magnetic_moment(sight: Sight, mu: Mapping[str, float]) -> Array:
+def magnetic_moment(view: ModelView, mu: Mapping[str, float]) -> Array:
     """Return the magnetic moment, remanent and induced, (3,) over R³; collective.
 
     It is in the frame of the model, at the displacement that its system has.
     """
-    return self_field(sight).moment(mu)
+    return self_field(view).moment(mu)
 
 
-def self_field(sight: Sight) -> SelfField:
+def self_field(view: ModelView) -> SelfField:
     """Return the self-field of a model, which keeps it until its magnetisation is replaced."""
-    model, magnetisation = sight.model, magnetisation_of(sight.loads)
+    model, magnetisation = view.model, magnetisation_of(view.loads)
     field_of_model = model.part_caches.get(SelfField)
     if field_of_model is None or field_of_model.magnetisation is not magnetisation:
-        if sight.model.r0.function_space.mesh.topology.dim == 3:
+        if view.model.r0.function_space.mesh.topology.dim == 3:
             # late, as it derives from the class here
             from magshell_fenicsx.parts.magnetism.self_field_of_solid import SelfFieldOfSolid
 
-            field_of_model = SelfFieldOfSolid(sight)
+            field_of_model = SelfFieldOfSolid(view)
         else:
-            field_of_model = SelfField(sight)
+            field_of_model = SelfField(view)
         model.part_caches[SelfField] = field_of_model
     return field_of_model
 
 
-def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
+def to_magpylib(view: ModelView, state: State, parts: int = 8) -> Any:
     """Return the magnetised shell at a state as a source of magpylib, of charged triangles.
 
     It is in m and T; in a case without units, over R and |Br|.
@@ -431,13 +431,13 @@ def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
     """
     from magshell_fenicsx.parts.magnetism.sources.source import magpylib
 
-    magnetisation = magnetisation_of(sight.loads)
+    magnetisation = magnetisation_of(view.loads)
     if magnetisation is None:
         raise CaseError(
             "to_magpylib: of a shell with a remanence or a susceptibility, this has neither"
         )
-    module, field_of_model, mirror = magpylib("to_magpylib"), self_field(sight), sight.mirror
-    Q, R = rotation(sight.azimuth), magnetisation.metres or 1.0
+    module, field_of_model, mirror = magpylib("to_magpylib"), self_field(view), view.mirror
+    Q, R = rotation(view.azimuth), magnetisation.metres or 1.0
 
     def charged_triangles() -> list[tuple[Array, Array]]:
         _, families = field_of_model.families(state.mu)
@@ -456,7 +456,7 @@ def to_magpylib(sight: Sight, state: State, parts: int = 8) -> Any:
             ]
         return triangles_and_charges
 
-    system = sight.model.system
+    system = view.model.system
     on_all_ranks = system.comm.allgather(system.at_state(state).evaluate(charged_triangles))
     triangles_and_charges = [part for on_rank in on_all_ranks for part in on_rank]
     corners, charges = (

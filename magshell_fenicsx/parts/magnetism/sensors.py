@@ -92,7 +92,7 @@ def units(context: Context) -> tuple[float, float]:
 
     They are in T, or over |Br|; nan if unknown.
     """
-    magnetic, E = context.of(MagneticSection), context.shell.youngs_modulus
+    magnetic, E = context.section_of(MagneticSection), context.shell.youngs_modulus
     if magnetic is None:
         return nan, nan
     if magnetic.remanent is None:
@@ -140,10 +140,10 @@ def refuse_unfit_reading(key: str, context: Context) -> None:
     ValueError
         With the key.
     """
-    if context.of(MagneticSection) is None:
+    if context.section_of(MagneticSection) is None:
         raise ValueError(f"{key}: need magnetic: nothing is magnetised, and no field applied")
     context.needs(key, "the whole shell")
-    if "a thickness that does not change" in context.withdrawn:  # it follows from the area
+    if "a thickness that does not change" in context.missing_offers:  # it follows from the area
         context.needs(key, "the area as drawn")
 
 

@@ -7,13 +7,13 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import AboutAxis, Lengths, Name
-from magshell_fenicsx.parts.step_control import Now, Target
+from magshell_fenicsx.parts.step_course import LoadStart, Target
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.path_step import Count, LoadStep
-from magshell_fenicsx.parts.observables import Seen, Sight
+from magshell_fenicsx.parts.observables import Observables, ModelView
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.quantity import DISTANCE, FORCE, TORQUE, TURN, WORK, Quantity
 from magshell_fenicsx.quantities.registry import QUANTITIES, RESERVED_NAMES
@@ -84,7 +84,7 @@ class SourceStep(LoadStep):
     def _end(self) -> float | None:
         return 1.0
 
-    def scale(self, now: Now) -> float:
+    def scale(self, load_start: LoadStart) -> float:
         return abs(self.factor or 1.0)
 
     def number(self, sources: Sequence[SourceSection]) -> int | None:
@@ -94,7 +94,7 @@ class SourceStep(LoadStep):
         return next((i for i, source in enumerate(sources) if source.name == self.source), None)
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
-        magnetic, key = context.of(MagneticSection), step.key
+        magnetic, key = context.section_of(MagneticSection), step.key
         sources = (magnetic.applied.sources if magnetic else None) or []
         if self.number(sources) is None:
             names = [source.name or str(i) for i, source in enumerate(sources)]
@@ -151,7 +151,7 @@ def source_size(loads: "Loads", name: str) -> float:
     raise KeyError(name)
 
 
-class SourcesSeen(Seen):
+class SourcesObservables(Observables):
     """Amplitudes of sources, and their conjugates in SI."""
 
     quantities = (
@@ -214,18 +214,18 @@ class SourcesSeen(Seen):
             motion.name: (bool(motion.turns), source_size(loads, motion.name)) for motion in motions
         }
 
-    def observe(self, sight: Sight, state: "State") -> dict[str, float]:
+    def observe(self, view: ModelView, state: "State") -> dict[str, float]:
         values: dict[str, float] = {}
-        for name, column in source_columns(sight.loads).items():
+        for name, column in source_columns(view.loads).items():
             values |= {
                 name: state.mu[name],
-                column: -sight.potential(state, name) / self._unit(sight, name),
+                column: -view.potential(state, name) / self._unit(view, name),
             }
         return values
 
-    def conjugate_unit(self, sight: Sight, name: str) -> float | None:
-        return self._unit(sight, name) if name in self.amplitudes(sight.loads) else None
+    def conjugate_unit(self, view: ModelView, name: str) -> float | None:
+        return self._unit(view, name) if name in self.amplitudes(view.loads) else None
 
-    def _unit(self, sight: Sight, name: str) -> float:
-        arm = 1.0 if source_columns(sight.loads)[name].startswith("source_force") else sight.length
-        return source_size(sight.loads, name) / (sight.force * arm * sight.model.multiplicity)
+    def _unit(self, view: ModelView, name: str) -> float:
+        arm = 1.0 if source_columns(view.loads)[name].startswith("source_force") else view.length
+        return source_size(view.loads, name) / (view.force * arm * view.model.multiplicity)

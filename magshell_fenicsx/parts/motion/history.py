@@ -191,7 +191,7 @@ class Viscosity(Ability):
     branches: Sequence[BranchSection]
 
     @classmethod
-    def of(cls, context: Context) -> "Viscosity | None":
+    def from_context(cls, context: Context) -> "Viscosity | None":
         shell = context.shell
         return (
             cls(shell.viscosity, shell.relaxation)

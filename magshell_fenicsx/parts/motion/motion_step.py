@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import Section, in_units
 from magshell_fenicsx.mesh.mirror import Mirror
-from magshell_fenicsx.parts.step_control import Ahead, Errors
+from magshell_fenicsx.parts.step_course import ExpectedEnd, Errors
 from magshell_fenicsx.parts.motion.history import (
     History,
     Level,
@@ -135,8 +135,8 @@ class TimeSection(Step):
     def motion(self) -> "TimeSection":
         return self
 
-    def ahead(self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float) -> Ahead:
-        return Ahead("the end", steps=self.points)
+    def expected_end(self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float) -> ExpectedEnd:
+        return ExpectedEnd("the end", steps=self.points)
 
     @property
     def rests(self) -> bool:
@@ -214,9 +214,9 @@ class TimeSection(Step):
 def _factors_of_sections(context: Context) -> set[str]:
     """Return the amplitudes of what sections ask for and no step drives, such as "interaction"."""
     from magshell_fenicsx.parts.path_step import FactorStep
-    from magshell_fenicsx.parts.registered import FIRST, STEPS  # which has this step too
+    from magshell_fenicsx.parts.registered import KINDS_BEFORE_LOAD, STEPS  # which has this step too
 
-    steps = [STEPS[kind] for kind in FIRST]
+    steps = [STEPS[kind] for kind in KINDS_BEFORE_LOAD]
     return {
         each.amplitude for each in steps if issubclass(each, FactorStep) and each.asked_for(context)
     }

@@ -28,7 +28,7 @@ def natural(context: Context, turn: float, within: Mapping[str, InsideRim]) -> N
 
     `within` has the rims of patches by name, see `Problem`.
     """
-    section = context.of(NaturalSection)
+    section = context.section_of(NaturalSection)
     if section is None:
         return None
     Q, R = rotation(turn), context.shell.reference
@@ -87,13 +87,13 @@ def along(context: Context) -> list[float | str] | str:
     """Return the first direction of the frame, the default one without a natural shape."""
     flat = isinstance(context.shell, MeshSurface | PlateSurface)
     flat = flat or (isinstance(context.shell, ShellSection) and context.shell.geometry == "strip")
-    natural = context.of(NaturalSection)
+    natural = context.section_of(NaturalSection)
     return (natural and natural.along) or ([1.0, 0.0, 0.0] if flat else MERIDIAN)
 
 
 def is_anisotropic(context: Context) -> bool:
     """Return whether curvature or stretch differ with direction, so that the frame matters."""
-    section = context.of(NaturalSection)
+    section = context.section_of(NaturalSection)
     assert section
     values = [section.curvature, section.stretch]
     patch_values = [
@@ -106,7 +106,7 @@ def is_anisotropic(context: Context) -> bool:
 
 def not_axisymmetric_because(context: Context, outline: Outline) -> str | None:
     """Return why the natural shape is not axisymmetric about e3; None if it is."""
-    section = context.of(NaturalSection)
+    section = context.section_of(NaturalSection)
     assert section
     direction, R = along(context), context.shell.reference
     k = components(section.curvature)
@@ -125,7 +125,7 @@ def not_axisymmetric_because(context: Context, outline: Outline) -> str | None:
 
 def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
     """Return whether a plane mirrors the natural shape; patches are mapped onto themselves."""
-    section = context.of(NaturalSection)
+    section = context.section_of(NaturalSection)
     assert section
     if section.user_fields:
         return False

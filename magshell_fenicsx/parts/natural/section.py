@@ -9,10 +9,10 @@ from pydantic import BeforeValidator, Field, model_validator
 from magshell_fenicsx.input.expressions import Formula, formula
 from magshell_fenicsx.input.section import _NUMBER, OrInMemory, Section, in_units
 from magshell_fenicsx.mesh.patch import UserField
-from magshell_fenicsx.parts.step_control import Target
+from magshell_fenicsx.parts.step_course import Target
 from magshell_fenicsx.parts.ability import Ability, Context, Formulas, Modelled, Offer
 from magshell_fenicsx.parts.path_step import LoadStep
-from magshell_fenicsx.parts.observables import Seen
+from magshell_fenicsx.parts.observables import Observables
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
@@ -237,21 +237,21 @@ class GrowthSection(LoadStep):
         return f"natural_{self.key}"
 
     @classmethod
-    def before(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
-        natural = context.of(NaturalSection)
+    def steps_before_load(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
+        natural = context.section_of(NaturalSection)
         if isinstance(loading, cls) or natural is None:
             return []
         keys = [key for key in ("stretch", "curvature") if getattr(natural, key) is not None]
         return [("natural", cls.model_validate({"kind": "natural", key: 1.0})) for key in keys]
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
-        if getattr(context.of(NaturalSection), self.key, None) is None:
+        if getattr(context.section_of(NaturalSection), self.key, None) is None:
             raise ValueError(
                 f"loading.{self.key}: is a factor of natural.{self.key}: give that too"
             )
 
 
-class NaturalSeen(Seen):
+class NaturalObservables(Observables):
     """The amplitudes of the natural shape."""
 
     quantities = (

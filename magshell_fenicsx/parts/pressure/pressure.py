@@ -9,10 +9,10 @@ from pydantic import Field
 
 from magshell_fenicsx.input.section import over_size
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.step_control import Course, Fit, GasSection, Here, Now, Target, Until
+from magshell_fenicsx.parts.step_course import StepCourse, SizingContext, GasSection, StepStart, LoadStart, Target, Until
 from magshell_fenicsx.parts.ability import Account, Context, Modelled
 from magshell_fenicsx.parts.path_step import PathStep
-from magshell_fenicsx.parts.observables import Seen, Sight
+from magshell_fenicsx.parts.observables import Observables, ModelView
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
 from magshell_fenicsx.quantities.quantity import PRESSURE, VOLUME
 from magshell_fenicsx.shape.revolution_sections import CapSurface
@@ -79,15 +79,15 @@ class PressureSection(PathStep):
         sides = {"outside": 1.0, "inside": -1.0}
         return {"pressed": {name: sides[face] for name, face in (self.on or {}).items()}}
 
-    def course(self, here: Here) -> Course:
-        course = super().course(here)
-        if here.open and "control" not in self.model_fields_set:
+    def course(self, step_start: StepStart) -> StepCourse:
+        course = super().course(step_start)
+        if step_start.open and "control" not in self.model_fields_set:
             course = replace(course, drive=replace(course.drive, control="arc"))
         if (
-            here.context.shell.rubber is not None and course.drive.first < 0
+            step_start.context.shell.rubber is not None and course.drive.first < 0
         ):  # blown up far beyond p_c
-            finer = partial(_longer, BLOWN / here.h)
-            course = replace(course, drive=replace(course.drive, scale=1 / here.h), finer=finer)
+            finer = partial(_longer, BLOWN / step_start.h)
+            course = replace(course, drive=replace(course.drive, scale=1 / step_start.h), finer=finer)
         return course
 
     def on_perfect(self, *, last: bool) -> Step:
@@ -101,14 +101,14 @@ class PressureSection(PathStep):
     def implied(cls) -> dict[str, Any]:
         return {"pressure": True}
 
-    def largest(self, fit: Fit) -> float | None:
+    def largest(self, sizing: SizingContext) -> float | None:
         """Without a local imperfection a sphere buckles anywhere, in waves of about 3.6 sqrt(Rh)."""
-        return None if fit.local else 1.2 * sqrt(fit.h)
+        return None if sizing.local else 1.2 * sqrt(sizing.h)
 
-    def begin(self, here: float) -> float:
-        return here
+    def begin(self, step_start: float) -> float:
+        return step_start
 
-    def first(self, change: float, now: Now, *, by_load: bool) -> float:
+    def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
         return copysign(0.1, change)
 
 
@@ -116,7 +116,7 @@ def _longer(factor: float, steps: "StepOptions") -> "StepOptions":
     return replace(steps, largest=factor * steps.largest)
 
 
-class PressureSeen(Seen):
+class PressureObservables(Observables):
     """What is conjugate to a live pressure is the change of volume, which every run has."""
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
@@ -127,18 +127,18 @@ class PressureSeen(Seen):
         for name in loads.pressed:
             patch_of(surface.patches, name, "loading.on")
 
-    def conjugate_unit(self, sight: Sight, name: str) -> float | None:
+    def conjugate_unit(self, view: ModelView, name: str) -> float | None:
         """Of ΔV/R³."""
         if name != PressureSection.amplitude:
             return None
-        return -sight.model.material.classical_pressure / sight.h / sight.model.multiplicity
+        return -view.model.material.classical_pressure / view.h / view.model.multiplicity
 
-    def left_out(self, sight: Sight) -> list[str]:
+    def left_out(self, view: ModelView) -> list[str]:
         from magshell_fenicsx.parts.pressure.openings import (
             no_potential,
         )  # the solver takes long to import
 
-        open_at = sight.model.without_potential if sight.loads.pressure else ()
+        open_at = view.model.without_potential if view.loads.pressure else ()
         return [no_potential(open_at)] if open_at else []
 
 
@@ -198,17 +198,17 @@ class Enclosed:
             ambient = float(self.section.ambient or 0.0) / (
                 self.classical_pressure * self.shell.youngs_modulus
             )
-        first, now, unit = self._volume(), self.pressure, self.unit
-        changed = self.conjugate / unit
-        if first + changed <= 0:
+        first, pressure, unit = self._volume(), self.pressure, self.unit
+        change = self.conjugate / unit
+        if first + change <= 0:
             raise CaseError(
-                f"hold.pressure.gas.volume: {first:.4g}: the shell has shrunk by {-changed:.4g} R^3 already"
+                f"hold.pressure.gas.volume: {first:.4g}: the shell has shrunk by {-change:.4g} R^3 already"
             )
-        if now >= ambient:
+        if pressure >= ambient:
             raise CaseError(
-                f"hold.pressure.gas: the pressure, {now:.4g} p_c, is not below the ambient {ambient:.4g} p_c"
+                f"hold.pressure.gas: the pressure, {pressure:.4g} p_c, is not below the ambient {ambient:.4g} p_c"
             )
-        content = (ambient - now) * (first + changed)
+        content = (ambient - pressure) * (first + change)
 
         def conjugate(p: float) -> tuple[float, float]:
             return unit * (content / (ambient - p) - first), unit * content / (ambient - p) ** 2

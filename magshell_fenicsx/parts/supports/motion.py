@@ -10,7 +10,7 @@ from pydantic import Field, model_validator
 from magshell_fenicsx.assembly.rigid_motion import RigidMotion
 from magshell_fenicsx.input.section import AboutAxis, Lengths, Name, Section, or_number
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
-from magshell_fenicsx.parts.step_control import Now, Target, Until
+from magshell_fenicsx.parts.step_course import LoadStart, Target, Until
 from magshell_fenicsx.parts.ability import Context, Modelled
 from magshell_fenicsx.parts.path_step import Count, PathStep
 from magshell_fenicsx.parts.step import ProgrammeStep
@@ -112,17 +112,17 @@ class EdgeSection(PathStep):
     def _end(self) -> float | None:
         return 1.0 if self.reaction is None and self.control != "reaction" else None
 
-    def first(self, change: float, now: Now, *, by_load: bool) -> float:
-        return change / self.points if by_load else copysign(1e-3 * self.scale(now), -change)
+    def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
+        return change / self.points if by_load else copysign(1e-3 * self.scale(load_start), -change)
 
-    def step(self, change: float | None, now: Now) -> float | None:
+    def step(self, change: float | None, load_start: LoadStart) -> float | None:
         return abs(change) / self.points if self.control == "reaction" and change else None
 
-    def scale(self, now: Now) -> float:
+    def scale(self, load_start: LoadStart) -> float:
         return abs(self.factor or 1.0)
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
-        boundary = context.of(BoundarySection)
+        boundary = context.section_of(BoundarySection)
         conditions = boundary.conditions() if boundary else {}
         held_names = sorted(
             name for name, condition in conditions.items() if condition not in UNHELD_CONDITIONS

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.parts.ability import Account, Context
-from magshell_fenicsx.parts.observables import Seen, Sight
+from magshell_fenicsx.parts.observables import Observables, ModelView
 from magshell_fenicsx.quantities.quantity import DISTANCE, MOMENT, REACTION, TURN, Quantity
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def only_turns(loads: "Loads", name: str) -> bool:
     return not any(m.motion.shift.any() for m in loads.moves if m.motion.name == name)
 
 
-class ReactionsSeen(Seen):
+class ReactionsObservables(Observables):
     """Motions of supports with their reactions, and the reactions of all supports."""
 
     quantities = (
@@ -89,27 +89,27 @@ class ReactionsSeen(Seen):
             for name in motion_columns(loads)
         }
 
-    def observe(self, sight: Sight, state: "State") -> dict[str, float]:
+    def observe(self, view: ModelView, state: "State") -> dict[str, float]:
         """Return amplitudes, reactions, forces and moments, in the case's units."""
         values: dict[str, float] = {}
-        for name, column in motion_columns(sight.loads).items():
+        for name, column in motion_columns(view.loads).items():
             values |= {
                 name: state.mu[name],
-                column: sight.potential(state, name) / -self._unit(sight, name),
+                column: view.potential(state, name) / -self._unit(view, name),
             }
-        if sight.reactions:
-            frame = rotation(sight.azimuth)
+        if view.reactions:
+            frame = rotation(view.azimuth)
             values |= observed_reactions(
-                sight.model, state, sight.mirror, frame, sight.force, sight.length
+                view.model, state, view.mirror, frame, view.force, view.length
             )
         return values
 
-    def conjugate_unit(self, sight: Sight, name: str) -> float | None:
-        return self._unit(sight, name) if name in self.amplitudes(sight.loads) else None
+    def conjugate_unit(self, view: ModelView, name: str) -> float | None:
+        return self._unit(view, name) if name in self.amplitudes(view.loads) else None
 
-    def _unit(self, sight: Sight, name: str) -> float:
-        arm = sight.length if only_turns(sight.loads, name) else 1.0
-        return -motion_size(sight.loads, name) / (sight.force * arm * sight.model.multiplicity)
+    def _unit(self, view: ModelView, name: str) -> float:
+        arm = view.length if only_turns(view.loads, name) else 1.0
+        return -motion_size(view.loads, name) / (view.force * arm * view.model.multiplicity)
 
 
 def observed_reactions(

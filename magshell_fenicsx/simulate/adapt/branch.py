@@ -79,7 +79,7 @@ def _coarsest_branch(first: Adapted, comm: MPI.Comm) -> tuple[Choice, Solved] | 
         raise NoResult("of a solid nothing is carried between meshes")
     for refinement in FIRST_REFINEMENTS:
         scene, choice = first.choice.scene(first.asked, comm), Choice(PATH_DEGREE, refinement)
-        scene.meshed = choice.applied
+        scene.remesh = choice.applied
         last: Record | None = None
         try:
             for record in follow(scene, search=False, remark=lambda text: None):

@@ -16,11 +16,11 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.control import ConstraintRow, PrescribedConjugate, PrescribedLoad
 from magshell_fenicsx.continuation.fold import FoldGuess, FoldLost, find_fold
 from magshell_fenicsx.continuation.system import State, System, Vector
+from magshell_fenicsx.simulate.contact_control import with_cuts_here, with_own_contact
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.steps import leaves_path
-from magshell_fenicsx.simulate.touch import of_its_own, with_cuts_here
 from magshell_fenicsx.simulate.transfer import cells_of_shells, chart, nodes_of_shells
 
 Array = NDArray[np.float64]
@@ -311,7 +311,9 @@ class History:
             raise NoResult("a motion ends at no single load")
         if not self.located:
             no_instability = (
-                "there is no instability up to the target" if steps and steps[-1].load.bound else ""
+                "there is no instability up to the target"
+                if steps and steps[-1].load.limit_target
+                else ""
             )
             raise NoResult(stopped or no_instability or "the case has neither a load nor a field")
         in_last = [record for record in self.located if record.step == self.located[-1].step]
@@ -394,7 +396,7 @@ def near_by(scene: Scene, source: Scene, neighbour: Ending) -> Ending | None:
             if is_fold
             else _equilibrium(scene, guess, neighbour)
         )
-        if end is None or (own_result := of_its_own(scene, end.state)) is None:
+        if end is None or (own_result := with_own_contact(scene, end.state)) is None:
             return end
         guess, tangent = own_result, end.tangent
     return None

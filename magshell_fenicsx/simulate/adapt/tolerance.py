@@ -161,7 +161,7 @@ def adapted_solid(problem: Problem, comm: MPI.Comm, say: Say, doing: Say) -> Ada
     assert tolerance is not None
     refinement, layers = (
         FIRST_REFINEMENTS[0],
-        (problem.context.of(SolidSection) or SolidSection()).layers,
+        (problem.context.section_of(SolidSection) or SolidSection()).layers,
     )
     while len(tried) < MOST_ROUNDS:
         doing(f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}")

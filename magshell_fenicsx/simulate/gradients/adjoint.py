@@ -34,7 +34,7 @@ from magshell_fenicsx.continuation.system import State, System, Vector, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.observables import Slope
 from magshell_fenicsx.parts.step import ProgrammeStep
-from magshell_fenicsx.parts.step_control import Gas
+from magshell_fenicsx.parts.step_course import Gas
 from magshell_fenicsx.shells.mass import mass_along
 from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.model_base import ModelBase

@@ -14,6 +14,7 @@ from magshell_fenicsx.continuation.system import State, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.problem.columns import sizes_of
 from magshell_fenicsx.simulate.adapt.ending import History
+from magshell_fenicsx.simulate.contact_control import contact_expanded_about
 from magshell_fenicsx.simulate.gradients.adjoint import (
     Adjoint,
     AdjointState,
@@ -24,12 +25,17 @@ from magshell_fenicsx.simulate.gradients.adjoint import (
 from magshell_fenicsx.simulate.gradients.fields import FIELDS, by_field
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, as_asked
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end
-from magshell_fenicsx.simulate.numbers import carried, goals, number_of, scene_with, size_of
+from magshell_fenicsx.simulate.perturbation import (
+    number_at_key,
+    perturbed_scene,
+    scale_at_key,
+    state_with_new_loads,
+    target_ratios,
+)
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Target
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.sensitivity import expand
-from magshell_fenicsx.simulate.touch import pressed_as_at
+from magshell_fenicsx.simulate.sensitivity import expand_contact
 from magshell_fenicsx.simulate.transfer import transfer
 
 STEP = 1e-4  # of what a change of a number is small against
@@ -61,7 +67,7 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
     """
     others = {} if others is None else others
     scene = adjoint.scene
-    value = number_of(scene.problem.context, key)
+    value = number_at_key(scene.problem.context, key)
     if (adjoint.gas or any(place.gas for place in adjoint.places)) and key.startswith("shell."):
         raise CaseError(f"{key}: has no derivative while a gas is held, whose law depends on it")
     if (
@@ -76,7 +82,7 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
 
     def contracted(p: float) -> float:
         if p != value and p not in others:
-            others[p] = scene_with(scene, key, p)
+            others[p] = perturbed_scene(scene, key, p)
         other = scene if p == value else others[p]
         first, total = adjoint.places[0], 0.0
         for place in reversed(adjoint.places):  # the last one, whose state stays, is the first
@@ -85,7 +91,7 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
                 *adjoint.left_loads,
                 *([adjoint.free_amplitude] if place.steps is None else []),
             }
-            state = carried(
+            state = state_with_new_loads(
                 scene,
                 other,
                 _transferred_state(scene, other, place.state),
@@ -94,7 +100,7 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
             )
             state = other.model.system.with_moved_supports(state)
             if other is not scene:
-                expand(scene, other, place.state)
+                expand_contact(scene, other, place.state)
             total += _residual_at(scene, other, place, state) + (
                 0.0 if adjoint.by_itself and place is first else _own_value(other, place, state)
             )
@@ -108,7 +114,7 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
         )
         return float(total + other.model.system.comm.allreduce(energies))
 
-    return _slope(contracted, value, size_of(scene.problem.context, key))
+    return _slope(contracted, value, scale_at_key(scene.problem.context, key))
 
 
 def _slope(f: Callable[[float], float], value: float, size: float) -> float:
@@ -147,7 +153,7 @@ def size_by_number(adjoint: Adjoint, key: str) -> float:
     if not adjoint.scale:
         return 0.0
     problem = adjoint.scene.problem
-    value, size = number_of(problem.context, key), size_of(problem.context, key)
+    value, size = number_at_key(problem.context, key), scale_at_key(problem.context, key)
     return _slope(
         lambda p: sizes_of(problem.with_values({key: p}).context).by_unit[adjoint.scale],
         value,
@@ -165,7 +171,7 @@ def _residual_at(scene: Scene, other: Scene, place: AdjointState, state: State) 
     """
     system, own_state = other.model.system, place.state
     change = dot(system.comm, transfer(scene, other, place.w), system.forces(state.u, state.mu))
-    targets = goals(scene, other, "conjugate", place.steps)
+    targets = target_ratios(scene, other, "conjugate", place.steps)
     for name, c in place.rows.items():
         held_value = -scene.model.system.potential(own_state.u, own_state.mu, name)
         unit = other.conjugate_unit(name) / scene.conjugate_unit(name) * targets.get(name, 1.0)
@@ -249,7 +255,7 @@ def derivative(adjoint: Adjoint, by: str, others: dict[float, Scene] | None = No
     for `others`.
     """
     size = adjoint.size
-    with pressed_as_at(adjoint.scene, adjoint.contact_state):
+    with contact_expanded_about(adjoint.scene, adjoint.contact_state):
         if by in FIELDS:
             of_field = by_field(adjoint, by)
             return replace(of_field, forces=size * of_field.forces)

@@ -16,6 +16,7 @@ from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.shell_sections import MeshSurface
 from magshell_fenicsx.simulate.adapt.ending import History
+from magshell_fenicsx.simulate.contact_control import stiffened_equilibrium
 from magshell_fenicsx.simulate.gradients.adjoint import (
     NO_BEGINS,
     Adjoint,
@@ -36,11 +37,10 @@ from magshell_fenicsx.simulate.gradients.vibration import (
     refuse_no_vibration,
     vibration,
 )
-from magshell_fenicsx.simulate.numbers import refuse_unknown_parameters
+from magshell_fenicsx.simulate.perturbation import refuse_unknown_parameters
 from magshell_fenicsx.simulate.record import Record
 from magshell_fenicsx.simulate.results import Functional, Target, barrier, differentiable
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.touch import rigid
 
 BARRIER = "barrier"
 
@@ -179,7 +179,9 @@ def vibration_at_end(scene: Scene, history: History, result: str) -> float | Non
         return None
     assert history.end
     scene = history.end.scene or scene
-    state = rigid(scene, scene.model.system.with_moved_supports(history.end.point.state))
+    state = stiffened_equilibrium(
+        scene, scene.model.system.with_moved_supports(history.end.point.state)
+    )
     return frequency(scene.problem, result, vibration(scene, state, result).value)
 
 

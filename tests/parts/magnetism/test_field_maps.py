@@ -29,7 +29,7 @@ from magshell_fenicsx.output.pictures.field_maps import (
     with_holes,
 )
 from magshell_fenicsx.output.pictures.plot import PicturedRun, plot
-from magshell_fenicsx.parts.registered import SEEN
+from magshell_fenicsx.parts.registered import OBSERVABLES
 from magshell_fenicsx.parts.observables import MapGrid
 
 MM = 1e-3
@@ -88,7 +88,7 @@ def test_a_map_is_many_sensors(symmetry: str, magnetic: dict[str, Any]) -> None:
     here = Scene(Case.from_source(given).problem())
     larger = 0.005 * here.model.r0.x.array[: here.model.system.size]
     state = State(larger, {**here.unloaded().mu, "lambda_m": 1e-3})
-    box, across, below = (grid for room in SEEN for grid in room.on_grids(here.sight, state))
+    box, across, below = (grid for room in OBSERVABLES for grid in room.on_grids(here.view, state))
     row = here.observe(state)
     read = np.array([[row[f"s{i}_B{axis}"] for axis in "xyz"] for i in range(len(at))])
     np.testing.assert_allclose(box.values, read, rtol=1e-9, atol=1e-15)

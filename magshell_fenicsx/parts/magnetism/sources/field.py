@@ -76,7 +76,7 @@ def placed_sources(context: Context, turn: float = 0.0) -> list[PlacedSource]:
 
 
 def _applied(context: Context) -> AppliedSection | None:
-    magnetic = context.of(MagneticSection)
+    magnetic = context.section_of(MagneticSection)
     return magnetic.applied if magnetic else None
 
 

@@ -112,7 +112,7 @@ class Target(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Now:
+class LoadStart:
     """The amplitude of a step where the step begins.
 
     Attributes
@@ -132,7 +132,7 @@ class Now:
     value: float
     conjugate: float
     unit: float
-    driven: bool
+    is_driven: bool
     size: float
     h: float
 
@@ -193,7 +193,7 @@ class ProgrammeStep:
 
 
 @dataclass(frozen=True)
-class Here:
+class StepStart:
     """Where a step begins, in the model's terms.
 
     Attributes
@@ -223,19 +223,19 @@ class Here:
     open: bool
 
     @property
-    def driven(self) -> bool:
+    def is_driven(self) -> bool:
         """Whether an earlier step has driven the amplitude."""
-        return any(self.step.name == other.name for other in self.context.before(self.step.number))
+        return any(self.step.name == other.name for other in self.context.steps_before(self.step.number))
 
-    def now(self) -> Now:
+    def load_start(self) -> LoadStart:
         """The amplitude of the step."""
         name = self.step.name
         size = self.step.load.size(self.context)
-        return Now(self.mu[name], -self.potential(name), self.unit(name), self.driven, size, self.h)
+        return LoadStart(self.mu[name], -self.potential(name), self.unit(name), self.is_driven, size, self.h)
 
 
 @dataclass(frozen=True)
-class Course:
+class StepCourse:
     """How a step goes on from where it begins.
 
     Attributes
@@ -272,7 +272,7 @@ class Course:
 
 
 @dataclass(frozen=True)
-class Ahead:
+class ExpectedEnd:
     """The end of a step in words, for those who wait for it.
 
     Attributes
@@ -289,7 +289,7 @@ class Ahead:
 
 
 @dataclass(frozen=True)
-class Fit:
+class SizingContext:
     """What element sizes depend on.
 
     Attributes

@@ -1,0 +1,238 @@
+"""Part of a shell that is modelled: its meridian, a half, a sector of waves, or all of it.
+
+A shell, its imperfections, supports, fields and loads each preserve some symmetry, a
+`SymmetryConstraint`. From these follows the smallest part that has the whole solution. The model's
+frame is turned about e3 so that the part's symmetry plane is its plane y = 0.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from magshell_fenicsx.case.case import Case
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.mirror import ROUNDING, Y0_PLANE, Mirror, Sector, rotation
+from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.models.shell.parameters import Condition, HeldComponents
+from magshell_fenicsx.parts.imperfections.imperfection import flaws
+from magshell_fenicsx.parts.imperfections.symmetry import leaves
+from magshell_fenicsx.parts.laminate import Laminated
+from magshell_fenicsx.parts.supports.boundary import BoundarySection, EdgeCondition, HeldSection
+from magshell_fenicsx.shape.outline import Outline, reference_shell_of
+from magshell_fenicsx.shape.shell_sections import MeshSurface
+from magshell_fenicsx.shape.symmetry_constraint import (
+    SymmetryConstraint,
+    common_mirror,
+    common_sector,
+    energy_without_mirror,
+    points_constraint,
+    shape_constraint,
+    unit,
+    why_not_axisymmetric,
+)
+
+
+@dataclass(frozen=True)
+class ModelledPart:
+    """Part of a shell that is modelled, and the frame of its model.
+
+    Attributes
+    ----------
+    axisymmetric
+        Whether the meridian is modelled.
+    plane
+        Symmetry plane of a half, or the sector, in the frame of the case; None for all.
+    turn
+        Angle about e3 (rad) by which the model's frame is turned from that of the case.
+    mirror
+        The same plane or sector in the model's frame.
+    """
+
+    axisymmetric: bool
+    plane: Mirror | None
+    turn: float
+    mirror: Mirror | None
+
+    @property
+    def is_symmetric(self) -> bool:
+        """Whether a half or a sector is modelled."""
+        return self.plane is not None
+
+    @property
+    def sector(self) -> Sector | None:
+        """The sector in the model's frame; None if no sector is modelled."""
+        return self.mirror if isinstance(self.mirror, Sector) else None
+
+    def name(self, model: str) -> str:
+        """Return the name of the part in words, such as "half shell"; `model` is that of a case."""
+        return "meridian" if self.axisymmetric else f"{_fraction(self.plane)} {model}"
+
+    def conditions(self, conditions: dict[str, Condition]) -> dict[str, Condition]:
+        """Return the conditions at edges of the part, its planes of symmetry among them."""
+        if self.mirror is None:
+            return conditions
+        removed_edges = self.mirror.removed_edges
+        of_part = {name: c for name, c in conditions.items() if name not in removed_edges}
+        return of_part | dict.fromkeys(self.mirror.planes, "symmetry")
+
+
+def modelled_part(
+    case: Case, outline: Outline, constraints: list[SymmetryConstraint], plane: Mirror | None
+) -> ModelledPart:
+    """Return the part of a shell that a case models.
+
+    Parameters
+    ----------
+    outline
+        The shell with the imperfections that do not grow.
+    constraints
+        Symmetry that each part of the case preserves.
+    plane
+        Symmetry plane of a half that is chosen already; None to look for one.
+
+    Raises
+    ------
+    CaseError
+        If the symmetry that the case asks for is not there.
+    """
+    is_axisymmetric = False
+    if plane is None:
+        is_axisymmetric, plane = _symmetry(case, outline, constraints)
+    if plane is None or not (outline.round and plane.through_e3):
+        return ModelledPart(is_axisymmetric, plane, 0.0, plane)
+    # the frame is turned into the plane
+    waves = plane.waves if isinstance(plane, Sector) else None
+    mirror = Y0_PLANE if waves is None else Sector.from_azimuth(0.0, waves)
+    return ModelledPart(is_axisymmetric, plane, plane.azimuth, mirror)
+
+
+def symmetry_constraints(
+    case: Case, outline: Outline, energies: Sequence[OwnTerm]
+) -> list[SymmetryConstraint]:
+    """Return the symmetry that the shell, its abilities, steps, points and `energies` preserve."""
+    context = case.context
+    constraints = [shape_constraint(case.shell, outline)]
+    for section in context.abilities:
+        constraints += section.leaves(context, outline)
+    for step in case.programme:
+        constraints += step.load.leaves(step, context, outline)
+    constraints.append(points_constraint(case.points.values(), case.shell.reference, outline))
+    constraints += [term.leaves(outline) for term in energies]
+    return constraints
+
+
+def own_mirror(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | None:
+    """Return a plane in which the mid-surface is its own image, with the edges that are lost.
+
+    Its thickness, plies and imperfections are their own images too. None if there is no such plane
+    that is the given one.
+
+    Parameters
+    ----------
+    loosely
+        See `mesh_mirrors`.
+    """
+    reference_shell = reference_shell_of(case.shell)
+    perfect = reference_shell.perfect
+    imperfections, one_by_one = flaws(case.imperfections, reference_shell), bool(case.patches)
+    constraints = [
+        shape_constraint(case.shell, perfect),
+        *leaves(imperfections, perfect, one_by_one=one_by_one),
+    ]
+    if plies := Laminated.from_laminate(case.context):
+        constraints += plies.leaves(case.context, perfect)
+    vectors = [unit(v) for constraint in constraints for v in constraint.vectors]
+    if perfect.round and plane.through_e3:
+        candidates: Sequence[Mirror] = [plane]
+    else:
+        candidates = perfect.mirrors(plane.in_plane_vectors, loosely)
+    for candidate in candidates:
+        has_vectors = all(abs(candidate.normal @ v) < ROUNDING for v in vectors)
+        if not candidate.is_plane_of(plane) or not has_vectors:
+            continue
+        if all(constraint.mirrors(candidate) for constraint in constraints):
+            return candidate
+    return None
+
+
+def edge_conditions(boundary: BoundarySection, turn: float) -> dict[str, Condition]:
+    """Return the conditions of a case in the model's terms, in a frame turned about e3 (rad)."""
+    terms: dict[EdgeCondition, Condition] = {
+        "hinged": "simply supported",
+        "symmetry": "plane",
+        "clamped": "clamped",
+        "simply supported": "simply supported",
+        "free": "free",
+    }
+    return {
+        name: HeldComponents(tuple(_turned_components(condition.components, turn)))
+        if isinstance(condition, HeldSection)
+        else terms[condition]
+        for name, condition in boundary.conditions().items()
+    }
+
+
+def _turned_components(components: tuple[int, ...], turn: float) -> list[int]:
+    """Return the components in a frame into which they turn as a whole."""
+    axes = np.eye(3)[list(components)] @ rotation(turn).T
+    return [i for i in range(3) if axes[:, i] @ axes[:, i] > 0.5]
+
+
+def _fraction(plane: Mirror | None) -> str:
+    """Return the fraction of the shell that is modelled, in words."""
+    if isinstance(plane, Sector):
+        return f"sector of {180 / plane.waves:.4g} degrees of the"
+    return "half" if plane else "full"
+
+
+def _symmetry(
+    case: Case, outline: Outline, constraints: list[SymmetryConstraint]
+) -> tuple[bool, Mirror | None]:
+    """Return whether to model the meridian, and else the plane of a half or the sector.
+
+    The plane is None for a full model.
+    """
+    reason = why_not_axisymmetric(constraints)
+    if reason and case.symmetry == "axisymmetric":
+        raise CaseError(f"symmetry: axisymmetric: {reason}")
+    if reason is None and case.symmetry in ("auto", "axisymmetric") and case.model == "shell":
+        return True, None
+    if isinstance(case.symmetry, int):
+        return False, _sector(case, outline, constraints, case.symmetry)
+    if case.symmetry not in ("auto", "half"):
+        return False, None
+    plane = common_mirror(constraints, outline, loosely=case.symmetry == "half")
+    if case.symmetry == "half" and plane is None:
+        if name := energy_without_mirror(constraints, outline):
+            raise CaseError(f"symmetry: half: the energy {name} does not share it")
+        hint = ""
+        if case.several:
+            hint = "; each shell is held, and its own image in it"
+        elif isinstance(case.shell, MeshSurface):
+            hint = (
+                "; edges of a mesh file must lie in it: mesh a half, mirror the nodes and "
+                "triangles, join them"
+            )
+        raise CaseError(
+            "symmetry: half: shell, supports, fields and load have no common mirror plane" + hint
+        )
+    return False, plane
+
+
+def _sector(
+    case: Case, outline: Outline, constraints: list[SymmetryConstraint], waves: int
+) -> Sector:
+    """Return the sector between two planes of symmetry of a number of waves."""
+    places = [np.array(x) for x in case.points.values()]
+    if sector := common_sector(constraints, outline, waves, places):
+        return sector
+    hint = ""
+    if case.several:
+        hint = "; each shell is held, and its own image in both"
+    elif isinstance(case.shell, MeshSurface):
+        hint = "; the mesh file must be its own image in both, with each of its edges and patches"
+    raise CaseError(
+        f"symmetry: {waves}: shell, supports, fields and load have no two mirror planes through e3 "
+        f"at an angle of {180 / waves:g} degrees with all named points between them{hint}"
+    )

@@ -1,0 +1,502 @@
+"""Records of a path of a scene, with the modes that the model excludes, and of its branches.
+
+A continuation run gives points. Between each two of them contact is checked; at each of them the
+modes that the model excludes are watched; and where load control fails, the path goes on by arc
+length.
+"""
+
+from collections.abc import Generator, Iterable, Iterator
+from dataclasses import replace
+from functools import partial
+from itertools import pairwise
+
+import numpy as np
+
+from magshell_fenicsx.continuation.bifurcation import BranchSwitch, switch_branch
+from magshell_fenicsx.continuation.continuation_run import ContinuationGoal, ContinuationRun
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import (
+    PathStopped,
+    Point,
+    RecordedValues,
+    StepOptions,
+    StepTooLong,
+)
+from magshell_fenicsx.continuation.stability_monitor import Crossing
+from magshell_fenicsx.continuation.system import State
+from magshell_fenicsx.quantities.registry import amplitude
+from magshell_fenicsx.simulate.contact_control import (
+    better_cuts,
+    closer_points,
+    passes,
+    raised_stiffnesses,
+    recall_cuts,
+    refuse_crossing,
+    refuse_passing,
+    refuse_return,
+    with_own_contact,
+)
+from magshell_fenicsx.simulate.record import Record, Stopped
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.stage import LONGEST, Stage
+
+# load at which a path ends, over that of the first excluded instability
+MAX_RATIO_TO_EXCLUDED = 2.0
+MAX_CONTACT_CHANGES = 10  # times that a first point gets stiffer penalties or new cuts
+FIRST_STEP_REDUCTION = (
+    1 / 16
+)  # of the first step: where load control fails in so short a step, a fold is looked for first
+
+
+Records = Generator[Record, None, State]  # records, and the model's state at the end
+
+
+class RecordStream:
+    """Records to iterate over once.
+
+    Attributes
+    ----------
+    end
+        The model's state at their end, after the last one.
+    """
+
+    def __init__(self, records: Records) -> None:
+        self._records, self.end = records, State(np.empty(0), {})
+
+    def __iter__(self) -> Iterator[Record]:
+        self.end = yield from self._records
+
+
+def follow_path(
+    stage: Stage, path: Path, start: Point, goal: ContinuationGoal, branches: int = 0
+) -> Records:
+    """Yield the records of a path, with instabilities that the model excludes, and of branches.
+
+    Each direction of the branch at the first bifurcation is followed for that number of steps, or
+    to the target.
+
+    With `until: bifurcation` an excluded instability ends the path. With `until: limit` the path
+    continues to the first instability of the model itself, up to `MAX_RATIO_TO_EXCLUDED` times the load of the
+    first excluded one.
+
+    Raises
+    ------
+    Stopped
+        If the path is lost.
+    """
+    records = RecordStream(
+        _records_in_stage(stage, checked_run(stage, path, start, goal), branches)
+    )
+    advance = stage.scene.model.system.advance
+    earlier_mu = start.state.mu
+    for record in records:
+        point = stage.point(record.point)
+        earlier_mu = (state := advance(point.state, earlier_mu)).mu
+        yield replace(record, point=replace(point, state=state))
+    return advance(stage.leave(records.end), earlier_mu)
+
+
+def checked_run(stage: Stage, path: Path, start: Point, goal: ContinuationGoal) -> ContinuationRun:
+    """Return a continuation run whose contacts are checked.
+
+    Bodies become stiffer on it; shells are cut anew, and get closer points where these move an
+    instability. Magnets on the way and returning bodies end it.
+    """
+    checks = _Checks(stage, path, goal.until != "points")
+    checks.walk = walk = ContinuationRun(path, start, goal, checks)
+    return walk
+
+
+class _Checks:
+    """Checks between each two successive points of a run; `renew` of a `ContinuationRun`.
+
+    Parameters
+    ----------
+    returns
+        Whether a body that goes back the way it came ends the run.
+
+    Attributes
+    ----------
+    walk
+        The run that they are of.
+    """
+
+    walk: ContinuationRun
+
+    def __init__(self, stage: Stage, path: Path, returns: bool) -> None:
+        self._stage, self._path, self._returns = stage, path, returns
+        self._cut_at = np.nan  # s of the point behind which cuts were last made anew: once for each
+        # s of the first point, and its negative pivots before anything was changed there
+        self._begin = np.nan, 0
+
+    def __call__(self, low: Point, high: Point) -> State | None:
+        """Return the first point's state with changed penalties or cuts; None if they are fit.
+
+        Raises
+        ------
+        PathStopped, StepTooLong
+            If the second point must not follow the first one.
+        """
+        if low.s != self._begin[0]:
+            self._begin = low.s, low.negative_pivots
+        findings = self._path.recorded_values(partial(self._finding, low, high)).values
+        if "too_long" in findings:
+            raise StepTooLong(findings["too_long"])
+        if "stopped" in findings:
+            raise PathStopped(
+                findings["stopped"], high if findings["at_high"] else low, final=findings["final"]
+            )
+        changed, of_cuts = findings["stiffer"], not findings["stiffer"]
+        if of_cuts:
+            self._cut_at, changed = low.s, findings["cuts"]
+            recall_cuts(self._stage, high, changed)
+        return State(low.state.u, {**low.state.mu, **changed}) if changed else None
+
+    def _finding(self, low: Point, high: Point) -> RecordedValues:
+        """Return why the second of two points is refused, or which amplitudes change.
+
+        With changed amplitudes it is solved again.
+        """
+        stage = self._stage
+        try:
+            refuse_crossing(stage, low, high)
+            refuse_passing(stage, low, high)
+            if self._returns:
+                refuse_return(stage, self._path.name, self.walk.points, high)
+        except StepTooLong as e:
+            return RecordedValues({"too_long": str(e)})
+        except PathStopped as e:
+            return RecordedValues({"stopped": str(e), "at_high": e.point is high, "final": e.final})
+        state = stage.leave(high.state)
+        stiffer = raised_stiffnesses(stage.scene, state)
+        may_recut = not stiffer and low.s != self._cut_at  # slid points are better than none
+        cuts = better_cuts(stage.scene, state) if may_recut else {}
+        has_instability = high.has_instability_since(low) or low.negative_pivots != self._begin[1]
+        closer = (
+            closer_points(stage, low, high) if has_instability and not (stiffer or cuts) else {}
+        )
+        return RecordedValues({"stiffer": stiffer, "cuts": cuts or closer})
+
+
+def _records_in_stage(stage: Stage, walk: ContinuationRun, branches: int) -> Records:
+    """Yield the records of `follow_path`, with points of the stage's system.
+
+    The return value is the state at the end of the last run.
+    """
+    stage.scene.progress.doing("looking for modes that the model excludes")
+    path, start, goal = walk.path, walk.points[0], walk.goal
+    finest = path.options.smallest
+    if path.control == "load" and goal.targets:
+        walk.path = _ending_early(path, path.options.first, finest)
+    records_ahead: list[Record] = []  # a fold that load control cannot pass
+    crossing, fold, stop_reason, final, monitor = None, "", "", False, stage.scene.stability_monitor
+    furthest = np.inf  # amplitude, once an excluded mode is unstable
+    for applied in stage.scene.model.fields:
+        applied.lost = ""
+    monitor.begin(path, start, stage.leave)
+    onward: ContinuationRun | None = walk
+    while onward:
+        walk, path, onward = onward, onward.path, None
+        try:
+            for label, point in walk:
+                mode, located = "", label in ("fold", "bifurcation")
+                is_beyond = walk.done or abs(point.state.mu[path.name]) > furthest
+                excluded = list(
+                    _excluded_records(path, monitor.pass_to(point, evaluate=located or is_beyond))
+                )
+                if excluded and goal.until == "bifurcation":
+                    yield excluded[0]
+                    break
+                yield from excluded
+                if excluded and goal.until == "limit":
+                    furthest = min(
+                        furthest, MAX_RATIO_TO_EXCLUDED * abs(excluded[0].point.state.mu[path.name])
+                    )
+                if label == "bifurcation":
+                    crossing_at_point = switch_branch(
+                        _arc_length_path(stage, path), point, partial(passes, stage)
+                    )
+                    crossing = crossing or crossing_at_point
+                    mode = (
+                        ("symmetric" if crossing_at_point.symmetric else "asymmetric")
+                        if crossing_at_point
+                        else ""
+                    )
+                if label == "fold":
+                    fold = f"; the last fold is at {amount(stage.scene, path.name, point.state.mu[path.name])}"
+                remark = cluster_remark(stage.scene, walk, point)
+                yield Record(
+                    label, path.name, point, mode, excluded_pivots=monitor.unstable, said=remark
+                )
+                if abs(point.state.mu[path.name]) > furthest:
+                    break
+        except PathStopped as e:
+            stop_reason, final = (
+                _stop_message(stage.scene, path, e, walk.points)
+                + fold
+                + stage.scene.lost_field_text(),
+                e.final,
+            )
+        excluded = list(_excluded_records(path, monitor.end()))
+        if excluded and stop_reason and goal.until == "bifurcation":
+            yield excluded[0]
+            stop_reason = ""
+            break
+        yield from excluded
+        if excluded and goal.until == "limit":
+            furthest = min(
+                furthest, MAX_RATIO_TO_EXCLUDED * abs(excluded[0].point.state.mu[path.name])
+            )
+        if stop_reason:
+            records_ahead, onward = _after_stop(stage, walk, finest, final=final)
+        if onward:
+            stage.scene.progress.doing(
+                "going on by arc length" if onward.path.control == "arc" else "in shorter steps"
+            )
+            stop_reason = ""
+            monitor.begin(onward.path, onward.points[0], stage.leave)
+    yield from records_ahead
+    if records_ahead:
+        at = amount(stage.scene, path.name, records_ahead[-1].point.state.mu[path.name])
+        target = amount(stage.scene, path.name, goal.targets[-1])
+        stop_reason = (
+            f"load control cannot pass the fold at {at}, before its target, {target}; {stop_reason}"
+        )
+    if monitor.unlocated:
+        why = f"a mode that the reduced model excludes is unstable from an unknown point on: {monitor.unlocated}"
+        stop_reason = f"{stop_reason}; {why}" if stop_reason else why
+    if stop_reason:
+        raise Stopped(stop_reason)
+    if branches and crossing:
+        yield from _branches(stage, path, crossing, goal, branches)
+    return walk.points[-1].state
+
+
+def _after_stop(
+    stage: Stage, walk: ContinuationRun, finest: float, *, final: bool
+) -> tuple[list[Record], ContinuationRun | None]:
+    """Return what ends a run that has stopped, or the run that goes on.
+
+    What ends it is a fold, with the excluded instabilities before it.
+
+    Under load control it goes on in steps down to `finest`, unless a fold explains why the last
+    step failed.
+    """
+    path, goal, last = walk.path, walk.goal, walk.points[-1]
+    if path.control != "load" or not goal.targets:
+        return [], None if final else _onward_by_arc(stage, walk)
+    shortest = path.options.smallest
+    last_resort = final or shortest <= finest
+    reach = abs(goal.targets[-1] - last.s)
+    if not last_resort:  # the step that failed ends at the next target, or before
+        distances = [
+            (target - last.s) * np.sign(goal.targets[-1] - last.s) for target in goal.targets
+        ]
+        reach = min(2 * shortest, *(distance for distance in distances if distance > 0))
+    records_ahead = _fold_ahead(stage, walk, reach)
+    if records_ahead or last_resort:
+        return records_ahead, None
+    return [], checked_run(stage, _ending_early(path, shortest, finest), last, goal)
+
+
+def _ending_early(path: Path, first: float, finest: float) -> Path:
+    """Return the path with steps that end early, to look for a fold."""
+    return path.with_step_options(
+        replace(path.options, first=first, smallest=max(finest, FIRST_STEP_REDUCTION * first))
+    )
+
+
+def _onward_by_arc(stage: Stage, walk: ContinuationRun) -> ContinuationRun | None:
+    """Return a run by arc length from where another one stopped; None if it must not or cannot be.
+
+    An instability is where it is however the path is controlled: only a target belongs to its
+    control.
+    """
+    path, goal, points = walk.path, walk.goal, walk.points
+    if path.control == "arc" or goal.targets:
+        return None
+    last, name, metric = points[-1], path.name, path.metric
+    step_lengths = [
+        metric.norm(b.state.u - a.state.u, b.state.mu[name] - a.state.mu[name])
+        for a, b in pairwise(points)
+    ]
+    first = float(np.median(step_lengths or [path.options.first * metric.norm(last.du, last.dmu)]))
+    by_arc = stage.path(
+        name, "arc", StepOptions(first, LONGEST * first, 1e-6 * first), metric.scale
+    )
+    start = by_arc.start(
+        last.state, last.dmu * (last.s - points[-2].s if step_lengths else goal.sense)
+    )
+    return checked_run(stage, by_arc, start, goal)
+
+
+def _branches(
+    stage: Stage, path: Path, crossing: BranchSwitch, goal: ContinuationGoal, steps: int
+) -> Iterator[Record]:
+    """Follow both directions of a branch, to the target of the path or for a number of steps."""
+    reasons = []
+    for number, start in enumerate(crossing.starts, 1):
+        try:
+            yield from follow_branch(
+                stage, _arc_length_path(stage, path), start, off_path(goal, steps), number
+            )
+        except Stopped as e:
+            reasons.append(f"branch {number}: {e}")
+    if reasons:
+        raise Stopped("; ".join(reasons))
+
+
+def off_path(goal: ContinuationGoal, steps: int) -> ContinuationGoal:
+    """Return the goal of a branch: the target of the path, or a number of steps."""
+    return goal if goal.until == "target" else ContinuationGoal("points", steps=steps)
+
+
+def follow_branch(
+    stage: Stage, path: Path, start: Point, goal: ContinuationGoal, number: int
+) -> Records:
+    """Yield the records of a branch, by arc length.
+
+    The return value is the state at the end, of the step's system.
+
+    Parameters
+    ----------
+    number
+        See `Record.branch`.
+
+    Raises
+    ------
+    Stopped
+        If the branch is lost.
+    """
+    try:
+        for _ in range(MAX_CONTACT_CHANGES):
+            if not (own_contact := with_own_contact(stage.scene, stage.leave(start.state))):
+                break
+            start = path.recorrected(
+                start, State(start.state.u, {**start.state.mu, **own_contact.mu})
+            )
+    except PathStopped as e:
+        raise Stopped(f"no first point of the branch with contact of its own: {e}") from None
+    walk, monitor, stop_reason = (
+        checked_run(stage, path, start, goal),
+        stage.scene.stability_monitor,
+        "",
+    )
+    monitor.begin(path, start, stage.leave, evaluate=True)
+    yield Record("step", path.name, start, branch=number, excluded_pivots=monitor.unstable)
+    try:
+        for label, point in walk:
+            for record in _excluded_records(
+                path, monitor.pass_to(point, evaluate=walk.done or label in ("fold", "bifurcation"))
+            ):
+                yield replace(record, branch=number)
+            remark = cluster_remark(stage.scene, walk, point)
+            yield Record(
+                label,
+                path.name,
+                point,
+                branch=number,
+                excluded_pivots=monitor.unstable,
+                said=remark,
+            )
+    except PathStopped as e:
+        stop_reason = _stop_message(stage.scene, path, e, walk.points)
+    for record in _excluded_records(path, monitor.end()):
+        yield replace(record, branch=number)
+    if stop_reason:
+        raise Stopped(stop_reason)
+    return walk.points[-1].state
+
+
+def _arc_length_path(stage: Stage, path: Path) -> Path:
+    """Return the path with arc-length control, whose steps are as long as the first on a branch."""
+    scale = path.metric.scale
+    return stage.path(path.name, "arc", StepOptions(0.1, LONGEST * 0.1, 1e-6), scale)
+
+
+def _fold_ahead(stage: Stage, walk: ContinuationRun, reach: float) -> list[Record]:
+    """Return the fold that ended a path under load control, located by arc length.
+
+    Excluded instabilities on the way come first. The result is empty if there is no fold within
+    the change `reach` of the load.
+    """
+    path, points, name = walk.path, walk.points, walk.path.name
+    last = points[-1]
+    first = np.copysign(path.options.first, walk.goal.targets[-1] - last.s)
+    onward = last.s - points[-2].s if len(points) > 1 else float(first)
+    by_arc, start = stage.resume(name, "arc", last.state, onward, path.metric.scale)
+    stage.scene.stability_monitor.begin(by_arc, start, stage.leave)
+    passed: list[Record] = []
+    try:
+        for label, point in ContinuationRun(by_arc, start, ContinuationGoal("limit", steps=20)):
+            passed += _excluded_records(
+                by_arc, stage.scene.stability_monitor.pass_to(point, evaluate=label == "fold")
+            )
+            if abs(point.state.mu[name] - last.s) > reach:
+                return []
+            if label == "fold":
+                return [
+                    *passed,
+                    Record(
+                        label, name, point, excluded_pivots=stage.scene.stability_monitor.unstable
+                    ),
+                ]
+    except PathStopped:
+        pass
+    return []
+
+
+def _excluded_records(path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
+    """Yield records of the points where excluded modes become unstable or stable."""
+    for crossing in crossings:
+        yield Record(
+            "bifurcation",
+            path.name,
+            crossing.point,
+            crossing.label,
+            excluded_pivots=crossing.unstable,
+        )
+
+
+def cluster_remark(scene: Scene, walk: ContinuationRun, point: Point) -> str:
+    """Return a remark on instabilities that were not parted, at the point that stands for them.
+
+    It is empty at other points.
+    """
+    other_end = next((high for low, high in walk.clusters if low is point), None)
+    if other_end is None:
+        return ""
+    name, count = walk.path.name, abs(other_end.negative_pivots - point.negative_pivots)
+    first, last = (amount(scene, name, end.state.mu[name]) for end in (point, other_end))
+    if count > 1:
+        return f"instabilities in {count} directions between {first} and {last} are too close to be located one by one"
+    return f"a fold and another instability between {first} and {last} are too close to be located one by one"
+
+
+def amount(scene: Scene, name: str, value: float) -> str:
+    """Return the value of an amplitude, as "pressure = 0.326233 (53.7 Pa)"."""
+    column = amplitude(name).column
+    in_units = scene.sizes.column(column)
+    measured = in_units and f" ({value * scene.sizes.size(column):.6g} {in_units.si})"
+    return f"{name} = {value:.6g}{measured or ''}"
+
+
+def _stop_message(scene: Scene, path: Path, stop: PathStopped, points: list[Point]) -> str:
+    """Return the message for a lost path; it names a fold in the controlled quantity."""
+    last = stop.point
+    place = f"the last point has {amount(scene, path.name, last.state.mu[path.name])}: {stop}"
+    if path.control == "load":
+        return f"load control stopped; {place}. To pass a limit point, use control: arc"
+    previous = points[-2] if len(points) > 1 else last
+    if path.control == "arc" or previous.dmu == last.dmu:
+        return f"the controlled path stopped; {place}"
+    # near a fold in the controlled s, (ds/dmu)^2 falls linearly to zero with s
+    a, b = previous.dmu**-2, last.dmu**-2
+    distance_ahead = b * (last.s - previous.s) / (a - b) if a > b else np.inf
+    if 0 < distance_ahead / (last.s - previous.s) < 10:
+        return (
+            f"the path turns back in the controlled displacement, {distance_ahead / last.s:.2%} "
+            "beyond the last point: a fold that displacement control cannot pass, but control: arc "
+            f"can; {place}"
+        )
+    return f"the controlled path stopped; {place}"

@@ -1,0 +1,562 @@
+"""Family of scenes in one number of their case: the systems of `continuation.boundary`.
+
+A number that only amplitudes depend on (a field, a stiffness, the factor of an earlier step) stays
+in one scene. Every other one has a scene for each value, on the same mesh in the chart; where the
+chart changes its size, the mesh with it. Of meridians these scenes share forms and kernels
+(`shared_forms`).
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from math import isclose
+
+import numpy as np
+
+from magshell_fenicsx.continuation.augmented import BoundaryPoint, Kind, NoSystem
+from magshell_fenicsx.continuation.boundary import BoundaryLost
+from magshell_fenicsx.continuation.factor import Factorisation
+from magshell_fenicsx.continuation.fold import times_tangent
+from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
+from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.system import State, Vector, max_abs
+from magshell_fenicsx.input.source import CaseError
+from magshell_fenicsx.mesh.patch import MeshError
+from magshell_fenicsx.problem.columns import own_amplitudes
+from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.shells.waves import Waves
+from magshell_fenicsx.simulate.perturbation import (
+    chart_bounds,
+    problem_on_mesh_of,
+    same_chart_bounds,
+)
+from magshell_fenicsx.simulate.record import Record
+from magshell_fenicsx.simulate.scene import Scene
+from magshell_fenicsx.simulate.sensitivity import stage_of_record
+from magshell_fenicsx.simulate.shared_forms import SharedForms
+from magshell_fenicsx.simulate.stage import Stage
+from magshell_fenicsx.simulate.steps import LOCATED
+from magshell_fenicsx.simulate.transfer import transfer
+
+MakeProblem = Callable[[float], Problem]  # from a value of the number
+DIFFERENCE_STEP = 1e-4  # of the range: of differences by the number
+# of the range: distance of the value at which the influence of the number is tested
+TEST_DISTANCE = 0.1
+FORCE_TOLERANCE = 1e-10  # relative differences of forces that are rounding
+# differences of forces in shared forms, over their change by the number
+SHARED_FORMS_TOLERANCE = 1e-7
+MAX_STAGES = 8  # that are remembered
+MAX_PROBLEMS = 4 * MAX_STAGES
+WAVES = "m = "  # begin of the name of a mode of waves around a meridian
+# work of a load along a mode, over the lengths of both: with less it is no fold
+MIN_FOLD_WORK = 1e-3
+INVERSE_ITERATIONS = 4  # for waves that are nearly neutral
+LINEARITY_TOLERANCE = 1e-12  # relative: amplitudes that depend on the number
+TINY_AMPLITUDE = 1e-300
+
+
+class NoInstability(CaseError):
+    """The case ends without an instability."""
+
+
+class ExcludedInstability(CaseError):
+    """The instability is one that the model excludes."""
+
+
+class NoInfluence(CaseError):
+    """The number changes nothing at the instability."""
+
+
+def first_instability(records: Sequence[Record]) -> Record:
+    """Return the first instability of a history's last step, which ends its case.
+
+    Raises
+    ------
+    NoInstability
+        If there is none.
+    """
+    path = [record for record in records if not record.branch]
+    last_step = path[-1].step if path else 0
+    located = [record for record in path if record.label in LOCATED and record.step == last_step]
+    if not located:
+        raise NoInstability(
+            "the case ends without an instability, and a boundary is that of a fold or a "
+            "bifurcation: give its last step until: limit, and a load that reaches one"
+        )
+    return located[0]
+
+
+def refuse_excluded_mode(mode: str) -> None:
+    """Check that a model has the mode of an instability.
+
+    Raises
+    ------
+    ExcludedInstability
+        If it has not.
+    """
+    if mode.startswith(WAVES) or mode == "antisymmetric":
+        raise ExcludedInstability(
+            f"the instability is one that the model excludes ({mode}): take symmetry: none"
+        )
+
+
+@dataclass(frozen=True)
+class _LinearAmplitudes:
+    """Amplitudes that are linear in the number: no problem is made for its values.
+
+    Attributes
+    ----------
+    value
+        A value of the number.
+    amplitudes, rates
+        The amplitudes there, and their derivatives by the number.
+    """
+
+    value: float
+    amplitudes: dict[str, float]
+    rates: dict[str, float]
+
+    def at(self, p: float) -> dict[str, float]:
+        """Return the amplitudes at another value."""
+        return {
+            name: amplitude + self.rates[name] * (p - self.value)
+            for name, amplitude in self.amplitudes.items()
+        }
+
+
+class SceneFamily:
+    """Scenes of one case in a number; a `continuation.augmented.SystemFamily`.
+
+    Parameters
+    ----------
+    scene, record
+        The scene at `value`, and its instability.
+    make_problem
+        Makes the problem at a value.
+    value_range
+        The range of values.
+
+    Attributes
+    ----------
+    kind, name
+        Kind of the instability, and the amplitude in which it is.
+    mode
+        See `Record`.
+    m
+        Number of waves around a meridian; 0: the mode is one of the model itself.
+    has_one_scene
+        Whether only amplitudes depend on the number.
+
+    Raises
+    ------
+    CaseError
+        If the number has no influence, or the instability cannot be followed.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        record: Record,
+        make_problem: MakeProblem,
+        value: float,
+        value_range: tuple[float, float],
+    ) -> None:
+        self.kind: Kind = "fold" if record.label == "fold" else "bifurcation"
+        self.name, self.mode = record.amplitude, record.mode
+        self.m = int(record.mode.removeprefix(WAVES)) if record.mode.startswith(WAVES) else 0
+        self._make_problem, self._range, self._record = make_problem, value_range, record
+        self._problems: dict[float, Problem] = {}
+        self._stages: dict[float, Stage] = {}
+        self._shared_forms: SharedForms | None = None
+        self._linear_amplitudes: _LinearAmplitudes | None = None
+        self._refuse_unfollowable(scene)
+        self._origin, self.has_one_scene = scene, False
+        self._test_value = self._choose_test_value(value)
+        base = self._origin if self._origin is not scene else self._scene(value)
+        point = replace(record.point, state=self._state_in(base, value))
+        self._first = replace(record, point=point)
+        self._record_value = value
+        self._stages[value] = self._base = stage_of_record(base, self._first)
+        self.has_one_scene = self._depends_by_amplitudes_alone(value)
+        if not self.has_one_scene:
+            self._share_forms(value)
+        else:
+            self._linear_amplitudes = self._find_linear_amplitudes(value, self._test_value)
+
+    def _find_linear_amplitudes(self, a: float, b: float) -> _LinearAmplitudes | None:
+        """Return the amplitudes if they are linear between two values; else None."""
+        low, middle, high = (self._amplitudes(p) for p in (a, (a + b) / 2, b))
+        for name in low:
+            ends = low[name] + high[name]
+            if not isclose(
+                2 * middle[name], ends, rel_tol=LINEARITY_TOLERANCE, abs_tol=TINY_AMPLITUDE
+            ):
+                return None
+        return _LinearAmplitudes(a, low, {name: (high[name] - low[name]) / (b - a) for name in low})
+
+    def _choose_test_value(self, value: float) -> float:
+        """Return another value, to compare forces there.
+
+        A term that is zero at the start, as a field may be, is in the scene of that value, which
+        then is the origin of all.
+        """
+        low, high = self._range
+        step = TEST_DISTANCE * (high - low)
+        candidates = [p for p in (value + step, value - step) if low <= p <= high]
+        names = self._origin.unloaded().mu.keys()
+        scenes = {p: self._scene(p) for p in candidates}
+        names_at = {p: scene.unloaded().mu.keys() for p, scene in scenes.items()}
+        test_value = max(candidates, key=lambda p: len(names_at[p]))
+        new_names = names_at[test_value] - names
+        if not names_at[test_value] > names:
+            return test_value
+        # its scene serves all values
+        old_origin, old_state = self._origin, self._record.point.state
+        self._origin = scenes[test_value]
+        problem = self._origin.problem
+        u, mu = transfer(old_origin, self._origin, old_state.u), dict(old_state.mu)
+        mu |= {name: problem.lambda_m if name == "lambda_m" else 0.0 for name in new_names}
+        point = replace(self._record.point, state=State(u, mu))
+        self._record = replace(self._record, point=point, step=len(problem.programme))
+        if len(candidates) > 1:
+            return min(candidates, key=lambda p: p == test_value)
+        return (value + test_value) / 2
+
+    def _refuse_unfollowable(self, scene: Scene) -> None:
+        """Refuse an instability whose loads change along a boundary, or an excluded one."""
+        record, programme = self._record, scene.problem.programme
+        if not (self.m and scene.model.axisymmetric):
+            refuse_excluded_mode(record.mode)
+        earlier_steps, step = programme[: record.step - 1], programme[record.step - 1]
+        if earlier_steps and any(how != "load" for how in step.load.hold.values()):
+            raise CaseError(
+                f"{step.key}.hold: a boundary needs what is held to be held from the start: give "
+                "one step"
+            )
+        for earlier in earlier_steps:
+            target = earlier.load.target or earlier.load.limit_target
+            if earlier.load.hold or (target and target[0].quantity == "conjugate"):
+                raise CaseError(
+                    f"{earlier.key}: ends at a displacement or a volume, so its load changes along "
+                    "a boundary"
+                )
+
+    @cached_property
+    def start(self) -> tuple[State, Vector]:
+        """The instability in the unknowns of the family, and a null vector.
+
+        Raises
+        ------
+        CaseError
+            If there is no eigenvector.
+        """
+        state = self._base.enter(self._first.point.state)
+        if self.m:
+            return state, self.null_vector(self._record_value, state, self.m)
+        try:
+            return state, critical_mode(self._base.newton, state).vector
+        except NoEigenpair as e:
+            raise CaseError(f"the instability has no null vector: {e}") from None
+
+    @property
+    def excludes(self) -> bool:
+        """Whether there are waves around a meridian, which its model excludes."""
+        return self._base.scene.model.axisymmetric
+
+    def kind_of(self, m: int, at: BoundaryPoint | None = None) -> Kind:
+        """Return the kind of a boundary of m waves, or of the model's own mode (m = 0).
+
+        Parameters
+        ----------
+        at
+            A point near it; None: at the instability.
+        """
+        if m:
+            return "bifurcation"
+        if at is None:
+            return self.kind
+        system, phi = self.solver_at(at.p).system, self.mode_at(at, 0, self.m)
+        load = system.load(at.state.u, at.state.mu, self.name)
+        work_scale = np.linalg.norm(load) * np.linalg.norm(phi)
+        return "fold" if abs(phi @ load) > MIN_FOLD_WORK * work_scale else "bifurcation"
+
+    def mode_at(self, crossing: BoundaryPoint, m: int, m_of_boundary: int) -> Vector:
+        """Return the mode that is neutral at a point of a boundary besides that of the boundary.
+
+        Parameters
+        ----------
+        m, m_of_boundary
+            Numbers of waves of the mode, and of that of the boundary; 0: of the model itself.
+
+        Raises
+        ------
+        BoundaryLost
+            If there is no eigenvector.
+        """
+        if not m:
+            try:
+                return critical_mode(self.solver_at(crossing.p), crossing.state).vector
+            except NoEigenpair as e:
+                raise BoundaryLost(
+                    f"the mode that becomes critical has no null vector: {e}"
+                ) from None
+        other_mode = crossing.phi if m == m_of_boundary else None
+        return self.null_vector(crossing.p, crossing.state, m, other_mode)
+
+    def null_vector(
+        self, p: float, state: State, m: int, other_mode: Vector | None = None
+    ) -> Vector:
+        """Return the mode of m waves at a state where these are neutral, nearly.
+
+        It is orthogonal to another mode, if one is given.
+        """
+        factors = self.factored_tangent(p, state, m)
+        v = np.sin(1.0 + np.arange(factors.matrix.getLocalSize()[0]))
+        for _ in range(INVERSE_ITERATIONS):
+            v = factors.solve(v)
+            if other_mode is not None:
+                v = v - (other_mode @ v) / (other_mode @ other_mode) * other_mode
+            v /= np.linalg.norm(v)
+        return v
+
+    def factored_tangent(self, p: float, state: State, m: int) -> Factorisation:
+        """Return the factors of the tangent of m waves, see `continuation.symmetry_breaking`."""
+        stage = self._stage_at(p)
+        return _waves(stage).factor_at(stage.leave(state), m)
+
+    def quadratic_form(self, p: float, state: State, m: int, v: Vector) -> float:
+        """Return v K v of the tangent of m waves, see `continuation.symmetry_breaking`."""
+        return float(v @ self._times_tangent(self._stage_at(p), state, m, v))
+
+    def counts(self, p: float, state: State) -> list[int]:
+        """Return numbers of unstable waves, see `continuation.symmetry_breaking`."""
+        stage = self._stage_at(p)
+        return _waves(stage).counts(stage.leave(state))
+
+    def _times_tangent(self, stage: Stage, state: State, m: int, v: Vector) -> Vector:
+        """Return the tangent of m waves times v."""
+        K = _waves(stage).tangent(stage.leave(state), m)
+        x, y = K.createVecs()
+        x.setArray(v)
+        K.mult(x, y)
+        return np.array(y.array_r)
+
+    def solver_at(self, p: float) -> BorderedNewton:
+        """Return the solver at a value."""
+        return self._stage_at(p).newton
+
+    def _stage_at(self, p: float) -> Stage:
+        return self._base if self.has_one_scene else self._stage(p)
+
+    def amplitudes(self, p: float) -> dict[str, float]:
+        """Return the amplitudes besides that of the instability."""
+        return self._other_amplitudes(self._stage_at(p), p)
+
+    @property
+    def costly(self) -> bool:
+        """Whether each value has a scene of its own."""
+        return not self.has_one_scene
+
+    def difference_weights(self, p: float, *, low_order: bool = False) -> list[tuple[float, float]]:
+        """Return weights and values of a difference of second order, where values are allowed.
+
+        One of low order is of first order, with one scene besides that of p itself.
+        """
+        d = DIFFERENCE_STEP * abs(self._range[1] - self._range[0])
+        central = [(0.5 / d, p + d), (-0.5 / d, p - d)]
+        if self._linear_amplitudes:
+            return central
+        if low_order:
+            d = d if self._has_problem(p + d) else -d
+            return [(1 / d, p + d), (-1 / d, p)]
+        if self._has_problem(p - d) and self._has_problem(p + d):
+            return central
+        d = d if self._has_problem(p + 2 * d) else -d
+        return [(-1.5 / d, p), (2 / d, p + d), (-0.5 / d, p + 2 * d)]
+
+    def _has_problem(self, p: float) -> bool:
+        """Whether a value is allowed."""
+        try:
+            self.problem(p)
+        except NoSystem:
+            return False
+        return True
+
+    def problem(self, p: float) -> Problem:
+        """Return the problem at a value.
+
+        Raises
+        ------
+        NoSystem
+            If it is not allowed.
+        """
+        if p not in self._problems:
+            try:
+                self._problems[p] = self._make_problem(p)
+            except CaseError as e:
+                raise NoSystem(str(e)) from None
+            while len(self._problems) > MAX_PROBLEMS:
+                self._problems.pop(next(iter(self._problems)))
+        return self._problems[p]
+
+    def _stage(self, p: float) -> Stage:
+        """Return the stage at a value; the latest ones are remembered."""
+        stage = self._stages.pop(p, None)
+        if stage is None:
+            scene = self._scene(p)
+            if self._base.device or self._base.along:
+                stage = self._base.on(scene)
+            else:
+                stage = Stage(scene, scene.newton)
+        self._stages[p] = stage
+        while len(self._stages) > MAX_STAGES:
+            self._stages.pop(next(iter(self._stages)))
+        return stage
+
+    def _scene(self, p: float) -> Scene:
+        """Return the scene at a value, on the mesh of the first one in its chart."""
+        old, new = self._origin.problem, self.problem(p)
+        symmetries = [(each.axisymmetric, each.mirror, each.azimuth) for each in (old, new)]
+        if symmetries[0] != symmetries[1]:
+            raise NoSystem(
+                "the symmetry of the model changes on the way: give the case symmetry: none"
+            )
+        try:
+            on_mesh = problem_on_moved_mesh(self._origin, new)
+            if self._shared_forms and (scene := self._shared_forms.scene_at(p, on_mesh)):
+                return scene
+            return Scene(on_mesh, self._origin.comm)
+        except MeshError as e:
+            raise NoSystem(f"there is no mesh: {e}") from None
+
+    def _state_in(self, base: Scene, p: float) -> State:
+        """Return the record's state in the unknowns of the family, whose order may differ."""
+        state = self._record.point.state
+        return State(transfer(self._origin, base, state.u), self._amplitudes(p))
+
+    def _amplitudes(self, p: float) -> dict[str, float]:
+        """Return the amplitudes of the model at the instability, for another value.
+
+        Those that the case gives are those of the problem at that value.
+        """
+        if self._linear_amplitudes:
+            return self._linear_amplitudes.at(p)
+        old, new, mu = self._origin.problem, self.problem(p), dict(self._record.point.state.mu)
+        earlier_steps = old.programme[: self._record.step - 1]
+        for before, after in zip(earlier_steps, new.programme, strict=False):
+            old_target, new_target = (
+                step.load.target or step.load.limit_target for step in (before, after)
+            )
+            if not (old_target and new_target) or old_target[0].quantity != "load":
+                continue
+            if isclose(mu.get(before.name, np.nan), old_target[1], rel_tol=1e-9):
+                mu[before.name] = new_target[1]
+        old_values, new_values = own_amplitudes(old.loads), own_amplitudes(new.loads)
+        mu |= {
+            name: new_values[name]
+            for name, value in old_values.items()
+            if name in new_values and value and mu.get(name) == value
+        }
+        if old.lambda_m and new.lambda_m != old.lambda_m:
+            ratio = new.lambda_m / old.lambda_m
+            mu |= {
+                name: ratio * value
+                for name, value in mu.items()
+                if name.startswith("lambda_") and name != self.name
+            }
+        return mu
+
+    def _depends_by_amplitudes_alone(self, value: float) -> bool:
+        """Whether the forces of another value are those of other amplitudes in the same scene.
+
+        Raises
+        ------
+        NoInfluence
+            If they are the same.
+        """
+        p, comm = self._test_value, self._origin.model.system.comm
+        forces = self._forces(self._base, value)
+        forces_at_p = self._forces(self._stage(p), p)
+        forces_by_amplitudes = self._forces(self._base, p)
+        size = max_abs(comm, forces) or 1.0
+        if max_abs(comm, forces_at_p - forces) <= FORCE_TOLERANCE * size:
+            raise NoInfluence("it has no influence on this instability")
+        return max_abs(comm, forces_at_p - forces_by_amplitudes) <= FORCE_TOLERANCE * size
+
+    def _share_forms(self, value: float) -> None:
+        """Take the forms of one scene for all values, if the forces of those that have a scene are
+        then the same.
+        """
+        shared_forms = SharedForms.of_scene(self._base.scene)
+        if shared_forms is None:
+            return
+        stages, comm = self._stages, self._origin.model.system.comm
+        forces_at = {p: self._forces(stage, p) for p, stage in stages.items()}
+        change = max(max_abs(comm, forces - forces_at[value]) for forces in forces_at.values())
+        self._shared_forms, self._stages = shared_forms, {}
+        differences = [
+            max_abs(comm, self._forces(self._stage(p), p) - forces)
+            for p, forces in forces_at.items()
+        ]
+        if max(differences) <= SHARED_FORMS_TOLERANCE * change:
+            self._base = self._stage(value)
+            return
+        shared_forms.leave()
+        self._shared_forms, self._stages = None, stages
+
+    def _forces(self, stage: Stage, p: float) -> Vector:
+        """Return residual, load, and the tangent along the null vector at the instability.
+
+        They are those of another scene, at another value.
+        """
+        system, (state, phi) = stage.newton.system, self.start
+        mu = {**self._other_amplitudes(stage, p), self.name: state.mu[self.name]}
+        state_at_p = State(state.u, mu)
+        if self.m:
+            product = self._times_tangent(stage, state_at_p, self.m, phi)
+        elif stage.scene.model.axisymmetric:
+            # its matrices cost little, and differences are less exact
+            product = stage.newton.factor_at(state_at_p).times(phi)
+        else:
+            product = times_tangent(system, state_at_p, phi)
+        return np.concatenate(
+            [system.residual(state.u, mu), system.load(state.u, mu, self.name), product]
+        )
+
+    def _other_amplitudes(self, stage: Stage, p: float) -> dict[str, float]:
+        """Return the amplitudes of a stage's system besides that of the instability."""
+        mu = stage.enter(State(self._first.point.state.u, self._amplitudes(p))).mu
+        return {name: value for name, value in mu.items() if name != self.name}
+
+
+def _waves(stage: Stage) -> Waves:
+    """Return the waves that the meridian of a stage excludes."""
+    model = stage.scene.model
+    assert model.axisymmetric
+    return model.waves
+
+
+def problem_on_moved_mesh(scene: Scene, new: Problem) -> Problem:
+    """Return a problem on the mesh of a scene, which is stretched with the chart."""
+    on_mesh, old = problem_on_mesh_of(scene, new), scene.problem
+    if scene.model.axisymmetric:
+        assert old.meridian
+        assert new.meridian
+        assert on_mesh.meridian
+        vertices = on_mesh.meridian.vertices
+        assert vertices is not None
+        knots, new_knots = old.meridian.knots, new.meridian.knots
+        if knots.shape != new_knots.shape:
+            raise NoSystem("a rim of a dimple appears or vanishes on the way")
+        moved_vertices = np.interp(vertices, knots, new_knots)
+        return replace(on_mesh, meridian=replace(on_mesh.meridian, vertices=moved_vertices))
+    if scene.model.midsurface and not same_chart_bounds(old.shape, new.shape):
+        patch = scene.model.midsurface.with_embedding(new.embedding)
+        old_bounds, new_bounds = chart_bounds(old.shape), chart_bounds(new.shape)
+        if old_bounds is None or new_bounds is None or patch.nodes.shape[1] != 2:
+            raise NoSystem("the mesh of this shape cannot move with the number")
+        low, size = old_bounds[0], old_bounds[1] - old_bounds[0]
+        new_low, new_size = new_bounds[0], new_bounds[1] - new_bounds[0]
+        nodes = new_low + (patch.nodes - low) / size * new_size
+        return replace(on_mesh, shape=replace(patch, nodes=nodes), points=new.points)
+    return on_mesh

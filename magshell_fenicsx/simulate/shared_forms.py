@@ -1,0 +1,100 @@
+"""Scenes of a meridian for other numbers of its case, which share the forms and kernels of one.
+
+Terms take what differs between two cases from the placement and from the parameters of their
+densities. So where two models have these alike, one of them serves both: each evaluation puts the
+values of its case in place first.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.problem.problem import Problem
+from magshell_fenicsx.shells.meridian import MeridianModel
+from magshell_fenicsx.simulate.scene import Scene, build_meridian_model
+
+Array = NDArray[np.float64]
+Numbers = dict[str, list[Array]]  # name of a term -> its numbers
+
+
+@dataclass
+class _NumbersOfForms:
+    """The numbers in the forms of a model, by a value of what they depend on.
+
+    A `SettableNumber`: setting its `value` puts the numbers for this value in place.
+
+    Attributes
+    ----------
+    places
+        The arrays of the model that its forms read.
+    for_values
+        Value -> the numbers for it.
+    """
+
+    places: Numbers
+    for_values: dict[float, Numbers] = field(default_factory=dict)
+    _value: float = np.nan
+
+    @property
+    def value(self) -> float:
+        return self._value
+
+    @value.setter
+    def value(self, value: float) -> None:
+        if value == self._value:
+            return
+        for name, numbers in self.for_values[value].items():
+            for place, number in zip(self.places[name], numbers, strict=True):
+                place[...] = number
+        self._value = value
+
+
+class SharedForms:
+    """Forms of one scene that others share; it must not be evaluated until these `leave` it.
+
+    Parameters
+    ----------
+    model
+        The model of the scene.
+    places
+        The arrays of the model's `numbers`.
+    """
+
+    def __init__(self, scene: Scene, model: MeridianModel, places: Numbers) -> None:
+        self._scene, self._model = scene, model
+        self._numbers = _NumbersOfForms(places, {np.inf: _copied(places)})
+
+    @staticmethod
+    def of_scene(scene: Scene) -> "SharedForms | None":
+        """Return the forms of a scene; None if what differs between cases is not in numbers alone."""
+        model = scene.model
+        if not model.axisymmetric:
+            return None
+        places = model.numbers()
+        return SharedForms(scene, model, places) if places else None
+
+    def scene_at(self, value: float, problem: Problem) -> Scene | None:
+        """Return the scene of a problem at a value of what varies.
+
+        None if its numbers are not in the same places.
+        """
+        model = build_meridian_model(problem, assembled=False)
+        numbers, places = model.numbers(), self._numbers.places
+        if numbers is None or _shapes(numbers) != _shapes(places):
+            return None
+        self._numbers.for_values[value] = _copied(numbers)
+        shared_model = self._model.with_numbers(model, self._numbers, value)
+        return self._scene.with_model(problem, shared_model)
+
+    def leave(self) -> None:
+        """Let the scene have its own numbers again."""
+        self._numbers.value = np.inf
+
+
+def _shapes(numbers: Numbers) -> list[tuple[str, list[tuple[int, ...]]]]:
+    return [(name, [np.shape(number) for number in of_term]) for name, of_term in numbers.items()]
+
+
+def _copied(numbers: Numbers) -> Numbers:
+    return {name: [np.array(number) for number in of_term] for name, of_term in numbers.items()}
