@@ -105,18 +105,18 @@ class Energy:
     Attributes
     ----------
     form_of
-        Of the jet of u: the energy on the domain, of which `IntegrationDomain.revolution_factor` times as much is
-        modelled.
+        Energy on the domain as a function of the jet of u; the modelled part has
+        `IntegrationDomain.revolution_factor` times as much.
     work
-        Of the jets of u and v: the virtual work of a load without potential, quadratic in u.
+        Virtual work of a load without potential, a function of the jets of u and v, quadratic in u.
     density
-        What is integrated; None for a load that is known by its vector.
+        Density that is integrated; None for a load that is known by its vector.
     from_initial
-        Whether it counts from the drawn placement.
+        Whether it counts from the initial placement.
     group, column
-        As of a `Term`; the group of "" is the name.
+        Group and column of the `Term`; a group "" is the name.
     reference_turn
-        Of a moment: the turn that its angle is counted from, and -Pi of one radian.
+        The turn that the angle of a moment is counted from, and -Pi of one radian; else None.
     """
 
     name: str
@@ -163,23 +163,23 @@ class IntegrationDomain:
     Attributes
     ----------
     jet
-        From a field of the placement's space to its value and derivatives.
+        Function from a field of the placement's space to its value and derivatives.
     covector
-        Of an edge, see `kinematics.conormal`.
+        Covector of an edge, see `kinematics.conormal`.
     widths
         h_e of edges between cells and at the boundary, see `edges.two_sided`.
     rule, edge_rule, contact_rule
         Degrees of the quadrature on cells, along edges (None where these are points) and under
         contact.
     tables
-        Of the space of the placement and places in the reference cell, away from singular ones: a
-        function from nodal values, with ghosts, to jets (6, cells, places, 3).
+        Function of the placement's space and of points in the reference cell, away from singular
+        ones, to a function from nodal values, with ghosts, to jets (6, cells, points, 3).
     variant
-        Of discontinuous fields, which are known at places where the coordinates are regular.
+        Lagrange variant of discontinuous fields, with nodes where the coordinates are regular.
     revolution_factor
-        What integrals are multiplied by: 2 pi on a meridian, where they are per radian.
+        Factor of integrals: 2 pi on a meridian, where they are per radian; else 1.
     initial_placement
-        The placement that volumes count from; None for r0.
+        Placement that volumes count from; None for r0.
     """
 
     r0: fem.Function

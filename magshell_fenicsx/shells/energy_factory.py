@@ -72,7 +72,7 @@ class EnergyFactory:
     Attributes
     ----------
     thickness
-        What multiplies h, (1,); None for 1.
+        Factor (1,) of h; None for 1.
     natural
         The natural shape; None if it is the drawn one.
     free_constants
@@ -84,14 +84,14 @@ class EnergyFactory:
     held_edges
         The edges that hold the normal, and those on mirror planes, whose energies were made.
     pressed
-        Of each cell, (1,): 1 where a live pressure acts from outside, -1 from inside, 0; None for
-        1.
+        Side of a live pressure in each cell, (1,): 1 from outside, -1 from inside, 0 without;
+        None for 1.
     creases
         Joints with springs or hinges.
     cell_materials
-        Of each cell the `parameters.OwnMaterial` of its shell; None where all have one.
+        `parameters.ShellMaterial.numbers` of each cell; None where all shells have one material.
     saturated
-        What is known of a soft material that saturates, when it was made.
+        Magnetisation state of a soft material that saturates, if it was made.
     """
 
     domain: IntegrationDomain

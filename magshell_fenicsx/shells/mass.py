@@ -130,7 +130,7 @@ class SupportInertia:
     Parameters
     ----------
     mass
-        Of all nodes, supports too.
+        Mass matrix of all nodes, supports too.
     amplitudes_at
         Amplitudes and their rates at a time, at a kink before or after it.
     first_velocity

@@ -70,7 +70,7 @@ class Probe:
     Attributes
     ----------
     nodes, weights
-        Of the cell, and its shape functions there.
+        Nodes of the cell, and its shape functions at the place.
     turn
         (2, 3) e_rho and e_z at the azimuth of the place.
     normal
@@ -97,11 +97,11 @@ class Probe:
         return Probe(nodes, values, turn, normal @ turn)
 
     def __call__(self, u: Vector) -> Array:
-        """u/R (3,) there."""
+        """Return u/R (3,) at the place."""
         return np.asarray(self.weights @ u.reshape(-1, 2)[self.nodes] @ self.turn)
 
     def rows(self, size: int) -> Array:
-        """(3, size): the same as a matrix."""
+        """Return the matrix (3, size) that gives u/R at the place from u."""
         matrix = np.zeros((3, size // 2, 2))
         matrix[:, self.nodes] = np.einsum("n,ki->ink", self.weights, self.turn)
         return matrix.reshape(3, size)
@@ -113,9 +113,9 @@ class MeridianModel(ThinModel):
     Parameters
     ----------
     degree
-        Of displacement and placement, 2 to 5.
+        Degree of displacement and placement, 2 to 5.
     conditions
-        Of the named ends, and of a named point on the axis; ends that are not named are free.
+        Conditions of named ends, and of a named point on the axis; other ends are free.
     loads
         A force at the pole; dead forces along e3 at the pole, on ends and areas, dead pressures and
         moments on ends; an applied field along e3, its gradient diag(a, a, b), a remanence that is
@@ -123,16 +123,16 @@ class MeridianModel(ThinModel):
     sigma
         Penalty of the C0 interior penalty form; None takes `default_penalty`.
     thickness
-        What multiplies the thickness, the same along every meridian; None for 1.
+        Factor of the thickness, the same along every meridian; None for 1.
     assembled
-        False for what is asked for its `numbers` alone: it has no system.
+        Whether to make the system; a model that serves its `numbers` alone needs none.
 
     Attributes
     ----------
     system, multiplicity, normals, supports
         See `ModelBase`; u = (U, W) along e_rho and e_z.
     held
-        Where the displacement is zero.
+        Supports of the axis and the ends.
     energies
         The terms, as functions of the displacement's jet.
     kernels
@@ -140,7 +140,7 @@ class MeridianModel(ThinModel):
     thickness
         h(x)/h, free to jump from cell to cell; None for 1.
     cell_materials
-        Of each cell the `parameters.ShellMaterial` of its shell; None where all have one.
+        `parameters.ShellMaterial.numbers` of each cell; None where all shells have one material.
     shell_contacts, t_junction_terms
         The contacts of shells with each other, and their T-junctions.
     """

@@ -45,16 +45,16 @@ class ModelBase:
     Attributes
     ----------
     system
-        What the solvers see.
+        System of equations that solvers take.
     multiplicity
-        Of how many such parts the shell is made: 2 for a half, 2 m for a sector of 180/m degrees,
-        else 1.
+        Number of modelled parts that make the shell: 2 for a half, 2 m for a sector of 180/m
+        degrees, else 1.
     u, r0
         Displacement and placement.
     normals
         n0 (3,) at the named points.
     loads, load_size, load_sizes
-        What loads it; and by amplitude the sum of the sizes of dead loads over E h R, and its
+        Loads; and by amplitude the sum of the sizes of dead loads over E h R, and its
         forms, see `DeadLoads`.
     supports
         Name of an edge, point or patch -> what it holds.
@@ -63,21 +63,20 @@ class ModelBase:
     fields
         The applied field, where it is known by its values.
     observed
-        Column -> the form that a term observes, see `OwnTerm.observed`; and what a field induces.
-        Of the modelled part.
+        Column -> form of the modelled part that a term observes, see `OwnTerm.observed`, or that a
+        field induces.
     contacts
         Approach of a body -> what is known of its contact, and the integrals of its pressure.
-    touchings
+    shell_contacts
         The contacts of parts of the shell with each other, or with itself.
     planes
-        Of symmetry at the edges of a shell.
+        Planes of symmetry at the edges of a shell.
     growing
         The placement, where imperfections grow.
     axes
         The components in space of displacement and placement.
     thickness
-        What multiplies that of a shell, (1,); None for 1, and for a solid, which has it in its
-        shape.
+        Factor (1,) of a shell's thickness; None for 1, and for a solid, which has it in its shape.
     midsurface
         The mesh of a mid-surface; None for a meridian or a solid.
     """
@@ -279,7 +278,7 @@ class ThinModel(ModelBase):
     Attributes
     ----------
     factory
-        What made the terms.
+        Factory that made the energies.
     """
 
     factory: EnergyFactory

@@ -82,7 +82,7 @@ class ShellMode:
     eigenvalue
         Over E h/R^2; negative for an unstable direction.
     vector
-        In the model's space, or of waves in that of their coefficients (U + V, V, W).
+        Mode in the model's space; of a wave in that of the coefficients (U + V, V, W).
     """
 
     label: str
@@ -125,7 +125,7 @@ class ShellModes:
     ) -> list[ShellMode]:
         """The lowest modes, ascending: of every family `count`, and all that are negative.
 
-        Of a tangent that is not symmetric, those of its symmetric part.
+        They are those of the symmetric part, where the tangent is not symmetric.
 
         Waves count once, though each has a twin turned by a quarter of its length. If the state is
         the undeformed one of a `allows_rigid_motion` shell, its rigid motions are among them, with

@@ -37,7 +37,7 @@ class SectorModes:
     Parameters
     ----------
     model
-        Of the sector.
+        Model of the sector.
     as_half
         The same shell on the mid-surface of a half.
     """

@@ -90,14 +90,14 @@ class ShellModel(ThinModel):
     midsurface
         Mesh and placement.
     degree
-        Of displacement and placement, 2 to 5.
+        Degree of displacement and placement, 2 to 5.
     conditions
         Edge name -> condition; edges that are not named are free. A vertex can be held too, and a
         patch clamped or held: then all of it.
     sigma
         Penalty of the C0 interior penalty form; None takes `default_penalty`.
     thickness
-        What multiplies the thickness; None for 1.
+        Factor of the thickness; None for 1.
     mirror
         The plane of the edge with the condition "symmetry", of a half model; both of a sector.
 
@@ -116,12 +116,11 @@ class ShellModel(ThinModel):
     thickness
         h(x)/h, free to jump from cell to cell; None for 1.
     cell_materials
-        Of each cell the `parameters.OwnMaterial` of its shell; None where all shells have one.
+        `parameters.ShellMaterial.numbers` of each cell; None where all shells have one material.
     mirror
-        Of a half model or a sector.
+        Planes of a half model or a sector.
     turns
-        Whether what it is made of, and all that loads it, is axisymmetric; whoever makes the model
-        may set it.
+        Whether its material and all its loads are axisymmetric; who makes the model may set it.
     """
 
     thin: Literal[True] = True

@@ -65,8 +65,8 @@ class SolidModel(ModelBase):
     Parameters
     ----------
     conditions
-        As of `ShellModel`: a whole face is clamped or in a mirror plane, else its middle line is
-        held.
+        Conditions as in `ShellModel`: a whole face is clamped or in a mirror plane, else its middle
+        line is held.
     loads
         A force has a patch, on the outer face; the magnetic energy is the full one.
     mirror
@@ -81,9 +81,9 @@ class SolidModel(ModelBase):
     Attributes
     ----------
     system, multiplicity, normals, kernels, supports
-        As of `ShellModel`.
+        See `ShellModel`.
     degree
-        Of the displacement: 2.
+        Degree of the displacement: 2.
     sigma
         None: nothing is penalised.
     """

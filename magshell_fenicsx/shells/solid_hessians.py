@@ -48,7 +48,7 @@ class BodyHessianIntegral:
     X
         The undeformed placement in the displacement's space.
     cells
-        Those of this rank.
+        Cells of this rank.
     rule
         Quadrature on the reference cell, or on a face of it.
     facet

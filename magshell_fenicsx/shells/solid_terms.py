@@ -51,21 +51,21 @@ class SolidDensity:
     Attributes
     ----------
     function
-        In the body of (X, u, H, *parameters) per volume, see `densities`; on its outer face of (X,
-        X1, X2, u, u1, u2, *parameters) per area of the reference cell; on ends, the faces above
-        edges, of (X, u, H, n, t, *parameters) per area.
+        The density as a function: in the body of (X, u, H, *parameters) per volume, see
+        `body_densities`; on its outer face of (X, X1, X2, u, u1, u2, *parameters) per area of the
+        reference cell; on ends, the faces above edges, of (X, u, H, n, t, *parameters) per area.
     parameters
         Numbers, or fields of vectors.
     parts
         The parts of the displacement's jet that it depends on.
     degree
-        Of the quadrature.
+        Degree of the quadrature.
     facets
-        Those that it lives on.
+        Facets that it is integrated on.
     upper
-        Whether it lives on the outer half of these alone.
+        Whether it is integrated on the outer half of these alone.
     work
-        On faces: the virtual work of a load without potential; it takes v before the parameters.
+        Virtual work of a load without potential, on faces; it takes v before the parameters.
     """
 
     function: Callable[..., Expr]

@@ -310,7 +310,7 @@ class MidSurfaces:
     Attributes
     ----------
     cells
-        Of all ranks.
+        Cells of all ranks.
     r0
         (nodes, 3) places.
     """
@@ -340,9 +340,9 @@ class MidSurfaces:
         Parameters
         ----------
         facets
-            Local ones of the edge.
+            Local facets of the edge.
         is_other_shell
-            Which local cells are of the other shell.
+            Whether each local cell is of the other shell.
         """
         first, nodes = self.cells.own_range.start, self.cells.nodes
         cells, ends = _cell_sides(self.V, facets, len(self.cells.own_range))
@@ -538,7 +538,7 @@ def refuse_misplaced_parallels(
     Raises
     ------
     MeshError
-        With the edge.
+        With the name of the edge.
     """
     for i, (joint, s, joint_cells) in enumerate(
         zip(joints, meridian.tied, meridian.joints, strict=True)

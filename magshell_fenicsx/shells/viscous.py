@@ -83,7 +83,7 @@ class Viscosity:
     Attributes
     ----------
     memory
-        Of the steps so far.
+        State after the steps so far.
     creep_time
         `kelvin`.
     """

@@ -49,11 +49,11 @@ class Waves:
     Parameters
     ----------
     system
-        Of the axisymmetric displacement.
+        System of the axisymmetric displacement.
     energies
         Its terms as functions of a jet.
     supports
-        What is held.
+        Supports of the axis and the ends.
     nonlocal_terms
         Contacts and T-junctions, whose entries are not in the pattern of the others.
 
@@ -238,7 +238,7 @@ class Waves:
         """The waves whose matrices are not positive definite, from the entries (nodes, entries) at
         the nodes.
 
-        On a piece of the axis of m the matrix is a mean of its five Bernstein coefficients with
+        On a range of m the matrix is a mean of its five Bernstein coefficients with
         weights that are not negative: if these are positive definite, it is so for every m of the
         piece. Else the piece is halved, for the next states too, until its waves are as few as
         coefficients.
@@ -318,7 +318,7 @@ class _WaveRange:
     Attributes
     ----------
     inner
-        What the values at the nodes weigh in the inner three Bernstein coefficients on the piece.
+        (3, nodes) weights of values at the nodes in the inner three Bernstein coefficients.
     """
 
     def __init__(self, first: int, last: int, nodes: NDArray[np.float64]) -> None:
@@ -411,7 +411,7 @@ class BandedMatrices:
     Parameters
     ----------
     rows, columns
-        Of each entry of the pattern; one triangle is enough.
+        Row and column of each entry of the pattern; one triangle is enough.
     constrained_rows
         Rows and columns that are replaced by those of the unit matrix.
     """

@@ -45,7 +45,7 @@ class Meridian:
     patches
         Name of each of several shells -> which cells; none of one.
     tied
-        Of each joint the parameters that it ties, see `shape.meridian_chart.MeridianChart`.
+        Pairs of parameters that joints tie, see `shape.meridian_chart.MeridianChart`.
     """
 
     mesh: mesh.Mesh
@@ -83,11 +83,11 @@ class Meridian:
         return max(1.0, float(self.section(self.mesh.geometry.x[:, 0])[:, 0].max()))
 
     def parameter(self, end: str) -> float:
-        """s there."""
+        """Return the parameter s of an end."""
         return float(self._parameters_of(self.ends[end])[0])
 
     def begins(self, end: str) -> bool:
-        """Whether the parameter grows from there."""
+        """Return whether the parameter grows from an end."""
         return bool(np.isclose(self._cell_ends.min(axis=1), self.parameter(end)).any())
 
     def facets_at(self, point: str) -> NDArray[np.int32]:
@@ -186,7 +186,7 @@ def make_meridian(
     vertices
         (n,) ascending from 0.
     names
-        Of its ends, None for the axis.
+        Names of the ends, None for the axis.
     points
         See `Meridian`; by default "pole", at the parameter 0; of several shells the highest place,
         and where that is held the highest on the axis.
@@ -260,12 +260,12 @@ def graded_vertices(
     end
         Value of the parameter at the outer edge.
     circles
-        Where the curvature jumps, rims of dimples: a vertex is put there, one for those that nearly
-        meet.
+        Parameters where the curvature jumps, and rims of dimples: a vertex is put there, one for
+        those that nearly meet.
     h
         Thickness over R, or the smaller size of the cells on the axis.
     largest
-        Of the cells, whatever the thickness.
+        Largest size of the cells, whatever the thickness.
     contact_size
         Cells of a size up to a distance from the start, where bodies press.
     everywhere

@@ -41,7 +41,7 @@ class WaveHessians:
     u
         The axisymmetric displacement.
     energies
-        Those that are not linear.
+        Energies that are not linear in the displacement.
 
     Attributes
     ----------

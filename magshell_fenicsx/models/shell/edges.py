@@ -78,7 +78,7 @@ def two_sided(
     width
         h_e: half the height of the flat triangles over the edge, averaged.
     law
-        That of both sides.
+        Laws of both sides.
     natural
         The natural forms on both sides; None if they are those of r0.
     """

@@ -48,7 +48,7 @@ class HessianIntegral:
     Parameters
     ----------
     batches
-        Those of this rank, perhaps none.
+        Batches of this rank, perhaps none.
     sides
         2 for interior edges.
     """
@@ -108,7 +108,7 @@ class HessianIntegral:
         u
             (dofs,) with ghosts.
         factors
-            By term; others are left out.
+            Factors of terms by name; others are left out.
         element_matrices
             (local cells, 9, pairs of functions), see `BlockMatrix.add_cells`.
         couple

@@ -35,27 +35,27 @@ class Density:
     Attributes
     ----------
     function
-        On cells of (r0, u, *parameters), per area of the coordinates; on boundary edges of
-        (r0, u, m, width, *parameters), see `edges`; on interior edges the same with pairs of
-        jets and covectors.
+        The density as a function: on cells of (r0, u, *parameters), per area of the coordinates;
+        on boundary edges of (r0, u, m, width, *parameters), see `edges`; on interior edges the
+        same with pairs of jets and covectors.
     parameters
-        Numbers, or fields that vary over the surface; `function` takes a field on interior edges as a
-        pair.
+        Numbers, or fields that vary over the surface; on interior edges `function` takes a field
+        as a pair.
     parts
-        The parts of the displacement's jet that it depends on.
+        Parts of the displacement's jet that the density depends on.
     linear
-        Those of them in which it is linear, all together.
+        Parts among these in which it is linear, all together.
     facets
-        Boundary edges that it lives on; None elsewhere.
+        Boundary edges that it is integrated on; None for cells and interior edges.
     sides
-        2 on interior edges.
+        Number of cells beside a point: 2 on interior edges, else 1.
     work
-        Of (r0, u, v, *parameters), linear in v: the virtual work of a load without potential, on
-        cells.
+        Virtual work of a load without potential, on cells: a function of (r0, u, v, *parameters),
+        linear in v.
     quadrature
-        Degree of its rule on cells; None for `cell_quadrature`.
+        Degree of the quadrature on cells; None for `cell_quadrature`.
     reference_parts
-        Further parts of the placement's jet alone.
+        Parts of the placement's jet that it depends on besides `parts`.
     """
 
     function: Callable[..., Expr]
@@ -88,13 +88,13 @@ class Density:
         Parameters
         ----------
         jets
-            Of r0, u and what else it takes, each on every side; with the jet of v the virtual work
-            is meant.
+            Jets of r0, u and what else the density takes, each on every side; with the jet of v
+            the value is the virtual work.
         edge
             The covector on every side and the width; None on cells.
         parameters
-            In place of its own; where there are two sides, a vector that varies holds both, one
-            after the other.
+            Values of the parameters; where there are two sides, a vector that varies holds both,
+            one after the other.
         """
         arguments = [*jets, *(edge[:1] if edge else ())]
         sided = [

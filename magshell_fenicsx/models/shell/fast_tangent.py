@@ -69,9 +69,9 @@ class FastTangent:
     u
         The displacement that the terms were written with.
     sites
-        Where they live; others may live there too.
+        Integrals of the terms; they may have other terms too.
     constraints
-        Of which components of u are zero; other directions are the system's.
+        Constraints of components of u; those along other directions are the system's.
     moving
         Local cells with nodes that move, and the terms' sites on these cells and their edges alone.
     """

@@ -57,7 +57,7 @@ class CellGeometry:
     Attributes
     ----------
     element
-        Of the placement.
+        Element of the placement.
     nodal
         (cells, nodes, 3) of a surface, an edge (without normals) or a body, of whose cells the
         third axis is across; (cells, nodes, 2) of a meridian, rho and z.
@@ -115,7 +115,7 @@ class ProjectedFormula:
     size
         The integral of |f|.
     missed
-        By how much integrals of f may still be wrong, over that of |f|.
+        Error that integrals of f may still have, over that of |f|.
     rest
         The root of the integral of |f - p|^2 over that of |f|^2, of all cells.
     widest
@@ -150,12 +150,12 @@ def project_formula(
     nodal, element
         (cells, nodes, components) at the points of the element.
     degree
-        Of the polynomials with the same moments, at most that of the element.
+        Degree of the polynomials with the same moments, at most that of the element.
     bounded
         Whether they stay between the least and the largest value in a cell; of their moments the
         first is kept.
     formulas
-        What varies in them, so that nothing between the places is missed.
+        Formulas that vary, whose ranges show what is between the places.
     """
     d, parts = cells.dimension, _uniform_parts(cells)
     X, w = (v.reshape(-1, *v.shape[2:]) for v in sampling_points(cells))
@@ -263,7 +263,7 @@ class _HiddenDetail:
     Attributes
     ----------
     hidden
-        By how much integrals over the reference cell differ from those of the places (cells,).
+        (cells,) difference of integrals over the reference cell from those of the places.
     variation
         The integral of |f - its mean|.
     leaves, deep

@@ -59,7 +59,7 @@ class PointGradient:
     terms
         All on cells, or all on edges with as many sides.
     parts
-        Which parts of the jets the points have.
+        Parts of the jets that the points have.
     points_per_entity, count
         Points of an entity, and of all; a chunk has whole entities.
     r0
@@ -161,7 +161,7 @@ class _KernelInput:
     Attributes
     ----------
     field
-        Of the points of a chunk.
+        Field of the values at the points of a chunk.
     values
         At all points.
     filled

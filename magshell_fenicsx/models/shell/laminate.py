@@ -35,7 +35,7 @@ class Laminate:
     matrices
         A, B, D (3, 6).
     direction
-        Of the angle 0 in the shell's frame; None for the meridians of its e3.
+        Direction of the angle 0 in the shell's frame; None for the meridians of its e3.
     isotropic
         Whether all directions are alike.
     axes, origin

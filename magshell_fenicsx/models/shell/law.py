@@ -37,9 +37,9 @@ class Law(ABC):
     parameter
         The law's own number.
     thickness_factor
-        What multiplies the thickness.
+        Factor of the thickness.
     modulus_factor
-        What multiplies Young's modulus.
+        Factor of Young's modulus.
     thins
         1 where the thickness follows from the area, so that the volume stays; else 0.
     depends_on_place
@@ -394,7 +394,7 @@ def elastic_density(
     """The density of a material, from one that takes a `law`, on two sides a pair of laws.
 
     The numbers of the law become parameters. `thickness` (1,) multiplies the thickness; None for 1.
-    `cell_materials` (4,) is `OwnMaterial.numbers`; None for one material.
+    `cell_materials` (4,) is `ShellMaterial.numbers`; None for one material.
     """
 
     def by_side(value: Any) -> Sequence[Any]:

@@ -37,7 +37,7 @@ class Ogden(Incompressible):
     Attributes
     ----------
     mu, alpha
-        Of each term, mu over E: the sum of mu alpha is 2/3, and each mu alpha positive.
+        Constants of the terms, mu over E: the sum of mu alpha is 2/3, each mu alpha is positive.
     """
 
     mu: Any = field(default=(), kw_only=True)

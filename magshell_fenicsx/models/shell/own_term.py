@@ -82,7 +82,7 @@ class FormulaParameter:
     text
         The formula.
     key
-        That of the case file, for messages.
+        Key of the case file, for messages.
     turn
         The frame of the model is turned about e3 by it (rad), the formula's is not.
     """
@@ -114,7 +114,7 @@ class OwnTerm:
     """The energy mu Pi(u), Pi the integral of a density over the undeformed mid-surface or, with
     `on`, along an edge.
 
-    Of its own name are the term, its amplitude mu and its column. What the density depends on is
+    The term, its amplitude mu and its column have its name. What the density depends on is
     found from it, and so are its derivatives and the symmetries that it leaves to a model.
 
     Parameters
@@ -147,7 +147,7 @@ class OwnTerm:
         `kinematics.Edge` after the jets: its outward conormal, and derivatives along this and by
         arc length. A solid has no such energies.
     key
-        That of the case file with this name, for messages.
+        Key of the case file with this name, for messages.
 
     Raises
     ------
@@ -450,7 +450,7 @@ class OwnTerm:
         Raises
         ------
         ValueError
-            With the density that is not.
+            With the density that differs.
         """
         for column, density in zip(
             ("", *self.observed)[-len(self.densities) :], self.densities, strict=True

@@ -34,7 +34,7 @@ class ShellMaterial:
     """The material of one of several shells: modulus and density over those of the first shell,
     Poisson's ratio, and the number of its law in `Material.laws`.
 
-    >>> OwnMaterial(2.0, 0.3).numbers
+    >>> ShellMaterial(2.0, 0.3).numbers
     (2.0, 0.3, 1.0, 0)
     """
 

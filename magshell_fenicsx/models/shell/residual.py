@@ -67,16 +67,16 @@ class FastResidual:
     r0, u
         The placement, and the displacement that the terms were written with.
     degree
-        Of the elements.
+        Degree of the elements.
     terms
-        What has a density.
+        Terms with a density.
     one_by_one
         Whether each term has a kernel of its own, so that it can be added alone.
 
     Attributes
     ----------
     names
-        Of the terms that it serves.
+        Names of the terms.
     """
 
     def __init__(

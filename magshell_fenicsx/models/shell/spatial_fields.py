@@ -159,7 +159,7 @@ class CellPolynomials:
     values
         (cells, nodes, size) at the nodes of the element `element`.
     cells
-        With their places.
+        The cells with their geometry.
     """
 
     values: Array
@@ -246,7 +246,7 @@ def by_patch(
     cells
         How many there are.
     key
-        Of the case file, for the message.
+        Key of the case file, for the message.
 
     Raises
     ------
@@ -286,11 +286,11 @@ def pattern_field(
     Parameters
     ----------
     finer
-        By how much the degree of the field is above that of r0.
+        Degree of the field less that of r0.
     name, size
-        Of the field, and how many numbers it has.
+        Name of the field, and how many numbers it has.
     key
-        Of the case, for the message.
+        Key of the case, for the message.
 
     Returns
     -------
@@ -431,7 +431,8 @@ def positions_and_normals(r0: fem.Function, points: Array | None = None) -> tupl
     """The nodes of every cell, or other reference points (n, 2), and the cell's normals there:
     (cells, n, 3) each.
 
-    On a meridian, whose placement is along e_rho and e_z, along (e_rho, e_theta, e_z).
+    On a meridian, whose placement has components along e_rho and e_z, they are along (e_rho,
+    e_theta, e_z).
     """
     V = r0.function_space
     element, size = V.element.basix_element, V.dofmap.index_map_bs
@@ -480,9 +481,9 @@ def field_in_body(
     Parameters
     ----------
     name
-        Of the field.
+        Name of the field.
     key
-        Of the case, for the message.
+        Key of the case, for the message.
 
     Raises
     ------
