@@ -237,13 +237,11 @@ class IntegrationDomain:
         They are parts of one measure, since a form may have only one of the boundary.
         """
         facets = np.concatenate(facet_groups)
-        numbers, order = (
-            np.repeat(
-                np.arange(1, len(facet_groups) + 1),
-                [len(facets_of_group) for facets_of_group in facet_groups],
-            ),
-            np.argsort(facets),
+        numbers = np.repeat(
+            np.arange(1, len(facet_groups) + 1),
+            [len(facets_of_group) for facets_of_group in facet_groups],
         )
+        order = np.argsort(facets)
         tags = mesh.meshtags(
             self.mesh, self.mesh.topology.dim - 1, facets[order], numbers[order].astype(np.int32)
         )
@@ -360,10 +358,8 @@ def meridian_domain(
     r0: fem.Function, initial_placement: fem.Function | None = None
 ) -> IntegrationDomain:
     """The meridian, a mesh of intervals."""
-    mesh_of_meridian, degree = (
-        r0.function_space.mesh,
-        r0.function_space.element.basix_element.degree,
-    )
+    mesh_of_meridian = r0.function_space.mesh
+    degree = r0.function_space.element.basix_element.degree
     tangent = revolved_jet(r0).r1
     width = (
         ufl.CellVolume(mesh_of_meridian) / 2 * ufl.sqrt(ufl.dot(tangent, tangent))

@@ -42,11 +42,11 @@ from magshell_fenicsx.models.shell.parameters import DeadLoad, Material
 from magshell_fenicsx.models.shell.spatial_fields import pattern_field
 from magshell_fenicsx.models.shell.thickness import thickness_weighted
 from magshell_fenicsx.parts.bodies.body_contact import (
-    Contact,
-    Pressing,
+    BodyContact,
+    ContactBody,
     contact_energy,
     contact_pressure,
-    pressed_radius,
+    radius_density,
     thinned_energy,
 )
 from magshell_fenicsx.parts.gap import thickness_ratio_at_points
@@ -420,10 +420,8 @@ class EnergyFactory:
         reference_parts = tuple(
             part for part in term.placement_parts if part not in term.parts
         )  # asked for of r0 alone
-        density_function, parts = (
-            _along(term, term.at_point(term.density)),
-            (*term.parts, *reference_parts),
-        )
+        density_function = _along(term, term.at_point(term.density))
+        parts = (*term.parts, *reference_parts)
         density = Density(
             density_function,
             self._parameters(term),
@@ -449,21 +447,19 @@ class EnergyFactory:
             }
         return {column: self._over_area(density) for column, density in by_column.items()}
 
-    def contact(self, contact: Contact) -> tuple[Energy, Pressing, dict[str, ufl.Form]]:
+    def contact(self, contact: ContactBody) -> tuple[Energy, BodyContact, dict[str, ufl.Form]]:
         """The energy of a body, what it knows of it, and the integrals of its pressure and of that
         times its radius.
         """
-        domain, approach = (
-            self.domain,
-            self.free_constants.setdefault(contact.amplitude, self._constant(0.0)),
-        )
+        domain = self.domain
+        approach = self.free_constants.setdefault(contact.amplitude, self._constant(0.0))
         rule, thins = domain.contact_rule, self.material.law.thins_somewhere
         thins_at = (
             thickness_ratio_at_points(domain, self.u, self.natural, self.law_of_cells.thins)
             if thins
             else None
         )
-        pressing = Pressing(
+        pressing = BodyContact(
             contact, self.material.h, domain.r0, self.u, approach, rule, self.thickness, thins_at
         )
         contact_density, parts = (
@@ -471,7 +467,7 @@ class EnergyFactory:
         )
         density = Density(per_area(contact_density), pressing.parameters, parts, quadrature=rule)
         density = self._thinning(density) if thins else density
-        of_radius = pressed_radius(self._constant(contact.front), self._constant(contact.direction))
+        of_radius = radius_density(self._constant(contact.front), self._constant(contact.direction))
         density_functions: dict[str, Callable[..., Expr]] = {
             "pressure": contact_pressure,
             "radius": of_radius,

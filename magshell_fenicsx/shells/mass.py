@@ -150,13 +150,11 @@ class SupportInertia:
         first_velocity: Vector | None = None,
     ) -> None:
         assert system.moving
-        self._system, self._moving, self._mass, self._at, self._carried = (
-            system,
-            system.moving,
-            mass,
-            amplitudes_at,
-            first_velocity,
-        )
+        self._system = system
+        self._moving = system.moving
+        self._mass = mass
+        self._at = amplitudes_at
+        self._carried = first_velocity
         self.names = system.moving.names
         self._x, self._y = mass.createVecs()
 

@@ -24,7 +24,7 @@ from magshell_fenicsx.models.shell import spatial_fields
 from magshell_fenicsx.models.shell.formula_projection import CellGeometry
 from magshell_fenicsx.models.shell.law import Law
 from magshell_fenicsx.models.shell.parameters import Material
-from magshell_fenicsx.parts.bodies.body_contact import Pressing, Region
+from magshell_fenicsx.parts.bodies.body_contact import BodyContact, Region
 from magshell_fenicsx.parts.forces.load_vectors import DeadLoads, point_entries
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
@@ -95,7 +95,7 @@ class ModelBase:
     supports: Mapping[str, Support]
     without_potential: tuple[str, ...] = ()
     observed: dict[str, fem.Form]
-    contacts: dict[str, tuple[Pressing, Mapping[str, fem.Form]]]
+    contacts: dict[str, tuple[BodyContact, Mapping[str, fem.Form]]]
     shell_contacts: "Sequence[SurfaceContact] | Sequence[MeridianContact]" = ()
     planes: tuple[Mirror, ...] = ()
     fields: Sequence[AppliedField] = ()
@@ -209,7 +209,7 @@ class ModelBase:
         )
 
     def cell_pressures(self, state: State) -> Array | None:
-        """The pressure of all contacts in each local cell, see `Pressing`; None without
+        """The pressure of all contacts in each local cell, see `BodyContact`; None without
         contacts.
         """
         if not (self.contacts or self.shell_contacts):
@@ -231,7 +231,7 @@ class ModelBase:
 
     def cells_evenly_pressed(self, state: State) -> NDArray[np.bool_]:
         """Whether the mean in each local cell is the pressure of a contact there, see
-        `Pressing`.
+        `BodyContact`.
         """
         pressings = [pressing for pressing, _ in self.contacts.values()]
 
@@ -288,10 +288,8 @@ class ThinModel(ModelBase):
         """Return the energies of the user's terms and of contact with bodies; sets what is observed
         of them.
         """
-        factory, terms_and_facets = (
-            self.factory,
-            [(term, edges[term.on] if term.on else None) for term in self.loads.own],
-        )
+        factory = self.factory
+        terms_and_facets = [(term, edges[term.on] if term.on else None) for term in self.loads.own]
         energies = [
             factory.user_energy(term, facets) for term, facets in terms_and_facets if term.density
         ]

@@ -44,10 +44,8 @@ class Revolution:
         begin = np.arange(len(vertices)) + np.cumsum([0, *is_apart])
         self.ends = np.column_stack([begin, begin + 1])
         self._at_ends = np.empty((2, self.ends.max() + 1), dtype=np.int64)
-        self._at_ends[0, self.ends], self._at_ends[1, self.ends] = (
-            np.arange(len(vertices))[:, None],
-            np.arange(2),
-        )
+        self._at_ends[0, self.ends] = np.arange(len(vertices))[:, None]
+        self._at_ends[1, self.ends] = np.arange(2)
         poles = model.meridian.poles
         s = model.meridian.cells[tuple(self._at_ends)]
         self._poles = np.asarray(np.isclose(s[:, None], poles).any(axis=1))
@@ -58,10 +56,8 @@ class Revolution:
         )  # e_rho, e_theta, e_z
         self._basis = np.moveaxis(basis, -1, 0)
         normals = nodal_normals(model.r0)
-        self.r0, self.n0 = (
-            self._swept(model.r0.x.array.reshape(-1, 2)),
-            self._swept(normals[:, [0, 2]]),
-        )
+        self.r0 = self._swept(model.r0.x.array.reshape(-1, 2))
+        self.n0 = self._swept(normals[:, [0, 2]])
         self.cells = self._triangles(sectors)
 
     def displacement(self, u: Vector) -> Array:

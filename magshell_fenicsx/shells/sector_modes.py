@@ -109,11 +109,9 @@ class SectorModes:
         """e3 x u - du/dtheta, by which the shape turns about e3 on an axisymmetric shell; None
         without any.
         """
-        half, system, modes = (
-            self.half_model,
-            self.half_model.system,
-            self.half_model.symmetry_breaking_modes,
-        )
+        half = self.half_model
+        system = self.half_model.system
+        modes = self.half_model.symmetry_breaking_modes
         if not isinstance(modes, AntisymmetricModes) or not self._model.turns:
             return None
         V = half.V
@@ -124,11 +122,9 @@ class SectorModes:
         rotation = np.cross([0.0, 0.0, 1.0], r0[dofs])
         metric = np.einsum("nqdi,nqei->nqde", a, a)
         c = np.linalg.solve(metric, np.einsum("nqdi,nqi->nqd", a, rotation)[..., None])[..., 0]
-        by_angle, total, count = (
-            np.einsum("nqd,nqdi->nqi", c, du),
-            np.zeros_like(u),
-            np.zeros(len(u)),
-        )
+        by_angle = np.einsum("nqd,nqdi->nqi", c, du)
+        total = np.zeros_like(u)
+        count = np.zeros(len(u))
         np.add.at(total, dofs, by_angle)
         np.add.at(count, dofs, 1.0)
         t = np.cross([0.0, 0.0, 1.0], u) - total / np.maximum(count, 1.0)[:, None]

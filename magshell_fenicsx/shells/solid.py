@@ -7,7 +7,7 @@ in the middle of the thickness; the pressure, the volume and the loaded patch ar
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -20,7 +20,7 @@ from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem,
 from magshell_fenicsx.assembly.free_parameters import FreeParameter, make_parameters
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.assembly.oblique_supports import Constraint, support_along
-from magshell_fenicsx.assembly.prescribed_motion import EdgeCurve, level_sides
+from magshell_fenicsx.assembly.prescribed_motion import EdgeCurve, EdgePressure, level_sides
 from magshell_fenicsx.assembly.terms import LinearTerm, Term
 from magshell_fenicsx.mesh.hexahedra import MIDSURFACE_HEIGHT, OUTER_FACE, BodyMesh, quadratic_space
 from magshell_fenicsx.mesh.mirror import Y0_PLANE, Mirror
@@ -108,96 +108,126 @@ class SolidModel(ModelBase):
         )
         loads = replace(loads, magnetic=magnetic, remanence=remanence)
         self.body, self.material, self.law = body, material, law
+        self.mirror, self._conditions = mirror, conditions
         self.normals = body.normals
         self.multiplicity = 2 if "symmetry" in conditions.values() else 1
+        self.load_size, self.load_sizes, self.contacts = {}, {}, {}
         self.kernels = KernelLog()
-        self.V = V = quadratic_space(body.mesh)
-        self.u, self.r0 = fem.Function(V, name="u"), fem.Function(V, name="r0")
+        self.V = quadratic_space(body.mesh)
+        self.u, self.r0 = fem.Function(self.V, name="u"), fem.Function(self.V, name="r0")
         self.r0.interpolate(lambda x: x)
-
-        def of_place(parameter: FormulaParameter) -> fem.Function:
-            return field_in_body(
-                Components([parameter.of_place]), V, name="factor", key=parameter.key, size=1
-            )
-
-        loads = self.loads = replace(
-            loads, own=tuple(term.with_functions(of_place) for term in loads.own)
-        )
-        hinged = tuple(
-            name
-            for name, condition in conditions.items()
-            if name in body.faces and condition not in ("free", "clamped", *MIRRORS)
-        )
-        free_constants, density_growth = (
-            dict[str, fem.Constant](),
-            dict[str, Callable[[SolidDensity], SolidDensity]](),
-        )
-        if loads.natural:
-            shape = body_shape(loads.natural, body, V, free_constants)
-            density_growth["grown"] = lambda density: grown_in_body(density, shape)
-        self.factory = factory = TermFactory(
-            body,
-            self.u,
-            law,
-            material.h,
-            self.kernels,
-            hinged,
-            free_constants=free_constants,
-            fields=[],
-            saturated=[],
-            **density_growth,
-        )
-        self._pattern, *areal = factory.distortions()
+        own = tuple(term.with_functions(self._formula_field) for term in loads.own)
+        self.loads = replace(loads, own=own)
+        self.factory = factory = self._make_factory()
+        self._pattern, *areal_distortion = factory.distortions()
         self._held, planes, self.supports = supports(body, self.r0, conditions)
         origin = closing_point([mirror, *planes] if self.multiplicity == 2 else planes)
         ends = {name: facets for name, facets in body.faces.items() if name != OUTER_FACE}
-        free_ends, self.without_potential = openings(self.r0, ends, conditions, in_middle(body, V))
-        closed = enclosed(loads, free_ends, self.without_potential)
-        swept = loads.pressure or closed
-        self._terms: list[Term] = [self._pattern, *areal, factory.compression()]
-        if loads.magnetic:
-            self._terms += factory.magnetic(loads.magnetic)
-        if loads.pressure:
-            potential = not self.without_potential
-            self._terms += factory.pressure(material.classical_pressure, potential=potential)
-        self._terms += [factory.user_energy(term) for term in loads.own if term.density]
-        self.observed = self.kernels.compile_all(factory.observed(term) for term in loads.own)
-        if loads.magnetic:
-            self.observed |= self.kernels.compile_all([factory.induced(loads.magnetic)])
-        self.load_size, self.load_sizes, self.contacts = {}, {}, {}
-        for name, force in loads.forces.items():
-            patch = outer_patch(body, V, force.point, force.patch, self.kernels)
-            self._terms.append(LinearTerm(name, patch[0], self.force_unit * patch[1], self.u, name))
-        measures = BodyMeasures(body, V, self.kernels) if loads.dead else None
-        for name, dead in loads.dead.items():
-            assert measures
-            self._terms.append(
-                self.dead_load_term(name, assemble_dead_loads(dead, V, measures, self.kernels))
-            )
-            self._terms += [
-                factory.moment(f"{name} moment {m.edge} {i}", m.edge, m.moment, name)
-                for i, m in enumerate(moments(dead))
-            ]
-            self._terms += [factory.user_energy(term, name) for term in potentials(dead)]
+        free_ends, self.without_potential = openings(
+            self.r0, ends, conditions, in_middle(body, self.V)
+        )
+        is_enclosed = enclosed(self.loads, free_ends, self.without_potential)
+        self._terms: list[Term] = [self._pattern, *areal_distortion, factory.compression()]
+        self._terms += self._field_and_pressure_terms()
+        self._terms += [factory.user_term(term) for term in self.loads.own if term.density]
+        self.observed = self._observed_forms()
+        self._terms += self._force_terms()
         self._faces = [
             body.faces[name] for name, condition in conditions.items() if condition == "symmetry"
         ]
-        self.mirror = mirror
-        self._sites = body_hessian_integrals(body, self.r0, self._terms, self.kernels)
-        at_edges = None
-        if closed:
-            in_planes = {name for name, condition in conditions.items() if condition in MIRRORS}
-            curves = {
-                name: self._rim(ends[name], MIDSURFACE_HEIGHT if name in hinged else 1.0)
-                for name in ends
-                if name in in_planes or motions_of(loads, name)
-            }
-            unit = material.classical_pressure / material.h
-            at_edges = pressed_edges(self.r0, curves, in_planes, loads, unit, origin)
-        self._moving = moving(self.r0, self.supports, loads, at_edges)
+        self._hessians = body_hessian_integrals(body, self.r0, self._terms, self.kernels)
+        edge_pressure = self._edge_pressure(ends, origin) if is_enclosed else None
+        self._moving = moving(self.r0, self.supports, self.loads, edge_pressure)
         self.system = self._system(self._held + self._held_on_mirror([mirror.normal]))
-        volume = factory.volume_change(None if swept else np.zeros(3) if origin is None else origin)
+        if self.loads.pressure or is_enclosed:
+            origin = None
+        elif origin is None:
+            origin = np.zeros(3)
+        volume = factory.volume_change(origin)
         self.observe(self.kernels.compile("volume energy", volume), body.points)
+
+    def _formula_field(self, parameter: FormulaParameter) -> fem.Function:
+        """Return a formula's field of shape (1,)."""
+        pattern = Components([parameter.of_place])
+        return field_in_body(pattern, self.V, name="factor", key=parameter.key, size=1)
+
+    @property
+    def _hinged(self) -> tuple[str, ...]:
+        """Names of the ends whose middle line alone is held."""
+        return tuple(
+            name
+            for name, condition in self._conditions.items()
+            if name in self.body.faces and condition not in ("free", "clamped", *MIRRORS)
+        )
+
+    def _make_factory(self) -> TermFactory:
+        """Return what makes the terms of this body."""
+        free_constants: dict[str, fem.Constant] = {}
+        growth: dict[str, Callable[[SolidDensity], SolidDensity]] = {}
+        if self.loads.natural:
+            shape = body_shape(self.loads.natural, self.body, self.V, free_constants)
+            growth["grown"] = partial(grown_in_body, shape=shape)
+        return TermFactory(
+            self.body,
+            self.u,
+            self.law,
+            self.material.h,
+            self.kernels,
+            self._hinged,
+            free_constants=free_constants,
+            **growth,
+        )
+
+    def _field_and_pressure_terms(self) -> list[Term]:
+        """Return the terms of magnetisation and of a live pressure."""
+        terms: list[Term] = []
+        if self.loads.magnetic:
+            terms += self.factory.magnetic(self.loads.magnetic)
+        if self.loads.pressure:
+            classical, potential = self.material.classical_pressure, not self.without_potential
+            terms += self.factory.pressure(classical, potential=potential)
+        return terms
+
+    def _observed_forms(self) -> dict[str, fem.Form]:
+        """Return the forms that the user's terms observe, and those of an induced magnetisation."""
+        factory, kernels = self.factory, self.kernels
+        observed = kernels.compile_all(factory.observed(term) for term in self.loads.own)
+        if self.loads.magnetic:
+            observed |= kernels.compile_all([factory.induced(self.loads.magnetic)])
+        return observed
+
+    def _force_terms(self) -> list[Term]:
+        """Return the terms of forces on patches, then those of dead loads."""
+        terms: list[Term] = []
+        for name, force in self.loads.forces.items():
+            dofs, shares = outer_patch(self.body, self.V, force.point, force.patch, self.kernels)
+            terms.append(LinearTerm(name, dofs, self.force_unit * shares, self.u, name))
+        if not self.loads.dead:
+            return terms
+        measures = BodyMeasures(self.body, self.V, self.kernels)
+        for name, dead in self.loads.dead.items():
+            vectors = assemble_dead_loads(dead, self.V, measures, self.kernels)
+            terms.append(self.dead_load_term(name, vectors))
+            terms += [
+                self.factory.moment(f"{name} moment {m.edge} {i}", m.edge, m.moment, name)
+                for i, m in enumerate(moments(dead))
+            ]
+            terms += [self.factory.user_term(term, name) for term in potentials(dead)]
+        return terms
+
+    def _edge_pressure(
+        self, ends: Mapping[str, NDArray[np.int32]], origin: Array | None
+    ) -> EdgePressure:
+        """Return the work of a live pressure on lids at the ends that move."""
+        hinged = self._hinged
+        in_planes = {name for name, condition in self._conditions.items() if condition in MIRRORS}
+        curves = {
+            name: self._rim(ends[name], MIDSURFACE_HEIGHT if name in hinged else 1.0)
+            for name in ends
+            if name in in_planes or motions_of(self.loads, name)
+        }
+        unit = self.material.classical_pressure / self.material.h
+        return pressed_edges(self.r0, curves, in_planes, self.loads, unit, origin)
 
     @cached_property
     def symmetry_breaking_modes(self) -> AntisymmetricModes | None:
@@ -261,7 +291,7 @@ class SolidModel(ModelBase):
                 motion.cells,
                 body_hessian_integrals(self.body, self.r0, self._terms, self.kernels, motion.cells),
             )
-        fast = FastTangent(self.u, self._sites, constraints, moving_cells)
+        fast = FastTangent(self.u, self._hessians, constraints, moving_cells)
         parameters: dict[str, FreeParameter] = {
             **make_parameters(factory.free_constants, self._terms, self.u, self.kernels)
         }

@@ -227,10 +227,8 @@ class TermFactory:
         V = self.u.function_space
         saturation, X = PointField(V.mesh, QUADRATURE_DEGREE, 2 * SIZE), fem.Function(V)
         X.interpolate(lambda x: x)
-        table, followed = (
-            V.element.basix_element.tabulate(1, saturation.points)[..., 0],
-            (X, self.u),
-        )
+        table = V.element.basix_element.tabulate(1, saturation.points)[..., 0]
+        followed = (X, self.u)
         normals = at_quadrature(n0, saturation.points)
 
         def places_and_normals() -> list[Array]:
@@ -249,10 +247,8 @@ class TermFactory:
 
     def remanent(self, field: Magnetisation, applied: AppliedField | None) -> list[SolidTerm]:
         """The terms, linear in the applied field, with the amplitude lambda_m."""
-        pattern, law = (
-            field.remanent,
-            body_densities if field.law == "deformation" else rotation_law,
-        )
+        pattern = field.remanent
+        law = body_densities if field.law == "deformation" else rotation_law
         Br = (
             field_in_body(pattern, self.u.function_space)
             if callable(pattern)
@@ -346,11 +342,9 @@ class TermFactory:
 
     def _volume_density(self, term: OwnTerm, density_function: Callable[..., Expr]) -> SolidDensity:
         """A density of the volume, which depends on places alone."""
-        flat, count, at_point = (
-            [ufl.zero(3)] * len(ALL_DERIVATIVES),
-            len(term.parameters),
-            term.at_point(density_function),
-        )
+        flat = [ufl.zero(3)] * len(ALL_DERIVATIVES)
+        count = len(term.parameters)
+        at_point = term.at_point(density_function)
 
         def per_volume(X: Expr, u: Expr, H: Expr, *parameters: Expr) -> Expr:
             return at_point(Jet(X, *flat), Jet(u, *flat), *parameters[:count]) / parameters[count]

@@ -189,10 +189,8 @@ class TieTerm:
         """(n, k, k) the second variation at the present u, along what these make of any k unknowns;
         collective.
         """
-        H, u = (
-            np.einsum("n,nck,ncl->nkl", self._tie, gap, gap, optimize=True),
-            global_values(self._u),
-        )
+        H = np.einsum("n,nck,ncl->nkl", self._tie, gap, gap, optimize=True)
+        u = global_values(self._u)
         if self._turns and len(H):
             of_parts = np.zeros((len(H), TANGENT_COMPONENTS, TANGENT_COMPONENTS))
             upper = np.triu_indices(TANGENT_COMPONENTS)
@@ -372,11 +370,9 @@ class MidSurfaces:
         """
         from scipy.spatial import cKDTree  # takes long to import
 
-        nearest, Y, distances = (
-            np.zeros(len(x), dtype=np.int64),
-            np.zeros((len(x), 2)),
-            np.full(len(x), np.inf),
-        )
+        nearest = np.zeros(len(x), dtype=np.int64)
+        Y = np.zeros((len(x), 2))
+        distances = np.full(len(x), np.inf)
         nodal = self.r0[self.cells.nodes[cells]]
         centres = nodal.mean(axis=1)
         radii = CELL_RADIUS_FACTOR * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
@@ -399,21 +395,17 @@ class MidSurfaces:
             point,
         )
         pair, projections = nearest_places(surface, self.r0, x, candidates, np.inf)
-        point, candidate_cells, reference_places, distance = (
-            projections.point,
-            candidate_cells[pair],
-            projections.X,
-            projections.distance,
-        )
+        point = projections.point
+        candidate_cells = candidate_cells[pair]
+        reference_places = projections.X
+        distance = projections.distance
         order = np.lexsort(
             (cells[candidate_cells], np.round(distance, 12), point)
         )  # of equal ones the first
         best = order[np.flatnonzero(np.diff(point[order], prepend=-1))]
-        nearest[point[best]], Y[point[best]], distances[point[best]] = (
-            cells[candidate_cells[best]],
-            reference_places[best],
-            distance[best],
-        )
+        nearest[point[best]] = cells[candidate_cells[best]]
+        Y[point[best]] = reference_places[best]
+        distances[point[best]] = distance[best]
         return nearest, Y, distances
 
 
@@ -641,11 +633,9 @@ def _angle(tangents: fem.Function, moved: fem.Function, edge_direction: fem.Func
     def unit(v: Expr) -> Expr:
         return v / ufl.sqrt(ufl.dot(v, v))
 
-    n, m, t = (
-        unit(ufl.cross(a1, a2)),
-        unit(ufl.cross(b1, b2)),
-        unit(edge_direction[0] * a1 + edge_direction[1] * a2),
-    )
+    n = unit(ufl.cross(a1, a2))
+    m = unit(ufl.cross(b1, b2))
+    t = unit(edge_direction[0] * a1 + edge_direction[1] * a2)
     return ufl.as_vector([ufl.dot(ufl.cross(n, m), t), ufl.dot(n, m)])
 
 

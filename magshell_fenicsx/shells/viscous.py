@@ -399,10 +399,8 @@ def _works(
 
     def law(j: Jet, side: str = "") -> Law:
         """Law of the shell at small strains, which a viscous stress follows too."""
-        of_shell, law_hereerials = (
-            densities.law_at(model.material.law.linear, j),
-            factory.cell_materials,
-        )
+        of_shell = densities.law_at(model.material.law.linear, j)
+        law_hereerials = factory.cell_materials
         of_shell = of_shell if t is None else of_shell.thicker((t(side) if side else t)[0])
         return (
             of_shell
@@ -416,10 +414,8 @@ def _works(
     strain, bend = given.strain(r0, "")
     up = kin.inverse_metric(r0)
     law_here = law(r0)
-    stretching, bending = (
-        work(law_here.stress(strain, up), E),
-        work(law_here.moment(strain, bend, up), K),
-    )
+    stretching = work(law_here.stress(strain, up), E)
+    bending = work(law_here.moment(strain, bend, up), K)
     coupled = work(
         law_here.moment(E, 0 * K, up), bend
     )  # of plies: a viscous bend makes membrane stress

@@ -100,10 +100,8 @@ class Meridian:
         """The cells of each shell, or of those that joints connect."""
         bodies = [*self.patches.values()] or [np.ones(len(self._cell_ends), dtype=bool)]
         for tied_parameters in self.tied:
-            begin, end = (
-                self._cell_ends[:, :1] - PARAMETER_TOLERANCE,
-                self._cell_ends[:, 1:] + PARAMETER_TOLERANCE,
-            )
+            begin = self._cell_ends[:, :1] - PARAMETER_TOLERANCE
+            end = self._cell_ends[:, 1:] + PARAMETER_TOLERANCE
             touched_cells = ((begin < tied_parameters) & (tied_parameters < end)).any(axis=1)
             connected = [of for of in bodies if (of & touched_cells).any()]
             bodies = [of for of in bodies if all(of is not part for part in connected)] + [

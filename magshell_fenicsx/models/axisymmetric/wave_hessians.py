@@ -109,10 +109,8 @@ class _WaveBatch:
         self._at_u, self._at_r0, self._at_initial = (
             points.field(PLANE * DERIVATIVES * sides) for _ in range(3)
         )
-        self._wave, self._geometry = (
-            points.field(WAVE * DERIVATIVES * sides),
-            points.field(2 * sides),
-        )
+        self._wave = points.field(WAVE * DERIVATIVES * sides)
+        self._geometry = points.field(2 * sides)
         fill(self._geometry, batch.geometry)
         fixed = (
             [domain.r0]
@@ -281,11 +279,9 @@ class _WaveBatch:
         """(points, entries of the Hessians) the weights of the integral, one at a vertex, and the
         lengths of cells.
         """
-        cells, weights, density = (
-            self._batch.cells[0],
-            self._batch.rule.weights,
-            self._energies[0].density,
-        )
+        cells = self._batch.cells[0]
+        weights = self._batch.rule.weights
+        density = self._energies[0].density
         lengths = np.abs(_lengths(self._u.function_space)[cells])
         sizes = np.ones(len(cells)) if density and density.on_edges else lengths
         of_jets = np.repeat(np.hstack(self._by_length), WAVE, axis=1)

@@ -124,10 +124,8 @@ class HessianIntegral:
             fill(self._u, self._jets(batch, u))
             fill(self._r0, placements[number])
             fill(self._geometry, np.repeat(batch.geometry, len(batch.rule.weights), axis=0))
-            contraction, blocks = (
-                self._contractions[batch.rule],
-                HessianBlocks(batch, self._coupled),
-            )
+            contraction = self._contractions[batch.rule]
+            blocks = HessianBlocks(batch, self._coupled)
             for kernel, factor in kernels:
                 blocks.add(kernel.evaluate(number), factor, kernel.pairs)
             if self._replaced and self._prestress:

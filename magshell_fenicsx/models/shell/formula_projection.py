@@ -210,10 +210,8 @@ def project_formula(
     Y, v = basix.make_quadrature(element.cell_type, 2 * degree)
     phi = space.tabulate(0, Y)[0, :, :, 0]
     p = np.linalg.solve(phi.T @ (v[:, None] * phi), moments)
-    residual_squares, lost_squares = (
-        np.zeros(len(scale)),
-        squares - np.einsum("q,cqi->c", v, np.matmul(phi, p) ** 2),
-    )
+    residual_squares = np.zeros(len(scale))
+    lost_squares = squares - np.einsum("q,cqi->c", v, np.matmul(phi, p) ** 2)
     residual_squares[projected_cells] = scale[projected_cells] * np.maximum(lost_squares, 0.0)
     size, rest = float(cells.sum_over_ranks(sizes)), float(cells.sum_over_ranks(residual_squares))
     side = np.sqrt(2.0) * scale ** (1 / min(d, 2))
@@ -290,10 +288,8 @@ class _HiddenDetail:
         deep = self.deep[cells]
         if not deep.any():
             return uniform_parts.in_each_cell(cells)
-        parts, largest = (
-            self.leaves[np.isin(self.leaves.cell, cells)],
-            1.001 * np.abs(uniform_parts.sides[0, 0]),
-        )
+        parts = self.leaves[np.isin(self.leaves.cell, cells)]
+        largest = 1.001 * np.abs(uniform_parts.sides[0, 0])
         small_parts, too_wide = list[SubCells](), np.abs(parts.sides[:, 0]) > largest
         while too_wide.any():
             small_parts.append(parts[~too_wide])
@@ -309,10 +305,8 @@ def _find_hidden_detail(
     `adaptive_sampling.leaves`; collective.
     """
     d, kind = cells.dimension, cells.element.cell_type
-    lattice, (points, weights) = (
-        Lattice.make(kind, LATTICE_DIVISIONS[d]),
-        basix.make_quadrature(kind, RULE_DEGREE[d]),
-    )
+    lattice = Lattice.make(kind, LATTICE_DIVISIONS[d])
+    (points, weights) = basix.make_quadrature(kind, RULE_DEGREE[d])
 
     def places_of(parts: SubCells) -> tuple[Array, Array]:
         X, w = parts.rule(
@@ -369,12 +363,10 @@ def _moments(
         return np.asarray(np.einsum("pq,pqi->pi", w, f))
 
     by_cell = np.zeros((len(projected_cells), space.dim, components))
-    sizes, squares, errors, children = (
-        np.zeros(len(projected_cells)),
-        np.zeros(len(projected_cells)),
-        0.0,
-        len(CHILDREN[cells.dimension]),
-    )
+    sizes = np.zeros(len(projected_cells))
+    squares = np.zeros(len(projected_cells))
+    errors = 0.0
+    children = len(CHILDREN[cells.dimension])
     coarse_integrals = [integrals(w, f) for _, w, _, f in map(evaluated, first_parts.batches())]
     for depth in range(MAX_DIVISIONS + 1):
         last = depth == MAX_DIVISIONS or cells.comm.allreduce(len(first_parts.cell)) > MAX_PARTS
@@ -391,10 +383,8 @@ def _moments(
             converged = (error <= threshold) | last
             errors += float((error[converged & (batch.cell < cells.owned)] ** 2).sum())
             is_added = np.repeat(converged, children)
-            cell_numbers, size = (
-                number[smaller.cell[is_added]],
-                np.linalg.norm(f[is_added], axis=-1),
-            )
+            cell_numbers = number[smaller.cell[is_added]]
+            size = np.linalg.norm(f[is_added], axis=-1)
             if len(cell_numbers):  # Basix tabulates no empty set of points
                 phi = space.tabulate(0, X[is_added].reshape(-1, X.shape[-1]))[0, :, :, 0].reshape(
                     *size.shape, space.dim

@@ -166,10 +166,8 @@ class Laminated(Law):
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
         frame = _Frame(self.direction, up)
         stretched, bent = frame.strain_components(E), frame.strain_components(K)
-        bending_work, coupling_work = (
-            _work(_stress(self.D, bent), bent),
-            _work(_stress(self.B, bent), stretched),
-        )
+        bending_work = _work(_stress(self.D, bent), bent)
+        coupling_work = _work(_stress(self.B, bent), stretched)
         return self._of_D / 2 * bending_work - self._of_B * coupling_work
 
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
@@ -202,10 +200,8 @@ class Laminated(Law):
         return self.modulus_factor * self.h**2 * self.thickness_factor**3
 
     def _moment(self, frame: "_Frame", E: Tensor, K: Tensor) -> Triple:
-        of_D, of_B = (
-            _stress(self.D, frame.strain_components(K)),
-            _stress(self.B, frame.strain_components(E)),
-        )
+        of_D = _stress(self.D, frame.strain_components(K))
+        of_B = _stress(self.B, frame.strain_components(E))
         M1, M2, M6 = (self._of_D * d - self._of_B * b for d, b in zip(of_D, of_B, strict=True))
         return M1, M2, M6
 
@@ -216,10 +212,8 @@ class _Frame:
     def __init__(self, direction: tuple[Scalar, Scalar], up: Tensor) -> None:
         (c1, c2), (a11, a12, a22) = direction, (up[..., 0, 0], up[..., 0, 1], up[..., 1, 1])
         direction_up = a11 * c1 + a12 * c2, a12 * c1 + a22 * c2
-        inverse_length, det = (
-            (c1 * direction_up[0] + c2 * direction_up[1]) ** -0.5,
-            a11 * a22 - a12**2,
-        )
+        inverse_length = (c1 * direction_up[0] + c2 * direction_up[1]) ** -0.5
+        det = a11 * a22 - a12**2
         self._up = up
         self.t1 = direction_up[0] * inverse_length, direction_up[1] * inverse_length
         self.t2 = -(det**0.5) * c2 * inverse_length, det**0.5 * c1 * inverse_length

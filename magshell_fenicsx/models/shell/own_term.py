@@ -354,13 +354,10 @@ class OwnTerm:
         # the first coordinate changes places with the second, so that the normal stays outward
         if self.varying:
             return False
-        order, S = (
-            [
-                ("r", *ALL_DERIVATIVES).index(name)
-                for name in ("r", "r2", "r1", "r22", "r12", "r11")
-            ],
-            mirror.reflection,
-        )
+        order = [
+            ("r", *ALL_DERIVATIVES).index(name) for name in ("r", "r2", "r1", "r22", "r12", "r11")
+        ]
+        S = mirror.reflection
 
         def image(r0: Array, u: Array, m: Array) -> Sample:
             return np.vstack([mirror.image(r0[:1]), r0[order[1:]] @ S]), u[order] @ S, m[::-1]
@@ -378,10 +375,8 @@ class OwnTerm:
                 p.mirrored(mirror, outline) for p in self.formula_parameters
             )
 
-        is_shared, name = (
-            self.mirrored(Y0_PLANE) and turns,
-            self.name + (" or what it observes" if self.observed else ""),
-        )
+        is_shared = self.mirrored(Y0_PLANE) and turns
+        name = self.name + (" or what it observes" if self.observed else "")
         return SymmetryConstraint(
             None if is_shared else f"the energy {name} does not share it", (), mirrors, name
         )
@@ -456,10 +451,8 @@ class OwnTerm:
             ("", *self.observed)[-len(self.densities) :], self.densities, strict=True
         ):
             for sample in _random_samples()[:COORDINATE_SAMPLES]:
-                value, value_in_others = (
-                    self._value(sample, density),
-                    self._value(_in_other_coordinates(sample), density),
-                )
+                value = self._value(sample, density)
+                value_in_others = self._value(_in_other_coordinates(sample), density)
                 if abs(value - value_in_others) > COORDINATE_TOLERANCE * max(
                     abs(value), abs(value_in_others)
                 ):  # nan: it has no value there
@@ -523,10 +516,8 @@ def _random_samples() -> list[Sample]:
     """Jets of r0 and u, and covectors, always the same."""
     # within a box about as large as a shell
     rng = np.random.default_rng(2026)
-    jets, covectors = (
-        rng.uniform(-1, 1, (SYMMETRY_SAMPLES, 2, 6, 3)),
-        rng.uniform(-1, 1, (SYMMETRY_SAMPLES, 2)),
-    )
+    jets = rng.uniform(-1, 1, (SYMMETRY_SAMPLES, 2, 6, 3))
+    covectors = rng.uniform(-1, 1, (SYMMETRY_SAMPLES, 2))
     return [(jets[i, 0], jets[i, 1] / 4, covectors[i]) for i in range(SYMMETRY_SAMPLES)]
 
 

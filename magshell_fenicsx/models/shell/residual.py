@@ -153,14 +153,10 @@ class _CellTerms:
             if name in FIRST_DERIVATIVES or any(name in term.density.jet_parts for term in terms)
         ]
         self._sheet = PointSampling(table, self._weights, [JET_NAMES.index(part) for part in parts])
-        cells, frames = (
-            np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32),
-            cell_frames(V.mesh),
-        )
-        geometry, count = (
-            np.repeat(frames[cells], points_per_cell, axis=0),
-            len(cells) * points_per_cell,
-        )
+        cells = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)
+        frames = cell_frames(V.mesh)
+        geometry = np.repeat(frames[cells], points_per_cell, axis=0)
+        count = len(cells) * points_per_cell
 
         def placement() -> Array:
             return _placement(r0, table, frames, parts)[cells].reshape(count, 3 * len(parts))

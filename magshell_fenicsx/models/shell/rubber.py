@@ -66,10 +66,8 @@ class Incompressible(Law):
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
         of_square, of_mixed, of_det, of_drawn = self._stiffness(surface := Stretched(E, up))
         T, tau = surface.deformed_trace(K), trace(K, up)
-        a, adjugate = (
-            (up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]),
-            (K[..., 1, 1], -K[..., 0, 1], K[..., 0, 0]),
-        )
+        a = (up[..., 0, 0], up[..., 0, 1], up[..., 1, 1])
+        adjugate = (K[..., 1, 1], -K[..., 0, 1], K[..., 0, 0])
         by_T, by_tau = of_square * T - of_mixed / 2 * tau, of_drawn * tau - of_mixed / 2 * T
         M11, M12, M22 = (
             by_T * deformed_up + by_tau * metric_up - of_det / 2 * curvature_cofactor

@@ -341,11 +341,9 @@ def pattern_on_edge(
     local = [int(np.flatnonzero(topology.connectivity(2, 1).links(c) == f)[0]) for c, f in pairs]
     element, placement_element = Q.element.basix_element, V.element.basix_element
     corners, ends = basix.geometry(element.cell_type), basix.topology(element.cell_type)[1]
-    family, interval, variant = (
-        basix.ElementFamily.P,
-        basix.CellType.interval,
-        basix.LagrangeVariant.gll_warped,
-    )
+    family = basix.ElementFamily.P
+    interval = basix.CellType.interval
+    variant = basix.LagrangeVariant.gll_warped
     edge_placement_element, edge_element = (
         basix.create_element(family, interval, cell_element.degree, variant)
         for cell_element in (placement_element, element)
