@@ -67,7 +67,7 @@ INTERIOR = "interior edges"
 
 @dataclass(frozen=True)
 class EnergyFactory:
-    """Makes the energies of one shell, and terms of them.
+    """Factory of the energies of one shell, and of terms from them.
 
     Attributes
     ----------
@@ -76,13 +76,13 @@ class EnergyFactory:
     natural
         The natural shape; None if it is the drawn one.
     free_constants
-        Constants of the parameters that enter freely.
+        Constants of the free parameters, by name.
     has_folds
         Whether cells meet at angles that are not small.
     fields
-        The applied fields known by values that were made.
+        Applied fields, known by values, that were made.
     held_edges
-        The edges that hold the normal, and those on mirror planes, whose energies were made.
+        Edges whose energies were made: those that hold the normal, and those on mirror planes.
     pressed
         Side of a live pressure in each cell, (1,): 1 from outside, -1 from inside, 0 without;
         None for 1.
@@ -111,7 +111,7 @@ class EnergyFactory:
     saturated: list[PointField] = field(default_factory=list)
 
     def term(self, energy: Energy) -> FormTerm:
-        """An energy as a term of the model's displacement."""
+        """Return an energy as a term of the model's displacement."""
         factor, u = self.domain.revolution_factor, self.domain.jet(self.u)
         form, work = factor * energy.form_of(u), None
         if energy.work:
@@ -185,39 +185,37 @@ class EnergyFactory:
         length = fem.assemble_scalar(self.log.compile(f"{name} length", self.domain.length(facets)))
         total = self.domain.revolution_factor * self._over_ranks(length)
         return self.domain.energy(
-            name, density, amplitude, counted=(reference_turn, intensity * total)
+            name, density, amplitude, reference_turn=(reference_turn, intensity * total)
         )
 
     def dead_energies(
         self, name: str, loads: Sequence[DeadLoad], edges_named: Mapping[str, Facets]
     ) -> list[Energy]:
-        """The moments and one's own potentials among the dead loads of an amplitude."""
-        turning = [
-            self.edge_moment(
-                f"{name} moment {load.edge} {i}", edges_named[load.edge], load.moment, name
-            )
-            for i, load in enumerate(moments(loads))
-        ]
-        return turning + [self.user_energy(term, amplitude=name) for term in potentials(loads)]
+        """Energies of the moments and of the user's potentials among the dead loads of an amplitude."""
+        energies = []
+        for i, load in enumerate(moments(loads)):
+            moment_name = f"{name} moment {load.edge} {i}"
+            facets = edges_named[load.edge]
+            energies.append(self.edge_moment(moment_name, facets, load.moment, name))
+        return energies + [self.user_energy(term, amplitude=name) for term in potentials(loads)]
 
     def antisymmetric_edges(self, facets: Facets, normal: Array) -> HessianTerm:
-        """The mirror plane's edges under antisymmetric displacements."""
+        """Term of the edges on a mirror plane under antisymmetric displacements."""
         domain, parameters = self.domain, (self._penalty, self._constant(normal))
         density = self._elastic_density(
             Density(antisymmetric_edge, parameters, ALL_DERIVATIVES, facets=facets)
         )
         v = fem.Function(self.u.function_space)
         jets = domain.j0, domain.jet(self.u), domain.jet(v)
-        energy = density.function(
-            *jets, domain.covector, domain.widths[1], *density.parameters
-        ) * domain.ds(facets)
+        arguments = *jets, domain.covector, domain.widths[1], *density.parameters
+        energy = density.function(*arguments) * domain.ds(facets)
         return HessianTerm("antisymmetric edges", density, energy, v, self.log)
 
     def magnetic(self, field: Magnetisation) -> list[Energy]:
-        """The terms of the chosen energy, linear in the applied field, with the amplitude lambda_m;
-        and what is soft.
+        """Energies of the shell's magnetisation in the applied field.
 
-        A field in space is known at the displacement u.
+        A remanence has the chosen energy, linear in the field, with the amplitude lambda_m; a soft
+        magnet has one of its own. A field in space is known at the displacement u.
         """
         applied = None
         if field.in_space:
@@ -227,10 +225,8 @@ class EnergyFactory:
             self.fields.append(applied)
         if field.soft is None:
             return self.remanent(field, applied)
-        return [
-            *([] if field.soft.alone else self.remanent(field, applied)),
-            self.soft_magnetic(field, field.soft, applied),
-        ]
+        energies = [] if field.soft.alone else self.remanent(field, applied)
+        return [*energies, self.soft_magnetic(field, field.soft, applied)]
 
     def soft_magnetic(
         self, field: Magnetisation, soft_magnet: SoftMagnet, applied: AppliedField | None
@@ -247,8 +243,8 @@ class EnergyFactory:
         )
 
     def induced(self, field: Magnetisation) -> dict[str, ufl.Form]:
-        """The integrals of the polarisation over the undeformed volume of what is modelled, over h;
-        and that volume.
+        """Integrals of the polarisation over the undeformed volume of the modelled part, over h; and
+        that volume.
         """
         if field.soft is None:
             return {}
@@ -265,17 +261,16 @@ class EnergyFactory:
     def _of_sheet(
         self, sheet: Sheet, soft_magnet: SoftMagnet, applied: AppliedField | None
     ) -> list[Parameter]:
-        """The susceptibility, or what is known of what saturates; the amplitudes, and the parts of
-        the field.
+        """Parameters of a sheet's densities: the susceptibility, or the magnetisation state where
+        it saturates; amplitudes; the vectors of the field, or its polynomial in space.
         """
         chi = soft_magnet.susceptibility
-        law = (
-            pattern_field(
+        if callable(chi):
+            law = pattern_field(
                 chi, self.domain.r0, name="susceptibility", key="magnetic.susceptibility", size=1
             )[0]
-            if callable(chi)
-            else self._constant(chi)
-        )
+        else:
+            law = self._constant(chi)
         amplitudes = [
             self.free_constants.setdefault(name, self._constant(0.0)) for name in sheet.amplitudes
         ]
@@ -283,12 +278,9 @@ class EnergyFactory:
             if not self.saturated:  # energy and observed forms share it
                 self.saturated.append(self._saturated(sheet, law, amplitudes, applied))
             law = self.saturated[0]
-        return [
-            law,
-            *amplitudes,
-            *map(self._constant, sheet.vectors),
-            *([applied.polynomial] if applied else []),
-        ]
+        vectors = map(self._constant, sheet.vectors)
+        polynomials = [applied.polynomial] if applied else []
+        return [law, *amplitudes, *vectors, *polynomials]
 
     def _saturated(
         self,
@@ -310,9 +302,7 @@ class EnergyFactory:
         return sheet.saturated(chi, amplitudes, applied, saturation, followed, places_and_normals)
 
     def remanent(self, field: Magnetisation, applied: AppliedField | None) -> list[Energy]:
-        """The terms of the chosen energy, linear in the applied field, with the amplitude
-        lambda_m.
-        """
+        """Energies of a remanence, linear in the applied field, with the amplitude lambda_m."""
         pattern, domain, thins = field.remanent, self.domain, self.material.law.thins_somewhere
         full = full_density(field.law, thins=thins)
         Br = pattern_field(pattern, domain.r0)[0] if callable(pattern) else self._constant(pattern)
@@ -322,34 +312,29 @@ class EnergyFactory:
             )
             return [domain.energy("magnetic", density, "lambda_m", column="magnetic")]
         directions = [("lambda_m", "", field.applied)]
-        directions += [
-            (name, name.replace("lambda_", " "), Ba)
-            for name, Ba in zip(TRANSVERSE_AMPLITUDES, field.across, strict=False)
-        ]
-        terms = [
-            domain.energy(
-                name + suffix,
-                self._magnetised(field, density_function, Br, self._constant(Ba)),
-                amplitude,
-                linear=name in LINEAR,
-                group=name,
-                column="magnetic",
-            )
-            for amplitude, suffix, Ba in directions
-            for name, density_function in magnetic_densities(
-                field.law, field.energy, thins=thins
-            ).items()
-        ]
+        for name, Ba in zip(TRANSVERSE_AMPLITUDES, field.across, strict=False):
+            directions.append((name, name.replace("lambda_", " "), Ba))
+        chosen_densities = magnetic_densities(field.law, field.energy, thins=thins)
+        energies = []
+        for amplitude, suffix, Ba in directions:
+            for name, density_function in chosen_densities.items():
+                energy = domain.energy(
+                    name + suffix,
+                    self._magnetised(field, density_function, Br, self._constant(Ba)),
+                    amplitude,
+                    linear=name in LINEAR,
+                    group=name,
+                    column="magnetic",
+                )
+                energies.append(energy)
         if field.gradient is not None:
-            density = self._magnetised(
-                field,
-                densities.in_gradient(full),
-                Br,
-                self._constant(field.gradient),
-                parts=VALUE_AND_FIRST,
+            in_gradient = densities.in_gradient(full)
+            gradient = self._constant(field.gradient)
+            density = self._magnetised(field, in_gradient, Br, gradient, parts=VALUE_AND_FIRST)
+            energies.append(
+                domain.energy("magnetic gradient", density, "lambda_m", column="magnetic")
             )
-            terms.append(domain.energy("magnetic gradient", density, "lambda_m", column="magnetic"))
-        return terms
+        return energies
 
     def _magnetised(
         self,
@@ -358,16 +343,16 @@ class EnergyFactory:
         *parameters: Parameter,
         parts: tuple[str, ...] = FIRST_DERIVATIVES,
     ) -> Density:
-        """A density of the remanence with the thickness and, if that thins with F, the natural
-        shape.
+        """Return a density of the remanence, weighted with the thickness; where this follows from F,
+        it has the natural shape too.
         """
         density = Density(per_area(density_function), parameters, parts=parts)
         thins = self.material.law.thins_somewhere and field.law == "deformation"
         return self._with_thickness(self._thinning(density) if thins else density)
 
     def pressure(self, *, potential: bool) -> Energy:
-        """Amplitude p/p_c of a live pressure: the potential p Delta V, or its virtual work where it
-        has none.
+        """Energy of a live pressure with the amplitude p/p_c: the potential p Delta V, or virtual
+        work where it has none.
         """
         unit = self._constant(self.material.classical_pressure / self.material.h)
         swept, follower_work = (
@@ -380,12 +365,12 @@ class EnergyFactory:
         return self.domain.energy("pressure", density, "pressure", from_initial=True)
 
     def _on_pressed(self, density_function: Callable[..., Expr]) -> Callable[..., Expr]:
-        """A density of a pressure where that acts, whose last parameter is then `pressed`."""
-        return (
-            density_function
-            if self.pressed is None
-            else lambda *given: given[-1][0] * density_function(*given[:-1])
-        )
+        """Return the density of a pressure on the pressed cells alone, by a last parameter
+        `pressed`.
+        """
+        if self.pressed is None:
+            return density_function
+        return lambda *given: given[-1][0] * density_function(*given[:-1])
 
     def swept_volume(self) -> ufl.Form:
         """Delta V/R^3 of the modelled part when its points move straight to their places, where it
@@ -413,14 +398,19 @@ class EnergyFactory:
     def user_energy(
         self, term: OwnTerm, facets: Facets | None = None, amplitude: str | None = None
     ) -> Energy:
-        """The energy of a part or one's own, with the amplitude of its name or another; `facets` of
-        a term's edge.
+        """Energy of a user's term, or of a part's.
+
+        Parameters
+        ----------
+        facets
+            Facets of the term's edge; None for the surface.
+        amplitude
+            Amplitude in place of the term's name.
         """
         assert term.density
-        reference_parts = tuple(
-            part for part in term.placement_parts if part not in term.parts
-        )  # asked for of r0 alone
-        density_function = _along(term, term.at_point(term.density))
+        # parts that are needed of r0 alone
+        reference_parts = tuple(part for part in term.placement_parts if part not in term.parts)
+        density_function = _per_coordinates(term, term.at_point(term.density))
         parts = (*term.parts, *reference_parts)
         density = Density(
             density_function,
@@ -437,7 +427,7 @@ class EnergyFactory:
         parameters = self._parameters(term)
         by_column = {
             column: Density(
-                _along(term, term.at_point(observed_density)), parameters, facets=facets
+                _per_coordinates(term, term.at_point(observed_density)), parameters, facets=facets
             )
             for column, observed_density in term.observed.items()
         }
@@ -448,24 +438,27 @@ class EnergyFactory:
         return {column: self._over_area(density) for column, density in by_column.items()}
 
     def contact(self, contact: ContactBody) -> tuple[Energy, BodyContact, dict[str, ufl.Form]]:
-        """The energy of a body, what it knows of it, and the integrals of its pressure and of that
-        times its radius.
+        """Energy and state of the contact with a body, and integrals of the pressure and of pressure
+        times radius.
         """
         domain = self.domain
         approach = self.free_constants.setdefault(contact.amplitude, self._constant(0.0))
         rule, thins = domain.contact_rule, self.material.law.thins_somewhere
-        thins_at = (
-            thickness_ratio_at_points(domain, self.u, self.natural, self.law_of_cells.thins)
-            if thins
-            else None
-        )
-        pressing = BodyContact(
+        thins_at = None
+        if thins:
+            thins_at = thickness_ratio_at_points(
+                domain, self.u, self.natural, self.law_of_cells.thins
+            )
+        body_contact = BodyContact(
             contact, self.material.h, domain.r0, self.u, approach, rule, self.thickness, thins_at
         )
-        contact_density, parts = (
-            (thinned_energy, VALUE_AND_FIRST) if thins else (contact_energy, ("r",))
+        if thins:
+            contact_density, parts = (thinned_energy, VALUE_AND_FIRST)
+        else:
+            contact_density, parts = (contact_energy, ("r",))
+        density = Density(
+            per_area(contact_density), body_contact.parameters, parts, quadrature=rule
         )
-        density = Density(per_area(contact_density), pressing.parameters, parts, quadrature=rule)
         density = self._thinning(density) if thins else density
         of_radius = radius_density(self._constant(contact.front), self._constant(contact.direction))
         density_functions: dict[str, Callable[..., Expr]] = {
@@ -473,11 +466,11 @@ class EnergyFactory:
             "radius": of_radius,
         }
         by_name = {
-            name: Density(per_area(contact_density), pressing.parameters, quadrature=rule)
-            for name, contact_density in density_functions.items()
+            name: Density(per_area(density_function), body_contact.parameters, quadrature=rule)
+            for name, density_function in density_functions.items()
         }
         integrals = {name: self._over_area(density) for name, density in by_name.items()}
-        return domain.energy(f"contact {contact.body}", density), pressing, integrals
+        return domain.energy(f"contact {contact.body}", density), body_contact, integrals
 
     def _over_area(self, density: Density) -> ufl.Form:
         return self.domain.revolution_factor * self.domain.integral(
@@ -494,11 +487,11 @@ class EnergyFactory:
         return float(self.domain.mesh.comm.allreduce(value))
 
     def _with_thickness(self, density: Density) -> Density:
-        """The density over E h with the thickness as it varies, if it does."""
+        """Return a density over E h weighted with the thickness, where that varies."""
         return density if self.thickness is None else thickness_weighted(density, self.thickness)
 
     def _thinning(self, density: Density) -> Density:
-        """A density of what thins, on the natural shape, and where the law of the shell says so."""
+        """Return a density of a shell that thins, on the natural shape and by the law of each cell."""
         law, cell_materials = self.material.law, self.cell_materials
         density = grown(density, self.natural) if self.natural else density
         if cell_materials is None or not isinstance(law, LawByShell):
@@ -528,15 +521,13 @@ class EnergyFactory:
         they vary.
         """
         density = self._with_thickness(density)
-        return (
-            density
-            if self.cell_materials is None
-            else thickness_weighted(density, self.cell_materials, 2)
-        )
+        if self.cell_materials is None:
+            return density
+        return thickness_weighted(density, self.cell_materials, 2)
 
     def _elastic_density(self, density: Density) -> Density:
-        """The density of the material with the thickness as it varies, and of the natural shape, if
-        there is one.
+        """Return a density with the material's law, the thickness as it varies, and the natural
+        shape.
         """
         law = self.material.law
         numbers = (self._constant(number) for number in law.numbers)
@@ -550,9 +541,9 @@ class EnergyFactory:
         return self._constant(self.sigma)
 
 
-def _along(term: OwnTerm, density_function: Callable[..., Expr]) -> Callable[..., Expr]:
-    """A density of a term per area of the coordinates or, on an edge, per length of its parameter;
-    see `Density.function`.
+def _per_coordinates(term: OwnTerm, density_function: Callable[..., Expr]) -> Callable[..., Expr]:
+    """Return a term's density per area of the coordinates or, on an edge, per length of its
+    parameter; see `Density.function`.
     """
     if term.on is None:
         return per_area(density_function)

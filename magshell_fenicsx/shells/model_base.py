@@ -174,9 +174,10 @@ class ModelBase:
     def volume_change(self, u: Vector, mu: Amplitudes | None = None) -> float:
         """Delta V/R^3 of the whole shell, whose supports move by these amplitudes."""
         moving = self.system.moving
-        lids = (
-            moving.edge_pressure.swept_volume(mu) if mu and moving and moving.edge_pressure else 0.0
-        )
+        if mu and moving and moving.edge_pressure:
+            lids = moving.edge_pressure.swept_volume(mu)
+        else:
+            lids = 0.0
         return self.multiplicity * (
             self.system.at_state(State(u, dict(mu or {}))).integral(self._volume) + lids
         )
@@ -201,12 +202,11 @@ class ModelBase:
 
     def region(self, state: State, approach: str) -> Region:
         """Return the region where a body touches the shell."""
-        pressing, forms = self.contacts[approach]
+        body_contact, forms = self.contacts[approach]
         evaluation = self.system.at_state(state)
         pressure, moment = (evaluation.integral(forms[name]) for name in ("pressure", "radius"))
-        return evaluation.evaluate(
-            lambda: pressing.region(self.system.comm, moment / pressure if pressure else 0.0)
-        )
+        mean_radius = moment / pressure if pressure else 0.0
+        return evaluation.evaluate(lambda: body_contact.region(self.system.comm, mean_radius))
 
     def cell_pressures(self, state: State) -> Array | None:
         """The pressure of all contacts in each local cell, see `BodyContact`; None without
@@ -214,18 +214,13 @@ class ModelBase:
         """
         if not (self.contacts or self.shell_contacts):
             return None
-        pressings = [pressing for pressing, _ in self.contacts.values()]
+        body_contacts = [body_contact for body_contact, _ in self.contacts.values()]
 
         def pressure_of_cells() -> Array:
-            body_pressures = [pressing.cell_pressures() for pressing in pressings]
-            return np.asarray(
-                sum(
-                    (
-                        *body_pressures,
-                        *(contact.cell_pressures_and_gaps()[0] for contact in self.shell_contacts),
-                    )
-                )
-            )
+            pressures = [body_contact.cell_pressures() for body_contact in body_contacts]
+            for contact in self.shell_contacts:
+                pressures.append(contact.cell_pressures_and_gaps()[0])
+            return np.asarray(sum(pressures))
 
         return self.system.at_state(state).evaluate(pressure_of_cells)
 
@@ -233,10 +228,10 @@ class ModelBase:
         """Whether the mean in each local cell is the pressure of a contact there, see
         `BodyContact`.
         """
-        pressings = [pressing for pressing, _ in self.contacts.values()]
+        body_contacts = [body_contact for body_contact, _ in self.contacts.values()]
 
         def flags_of_cells() -> NDArray[np.bool_]:
-            body_flags = [pressing.evenly_pressed() for pressing in pressings]
+            body_flags = [body_contact.evenly_pressed() for body_contact in body_contacts]
             shell_flags = [contact.cell_pressures_and_gaps()[2] for contact in self.shell_contacts]
             return np.asarray(np.any([*body_flags, *shell_flags], axis=0))
 
@@ -300,9 +295,9 @@ class ThinModel(ModelBase):
             self.observed |= self.kernels.compile_all([factory.induced(self.loads.magnetic)])
         self.contacts = {}
         for contact in self.loads.contacts:
-            energy, pressing, integrals = factory.contact(contact)
+            energy, body_contact, integrals = factory.contact(contact)
             energies.append(energy)
-            self.contacts[contact.amplitude] = pressing, self.kernels.compile_all([integrals])
+            self.contacts[contact.amplitude] = body_contact, self.kernels.compile_all([integrals])
         return energies
 
     @property

@@ -64,11 +64,9 @@ def mode_space(model: Model) -> ModeSpace:
     call. Collective.
     """
     modes = None if isinstance(model, MeridianModel) else model.symmetry_breaking_modes
-    return (
-        ModeSpace(modes.half_model, modes.unfold)
-        if isinstance(modes, SectorModes)
-        else ModeSpace(model)
-    )
+    if isinstance(modes, SectorModes):
+        return ModeSpace(modes.half_model, modes.unfold)
+    return ModeSpace(model)
 
 
 @dataclass(frozen=True)
@@ -230,9 +228,10 @@ def _families(
 
     if isinstance(model, MeridianModel):
         free_motions = model.rigid_motions(rest.mu) if rest else None
-        axial_count, transverse_count = (
-            (len(free_motions.along), len(free_motions.across)) if free_motions else (0, 0)
-        )
+        if free_motions:
+            axial_count, transverse_count = (len(free_motions.along), len(free_motions.across))
+        else:
+            axial_count, transverse_count = (0, 0)
         torsions: list[Vector] = [*free_motions.around] if free_motions else []
         yield family_of_system("", model.system, axial_count)
         waves = model.symmetry_breaking_modes.waves

@@ -136,9 +136,10 @@ class ShellSupports:
 
     def _add_support(self, name: str, condition: Condition) -> Support:
         """Add the support of an edge, a patch or a point, and the energy of a clamped edge."""
-        components = (
-            condition.components if isinstance(condition, HeldComponents) else ALL_COMPONENTS
-        )
+        if isinstance(condition, HeldComponents):
+            components = condition.components
+        else:
+            components = ALL_COMPONENTS
         edge, turn = "", None
         if name in self._clamped:
             edge = f"{name} clamped edges" if len(self._clamped) > 1 else "clamped edges"

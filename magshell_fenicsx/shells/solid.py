@@ -317,11 +317,9 @@ def _in_cells(field: Magnetisation, body: BodyMesh) -> Magnetisation:
         If the body has no such patch.
     """
     by_cell = field.on(body.patches, len(body.layer_bounds))
-    return (
-        replace(by_cell, remanent=_layered(field.layers, body))
-        if field.layers and not field.patches
-        else by_cell
-    )
+    if field.layers and not field.patches:
+        return replace(by_cell, remanent=_layered(field.layers, body))
+    return by_cell
 
 
 def _layered(layers: Sequence[tuple[float, Array]], body: BodyMesh) -> ByPatch:

@@ -81,9 +81,9 @@ class SolidDensity:
     def rule(self) -> tuple[Array, Array]:
         """Points on the reference facet, and their weights."""
         points, weights = basix.make_quadrature(basix.CellType.quadrilateral, self.degree)
-        return (
-            ((points + np.eye(2)[1]) / [1.0, 2.0], weights / 2) if self.upper else (points, weights)
-        )
+        if self.upper:
+            return ((points + np.eye(2)[1]) / [1.0, 2.0], weights / 2)
+        return (points, weights)
 
 
 class SolidTerm(DensityTerm[SolidDensity]):
@@ -198,11 +198,12 @@ class TermFactory:
         parts of the field.
         """
         chi, V = soft_magnet.susceptibility, self.u.function_space
-        law = (
-            field_in_body(chi, V, name="susceptibility", key="magnetic.susceptibility", size=1)
-            if callable(chi)
-            else self._constants(chi)[0]
-        )
+        if callable(chi):
+            law = field_in_body(
+                chi, V, name="susceptibility", key="magnetic.susceptibility", size=1
+            )
+        else:
+            law = self._constants(chi)[0]
         n0 = field_in_body(radial, V, name="n0")
         amplitudes = [
             self.free_constants.setdefault(name, self._constants(0.0)[0])
@@ -249,11 +250,10 @@ class TermFactory:
         """The terms, linear in the applied field, with the amplitude lambda_m."""
         pattern = field.remanent
         law = body_densities if field.law == "deformation" else rotation_law
-        Br = (
-            field_in_body(pattern, self.u.function_space)
-            if callable(pattern)
-            else self._constants(pattern)[0]
-        )
+        if callable(pattern):
+            Br = field_in_body(pattern, self.u.function_space)
+        else:
+            Br = self._constants(pattern)[0]
         if applied:
             density = SolidDensity(
                 law.magnetic_in_space,
@@ -410,19 +410,20 @@ class TermFactory:
         parameters = self._constants(
             unit, *([origin] if origin is not None and origin.any() else [])
         )
-        face_density, end_density = (
-            (body_densities.swept_volume, body_densities.swept_volume_on_end)
-            if moves_straight
-            else (body_densities.pressure, body_densities.sealing)
-        )
-        face_work, end_work = (
-            (None, None)
-            if potential
-            else (
+        if moves_straight:
+            face_density, end_density = (
+                body_densities.swept_volume,
+                body_densities.swept_volume_on_end,
+            )
+        else:
+            face_density, end_density = (body_densities.pressure, body_densities.sealing)
+        if potential:
+            face_work, end_work = (None, None)
+        else:
+            face_work, end_work = (
                 body_densities.follower_pressure_work,
                 body_densities.follower_pressure_work_on_end,
             )
-        )
         of_faces = {
             "pressure": SolidDensity(
                 face_density,

@@ -376,9 +376,10 @@ class MidSurfaces:
         nodal = self.r0[self.cells.nodes[cells]]
         centres = nodal.mean(axis=1)
         radii = CELL_RADIUS_FACTOR * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
-        cells_near = (
-            cKDTree(centres).query_ball_point(x, 2 * radii.max()) if len(cells) else [[]] * len(x)
-        )
+        if len(cells):
+            cells_near = cKDTree(centres).query_ball_point(x, 2 * radii.max())
+        else:
+            cells_near = [[]] * len(x)
         point = np.repeat(np.arange(len(x)), [len(numbers) for numbers in cells_near])
         candidate_cells = np.concatenate(
             [np.asarray(numbers, dtype=np.int64) for numbers in (*cells_near, [])]
@@ -572,11 +573,12 @@ def _tie_stiffness(
     """(n, 2) stiffness of both ties at points that stand for a length `weight`, of cells with sides
     of that length.
     """
-    turning_stiffness = (
-        TIE_STIFFNESS_RATIO * factors[:, 1] * material.bending_stiffness / length
-        if joint.rigid
-        else joint.stiffness
-    )
+    if joint.rigid:
+        turning_stiffness = (
+            TIE_STIFFNESS_RATIO * factors[:, 1] * material.bending_stiffness / length
+        )
+    else:
+        turning_stiffness = joint.stiffness
     return np.column_stack(
         [weight * TIE_STIFFNESS_RATIO * factors[:, 0] / length, weight * turning_stiffness]
     )
@@ -592,11 +594,10 @@ def _refuse_apart(
     )
     if largest_distance > MAX_DISTANCE_IN_THICKNESSES * h:
         edge, other = joint.edges
-        distance_text = (
-            f"by {largest_distance:.4g} R"
-            if np.isfinite(largest_distance)
-            else "by more than a cell"
-        )
+        if np.isfinite(largest_distance):
+            distance_text = f"by {largest_distance:.4g} R"
+        else:
+            distance_text = "by more than a cell"
         raise MeshError(
             f"{key}: the edge {edge} is not on the mid-surface of {other}, {distance_text} at "
             f"{place_text(place)}, over R: move one of the shells"

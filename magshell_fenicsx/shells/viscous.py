@@ -128,11 +128,10 @@ class Viscosity:
     def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
         """The forces at a part of the step from u0 to u1, with the velocity v there."""
         displacement = u0 + part * (u1 - u0)
-        stress = (
-            self.creep_time * self._strain_rate(displacement, v)
-            if self.creep_time
-            else np.zeros((*self._places.shape, STRAIN_SIZE))
-        )
+        if self.creep_time:
+            stress = self.creep_time * self._strain_rate(displacement, v)
+        else:
+            stress = np.zeros((*self._places.shape, STRAIN_SIZE))
         if self._branches:
             for branch, q, end in zip(
                 self._branches, self.memory.strains, self._evolved(u0, u1, dt), strict=True
@@ -218,17 +217,16 @@ class Viscosity:
         """Return the part of a change of the mean rate, from the last step to this one, that is
         left in the spring.
         """
-        return (
-            0.0
-            if self.memory.rate is None
-            else _curvature_weight(dt / branch.time) * dt * 2 * dt / (dt + self.memory.dt)
-        )
+        if self.memory.rate is None:
+            return 0.0
+        return _curvature_weight(dt / branch.time) * dt * 2 * dt / (dt + self.memory.dt)
 
     def _strain_change(self, u0: Vector, u1: Vector) -> Array:
         if self._first_strain[0] is not u0:
-            self._first_strain = (
-                self._last_strain if self._last_strain[0] is u0 else (u0, self._strain(u0))
-            )
+            if self._last_strain[0] is u0:
+                self._first_strain = self._last_strain
+            else:
+                self._first_strain = (u0, self._strain(u0))
         if self._last_strain[0] is not u1:
             self._last_strain = u1, self._strain(u1)
         return self._last_strain[1] - self._first_strain[1]
@@ -400,14 +398,12 @@ def _works(
     def law(j: Jet, side: str = "") -> Law:
         """Law of the shell at small strains, which a viscous stress follows too."""
         of_shell = densities.law_at(model.material.law.linear, j)
-        law_hereerials = factory.cell_materials
+        materials = factory.cell_materials
         of_shell = of_shell if t is None else of_shell.thicker((t(side) if side else t)[0])
-        return (
-            of_shell
-            if law_hereerials is None
-            else of_shell.with_material(
-                *((law_hereerials(side) if side else law_hereerials)[i] for i in (0, 1, 3))
-            )
+        if materials is None:
+            return of_shell
+        return of_shell.with_material(
+            *((materials(side) if side else materials)[i] for i in (0, 1, 3))
         )
 
     E, K = _strains(r0, u)

@@ -112,11 +112,10 @@ class _WaveBatch:
         self._wave = points.field(WAVE * DERIVATIVES * sides)
         self._geometry = points.field(2 * sides)
         fill(self._geometry, batch.geometry)
-        fixed = (
-            [domain.r0]
-            if domain.initial_placement is None
-            else [domain.r0, domain.initial_placement]
-        )
+        if domain.initial_placement is None:
+            fixed = [domain.r0]
+        else:
+            fixed = [domain.r0, domain.initial_placement]
         self._placed = Memo(self._place, lambda: tuple(field.x.array for field in fixed))
         self._m = fem.Constant(points._mesh, 1.0)
         self._given = [
@@ -178,11 +177,13 @@ class _WaveBatch:
         kernels = []
         for e, (parameters, _) in zip(self._energies, self._given, strict=True):
             assert e.density
-            start, shift = (
-                (initial_jets, [a - b for a, b in zip(r0, initial_jets, strict=True)])
-                if self._is_drawn(e)
-                else (r0, None)
-            )
+            if self._is_drawn(e):
+                start, shift = (
+                    initial_jets,
+                    [a - b for a, b in zip(r0, initial_jets, strict=True)],
+                )
+            else:
+                start, shift = (r0, None)
             displacements = [a + b for a, b in zip(u, shift, strict=True)] if shift else u
             W = ufl.zero()
             for part in range(2):  # the cosine's and the sine's
@@ -363,9 +364,10 @@ def _batches(domain: IntegrationDomain, density: Density | None) -> Iterable[Ent
         return
     topology.create_connectivity(0, 1)
     links, corners = topology.connectivity(0, 1), topology.connectivity(1, 0).array.reshape(-1, 2)
-    inner = (
-        np.flatnonzero(np.diff(links.offsets) == 2) if density.facets is None else density.facets
-    )
+    if density.facets is None:
+        inner = np.flatnonzero(np.diff(links.offsets) == 2)
+    else:
+        inner = density.facets
     cells_at_vertex = np.array([links.links(vertex) for vertex in inner], dtype=np.int32).reshape(
         len(inner), -1
     )

@@ -40,9 +40,10 @@ class ControlPoints:
 
     def weights(self, x: Array) -> "scipy.sparse.csr_matrix":
         """w (m, n) at places (m, 3). Far from all points the nearest one counts alone."""
-        places = (
-            np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]]) if self.is_axisymmetric else x
-        )
+        if self.is_axisymmetric:
+            places = np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]])
+        else:
+            places = x
         tree, count = scipy.spatial.cKDTree(self.places), len(self.places)
         neighbour_count = min(FIRST_NEIGHBOURS, count)
         while True:

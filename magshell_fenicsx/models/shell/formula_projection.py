@@ -174,11 +174,10 @@ def project_formula(
     )
     size, differs, square = map(float, sums)
     scale, sizes = area.sum(axis=1) / w.sum(), (area * magnitude).sum(axis=1)
-    detail = (
-        _find_hidden_detail(values, formulas, cells, np.einsum("q,cqi->ci", w, f))
-        if formulas
-        else _HiddenDetail.none(len(scale))
-    )
+    if formulas:
+        detail = _find_hidden_detail(values, formulas, cells, np.einsum("q,cqi->ci", w, f))
+    else:
+        detail = _HiddenDetail.none(len(scale))
     hidden_by_cell = scale * detail.hidden
     hidden_integral = float(cells.sum_over_ranks(hidden_by_cell))
     size += hidden_integral

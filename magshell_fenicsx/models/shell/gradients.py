@@ -118,9 +118,9 @@ class PointGradient:
             (sum(self._work, ufl.zero()), self._v),
         ]
         sums = [(W, z) for W, z in sums if z in extract_coefficients(W)]
-        return (
-            point_gradient(f"{', '.join(self._names)} gradient", sums, self._log) if sums else None
-        )
+        if sums:
+            return point_gradient(f"{', '.join(self._names)} gradient", sums, self._log)
+        return None
 
     def energy(self, name: str) -> PointKernel | None:
         """The kernel of a term's energy; None if that is zero."""

@@ -283,11 +283,9 @@ class LawByShell(Law):
 
     @property
     def linear(self) -> "LawByShell":
-        return (
-            self
-            if all(law.linear is law for law in self.laws)
-            else self._with_each_law(lambda law: law.linear)
-        )
+        if all(law.linear is law for law in self.laws):
+            return self
+        return self._with_each_law(lambda law: law.linear)
 
     @property
     def bending_stiffness(self) -> Scalar:

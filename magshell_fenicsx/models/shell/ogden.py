@@ -151,8 +151,6 @@ def _horner(c: list[float], w: Scalar) -> Scalar:
 
 
 def _conditional(condition: Any, if_true: Scalar, if_false: Scalar) -> Scalar:
-    return (
-        ufl.conditional(condition, if_true, if_false)
-        if isinstance(condition, Expr)
-        else np.where(condition, if_true, if_false)
-    )
+    if isinstance(condition, Expr):
+        return ufl.conditional(condition, if_true, if_false)
+    return np.where(condition, if_true, if_false)

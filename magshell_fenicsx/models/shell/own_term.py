@@ -545,15 +545,14 @@ def _as_expression(
         value = np.where(value.largest == 0, 1.0, value.largest)
         value = value if len(value) > 1 else float(value[0])
     if isinstance(value, ufl.Coefficient):  # of any value
-        value = (
-            np.arange(1.0, 1 + prod(value.ufl_shape)) if value.ufl_shape not in ((), (1,)) else 1.0
-        )
+        if value.ufl_shape not in ((), (1,)):
+            value = np.arange(1.0, 1 + prod(value.ufl_shape))
+        else:
+            value = 1.0
     if isinstance(value, Free):
         return ufl.as_ufl(
             value.value or 1.0
         )  # of no place in its range, such as zero, that hides terms
-    return (
-        ufl.as_ufl(float(value))
-        if np.ndim(value) == 0
-        else ufl.as_tensor(np.asarray(value, dtype=float).tolist())
-    )
+    if np.ndim(value) == 0:
+        return ufl.as_ufl(float(value))
+    return ufl.as_tensor(np.asarray(value, dtype=float).tolist())

@@ -70,9 +70,9 @@ class Material:
     def law(self) -> Law:
         """How a shell of it resists strains."""
         if self.laws:
-            return (
-                LawByShell(self.h, self.nu, laws=self.laws) if len(self.laws) > 1 else self.laws[0]
-            )
+            if len(self.laws) > 1:
+                return LawByShell(self.h, self.nu, laws=self.laws)
+            return self.laws[0]
         if self.laminate:
             return Laminated.from_laminate(self.laminate, self.h, self.nu)
         if isinstance(self.rubber, tuple):

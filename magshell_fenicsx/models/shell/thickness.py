@@ -47,11 +47,9 @@ class Thickness:
         """
         if self.carried:
             return np.array(self.carried(x)[..., 0])
-        return (
-            np.array(self.of_position(*np.moveaxis(x, -1, 0)))
-            if self.of_position
-            else np.ones(x.shape[:-1])
-        )
+        if self.of_position:
+            return np.array(self.of_position(*np.moveaxis(x, -1, 0)))
+        return np.ones(x.shape[:-1])
 
     def values_in_cells(self, cells: CellGeometry, nodal: Array) -> Array:
         """The values (cells, nodes) of a formula as `project_formula`; collective."""
@@ -128,11 +126,10 @@ def thickness_field(
     values = thickness.values_in_cells(cell_geometry(r0), values)
     for name, factor in (thickness.patches or {}).items():
         is_inside = patch_of(patches or {}, name, "shell.thickness_factor")
-        values[is_inside] = (
-            factor.in_cells(select_cells(cell_geometry(r0), is_inside))
-            if isinstance(factor, PlacedFactor)
-            else factor
-        )
+        if isinstance(factor, PlacedFactor):
+            values[is_inside] = factor.in_cells(select_cells(cell_geometry(r0), is_inside))
+        else:
+            values[is_inside] = factor
     refuse_unfit(values, nodes, V.mesh.comm)
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (1,)))
     field = PlacementField(Q, "thickness", lambda r: thickness_field(thickness, r, patches))
