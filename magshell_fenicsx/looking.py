@@ -145,7 +145,7 @@ def _placed(case: "Case") -> Iterator[None]:
     try:
         yield
     except CaseError as e:
-        raise CaseError(case.placed(str(e))) from None
+        raise CaseError(case.with_place(str(e))) from None
 
 
 def _names() -> list[str]:

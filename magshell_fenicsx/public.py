@@ -57,7 +57,7 @@ def problem_of(
     try:
         return (case.with_terms([*case.own_terms, *terms]) if terms else case).problem()
     except (CaseError, MeshError) as e:
-        raise type(e)(case.placed(str(e))) from None
+        raise type(e)(case.with_place(str(e))) from None
 
 
 def processes(given: Any, comm: MPI.Comm | None = None) -> MPI.Comm:

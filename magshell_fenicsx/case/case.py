@@ -358,9 +358,9 @@ class Case(WithParts):
         sections |= self.several.readers if self.several else {}
         return {key: s for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
 
-    def placed(self, message: str) -> str:
+    def with_place(self, message: str) -> str:
         """Return a message with the place of its key in the file."""
-        return super().placed(in_words_of_shells(message, self.origin.data))
+        return super().with_place(in_words_of_shells(message, self.origin.data))
 
     @classmethod
     def load(cls, file: str | Path, settings: Sequence[str] = ()) -> "Case":

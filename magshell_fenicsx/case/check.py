@@ -35,7 +35,7 @@ def describe(case: Case, problem: Problem | None = None) -> str:
     try:
         return _description(case, problem or make_problem(case))
     except (CaseError, MeshError) as e:
-        raise CaseError(case.placed(str(e))) from None
+        raise CaseError(case.with_place(str(e))) from None
 
 
 def _description(case: Case, problem: Problem) -> str:

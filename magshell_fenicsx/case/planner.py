@@ -39,8 +39,8 @@ from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.ability import Modelled
-from magshell_fenicsx.parts.bodies.body_contact import Contact
-from magshell_fenicsx.parts.bodies.body_setup import Pressed, body_leaves, contacts
+from magshell_fenicsx.parts.bodies.body_contact import ContactBody
+from magshell_fenicsx.parts.bodies.body_setup import ContactZone, body_symmetry, contact_bodies
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry, flaws, in_frame
 from magshell_fenicsx.parts.imperfections.modes import Mode, ModesSection
 from magshell_fenicsx.parts.imperfections.symmetry import (
@@ -235,7 +235,7 @@ def document_of(case: Case) -> Document:
         data=case.model_dump(mode="json", exclude_none=True),
         name=case.file_name,
         outside=case.outside,
-        placed=case.placed,
+        with_place=case.with_place,
     )
 
 
@@ -418,14 +418,14 @@ def _constraints(
     one_by_one = bool(case.patches)
     constraints = symmetry_constraints(case, outline, energies)
     constraints += leaves(shell.imperfections, shell.perfect, one_by_one=one_by_one)
-    constraints += [body_leaves(contact) for contact in _body_contacts(case, shell.reference)]
+    constraints += [body_symmetry(contact) for contact in _body_contacts(case, shell.reference)]
     return constraints
 
 
-def _body_contacts(case: Case, reference: ReferenceShell) -> tuple[Contact, ...]:
+def _body_contacts(case: Case, reference: ReferenceShell) -> tuple[ContactBody, ...]:
     """Return the contacts of a case with rigid bodies, in the frame of a reference shell."""
     driven = {step.name for step in case.programme}
-    return contacts(case.bodies, case.approaches, driven, reference)
+    return contact_bodies(case.bodies, case.approaches, driven, reference)
 
 
 @dataclass(frozen=True)
@@ -510,8 +510,8 @@ class _MeshPlan:
     shape: Chart | RimmedGrid
     size: Grading
     points: dict[str, Array]
-    bodies: tuple[Contact, ...]
-    contact_regions: Sequence[Pressed]
+    bodies: tuple[ContactBody, ...]
+    contact_regions: Sequence[ContactZone]
     rim_count: int
 
 
@@ -539,7 +539,7 @@ def _mesh_plan(
     bodies = _body_contacts(case, replace(shell.reference, turn=part.turn))
     sampled_shell = replace(shell.reference, imperfect=outline)
     contact_regions = [
-        Pressed.by(
+        ContactZone.of_body(
             contact,
             (step.load for step in case.programme if step.name == contact.amplitude),
             sampled_shell,

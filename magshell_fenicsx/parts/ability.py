@@ -121,7 +121,9 @@ class Context:
 
     def driven_before(self, number: int) -> set[str]:
         """Return the amplitudes that steps before one have driven."""
-        return {name for step in self.steps_before(number) for name in (step.name, *step.load.drives)}
+        return {
+            name for step in self.steps_before(number) for name in (step.name, *step.load.drives)
+        }
 
     def has_modulus(self, what: str) -> None:
         """See that there is a modulus, which something needs.
@@ -172,8 +174,7 @@ class Context:
 
     @property
     def time_unit(self) -> float | None:
-        """R √(ρ/E), the unit of times: in seconds where the case has units; None without a density.
-        """
+        """R √(ρ/E), the unit of times: in seconds where the case has units; None without a density."""
         density, modulus = self.shell.density, self.shell.youngs_modulus
         return (
             float(self.shell.reference * np.sqrt(density / modulus))

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import Section, or_number
-from magshell_fenicsx.parts.step_course import StepCourse, Target
 from magshell_fenicsx.parts.ability import Account, Context, KeyAbility, Modelled
-from magshell_fenicsx.parts.path_step import FactorStep
 from magshell_fenicsx.parts.observables import Observables
+from magshell_fenicsx.parts.path_step import FactorStep
 from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.parts.step_course import StepCourse, Target
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
@@ -218,7 +218,7 @@ class FoldStep(FactorStep):
 class FoldObservables(Observables):
     """How far the angles have grown."""
 
-    def named(self, loads: "Loads") -> Sequence[str]:
+    def free_amplitudes(self, loads: "Loads") -> Sequence[str]:
         return (AMPLITUDE,) if any(joint.angle is not None for joint in loads.joints) else ()
 
 

@@ -18,14 +18,14 @@ from magshell_fenicsx.models.shell.parameters import (
 )
 
 if TYPE_CHECKING:
-    from magshell_fenicsx.parts.bodies.body_contact import Contact
+    from magshell_fenicsx.parts.bodies.body_contact import ContactBody
+    from magshell_fenicsx.parts.contact.contact_section import Pair
     from magshell_fenicsx.parts.joints import Joint
     from magshell_fenicsx.parts.magnetism.field_maps import FieldMap
     from magshell_fenicsx.parts.magnetism.interaction import Interaction
     from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
     from magshell_fenicsx.parts.magnetism.sensors import Sensor
     from magshell_fenicsx.parts.natural.shape import Natural
-    from magshell_fenicsx.parts.contact.contact_section import Pair
 
 
 @dataclass(frozen=True)
@@ -63,7 +63,7 @@ class Loads:
     own: tuple[OwnTerm, ...] = ()
     natural: "Natural | None" = None
     moves: tuple[Move, ...] = ()
-    contacts: "tuple[Contact, ...]" = ()
+    contacts: "tuple[ContactBody, ...]" = ()
     growing: Mapping[str, tuple[Deviation, ...]] = field(default_factory=dict)
     remanence: "Magnetisation | None" = None
     sensors: "tuple[Sensor, ...]" = ()

@@ -1,5 +1,5 @@
-"""What rooms of parts see of a state: their columns of path.csv, and the units of what is conjugate
-to amplitudes.
+"""Observables: what parts observe of a state, as columns of path.csv, maps and lines of
+summary.json; and the units of what is conjugate to amplitudes.
 """
 
 from collections.abc import Mapping, Sequence
@@ -52,7 +52,7 @@ class ModelView:
 
     @property
     def loads(self) -> "Loads":
-        """What loads the model."""
+        """All that loads the model."""
         return self.model.loads
 
     @property
@@ -66,7 +66,7 @@ class ModelView:
         return self.modulus * self.h * self.length**2
 
     def potential(self, state: "State", name: str) -> float:
-        """Pi_i(u) of an amplitude, of what is modelled."""
+        """Return Pi_i(u) of an amplitude, of what is modelled."""
         return self.model.system.potential(state.u, state.mu, name)
 
 
@@ -92,19 +92,18 @@ class Slope:
 
 @dataclass(frozen=True)
 class MapGrid:
-    """A rectangle or a box in space with vectors at its points, in the frame of the case; lengths
-    are over R.
+    """Vectors at the points of a rectangle or a box in space, in the frame of the case.
 
     Attributes
     ----------
     corner, sides
-        (3,) where it begins, and (2, 3) or (3, 3) its sides, perpendicular to each other.
+        (3,) where it begins, and (2, 3) or (3, 3) its sides, perpendicular to each other; over R.
     points
         How many along each side.
     unit
         Of the values.
     words
-        What the values are.
+        Meaning of the values.
     values
         (n, 3) at the points, along the first side first; nan where there are none.
     """
@@ -119,14 +118,14 @@ class MapGrid:
 
     @property
     def places(self) -> Array:
-        """(n, 3) of its points."""
+        """The places (n, 3) of its points, over R."""
         along = np.meshgrid(*(np.linspace(0.0, 1.0, n) for n in self.points[::-1]), indexing="ij")
         shares = np.stack([each.ravel() for each in along[::-1]], axis=-1)
         return np.asarray(self.corner + shares @ self.sides)
 
 
 class Observables:
-    """What a room sees; by default nothing.
+    """The base of what a part observes of a state; by default nothing.
 
     Attributes
     ----------
@@ -146,11 +145,11 @@ class Observables:
         register_for_all_cases(cls.quantities, cls.varied)
 
     def amplitudes(self, loads: "Loads") -> Sequence[str]:
-        """Its amplitudes."""
+        """Return the amplitudes that are its columns."""
         return ()
 
-    def named(self, loads: "Loads") -> Sequence[str]:
-        """Further amplitudes, which are columns themselves and begin at zero."""
+    def free_amplitudes(self, loads: "Loads") -> Sequence[str]:
+        """Return further amplitudes, which are columns themselves and begin at zero."""
         return ()
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
@@ -163,51 +162,51 @@ class Observables:
         """
 
     def conjugates(self, loads: "Loads") -> dict[str, str]:
-        """Amplitude -> the column of what is conjugate to it, besides those of every run."""
+        """Return amplitude -> column of its conjugate, besides those of every run."""
         return {}
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
-        """Columns besides those of every run; `supports` are those whose reactions are reported."""
+        """Return columns besides those of every run; `supports` are those with reported reactions."""
         return (*self.amplitudes(loads), *self.conjugates(loads).values())
 
     def moments(self, loads: "Loads") -> Sequence[str]:
-        """Those of its columns that are moments where others of the kind are forces."""
+        """Return the columns that are moments where others of the kind are forces."""
         return ()
 
-    def ways(self, loads: "Loads") -> dict[str, tuple[bool, float]]:
-        """Of amplitudes that are motions: whether it turns, and how far it goes at one, over R or
-        in rad.
+    def motions(self, loads: "Loads") -> dict[str, tuple[bool, float]]:
+        """Return amplitudes that are motions: whether each turns, and its way at one (over R, or
+        rad).
         """
         return {}
 
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
-        """Column -> value."""
+        """Return column -> value."""
         return {}
 
     def grids(self, loads: "Loads") -> Sequence[str]:
-        """Names of the grids in space on which it sees something."""
+        """Return the names of the grids in space on which it observes a field."""
         return ()
 
     def on_grids(self, view: ModelView, state: "State") -> Sequence[MapGrid]:
-        """These grids with what it sees there; collective."""
+        """Return these grids with the fields there; collective."""
         return ()
 
     def differentiable(self, loads: "Loads") -> Sequence[str]:
-        """Its columns that have a `slope`."""
+        """Return the columns that have a `slope`."""
         return ()
 
     def slope(self, view: ModelView, state: "State", column: str) -> Slope | None:
-        """A column with its derivatives; None if it is another room's; collective."""
+        """Return a column with its derivatives; None if it is another part's. Collective."""
         return None
 
     def left_out(self, view: ModelView) -> Sequence[str]:
-        """What the model lacks of it, for people."""
+        """Return what the model lacks of it, for people."""
         return ()
 
     def summary(self, view: ModelView, state: "State") -> dict[str, Any]:
-        """What summary.json says of the end of a path; collective."""
+        """Return what summary.json says of the end of a path; collective."""
         return {}
 
     def conjugate_unit(self, view: ModelView, name: str) -> float | None:
-        """-dPi/dmu of one unit of what is conjugate to an amplitude; None if it is another room's."""
+        """Return -dPi/dmu of one unit of an amplitude's conjugate; None if it is another part's."""
         return None

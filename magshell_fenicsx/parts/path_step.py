@@ -10,19 +10,19 @@ import numpy as np
 from pydantic import Field, PrivateAttr, model_validator
 
 from magshell_fenicsx.input.section import is_over_unit, over_unit
+from magshell_fenicsx.parts.ability import Context
+from magshell_fenicsx.parts.step import LEAST_TARGET, Step
 from magshell_fenicsx.parts.step_course import (
     Control,
-    StepCourse,
     Drive,
-    StepStart,
     LoadStart,
     Prescribed,
     SnapSection,
+    StepCourse,
+    StepStart,
     Target,
     Until,
 )
-from magshell_fenicsx.parts.ability import Context
-from magshell_fenicsx.parts.step import LEAST_TARGET, Step
 
 Count = Annotated[
     int, Field(ge=1, le=10000, description="Equal parts to the target, each a row; or steps")
@@ -231,7 +231,9 @@ class PathStep(Step):
     def course(self, step_start: StepStart) -> StepCourse:
         until = "target" if self.until == "zero" else self.until
         steps = self.points if until == "points" else None
-        return StepCourse(self.drive(self.load_start(step_start)), until, steps, self.curves(step_start))
+        return StepCourse(
+            self.drive(self.load_start(step_start)), until, steps, self.curves(step_start)
+        )
 
     def load_start(self, step_start: StepStart) -> LoadStart:
         """Its amplitude where it begins."""

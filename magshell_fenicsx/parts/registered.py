@@ -1,6 +1,4 @@
-"""The lists of all parts, of all kinds of steps and of what rooms observe; and the base of a case
-that they make.
-"""
+"""The lists of all parts, of all kinds of steps and of all observables; and the base of a case."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -114,22 +112,23 @@ class WithOwnTerms(Section):
     _origin: Origin = PrivateAttr(default=Origin())
 
     def written_as(self, origin: Origin) -> Self:
-        """The case, with the places of its keys for messages that it does not make itself."""
+        """Return the case, with the places of its keys for messages that it does not make itself."""
         self._origin = origin
         return self
 
     @property
     def origin(self) -> Origin:
-        """Where and how it was written."""
+        """Where and how the case was written."""
         return self._origin
 
     @property
     def file_name(self) -> str:
-        """Name of its case file; empty without one."""
+        """The name of its case file; empty without one."""
         return Path(self._origin.place(())).name if self._origin.place else ""
 
-    def placed(self, message: str) -> str:
-        """A message that begins with a key of the case, with the place of this key before it.
+    def with_place(self, message: str) -> str:
+        """Return a message that begins with a key of the case, with the place of this key before
+        it.
 
         A name after the key, as that of a patch, is looked for below it.
         """
@@ -144,12 +143,13 @@ class WithOwnTerms(Section):
 
     @property
     def own_terms(self) -> tuple[OwnTerm, ...]:
-        """The user-defined energies; what is made of the case has them."""
+        """The user-defined energies, which all that is made of the case has."""
         return self._own_terms
 
     def with_terms(self, terms: Sequence[OwnTerm]) -> Self:
-        """A copy of the case with these energies, for `run`, `Scene` and whatever else takes a
-        case.
+        """Return a copy of the case with user-defined energies.
+
+        `run`, `Scene` and all else that takes a case take it.
         """
         copied = self.model_copy()
         copied._own_terms = tuple(terms)
@@ -162,23 +162,23 @@ class WithOwnTerms(Section):
 
 
 def parts_of(context: Context) -> dict[str, Part]:
-    """The registered parts that a problem has, by key."""
+    """Return the registered parts that a problem has, by key."""
     return {key: part for key in PART_CLASSES if (part := context.sections.get(key)) is not None}
 
 
 def abilities_of(context: Context) -> list[Ability]:
-    """All that add something to a problem."""
+    """Return all abilities that a problem has."""
     listed = (ability.from_context(context) for ability in ABILITY_CLASSES)
     return [*parts_of(context).values(), *(ability for ability in listed if ability is not None)]
 
 
 def accounts(context: Context, loads: "Loads") -> list[Account]:
-    """What all rooms have in a model."""
+    """Return the lines of `magshell check` on all abilities of a model."""
     return [import_module(f"{__package__}.{module}").account(context, loads) for module in ACCOUNTS]
 
 
-def _named(path: str) -> Any:
-    """The class at a path below this room."""
+def _class_at(path: str) -> Any:
+    """Return the class at a path below this package."""
     module, _, name = path.rpartition(".")
     return getattr(import_module(f"{__package__}.{module}"), name)
 
@@ -186,13 +186,13 @@ def _named(path: str) -> Any:
 PART_CLASSES: dict[str, type[Part]] = {
     key: getattr(import_module(f"{__package__}.{key}"), name) for key, name in REGISTERED.items()
 }
-STEPS: dict[str, type[Step]] = {kind: _named(path) for kind, path in KINDS_OF_STEPS.items()}
-ABILITY_CLASSES: tuple[type[Ability], ...] = tuple(map(_named, ABILITIES))
-OBSERVABLES: tuple[Observables, ...] = tuple(_named(path)() for path in OBSERVABLE_CLASSES)
+STEPS: dict[str, type[Step]] = {kind: _class_at(path) for kind, path in KINDS_OF_STEPS.items()}
+ABILITY_CLASSES: tuple[type[Ability], ...] = tuple(map(_class_at, ABILITIES))
+OBSERVABLES: tuple[Observables, ...] = tuple(_class_at(path)() for path in OBSERVABLE_CLASSES)
 
 
 def _meaning(part: type[Part]) -> str:
-    """The first sentence of its docstring."""
+    """Return the first sentence of a part's docstring."""
     return cleandoc(part.__doc__ or "").split(".")[0]
 
 

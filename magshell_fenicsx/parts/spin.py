@@ -8,10 +8,10 @@ from pydantic import BeforeValidator, Field
 from magshell_fenicsx.input.section import over_size
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.parts.step_course import Target
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.path_step import BodyForceStep
 from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.parts.step_course import Target
 from magshell_fenicsx.quantities.quantity import NEEDS_DENSITY, Quantity, Unit
 
 if TYPE_CHECKING:

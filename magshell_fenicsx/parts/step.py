@@ -11,22 +11,22 @@ from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.mesh.grading import Feature
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.models.shell.own_term import OwnTerm
+from magshell_fenicsx.parts.ability import Context, Formulas, Modelled
 from magshell_fenicsx.parts.step_course import (
-    ExpectedEnd,
-    StepCourse,
     Curves,
-    SizingContext,
-    StepStart,
+    ExpectedEnd,
     Hold,
     SearchSection,
+    SizingContext,
     SnapSection,
+    StepCourse,
+    StepStart,
     Target,
     Until,
 )
 from magshell_fenicsx.parts.step_course import (
     ProgrammeStep as ProgrammeStep,
 )
-from magshell_fenicsx.parts.ability import Context, Formulas, Modelled
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import register
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
@@ -200,7 +200,9 @@ class Step(Section):
         return None
 
     @classmethod
-    def steps_before_load(cls, context: Context, loading: "Step | None") -> list[tuple[str, "Step"]]:
+    def steps_before_load(
+        cls, context: Context, loading: "Step | None"
+    ) -> list[tuple[str, "Step"]]:
         """The steps of this kind that come before the only load of a case, each with the key that
         asks for it.
         """
@@ -275,7 +277,9 @@ class Step(Section):
         return []
 
     @classmethod
-    def mesh_features(cls, loads: Sequence[Self], place: Array, sizing: "SizingContext") -> list[Feature]:
+    def mesh_features(
+        cls, loads: Sequence[Self], place: Array, sizing: "SizingContext"
+    ) -> list[Feature]:
         """Small elements around a place in the chart with these loads of the kind."""
         return []
 

@@ -1,5 +1,5 @@
-"""How a step is driven, as data: what it holds and how it ends, where it begins, what it
-prescribes, how it goes on.
+"""How a step is driven, as data: what it holds and how it ends, where it begins, what it prescribes
+and how it goes on.
 """
 
 from collections.abc import Callable, Mapping
@@ -54,7 +54,7 @@ class GasSection(Section):
 
 
 class Gas(Section):
-    """The pressure follows from a gas under the shell."""
+    """A pressure that follows from a gas under the shell."""
 
     gas: GasSection
     """The gas"""
@@ -89,7 +89,7 @@ Errors: TypeAlias = Literal["step", "motion"]
 
 
 class SnapSection(Section):
-    """Of `then: snap`."""
+    """How the shell is released with `then: snap`."""
 
     push: float = Field(default=0.05, gt=0, le=10)
     """How far it leaves the fold, along the path's direction there [h]"""
@@ -103,8 +103,8 @@ class SnapSection(Section):
 
 
 class Target(NamedTuple):
-    """What the value of a key prescribes: the amplitude or its conjugate, and the column of
-    path.csv with it.
+    """What the value of a key prescribes, the amplitude or its conjugate, and its column of
+    path.csv.
     """
 
     quantity: Prescribed
@@ -121,10 +121,10 @@ class LoadStart:
         mu, and -dPi/dmu.
     unit
         -dPi/dmu of one unit of the key that prescribes it.
-    driven
+    is_driven
         Whether an earlier step has driven the amplitude.
     size
-        What a target of one is, see `Step.size`.
+        The amplitude at a target of one, see `Step.size`.
     h
         Thickness over R.
     """
@@ -144,7 +144,7 @@ class Drive:
     Attributes
     ----------
     quantity, end
-        What has a target, mu or -dPi/dmu, and the target; None without.
+        The quantity with a target, mu or -dPi/dmu, and the target; None without.
     targets
         Requested values on the way, the last of them `end`.
     first
@@ -175,7 +175,9 @@ class ProgrammeStep:
     name
         Name of its amplitude; a second force or list of dead loads has a number, such as "force_2".
     key
-        Where it is in the case file.
+        Its place in the case file.
+    load
+        Its section.
     """
 
     number: int
@@ -194,14 +196,16 @@ class ProgrammeStep:
 
 @dataclass(frozen=True)
 class StepStart:
-    """Where a step begins, in the model's terms.
+    """The state where a step begins, in the model's terms.
 
     Attributes
     ----------
     loads
-        What loads the model.
+        All that loads the model.
     turn
-        Azimuth of its frame (rad).
+        Azimuth of the model's frame (rad).
+    h
+        Thickness over R.
     mu
         The amplitudes.
     potential
@@ -225,13 +229,17 @@ class StepStart:
     @property
     def is_driven(self) -> bool:
         """Whether an earlier step has driven the amplitude."""
-        return any(self.step.name == other.name for other in self.context.steps_before(self.step.number))
+        return any(
+            self.step.name == other.name for other in self.context.steps_before(self.step.number)
+        )
 
     def load_start(self) -> LoadStart:
-        """The amplitude of the step."""
+        """Return the amplitude of the step at its begin."""
         name = self.step.name
         size = self.step.load.size(self.context)
-        return LoadStart(self.mu[name], -self.potential(name), self.unit(name), self.is_driven, size, self.h)
+        return LoadStart(
+            self.mu[name], -self.potential(name), self.unit(name), self.is_driven, size, self.h
+        )
 
 
 @dataclass(frozen=True)
@@ -241,23 +249,23 @@ class StepCourse:
     Attributes
     ----------
     until
-        Of the walk.
+        The end of the path.
     steps
-        The largest number of steps; None: the walk's own.
+        The largest number of steps; None: the path's own.
     curves
         Amplitudes that are functions of the step's own, and its value; None where the model has it
         itself.
     finer
-        The lengths of steps of a path, from those that follow from the first one.
+        Returns the lengths of steps of a path, of those that follow from the first one.
     forbidden
-        What is said of an instability that must not be on the way, by its amplitudes and its name;
-        None if it may.
+        Returns what is said of an instability that must not be on the way, by its amplitudes and
+        its name; None if it may.
     at_once
         Whether that ends the step, or it goes on to its end first.
     label
-        Of points that are no instabilities, in place of the walk's own.
+        Of points that are no instabilities, in place of the path's own.
     impossible
-        Why there is no way; empty if there is one.
+        Why there is no such path; empty if there is one.
     """
 
     drive: Drive
@@ -295,9 +303,9 @@ class SizingContext:
     Attributes
     ----------
     h
-        Over R.
+        Thickness over R.
     refinement
-        By which sizes are divided.
+        Divisor of the sizes.
     solid
         Whether the body is modelled in three dimensions.
     local

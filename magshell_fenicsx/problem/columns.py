@@ -27,7 +27,7 @@ def sizes_in_units(problem: Problem) -> Sizes:
         return sizes
     lengths, angles = dict[str, tuple[Unit, float]](), dict[str, tuple[Unit, float]]()
     for registered in OBSERVABLES:
-        for name, (is_rotation, amount) in registered.ways(problem.loads).items():
+        for name, (is_rotation, amount) in registered.motions(problem.loads).items():
             if amount and is_rotation:
                 angles[name] = (TURN, float(np.degrees(amount)))
             elif amount:
@@ -40,7 +40,7 @@ def own_amplitudes(loads: Loads) -> dict[str, float]:
 
     They are those of parts, of the user's energies, and of their parameters.
     """
-    of_parts = {name: 0.0 for registered in OBSERVABLES for name in registered.named(loads)}
+    of_parts = {name: 0.0 for registered in OBSERVABLES for name in registered.free_amplitudes(loads)}
     terms = [term for term in loads.own if term.density]
     return (
         of_parts

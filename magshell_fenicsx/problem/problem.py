@@ -114,14 +114,14 @@ class Document:
         Name of the file.
     outside
         Hashes of what is solved besides `data`, such as files; None for one that cannot be read.
-    placed
+    with_place
         Message that begins with a key -> the same with the place of the key before it.
     """
 
     data: Mapping[str, Any] = field(default_factory=dict)
     name: str = ""
     outside: Mapping[str, str | None] = field(default_factory=dict)
-    placed: Callable[[str], str] = str
+    with_place: Callable[[str], str] = str
 
 
 @dataclass(frozen=True)

@@ -311,7 +311,7 @@ def _unloaded_result(problem: Problem, folder: Path | None, output: RunOutput) -
 
             refuse_unknown(scene)
     except (CaseError, MeshError) as e:
-        raise type(e)(problem.document.placed(str(e))) from None
+        raise type(e)(problem.document.with_place(str(e))) from None
     if mesh and mesh.branch:
         scene.remesh = mesh.branch.choice.applied
     return Result(scene, scene.unloaded(), adapted=mesh)

@@ -20,7 +20,7 @@ from magshell_fenicsx.continuation.modes import NoEigenpair, critical_mode
 from magshell_fenicsx.continuation.point import PathStopped, Point, StepTooLong
 from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.bodies.body_contact import Contact
+from magshell_fenicsx.parts.bodies.body_contact import ContactBody
 from magshell_fenicsx.parts.contact.contact_section import Pair
 from magshell_fenicsx.parts.contact.meridian_contact import MeridianContact
 from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact
@@ -463,7 +463,7 @@ def support_motion_limit(scene: Scene, state: State, name: str, end: float) -> t
     return float(begin + low * (end - begin)), meeting_shells(high)
 
 
-def touching_bodies(scene: Scene, state: State) -> list[Contact]:
+def touching_bodies(scene: Scene, state: State) -> list[ContactBody]:
     """Return the contacts of the bodies that touch."""
     contacts = scene.problem.loads.contacts
     return [
@@ -510,7 +510,7 @@ def contact_expanded_about(scene: Scene, state: State | None) -> Iterator[None]:
             shell_contact.hold(None)
 
 
-def with_stiffer_bodies(scene: Scene, state: State, bodies: list[Contact]) -> State | None:
+def with_stiffer_bodies(scene: Scene, state: State, bodies: list[ContactBody]) -> State | None:
     """Return the equilibrium near a state with bodies `STIFFENING` times as stiff.
 
     None if there is none within `MAX_DISPLACEMENT`.

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.continuation.system import Amplitudes, State, Vector
-from magshell_fenicsx.parts.bodies.body_contact import Pressing
+from magshell_fenicsx.parts.bodies.body_contact import BodyContact
 from magshell_fenicsx.parts.contact.time_averaging import TimeAveragedContact, samples_of_step
 from magshell_fenicsx.simulate.contact_control import stiff_for
 
@@ -47,7 +47,7 @@ class ContactsInTime:
     def __init__(
         self,
         system: FiniteElementSystem,
-        body_contacts: Mapping[str, Pressing],
+        body_contacts: Mapping[str, BodyContact],
         shell_contacts: Sequence[TimeAveragedContact],
     ) -> None:
         self._system, self._shell_contacts = system, shell_contacts
@@ -90,7 +90,7 @@ class ContactsInTime:
     def use_state_forces(self) -> None:
         """Take the present forces again."""
         for pressing in self._body_contacts:
-            pressing.present()
+            pressing.use_present_forces()
         for contact in self._shell_contacts:
             contact.samples = ()
 
@@ -116,7 +116,7 @@ class ContactsInTime:
     def _places(self, state: State) -> _ContactPlaces:
         return self._system.at_state(state).evaluate(
             lambda: _ContactPlaces(
-                [contact.where for contact in self._body_contacts],
+                [contact.point_state for contact in self._body_contacts],
                 [contact.displacement for contact in self._shell_contacts],
             )
         )

@@ -39,23 +39,23 @@ DEPTHS = 0.9, 0.03, 0.8, 0.2  # of the dents, over the height of the shell above
 FOLD_WIDTH = 0.2  # of half a fold, over sqrt(2 h H)
 SUPPORT_DISTANCE = 3.0  # such widths between a fold and the supports
 MIN_HEIGHT = 2.0  # shells of a smaller height, over h, are flat
-ROUNDING = 1e-9
-FLATNESS_TOLERANCE = (
-    1e-6  # a smaller mean square distance from a plane or a line, over the largest, is zero
-)
+ROUNDING = 1e-9  # of a component of a unit normal
+# a smaller mean square distance from a plane or a line, over the largest, is zero
+FLATNESS_TOLERANCE = 1e-6
 
 
 def dented_states(scene: Scene, state: State) -> Iterator[State]:
-    """Dented copies of a state, none of flat shells; of several shells each alone, then all.
+    """Yield dented copies of a state; collective.
 
-    Collective.
+    There are none of flat shells. Of several shells each is dented alone, then all are.
     """
     system = scene.model.system
     x = (scene.model.r0.x.array[: system.size] + state.u).reshape(-1, scene.model.V.dofmap.bs)
-    parts = [CurvedShell.of(scene, x, inside) for inside in nodes_of_shells(scene)]
-    curved = [part for part in parts if part.top > MIN_HEIGHT * scene.problem.material.h]
+    h = scene.problem.material.h
+    shells = [CurvedShell.of_nodes(scene, x, is_own) for is_own in nodes_of_shells(scene)]
+    curved = [shell for shell in shells if shell.top > MIN_HEIGHT * h]
     for depth in DEPTHS:
-        dents = [part.dent(depth, scene.problem.material.h) for part in curved]
+        dents = [shell.dent(depth, h) for shell in curved]
         for dent in [*dents, np.sum(dents, axis=0)] if len(dents) > 1 else dents:
             yield State(state.u + system.zero_at_supports(dent.ravel()), dict(state.mu))
 
@@ -66,64 +66,73 @@ class CurvedShell:
 
     Attributes
     ----------
-    inside
+    is_own
         (n,) which nodes are its own.
+    normal
+        Unit normal of the plane.
     height
-        (n,) along the normal.
+        (n,) heights of nodes along the normal.
     top
         The largest height.
     """
 
-    inside: NDArray[np.bool_]
+    is_own: NDArray[np.bool_]
     normal: Array
     height: Array
     top: float
 
     @classmethod
-    def of(cls, scene: Scene, x: Array, inside: NDArray[np.bool_]) -> "CurvedShell":
-        """Of places (n, 2 or 3) of this rank's nodes; collective."""
+    def of_nodes(cls, scene: Scene, x: Array, is_own: NDArray[np.bool_]) -> "CurvedShell":
+        """Return the shell of some of this rank's nodes at places x (n, 2 or 3); collective."""
         comm = scene.model.system.comm
-        normal, level = _plane(scene, x, inside)
+        normal, level = _plane(scene, x, is_own)
         height = x @ normal - level
-        top = float(comm.allreduce(float(height[inside].max(initial=0.0)), MPI.MAX))
-        bottom = float(comm.allreduce(float(height[inside].min(initial=0.0)), MPI.MIN))
+        top = float(comm.allreduce(float(height[is_own].max(initial=0.0)), MPI.MAX))
+        bottom = float(comm.allreduce(float(height[is_own].min(initial=0.0)), MPI.MIN))
         if -bottom > top:  # it hangs down
-            return cls(inside, -normal, -height, -bottom)
-        return cls(inside, normal, height, top)
+            return cls(is_own, -normal, -height, -bottom)
+        return cls(is_own, normal, height, top)
 
     def dent(self, depth: float, h: float) -> Array:
-        """The displacement (n, 2 or 3) of a dent of this part of its height; h is the thickness."""
+        """Return the displacement (n, 2 or 3) of a dent.
+
+        Parameters
+        ----------
+        depth
+            Its part of the shell's height.
+        h
+            The thickness over R.
+        """
         width = FOLD_WIDTH * np.sqrt(2 * h * depth * self.top)
-        height_above = self.height - max(
-            (1 - depth) * self.top, min(SUPPORT_DISTANCE * width, self.top / 2)
-        )
-        dent = np.where(self.inside, -2 * width * np.logaddexp(0.0, height_above / width), 0.0)
+        lowest_plane = min(SUPPORT_DISTANCE * width, self.top / 2)
+        height_above = self.height - max((1 - depth) * self.top, lowest_plane)
+        dent = np.where(self.is_own, -2 * width * np.logaddexp(0.0, height_above / width), 0.0)
         return np.outer(dent, self.normal)
 
 
-def _plane(scene: Scene, x: Array, inside: NDArray[np.bool_]) -> tuple[Array, float]:
-    """The unit normal of the plane of the supports and its height along it; the best plane of a
-    shell without any.
+def _plane(scene: Scene, x: Array, is_own: NDArray[np.bool_]) -> tuple[Array, float]:
+    """Return the unit normal of the plane of the supports, and its height along it.
+
+    Of a shell without supports it is the best plane.
 
     Parameters
     ----------
     x
         Places (n, 2 or 3) of this rank's nodes.
-    inside
+    is_own
         (n,) which are the shell's own.
     """
     is_held = np.zeros(len(x), dtype=bool)
     for support in scene.model.supports.values():
         is_held[support.dofs[support.dofs < x.size] // x.shape[1]] = True
-    is_held &= inside
+    is_held &= is_own
     if scene.model.axisymmetric:
         return np.array([0.0, 1.0]), float(x[is_held, 1].mean()) if is_held.any() else 0.0
     level, spread = _moments(scene, x[is_held])
     size, axes = np.linalg.eigh(spread)
-    if (
-        size[1] <= FLATNESS_TOLERANCE * size[2]
-    ):  # on one line: the plane through it that is nearest to the shell
-        _, spread = _moments(scene, x[inside])
+    # on one line: the plane through it that is nearest to the shell
+    if size[1] <= FLATNESS_TOLERANCE * size[2]:
+        _, spread = _moments(scene, x[is_own])
         direction = np.outer(axes[:, 2], axes[:, 2]) if size[2] > 0 else np.zeros((3, 3))
         projection = np.eye(3) - direction
         size, axes = np.linalg.eigh(projection @ spread @ projection + direction * np.trace(spread))
@@ -133,8 +142,9 @@ def _plane(scene: Scene, x: Array, inside: NDArray[np.bool_]) -> tuple[Array, fl
 
 
 def _moments(scene: Scene, x: Array) -> tuple[Array, Array]:
-    """The mean (3,) and the covariance (3, 3) of places of all ranks, of a part of a shell with
-    their images.
+    """Return the mean (3,) and the covariance (3, 3) of places of all ranks.
+
+    Of a half or a sector the images of the places are among them.
     """
     comm, mirror = scene.model.system.comm, scene.problem.mirror
     if mirror:
@@ -147,7 +157,7 @@ def _moments(scene: Scene, x: Array) -> tuple[Array, Array]:
 def search_at_end_of_step(
     scene: Scene, step: ProgrammeStep, begin: State, end: State
 ) -> Iterator[Record]:
-    """The solutions that the search of a step finds at its end, if the case requests one.
+    """Yield the solutions that the search of a step finds at its end, if the case requests one.
 
     Parameters
     ----------
@@ -155,9 +165,9 @@ def search_at_end_of_step(
         The states at both ends of the step.
     """
     if step.load.search:
-        is_held = held_conjugates_of_step(scene, step, begin)
+        held = held_conjugates_of_step(scene, step, begin)
         name = step.name if step.name in end.mu else "lambda_m"  # of a turning field
-        for record in _solutions(make_stage(scene, end, is_held), name, end, step.load.search):
+        for record in _solutions(make_stage(scene, end, held), name, end, step.load.search):
             yield replace(record, amplitude=step.name)
 
 
@@ -170,10 +180,9 @@ def solutions(
     stable: bool = False,
     seconds: float | None = None,
 ) -> Iterator[Record]:
-    """Further equilibria at the amplitudes of a known one, such as snapped shapes; all amplitudes
-    are loads.
+    """Find further equilibria at the amplitudes of a known one, such as snapped shapes.
 
-    Every one is confirmed by Newton's method, and differs from all others. There may be more.
+    All amplitudes are loads. Every one is confirmed by Newton's method, and differs from all others. There may be more.
 
     Parameters
     ----------
@@ -202,16 +211,17 @@ def solutions(
 
 
 def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> Iterator[Record]:
+    """Yield the records of the solutions that a search finds from a state of the model."""
     scene, start = stage.scene, time.perf_counter()
     dents = _Dents(stage, state)
 
-    def over() -> bool:
-        late = search.seconds is not None and time.perf_counter() - start > search.seconds
-        return bool(scene.comm.bcast(late))
+    def is_over() -> bool:
+        is_late = search.seconds is not None and time.perf_counter() - start > search.seconds
+        return bool(scene.comm.bcast(is_late))
 
     path = stage.path(name, "load", StepOptions(1.0, 1.0, 1.0))
     guesses = [partial(dents.settled, number) for number in range(dents.count)]
-    limits = SearchLimits(search.solutions, search.guesses, over)
+    limits = SearchLimits(search.solutions, search.guesses, is_over)
     excluded = scene.model.symmetry_breaking_modes
     descend = dents.descended if search.stable else None
     solutions_found = further_solutions(
@@ -224,20 +234,20 @@ def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> 
 
 
 def _rules(stage: Stage) -> AcceptanceRules:
-    """What solutions have to keep: penalties and cuts of their own, within the bound, and no shell
-    through another.
+    """Return the rules for solutions.
+
+    They have penalties and cuts of their own, within the bound, and no shell passes through
+    another.
     """
     scene = stage.scene
+    if not scene.model.shell_contacts:
+        return AcceptanceRules()
 
-    def own(state: State) -> State | None:
+    def with_fit_contact(state: State) -> State | None:
         changed = with_own_contact(scene, stage.leave(state))
         return State(state.u, {**state.mu, **changed.mu}) if changed else None
 
-    return (
-        AcceptanceRules(partial(passes, stage), own)
-        if scene.model.shell_contacts
-        else AcceptanceRules()
-    )
+    return AcceptanceRules(partial(passes, stage), with_fit_contact)
 
 
 class _Dents:
@@ -254,10 +264,13 @@ class _Dents:
         return Settling(scene.model.system, scene.unloaded(), partial(passes, load_stage(scene)))
 
     def settled(self, number: int) -> State:
-        """One that has come there without shells that pass through each other."""
+        """Return a dented shell that has settled without shells that pass through each other."""
         guess = before_passing(load_stage(self._stage.scene), self._state, self._guesses[number])
         return self._stage.enter(self._settling.settled(guess))
 
     def descended(self, state: State) -> State:
-        """A state of the stage further down in energy; amplitudes whose conjugates are held stay."""
+        """Return a state of the stage further down in energy.
+
+        Amplitudes whose conjugates are held stay.
+        """
         return self._stage.enter(self._settling.settled(self._stage.leave(state)))

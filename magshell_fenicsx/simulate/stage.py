@@ -1,4 +1,8 @@
-"""The solver of a step of a programme."""
+"""Stage of a programme: a scene with the solver of one of its steps.
+
+A step may hold conjugates of loads, or vary several amplitudes together. Then its system has other
+unknowns than the model, and a stage translates states between the two.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -20,6 +24,8 @@ from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 
 LONGEST = 50.0  # step by arc length, over the first
+LONGEST_CONTROLLED = 2.0  # step in a prescribed quantity, over the first
+SHORTEST = 1e-5  # step, over the first
 
 
 @dataclass(frozen=True)
@@ -40,41 +46,45 @@ class Stage:
     along: ParametrisedSystem | None = None
 
     def enter(self, state: State) -> State:
-        """A state of the model as a state of the step's system."""
+        """Return a state of the model as a state of the step's system."""
         state = self.device.enter(state) if self.device else state
         return self.along.contract(state) if self.along else state
 
     def leave(self, state: State) -> State:
-        """A state of the step's system as a state of the model."""
+        """Return a state of the step's system as a state of the model."""
         state = self.along.expand(state) if self.along else state
         state = self.device.leave(state) if self.device else state
         return self.scene.model.system.with_moved_supports(state)
 
     def point(self, point: Point) -> Point:
-        """A point of the step's path with the model's displacement and amplitudes."""
+        """Return a point of the step's path with the model's displacement and amplitudes."""
         du = self.device.displacement(point.du) if self.device else point.du
         return replace(point, state=self.leave(point.state), du=du)
 
     def on(self, scene: Scene) -> "Stage":
-        """The same step on another scene, with the same values of what is held."""
+        """Return the stage of the same step on another scene, with the same held values."""
         system: System = scene.model.system
         device = self.device.for_system(system) if self.device else None
-        along = self.along.for_system(device or system) if self.along else None
-        return Stage(scene, scene.newton.for_system(along or device or system), device, along)
+        parametrised = self.along.for_system(device or system) if self.along else None
+        newton = scene.newton.for_system(parametrised or device or system)
+        return Stage(scene, newton, device, parametrised)
 
     def padded(self, u: Vector) -> Vector:
-        """A vector of the model as one of the step's system."""
+        """Return a vector of the model as one of the step's system."""
         return self.device.padded(u) if self.device else u
 
     def displaced(self, x: Vector) -> Vector:
-        """A vector of the step's system with zeros for the unknown amplitudes and where nodes are
-        held.
+        """Return a vector of the step's system with displacements alone.
+
+        It has zeros for the unknown amplitudes and at supports.
         """
-        held = self.scene.model.system.zero_at_supports
-        return self.device.padded(held(self.device.displacement(x))) if self.device else held(x)
+        zero_at_supports = self.scene.model.system.zero_at_supports
+        if self.device is None:
+            return zero_at_supports(x)
+        return self.device.padded(zero_at_supports(self.device.displacement(x)))
 
     def path(self, name: str, control: Control, options: StepOptions, scale: float = 1.0) -> Path:
-        """A path of the step's system.
+        """Return a path of the step's system.
 
         Raises
         ------
@@ -83,48 +93,48 @@ class Stage:
         """
         if control == "conjugate":
             _refuse_open(self.scene, name)
-        scene, path_arguments = (
-            self.scene,
-            (self.newton, name, control, options, scale, self.scene.journal, self.scene.progress),
-        )
-        return (
-            Path(*path_arguments, partial(first_contact, scene, self.leave))
-            if scene.model.shell_contacts
-            else Path(*path_arguments)
-        )
+        scene = self.scene
+        arguments = self.newton, name, control, options, scale, scene.journal, scene.progress
+        if scene.model.shell_contacts:
+            return Path(*arguments, partial(first_contact, scene, self.leave))
+        return Path(*arguments)
 
     def begin(
         self, name: str, control: Control, state: State, first: float, scale: float = 1.0
     ) -> tuple[Path, Point]:
-        """A path from a state of the model in equilibrium; its first step changes the amplitude by
-        about `first`.
+        """Return a path from a state of the model in equilibrium, and its first point.
 
-        `scale` is that of `Path`.
+        Parameters
+        ----------
+        first
+            About the change of the amplitude in the first step.
+        scale
+            See `Path`.
         """
         return self.resume(name, control, self.enter(state), first, scale)
 
     def resume(
         self, name: str, control: Control, state: State, first: float, scale: float = 1.0
     ) -> tuple[Path, Point]:
-        """The same from a state of the step's system."""
+        """Return a path as `begin` does, from a state of the step's system."""
         path = self.path(name, control, StepOptions(1.0, 1.0, 1.0), abs(scale))
         start = path.start(state, first)
         step = abs(first / start.dmu)
-        return path.with_step_options(
-            StepOptions(step, (LONGEST if control == "arc" else 2) * step, 1e-5 * step)
-        ), start
+        longest = LONGEST if control == "arc" else LONGEST_CONTROLLED
+        return path.with_step_options(StepOptions(step, longest * step, SHORTEST * step)), start
 
 
 def _refuse_open(scene: Scene, name: str) -> None:
+    """Refuse to prescribe the volume where a free edge leaves the pressure without a potential."""
     if name == "pressure" and (open_at := scene.model.without_potential):
         raise Stopped(
-            f"a volume cannot be held or prescribed: a pressure that follows the free edge {open_at[0]} is conjugate "
-            "to none: use control: arc or control: load"
+            "a volume cannot be held or prescribed: a pressure that follows the free edge "
+            f"{open_at[0]} is conjugate to none: use control: arc or control: load"
         )
 
 
 def load_stage(scene: Scene) -> Stage:
-    """A stage in which all other amplitudes are loads."""
+    """Return a stage in which all other amplitudes are loads."""
     return Stage(scene, scene.newton)
 
 
@@ -134,7 +144,7 @@ def make_stage(
     held: Mapping[str, HeldConjugate] | None = None,
     curves: tuple[str, Mapping[str, Curve], float] | None = None,
 ) -> Stage:
-    """The stage of a step.
+    """Return the stage of a step.
 
     Parameters
     ----------

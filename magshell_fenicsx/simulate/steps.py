@@ -7,7 +7,7 @@ from magshell_fenicsx.continuation.device import Conjugate
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.parts.bodies.contact_step import finer as along_contact
+from magshell_fenicsx.parts.bodies.contact_step import contact_step_options as along_contact
 from magshell_fenicsx.parts.pressure.pressure import Enclosed
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.step_course import Drive, Gas, GasSection, StepCourse, StepStart

@@ -242,7 +242,7 @@ def design(
             with heard(comm, say) as progress:
                 return _designed(Design(vary, goal, folder, comm, progress), Path(file), comm)
     except CaseError as e:
-        raise CaseError(case.placed(str(e))) from None
+        raise CaseError(case.with_place(str(e))) from None
 
 
 def _designed(search: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:

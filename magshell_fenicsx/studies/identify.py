@@ -169,7 +169,7 @@ def identify(
                 comm, lambda: _write(identified, draw_result, folder, predictor, programmes)
             )
     except CaseError as e:
-        raise CaseError(case.placed(str(e))) from None
+        raise CaseError(case.with_place(str(e))) from None
     for line in identified.content["said"]:
         once(line)
     return identified

@@ -12,8 +12,8 @@ from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.assembly.nonlocal_terms import times
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.shell.antisymmetric import AntisymmetricModes
-from magshell_fenicsx.parts.contact.symmetry_images import ContactWithImages
 from magshell_fenicsx.parts.contact.surface_contact import SurfaceContact
+from magshell_fenicsx.parts.contact.symmetry_images import ContactWithImages
 
 Array = NDArray[np.float64]
 RING: dict[str, Any] = {

@@ -19,7 +19,7 @@ from magshell_fenicsx.models.shell.strains import (
     bending_moment,
     principal,
 )
-from magshell_fenicsx.parts.bodies.body_contact import Contact
+from magshell_fenicsx.parts.bodies.body_contact import ContactBody
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.natural.shape import CURVATURE, STRETCH, Natural
 
@@ -310,7 +310,7 @@ class PointFields:
         material: Material,
         field: Magnetisation | None,
         thickness: Array | None,
-        contacts: Sequence[Contact] = (),
+        contacts: Sequence[ContactBody] = (),
         remanence: Magnetisation | None = None,
         natural: Natural | None = None,
         made_of: Array | None = None,

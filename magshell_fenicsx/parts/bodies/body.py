@@ -1,6 +1,4 @@
-"""What all rigid bodies have in common: their sections, where they stand, and their signed
-distance.
-"""
+"""The base of rigid bodies: their sections, where they are, and their signed distance."""
 
 import re
 from abc import ABC, abstractmethod
@@ -24,17 +22,15 @@ from magshell_fenicsx.shape.symmetry_constraint import unit
 Array = NDArray[np.float64]
 Axis = DirectionVector
 Size = Annotated[float, or_number("metre"), Field(gt=0, le=1e9)]
-ALONG = 1e-6  # part of an axis across the approach that counts as none
+AXIS_TOLERANCE = 1e-6  # an axis whose part across the approach is shorter is along it
 
 
 class Distance(ABC):
-    """The signed distance of a body at approach zero, positive outside, with its outline; all over
-    R.
-    """
+    """The signed distance of a body at approach zero, positive outside, with its outline; over R."""
 
     @abstractmethod
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
-        """Places (n, 3) -> the distance (n,), its gradient (n, 3) and its Hessian (n, 3, 3)."""
+        """Return the distance (n,), its gradient (n, 3) and its Hessian (n, 3, 3) at places (n, 3)."""
 
     @property
     @abstractmethod
@@ -47,14 +43,14 @@ class Distance(ABC):
         return None
 
     @property
-    def held(self) -> Sequence[Array]:
-        """Vectors (3,) that a mirror plane through e3 must hold, of a body that is round about
+    def mirror_vectors(self) -> Sequence[Array]:
+        """Vectors (3,) that a mirror plane through e3 must contain, of a body that is round about
         them.
         """
         return ()
 
     @property
-    def across(self) -> Sequence[Array]:
+    def possible_mirror_vectors(self) -> Sequence[Array]:
         """Vectors (3,) of which each may lie in a mirror plane through e3, of a body with several
         planes.
         """
@@ -86,8 +82,8 @@ class PlacedBody:
     Q: Array
     R: float
 
-    def across(self, axis: list[float]) -> Array:
-        """The unit vector along the part of an axis that is across the approach.
+    def axis_across(self, axis: list[float]) -> Array:
+        """Return the unit vector along the part of an axis that is across the approach.
 
         Raises
         ------
@@ -96,15 +92,16 @@ class PlacedBody:
         """
         v = self.Q @ unit(np.array(axis))
         v = v - (v @ self.direction) * self.direction
-        if (size := float(np.linalg.norm(v))) < ALONG:
+        if (size := float(np.linalg.norm(v))) < AXIS_TOLERANCE:
             raise CaseError(f"{self.key}.axis: is along the approach; give an axis across it")
         return np.asarray(v / size)
 
     def axes(self, axis: list[float]) -> Array:
-        """Unit vectors as rows (3, 3): along an axis, across it and the approach, and along the
-        approach.
+        """Return unit vectors as rows (3, 3).
+
+        They are along an axis, across it and the approach, and along the approach.
         """
-        first = self.across(axis)
+        first = self.axis_across(axis)
         return np.stack([first, np.cross(self.direction, first), self.direction])
 
 
@@ -134,24 +131,24 @@ class BodySection(Section):
     """Largest penetration that is allowed; with a given `stiffness` the run stops where it is more [h]"""
 
     @property
-    def ahead(self) -> float:
-        """How far its front is from its reference point, in the case's unit."""
+    def front_offset(self) -> float:
+        """Distance of its front from its reference point, in the case's unit."""
         return 0.0
 
     @property
-    def blunt(self) -> float:
+    def blunt_radius(self) -> float:
         """Radius of what touches, in the case's unit; infinite for a plane."""
         return float(getattr(self, "radius", inf))
 
     def words(self, *, with_units: bool) -> str:
-        """What it is, in the account of what is built."""
+        """Return its description in `magshell check`."""
         radius = getattr(self, "radius", None)
         if radius is None:
             return self.kind
         return f"{self.kind} of radius " + (f"{1e3 * radius:g} mm" if with_units else f"{radius:g}")
 
-    def distance(self, placed: PlacedBody) -> Distance:
-        """Its distance where it stands.
+    def distance(self, placed_body: PlacedBody) -> Distance:
+        """Return its signed distance where it is.
 
         Raises
         ------
@@ -164,7 +161,7 @@ class BodySection(Section):
 def place_body(
     section: BodySection, key: str, place: Array, normal: Array, half: float, Q: Array, R: float
 ) -> PlacedBody:
-    """Where a body is.
+    """Return where a body is.
 
     Parameters
     ----------
@@ -173,13 +170,13 @@ def place_body(
     half
         Half the thickness over R.
     """
-    out = normal if section.side == "outside" else -normal
-    d = unit(-out if section.direction is None else np.array(section.direction))
-    d, ahead = Q @ d, section.ahead / R
-    front = Q @ (place + half * out)
+    outward = normal if section.side == "outside" else -normal
+    d = unit(-outward if section.direction is None else np.array(section.direction))
+    d, front_offset = Q @ d, section.front_offset / R
+    front = Q @ (place + half * outward)
     if section.position is not None:
-        front = Q @ (np.array(section.position) / R) + ahead * d
-    return PlacedBody(key, front, front - ahead * d, d, Q, R)
+        front = Q @ (np.array(section.position) / R) + front_offset * d
+    return PlacedBody(key, front, front - front_offset * d, d, Q, R)
 
 
 class RigidBodies(KeyAbility[Mapping[str, BodySection]]):
@@ -204,8 +201,9 @@ class RigidBodies(KeyAbility[Mapping[str, BodySection]]):
 
 
 def rounded(q: Array, edge: float) -> tuple[Array, Array, Array]:
-    """The signed distance from a convex corner in two or three coordinates, less a radius, with
-    derivatives by q.
+    """Return the signed distance from a rounded convex corner, with derivatives by q.
+
+    The corner is in two or three coordinates.
 
     Parameters
     ----------
@@ -214,11 +212,15 @@ def rounded(q: Array, edge: float) -> tuple[Array, Array, Array]:
     edge
         Radius that rounds the core.
     """
-    m = np.maximum(q, 0.0)
-    far = np.linalg.norm(m, axis=1)
-    outside = far > 0
+    outside_part = np.maximum(q, 0.0)
+    distance = np.linalg.norm(outside_part, axis=1)
+    outside = distance > 0
     nearest = np.eye(q.shape[1])[q.argmax(axis=1)]
-    n = np.where(outside[:, None], m / np.maximum(far, 1e-300)[:, None], nearest)
-    active = (m > 0)[:, :, None] * np.eye(q.shape[1])
-    H = (active - n[:, :, None] * n[:, None, :]) / np.maximum(far, 1e-300)[:, None, None]
-    return np.where(outside, far, q.max(axis=1)) - edge, n, np.where(outside[:, None, None], H, 0.0)
+    n = np.where(outside[:, None], outside_part / np.maximum(distance, 1e-300)[:, None], nearest)
+    active = (outside_part > 0)[:, :, None] * np.eye(q.shape[1])
+    H = (active - n[:, :, None] * n[:, None, :]) / np.maximum(distance, 1e-300)[:, None, None]
+    return (
+        np.where(outside, distance, q.max(axis=1)) - edge,
+        n,
+        np.where(outside[:, None, None], H, 0.0),
+    )

@@ -1,17 +1,18 @@
-"""Rigid bodies that press on the shell: the penalty of the gap by its Taylor polynomial at each
-quadrature point.
+"""Contact with rigid bodies: the penalty of the gap by its Taylor polynomial at each quadrature
+point.
 
 The gap between a body and the shell's face is g(x - a d) - t h/2, with the body's signed distance g
 at approach zero, its approach a along d, the place x of the mid-surface and the factor t of the
-thickness. The penalty psi(-gap) is zero where the gap is open. As of an applied field (`applied`),
-the polynomial of second order in y = u - a d at the present y has the derivatives of the penalty
-itself, by the displacement and by the approach, for every shape of a body. Where the thickness
-varies, or is that of a shell that gets thinner as it stretches, t is one more variable of the
-polynomial.
+thickness. The penalty psi(-gap) is zero where the gap is open. As of an applied field
+(`magnetism.applied`), the polynomial of second order in y = u - a d at the present y has the
+derivatives of the penalty itself, by the displacement and by the approach, for every shape of a
+body. Where the thickness varies, or is that of a shell that gets thinner as it stretches, t is one
+more variable of the polynomial. docs/theory.md, Contact.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import basix
 import numpy as np
@@ -34,17 +35,16 @@ from magshell_fenicsx.parts.gap import (
 )
 
 Array = NDArray[np.float64]
-PAIRS = np.triu_indices(3)
-SIZE = 3 + 1 + 3 + 6  # y*, psi*, its gradient, its Hessian by pairs i <= j
-FACE = (
-    1 + 1 + 3 + 1
-)  # t*, the derivatives of psi* by the thickness factor t, of its gradient, and the second by t
+INDEX_PAIRS = np.triu_indices(3)  # i <= j of a Hessian
+POLYNOMIAL_SIZE = 3 + 1 + 3 + 6  # y*, psi*, its gradient, its Hessian by pairs i <= j
+# t*, and derivatives by the thickness factor t: of psi*, of its gradient, and the second of psi*
+FACE_SIZE = 1 + 1 + 3 + 1
 LARGEST_OVER_MEAN_PRESSURE = 1.5  # in a cell whose mean is drawn, at most
-PRESSED = 1e-3  # of the largest pressure: less does not count as contact
+PRESSURE_THRESHOLD = 1e-3  # over the largest pressure: less does not count as contact
 
 
 @dataclass(frozen=True)
-class Contact:
+class ContactBody:
     """A rigid body, dimensionless and in the model's frame.
 
     Attributes
@@ -54,7 +54,7 @@ class Contact:
     amplitude
         Name of its approach, over h.
     distance
-        At approach zero.
+        Its signed distance at approach zero.
     direction
         Unit vector (3,) of the approach.
     front
@@ -64,10 +64,10 @@ class Contact:
         k of the penalty, over E h/R^2.
     bound
         Largest penetration that is allowed, over h.
-    given
-        Whether the case gives its stiffness, which then stays.
     size
         Radius over R of what touches, such as a ball's; infinite for a plane.
+    given
+        Whether the case gives its stiffness, which then stays.
     start, lift
         Of a body that starts at the shell's face: the place (3,) of the mid-surface there, and from
         it to the face; None of one with a position of its own.
@@ -86,28 +86,35 @@ class Contact:
     lift: Array | None = None
 
     def gap(self, x: Array, approach: float, half: float | Array) -> tuple[Array, Array, Array]:
-        """The gap at places (n, 3) with its gradient and Hessian; `approach` and half the thickness
-        over R.
+        """Return the gap at places (n, 3) over R, with its gradient and Hessian.
+
+        Parameters
+        ----------
+        approach, half
+            The approach, and half the thickness, over R.
         """
         g, n, N = self.distance(x - approach * self.direction)
         return g - half, n, N
 
     @property
     def setting(self) -> str:
-        """Name of its stiffness among the amplitudes of a state, where it was raised."""
+        """The name of its stiffness in a state, where it was raised."""
         return f"stiffness_{self.body}"
 
 
 def contact_energy(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr) -> Expr:
-    """psi per undeformed area from its polynomial P (`SIZE`,); `motion` is d for an approach of
-    one.
+    """Return psi per undeformed area from its polynomial P (`POLYNOMIAL_SIZE`,).
 
-    Where the thickness varies, what psi changes by with it (`FACE`,) and its factor (1,) are given
-    too.
+    Parameters
+    ----------
+    motion
+        d for an approach of one.
+    face
+        Where the thickness varies: the derivatives by it (`FACE_SIZE`,), and its factor (1,).
     """
-    s = _moved(u, P, motion, approach)
+    s = _off_expansion_point(u, P, motion, approach)
     psi = _polynomial(P, s)
-    return psi + _of_face(face[0], face[1][0], s) if face else psi
+    return psi + _face_term(face[0], face[1][0], s) if face else psi
 
 
 def thinned_energy(
@@ -121,15 +128,22 @@ def thinned_energy(
     natural: Forms | None = None,
     thins: Expr | int = 1,
 ) -> Expr:
-    """That of a shell that gets thinner as it stretches, which its thickness factor, if it varies,
-    multiplies.
+    """Return `contact_energy` of a shell that gets thinner as it stretches.
+
+    Parameters
+    ----------
+    F
+        The derivatives by the thickness (`FACE_SIZE`,).
+    factor
+        The factor of the thickness, if it varies.
     """
-    s, t = _moved(u, P, motion, approach), thickness_ratio(r0, u, natural, thins)
-    return _polynomial(P, s) + _of_face(F, factor[0][0] * t if factor else t, s)
+    s, t = _off_expansion_point(u, P, motion, approach), thickness_ratio(r0, u, natural, thins)
+    return _polynomial(P, s) + _face_term(F, factor[0][0] * t if factor else t, s)
 
 
 def _polynomial(P: Expr, s: Expr) -> Expr:
-    pairs = enumerate(zip(*PAIRS, strict=True))
+    """Return the polynomial at an offset s from its expansion point."""
+    pairs = enumerate(zip(*INDEX_PAIRS, strict=True))
     return (
         P[3]
         + ufl.dot(_gradient(P), s)
@@ -137,30 +151,36 @@ def _polynomial(P: Expr, s: Expr) -> Expr:
     )
 
 
-def _of_face(F: Expr, t: Expr, s: Expr) -> Expr:
-    more = t - F[0]
-    return more * (F[1] + ufl.dot(ufl.as_vector([F[2 + i] for i in range(3)]), s) + more / 2 * F[5])
+def _face_term(F: Expr, t: Expr, s: Expr) -> Expr:
+    """Return what psi changes by with the thickness factor t, at an offset s."""
+    change = t - F[0]
+    return change * (
+        F[1] + ufl.dot(ufl.as_vector([F[2 + i] for i in range(3)]), s) + change / 2 * F[5]
+    )
 
 
 def contact_pressure(
     r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr, **options: Forms
 ) -> Expr:
-    """The pressure on the shell per undeformed area, at the state of P."""
+    """Return the pressure on the shell per undeformed area, at the state of P."""
     return ufl.sqrt(ufl.dot(_gradient(P), _gradient(P)))
 
 
-def pressed_radius(front: Expr, along: Expr) -> Callable[..., Expr]:
-    """The pressure times the distance from the axis of the approach."""
+def radius_density(front: Expr, axis: Expr) -> Callable[..., Expr]:
+    """Return the density of the pressure times the distance from the axis of the approach."""
 
     def density(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr) -> Expr:
         x = r0.r + u.r - front
-        off = x - ufl.dot(x, along) * along
-        return contact_pressure(r0, u, P, motion, approach) * ufl.sqrt(ufl.dot(off, off))
+        from_axis = x - ufl.dot(x, axis) * axis
+        return contact_pressure(r0, u, P, motion, approach) * ufl.sqrt(
+            ufl.dot(from_axis, from_axis)
+        )
 
     return density
 
 
-def _moved(u: Jet, P: Expr, motion: Expr, approach: Expr) -> Expr:
+def _off_expansion_point(u: Jet, P: Expr, motion: Expr, approach: Expr) -> Expr:
+    """Return the offset of the place from the expansion point of the polynomial."""
     return u.r - approach * motion - ufl.as_vector([P[i] for i in range(3)])
 
 
@@ -170,7 +190,7 @@ def _gradient(P: Expr) -> Expr:
 
 @dataclass(frozen=True)
 class Region:
-    """Where a body touches, over R.
+    """The region in which a body touches; lengths are over R.
 
     Attributes
     ----------
@@ -188,12 +208,20 @@ class Region:
 
 
 @dataclass(frozen=True)
-class _Expanded:
-    """The penalty of the points that are pressed: which they are, psi and its derivatives by the
-    depth, normals.
+class _ActivePenalty:
+    """The penalty at the points that are pressed.
+
+    Attributes
+    ----------
+    is_pressed
+        (points,).
+    value, first, second
+        psi and its derivatives by the penetration.
+    n, N
+        Normals, and Hessians of the distance.
     """
 
-    pressed: NDArray[np.bool_]
+    is_pressed: NDArray[np.bool_]
     value: Array
     first: Array
     second: Array
@@ -201,21 +229,21 @@ class _Expanded:
     N: Array
 
     def penalty(self) -> tuple[NDArray[np.bool_], Array]:
-        """These points, and psi with its gradient and half its Hessian there."""
+        """Return which points are pressed, and psi with its gradient and half its Hessian there."""
         H = (
             self.second[..., None] * self.n[:, :, None] * self.n[:, None, :]
             - self.first[..., None] * self.N
         )
-        return self.pressed, _flat(self.value, -self.first * self.n, H)
+        return self.is_pressed, _flattened(self.value, -self.first * self.n, H)
 
 
-def _flat(value: Array, gradient: Array, H: Array) -> Array:
-    """The polynomial of a function without its place."""
-    pairs = H[:, *PAIRS] * np.where(PAIRS[0] == PAIRS[1], 0.5, 1.0)
+def _flattened(value: Array, gradient: Array, H: Array) -> Array:
+    """Return the polynomial of a function, without its expansion point."""
+    pairs = H[:, *INDEX_PAIRS] * np.where(INDEX_PAIRS[0] == INDEX_PAIRS[1], 0.5, 1.0)
     return np.concatenate([value, gradient, pairs], axis=1)
 
 
-class Pressing:
+class BodyContact:
     """The polynomials of a contact at the quadrature points of a shell or a meridian.
 
     Parameters
@@ -229,86 +257,78 @@ class Pressing:
     degree
         Of the quadrature.
     thickness
-        What multiplies h; None for 1.
-    thinning
-        How thick the deformed shell is over that, see `thickness_ratio_at_points`; None for 1.
+        Factor of h; None for 1.
+    ratio_at_points
+        The deformed over the undeformed thickness, see `gap.thickness_ratio_at_points`; None for 1.
 
     Attributes
     ----------
     parameters
-        Those of the densities.
+        Of the densities.
     polynomial
         The first of them.
     stiffness
-        In the penalty.
+        k of the penalty, over E h/R^2.
     """
 
     def __init__(
         self,
-        contact: Contact,
+        contact: ContactBody,
         h: float,
         r0: fem.Function,
         u: fem.Function,
         approach: fem.Constant,
         degree: int,
         thickness: fem.Function | None = None,
-        thinning: ThicknessRatio | None = None,
+        ratio_at_points: ThicknessRatio | None = None,
     ) -> None:
         V = u.function_space
         self.contact, self._h, self._u, self._approach = contact, h, u, approach
-        self.polynomial = PointField(V.mesh, degree, SIZE)
+        self.polynomial = PointField(V.mesh, degree, POLYNOMIAL_SIZE)
         self._points, self._degree = self.polynomial.points, degree
-        self._r0 = Memo(lambda: at_quadrature(r0, self._points), lambda: (r0.x.array,))
-        thick = [] if thickness is None else [thickness.x.array]
-
-        thins = thinning and thinning(self._points)
+        self._placement_memo = Memo(lambda: at_quadrature(r0, self._points), lambda: (r0.x.array,))
+        ratio_memo = ratio_at_points and ratio_at_points(self._points)
 
         def factor() -> float | Array:
-            given = (
-                1.0 if thickness is None else at_quadrature(thickness, self._points)[..., 0].ravel()
-            )
-            return given if thins is None else given * thins.renew()
+            factor: float | Array = 1.0
+            if thickness is not None:
+                factor = at_quadrature(thickness, self._points)[..., 0].ravel()
+            return factor if ratio_memo is None else factor * ratio_memo.renew()
 
-        self._factor = Memo(factor, lambda: (*thick, *([thins.renew()] if thins else [])))
-        self._face = (
-            None if thickness is None and thins is None else PointField(V.mesh, degree, FACE)
-        )
+        def thicknesses() -> tuple[Array, ...]:
+            given = () if thickness is None else (thickness.x.array,)
+            return (*given, ratio_memo.renew()) if ratio_memo else given
+
+        self._factor_memo = Memo(factor, thicknesses)
+        self._face_field: PointField | None = None
         motion = fem.Constant(V.mesh, h * contact.direction)
-        varying = () if thickness is None else (thickness,)
-        self.parameters = (
-            self.polynomial,
-            motion,
-            approach,
-            *(() if self._face is None else (self._face, *varying)),
-        )
+        self.parameters: tuple[Any, ...] = self.polynomial, motion, approach
+        if thickness is not None or ratio_memo is not None:
+            self._face_field = PointField(V.mesh, degree, FACE_SIZE)
+            self.parameters = *self.parameters, self._face_field
+        if thickness is not None:
+            self.parameters = *self.parameters, thickness
         self._owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
         self.stiffness = fem.Constant(V.mesh, contact.stiffness)
-        self._mean: tuple[
-            Array, ...
-        ] = ()  # derivatives of a step by place and thickness, in place of the present ones
-        self._about: tuple[Array, ...] = ()  # the gap about which the penalty is expanded
+        # derivatives of a step by place and thickness, in place of the present ones
+        self._step_derivatives: tuple[Array, ...] = ()
+        self._expansion_gap: tuple[Array, ...] = ()  # about which the penalty is expanded
 
         def places() -> tuple[Array, ...]:
-            return (
-                r0.x.array,
-                u.x.array,
-                approach.value,
-                *thick,
-                *([thins.renew()] if thins else []),
-            )
+            return r0.x.array, u.x.array, approach.value, *thicknesses()
 
         def forces() -> tuple[Array, ...]:
-            return *places(), self.stiffness.value, *self._mean, *self._about
+            return *places(), self.stiffness.value, *self._step_derivatives, *self._expansion_gap
 
-        self._gaps = Memo(lambda: self._gap_at(self.place, self.factor), places)
-        self._pressed = Memo(self._expanded, forces)
-        self.polynomial.compute_by(self._polynomials, forces)
-        if self._face is not None:
-            self._face.compute_by(self._by_thickness, forces)
+        self._gap_memo = Memo(lambda: self._gap_at(self.place, self.factor), places)
+        self._penalty_memo = Memo(self._active_penalty, forces)
+        self.polynomial.compute_by(self._compute_polynomials, forces)
+        if self._face_field is not None:
+            self._face_field.compute_by(self._compute_face_terms, forces)
 
     @property
     def history(self) -> tuple[str, tuple[fem.Constant, float]]:
-        """Its stiffness, see `FiniteElementSystem`."""
+        """The name of its stiffness with the constant and its default, see `FiniteElementSystem`."""
         return self.contact.setting, (self.stiffness, self.contact.stiffness)
 
     @property
@@ -318,48 +338,55 @@ class Pressing:
 
     @property
     def gap(self) -> Array:
-        """At all points, over R."""
-        return self._gaps.renew()[0]
+        """The gaps at all points, over R."""
+        return self._gap_memo.renew()[0]
 
     def _gap_at(self, y: Array, factor: float | Array) -> tuple[Array, Array, Array]:
-        """The gap and its derivatives at places `place`, of a shell so many times as thick."""
-        return self.contact.gap((self._r0.renew() + y).reshape(-1, 3), 0.0, self._h / 2 * factor)
+        """Return the gap and its derivatives at places y (see `place`), of a thickness factor."""
+        x = (self._placement_memo.renew() + y).reshape(-1, 3)
+        return self.contact.gap(x, 0.0, self._h / 2 * factor)
 
-    def _expanded(self) -> "_Expanded":
-        """The penalty where points are pressed, few of all."""
-        gap, n, N = self._gaps.renew()
-        about = self._about[0] if self._about else gap
-        pressed = about < 0
+    def _active_penalty(self) -> "_ActivePenalty":
+        """Return the penalty where points are pressed, few of all."""
+        gap, n, N = self._gap_memo.renew()
+        expansion_gap = self._expansion_gap[0] if self._expansion_gap else gap
+        is_pressed = expansion_gap < 0
         k = float(self.stiffness.value)
-        of_depth = expanded_penalty(-gap[pressed], -about[pressed], k, SOFT_PENETRATION * self._h)
-        value, first, second = (a[:, None] for a in of_depth)
-        return _Expanded(pressed, value, first, second, n[pressed], N[pressed])
+        penalties = expanded_penalty(
+            -gap[is_pressed], -expansion_gap[is_pressed], k, SOFT_PENETRATION * self._h
+        )
+        value, first, second = (a[:, None] for a in penalties)
+        return _ActivePenalty(is_pressed, value, first, second, n[is_pressed], N[is_pressed])
 
-    def _polynomials(self) -> Array:
-        """psi, its gradient and its Hessian at the places of the points."""
+    def _compute_polynomials(self) -> Array:
+        """Return psi, its gradient and its Hessian at the places of the points."""
         y = self.place
-        flat = np.zeros((*y.shape[:2], SIZE))
-        flat[..., :3] = y
-        pressed, psi = self._step_mean() if self._mean else self._pressed.renew().penalty()
-        flat.reshape(-1, SIZE)[pressed, 3:] = psi
-        return flat
+        polynomials = np.zeros((*y.shape[:2], POLYNOMIAL_SIZE))
+        polynomials[..., :3] = y
+        is_pressed, psi = (
+            self._step_mean() if self._step_derivatives else self._penalty_memo.renew().penalty()
+        )
+        polynomials.reshape(-1, POLYNOMIAL_SIZE)[is_pressed, 3:] = psi
+        return polynomials
 
     def _step_mean(self) -> tuple[NDArray[np.bool_], Array]:
-        gradient, H, _ = self._mean
-        return np.ones(len(gradient), dtype=bool), _flat(np.zeros((len(gradient), 1)), gradient, H)
+        gradient, H, _ = self._step_derivatives
+        return np.ones(len(gradient), dtype=bool), _flattened(
+            np.zeros((len(gradient), 1)), gradient, H
+        )
 
-    def _by_thickness(self) -> Array:
-        """The factor of the thickness, and what psi changes by with it."""
-        at, half = self._pressed.renew(), self._h / 2
-        by_t = np.zeros((len(at.pressed), FACE))
+    def _compute_face_terms(self) -> Array:
+        """Return the thickness factor, and what psi changes by with it."""
+        active, half = self._penalty_memo.renew(), self._h / 2
+        by_t = np.zeros((len(active.is_pressed), FACE_SIZE))
         by_t[:, 0] = self.factor
-        if self._mean:
-            by_t[:, 1:] = self._mean[2]
+        if self._step_derivatives:
+            by_t[:, 1:] = self._step_derivatives[2]
         else:
-            by_t[at.pressed, 1:] = half * np.concatenate(
-                [at.first, -at.second * at.n, half * at.second], axis=1
+            by_t[active.is_pressed, 1:] = half * np.concatenate(
+                [active.first, -active.second * active.n, half * active.second], axis=1
             )
-        return by_t.reshape(*self.polynomial.values.shape[:2], FACE)
+        return by_t.reshape(*self.polynomial.values.shape[:2], FACE_SIZE)
 
     def expand_about(self, gap: Array) -> None:
         """Take in place of the penalty its Taylor polynomial about a gap, of the same contact
@@ -368,43 +395,42 @@ class Pressing:
         For differences by a number of the case: a body that is hard closes or opens within a far
         smaller way.
         """
-        self._about = (gap,)
+        self._expansion_gap = (gap,)
 
     @property
     def place(self) -> Array:
-        """y = u - a d at the points, (cells, points, 3)."""
+        """The places y = u - a d of the points, (cells, points, 3)."""
         return at_quadrature(self._u, self._points) - float(self._approach.value) * self.motion
 
     @property
     def factor(self) -> float | Array:
         """The thickness over h at the points, (cells * points,) where it varies."""
-        return self._factor.renew()
+        return self._factor_memo.renew()
 
     @property
-    def where(self) -> tuple[Array, float | Array]:
+    def point_state(self) -> tuple[Array, float | Array]:
         """`place` and `factor`."""
         return self.place, self.factor
 
     def average(
         self, begin: tuple[Array, float | Array], end: tuple[Array, float | Array], part: float
     ) -> None:
-        """Take the forces of a step in place of the present ones, until `present`; see
-        docs/theory.md, Motion.
+        """Take the forces of a step in place of the present ones, until `use_present_forces`.
 
         Their product with the change of y is that of psi, plus what the step dissipates: the mean
         gradient is that of psi along the normal, over the penetration and not over time, so that it
-        counts where contact sets in or ceases.
+        counts where contact sets in or ceases. See docs/theory.md, Motion.
 
         Parameters
         ----------
         begin, end
-            `where` at both ends of the step.
+            `point_state` at both ends of the step.
         part
             Of the step at which the system has its forces.
         """
         k, soft, half = float(self.stiffness.value), SOFT_PENETRATION * self._h, self._h / 2
         middle = (begin[0] + end[0]) / 2, (begin[1] + end[1]) / 2
-        gaps, n, N = zip(*(self._gap_at(*where) for where in (begin, middle, end)), strict=True)
+        gaps, n, N = zip(*(self._gap_at(*state) for state in (begin, middle, end)), strict=True)
         s0, _, s1 = (-gap for gap in gaps)
         mean, slope = mean_pressure(s0, s1, k, soft)
         normal, bend = (n[0] + 4 * n[1] + n[2]) / 6, (2 * N[1] + N[2]) / 6
@@ -416,55 +442,64 @@ class Pressing:
         def times(c: Array, a: Array) -> Array:
             return c.reshape(-1, *[1] * (a.ndim - 1)) * a
 
-        late = part - 0.5
-        gradient = -times(mean, normal) - late * (times(p1, n[2]) - times(p0, n[0]))
+        off_middle = part - 0.5
+        gradient = -times(mean, normal) - off_middle * (times(p1, n[2]) - times(p0, n[0]))
         H = (
             times(slope, outer(normal))
             - times(mean, bend)
-            + late * (times(stiff, outer(n[2])) - times(p1, N[2]))
+            + off_middle * (times(stiff, outer(n[2])) - times(p1, N[2]))
         )
-        by_t = half * (mean + late * (p1 - p0))
-        of_both = -half * (times(slope, normal) + late * times(stiff, n[2])) / part
-        twice = half**2 * (slope + late * stiff) / part
-        self._mean = gradient, np.asarray(H / part), np.column_stack([by_t, of_both, twice])
+        by_t = half * (mean + off_middle * (p1 - p0))
+        mixed = -half * (times(slope, normal) + off_middle * times(stiff, n[2])) / part
+        second_by_t = half**2 * (slope + off_middle * stiff) / part
+        self._step_derivatives = (
+            gradient,
+            np.asarray(H / part),
+            np.column_stack([by_t, mixed, second_by_t]),
+        )
 
-    def present(self) -> None:
+    def use_present_forces(self) -> None:
         """Take the present forces again."""
-        self._mean = ()
+        self._step_derivatives = ()
 
     def cell_pressures(self) -> Array:
-        """The mean pressure in each local cell, over E h/R: the ring of a contact is narrower than
-        that of nodes.
+        """Return the mean pressure in each local cell, over E h/R.
+
+        The ring of a contact is narrower than that of nodes.
         """
         V = self._u.function_space
         weights = basix.make_quadrature(V.mesh.basix_cell(), self._degree)[1]
-        return np.asarray(self._sizes() @ weights / weights.sum())
+        return np.asarray(self._pressures() @ weights / weights.sum())
 
     def evenly_pressed(self) -> NDArray[np.bool_]:
-        """Whether all points of each local cell are pressed, and its mean is near its pressure."""
-        size = self._sizes()
-        even = size.max(axis=1) <= LARGEST_OVER_MEAN_PRESSURE * self.cell_pressures()
-        return np.asarray((size > 0).all(axis=1) & even)
+        """Return whether all points of each local cell are pressed, and its mean is near its
+        pressure.
+        """
+        pressures = self._pressures()
+        is_even = pressures.max(axis=1) <= LARGEST_OVER_MEAN_PRESSURE * self.cell_pressures()
+        return np.asarray((pressures > 0).all(axis=1) & is_even)
 
-    def _sizes(self) -> Array:
-        """The pressure at the points of local cells, over E h/R."""
+    def _pressures(self) -> Array:
+        """Return the pressure at the points of local cells, over E h/R."""
         self.polynomial.renew()
         return np.asarray(np.linalg.norm(self.polynomial.values[..., 4:7], axis=-1))
 
     def region(self, comm: MPI.Comm, radius: float) -> Region:
-        """Where the body touches; `radius` is the mean one."""
+        """Return where the body touches; `radius` is the mean one."""
         owned = slice(0, self._owned * len(self._points))
         gap, x = (
             self.gap[owned],
-            (self._r0.renew() + self.place).reshape(-1, 3)[owned] - self.contact.front,
+            (self._placement_memo.renew() + self.place).reshape(-1, 3)[owned] - self.contact.front,
         )
         pressure, d = (
             penalty(-gap, float(self.stiffness.value), SOFT_PENETRATION * self._h)[1],
             self.contact.direction,
         )
-        most = comm.allreduce(float(pressure.max(initial=0.0)), MPI.MAX)
-        from_axis = np.linalg.norm(x - (x @ d)[:, None] * d, axis=1)[pressure > PRESSED * most]
+        largest = comm.allreduce(float(pressure.max(initial=0.0)), MPI.MAX)
+        from_axis = np.linalg.norm(x - (x @ d)[:, None] * d, axis=1)[
+            pressure > PRESSURE_THRESHOLD * largest
+        ]
         penetration = comm.allreduce(float(-gap.min(initial=np.inf)), MPI.MAX)
         inner = comm.allreduce(float(from_axis.min(initial=np.inf)), MPI.MIN)
         outer = comm.allreduce(float(from_axis.max(initial=0.0)), MPI.MAX)
-        return Region(penetration, radius, inner if most else 0.0, outer)
+        return Region(penetration, radius, inner if largest else 0.0, outer)

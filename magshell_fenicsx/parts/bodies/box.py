@@ -36,11 +36,11 @@ class BoxSection(BodySection):
     """Along the first size, of any length; its part across the approach counts, and there must be one"""
 
     @property
-    def ahead(self) -> float:
+    def front_offset(self) -> float:
         return self.size[2] / 2
 
     @property
-    def blunt(self) -> float:
+    def blunt_radius(self) -> float:
         return min(self.size[:2]) / 2
 
     @model_validator(mode="after")
@@ -49,14 +49,22 @@ class BoxSection(BodySection):
             raise ValueError("edge: a rounding is at most half of the smallest size")
         return self
 
-    def distance(self, placed: PlacedBody) -> Distance:
-        half = np.array(self.size) / placed.R / 2
-        return Box(placed.centre, placed.axes(self.axis), half, self.edge / placed.R)
+    def distance(self, placed_body: PlacedBody) -> Distance:
+        half = np.array(self.size) / placed_body.R / 2
+        return Box(placed_body.centre, placed_body.axes(self.axis), half, self.edge / placed_body.R)
 
 
 @dataclass(frozen=True)
 class Box(Distance):
-    """`axes` (3, 3) are its unit vectors as rows, `half` its half sizes along them."""
+    """A box with rounded edges.
+
+    Attributes
+    ----------
+    axes, half
+        (3, 3) its unit vectors as rows, and half its sizes along them.
+    edge
+        Radius of the rounding.
+    """
 
     centre: Array
     axes: Array
@@ -78,5 +86,5 @@ class Box(Distance):
         return drawn_bodies.block(self.half).transformed(self.axes.T, self.centre)
 
     @property
-    def across(self) -> Sequence[Array]:
+    def possible_mirror_vectors(self) -> Sequence[Array]:
         return [*self.axes]

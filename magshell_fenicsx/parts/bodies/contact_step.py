@@ -1,4 +1,4 @@
-"""A rigid body that presses on the shell."""
+"""The step `kind: contact`: a rigid body that presses on the shell, and its observables."""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -8,11 +8,18 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
 from pydantic import Field
 
 from magshell_fenicsx.input.section import Name, over_size
-from magshell_fenicsx.parts.step_course import Control, StepCourse, StepStart, LoadStart, Target, Until
 from magshell_fenicsx.parts.ability import Context
+from magshell_fenicsx.parts.observables import ModelView, Observables
 from magshell_fenicsx.parts.path_step import Count, PathStep
-from magshell_fenicsx.parts.observables import Observables, ModelView
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
+from magshell_fenicsx.parts.step_course import (
+    Control,
+    LoadStart,
+    StepCourse,
+    StepStart,
+    Target,
+    Until,
+)
 from magshell_fenicsx.quantities.quantity import PLACE, POINT_FORCE, THICKNESS, Amplitude, Quantity
 
 if TYPE_CHECKING:
@@ -20,14 +27,11 @@ if TYPE_CHECKING:
     from magshell_fenicsx.continuation.system import State
     from magshell_fenicsx.parts.loads import Loads
 
-# least step along a contact: folds are as sharp as the penalty's stiffness changes, over 1e-3 h of
-# gap
-SHARP = 1e-9
-EASY, HARD = (
-    4,
-    8,
-)  # matrices of a step along a contact, whose rim moves from point to point before it settles
-FIRST_APPROACH = 0.1  # of h: the first step of the approach towards a force
+# of a path along a contact: folds are as sharp as the penalty's stiffness changes, over 1e-3 h
+SMALLEST_STEP = 1e-9
+# matrices of a step along a contact, whose rim moves from point to point before it settles
+EASY_ITERATIONS, HARD_ITERATIONS = 4, 8
+FIRST_APPROACH = 0.1  # over h: the first step towards a force
 
 
 class ContactSection(PathStep):
@@ -82,33 +86,34 @@ class ContactSection(PathStep):
         return "load" if self.control == "approach" else super().prescribed
 
     def course(self, step_start: StepStart) -> StepCourse:
-        return replace(super().course(step_start), finer=finer)
+        return replace(super().course(step_start), contact_step_options=contact_step_options)
 
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
         return change / self.points if by_load else copysign(FIRST_APPROACH, -change)
 
 
-def finer(options: "StepOptions") -> "StepOptions":
-    """Steps of a path along which contact sets in, grows and ceases."""
+def contact_step_options(options: "StepOptions") -> "StepOptions":
+    """Return the step control of a path along which contact sets in, grows and ceases."""
     return replace(
         options,
-        easy_factorisations=EASY,
-        easy_iterations=EASY,
-        hard_factorisations=HARD,
-        smallest=min(options.smallest, SHARP),
+        easy_factorisations=EASY_ITERATIONS,
+        easy_iterations=EASY_ITERATIONS,
+        hard_factorisations=HARD_ITERATIONS,
+        smallest=min(options.smallest, SMALLEST_STEP),
     )
 
 
 def approaches(bodies: Collection[str], loads: Sequence[Step]) -> dict[str, str]:
-    """Body -> name of its approach, the amplitude; a single one needs no name beside it, unless a
-    load is `force`.
+    """Return body -> name of its approach, the amplitude.
+
+    A single one needs no name beside it, unless a load is `force`.
     """
-    alone = len(bodies) == 1 and not any(load.amplitude == "force" for load in loads)
-    return {name: "approach" if alone else f"approach_{name}" for name in bodies}
+    is_single = len(bodies) == 1 and not any(load.amplitude == "force" for load in loads)
+    return {name: "approach" if is_single else f"approach_{name}" for name in bodies}
 
 
 class BodiesObservables(Observables):
-    """Approach, force, penetration and radii of each body."""
+    """The approach, force, penetration and radii of each body."""
 
     quantities = (
         Quantity(
@@ -184,9 +189,9 @@ class BodiesObservables(Observables):
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
         model, h, values = view.model, view.h, dict[str, float]()
         for name in model.contacts:
-            at, force = model.region(state, name), view.potential(state, name)
-            numbers = (state.mu[name], -force / self._unit(view), at.penetration / h)
-            radii = (view.length * radius for radius in (at.radius, at.inner, at.outer))
+            region, force = model.region(state, name), view.potential(state, name)
+            numbers = (state.mu[name], -force / self._unit(view), region.penetration / h)
+            radii = (view.length * radius for radius in (region.radius, region.inner, region.outer))
             k = float(model.contacts[name][0].stiffness.value)
             values |= dict(zip(contact_columns(name), (*numbers, *radii, k), strict=True))
         return values
@@ -199,6 +204,6 @@ class BodiesObservables(Observables):
 
 
 def contact_columns(approach: str) -> tuple[str, ...]:
-    """The columns of a body: its approach, the force on it, and the rest."""
+    """Return the columns of a body: its approach, the force on it, and the rest."""
     first, *others = (q.name for q in BodiesObservables.quantities)
     return tuple(column + approach.removeprefix("approach") for column in (first, "force", *others))

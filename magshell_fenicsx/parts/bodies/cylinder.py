@@ -26,16 +26,18 @@ class CylinderSection(BodySection):
     """Along the cylinder, of any length, not along the approach"""
 
     @property
-    def ahead(self) -> float:
+    def front_offset(self) -> float:
         return self.radius
 
-    def distance(self, placed: PlacedBody) -> Distance:
-        return Cylinder(placed.centre, placed.across(self.axis), self.radius / placed.R)
+    def distance(self, placed_body: PlacedBody) -> Distance:
+        return Cylinder(
+            placed_body.centre, placed_body.axis_across(self.axis), self.radius / placed_body.R
+        )
 
 
 @dataclass(frozen=True)
 class Cylinder(Distance):
-    """That of a sphere, of places without their part along the unit vector `axis`."""
+    """A cylinder without ends: the distance of a sphere, across the unit vector `axis`."""
 
     centre: Array
     axis: Array
@@ -60,5 +62,5 @@ class Cylinder(Distance):
         )
 
     @property
-    def held(self) -> Sequence[Array]:
+    def mirror_vectors(self) -> Sequence[Array]:
         return [self.axis]

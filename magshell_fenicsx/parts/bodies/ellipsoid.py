@@ -14,13 +14,12 @@ from magshell_fenicsx.shape.drawn_bodies import Solid
 from magshell_fenicsx.shape.reference_shell import sphere_lines
 
 Array = NDArray[np.float64]
-STEPS = 60  # of Newton's method, which takes about six
-# of a semi-axis: places nearer to a plane of symmetry are moved there, where the nearest place is
-# one
-CENTRAL = 1e-12
-SOLVED = 1e-15  # change of the parameter, over the largest semi-axis squared
+MAX_NEWTON_ITERATIONS = 60  # which takes about six
+# over a semi-axis: the least distance from planes of symmetry, so that the nearest place is one
+PLANE_OFFSET = 1e-12
+PARAMETER_TOLERANCE = 1e-15  # change of t, over the largest semi-axis squared
 # least 1 + distance times curvature: beyond a centre of curvature another place is nearest
-FLAT = 1e-9
+MIN_CURVATURE_FACTOR = 1e-9
 
 
 class EllipsoidSection(BodySection):
@@ -34,25 +33,34 @@ class EllipsoidSection(BodySection):
     """Along the first semi-axis, of any length; its part across the approach counts, and there must be one"""
 
     @property
-    def ahead(self) -> float:
+    def front_offset(self) -> float:
         return self.semi_axes[2]
 
     @property
-    def blunt(self) -> float:
+    def blunt_radius(self) -> float:
         """The smaller radius of curvature of its front, in the case's unit."""
         return min(self.semi_axes[:2]) ** 2 / self.semi_axes[2]
 
-    def distance(self, placed: PlacedBody) -> Distance:
-        return Ellipsoid(placed.centre, placed.axes(self.axis), np.array(self.semi_axes) / placed.R)
+    def distance(self, placed_body: PlacedBody) -> Distance:
+        return Ellipsoid(
+            placed_body.centre,
+            placed_body.axes(self.axis),
+            np.array(self.semi_axes) / placed_body.R,
+        )
 
 
 @dataclass(frozen=True)
 class Ellipsoid(Distance):
-    """`axes` (3, 3) are its unit vectors as rows, `semi` its semi-axes a_i along them.
+    """An ellipsoid.
 
     The nearest place of the surface to y has the coordinates a_i² y_i/(t + a_i²), with the largest
     root t of F(t) = sum (a_i y_i/(t + a_i²))² - 1. F falls and is convex there, so Newton's method
     from a place with 0 <= F <= 2 goes up to the root and never past it.
+
+    Attributes
+    ----------
+    axes, semi
+        (3, 3) its unit vectors as rows, and its semi-axes a_i along them.
     """
 
     centre: Array
@@ -72,22 +80,22 @@ class Ellipsoid(Distance):
         )  # the curvatures of the surface
         curvatures, directions = np.linalg.eigh(S)
         parallel = curvatures / np.maximum(
-            1 + g[:, None] * curvatures, FLAT
+            1 + g[:, None] * curvatures, MIN_CURVATURE_FACTOR
         )  # and of its parallel one
         N = np.einsum("nia,na,nja->nij", directions, parallel, directions)
         return g, n @ self.axes, np.einsum("ai,nab,bj->nij", self.axes, N, self.axes, optimize=True)
 
     def nearest(self, y: Array) -> Array:
-        """The nearest places (n, 3) of its surface to places (n, 3), along its axes."""
+        """Return the nearest places (n, 3) of its surface to places (n, 3), along its axes."""
         a = self.semi
-        size = np.maximum(np.abs(y), CENTRAL * a)
+        size = np.maximum(np.abs(y), PLANE_OFFSET * a)
         t = (a * size - a**2).max(axis=1)
-        for _ in range(STEPS):
+        for _ in range(MAX_NEWTON_ITERATIONS):
             ratio = a * size / (t[:, None] + a**2)
             F, slope = (ratio**2).sum(axis=1) - 1, -2 * (ratio**2 / (t[:, None] + a**2)).sum(axis=1)
             step = -F / slope
             t = t + step
-            if np.abs(step).max(initial=0.0) <= SOLVED * a.max() ** 2:
+            if np.abs(step).max(initial=0.0) <= PARAMETER_TOLERANCE * a.max() ** 2:
                 break
         return np.asarray(np.where(y < 0, -1.0, 1.0) * a**2 * size / (t[:, None] + a**2))
 
@@ -103,5 +111,5 @@ class Ellipsoid(Distance):
         )
 
     @property
-    def across(self) -> Sequence[Array]:
+    def possible_mirror_vectors(self) -> Sequence[Array]:
         return [*self.axes]

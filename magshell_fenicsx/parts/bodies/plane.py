@@ -19,13 +19,21 @@ class PlaneSection(BodySection):
 
     kind: Literal["plane"]
 
-    def distance(self, placed: PlacedBody) -> Distance:
-        return Plane(placed.front, placed.direction)
+    def distance(self, placed_body: PlacedBody) -> Distance:
+        return Plane(placed_body.front, placed_body.direction)
 
 
 @dataclass(frozen=True)
 class Plane(Distance):
-    """The body is behind `front`, seen along the unit vector `along`."""
+    """A half-space.
+
+    Attributes
+    ----------
+    front
+        A place of its face.
+    along
+        Unit vector from the body to the shell's side, along the approach.
+    """
 
     front: Array
     along: Array

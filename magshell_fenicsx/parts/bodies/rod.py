@@ -30,13 +30,28 @@ class RodSection(BodySection):
             raise ValueError("edge: a rounding is no larger than the radius")
         return self
 
-    def distance(self, placed: PlacedBody) -> Distance:
-        return Rod(placed.front, placed.direction, self.radius / placed.R, self.edge / placed.R)
+    def distance(self, placed_body: PlacedBody) -> Distance:
+        return Rod(
+            placed_body.front,
+            placed_body.direction,
+            self.radius / placed_body.R,
+            self.edge / placed_body.R,
+        )
 
 
 @dataclass(frozen=True)
 class Rod(Distance):
-    """The body is behind the middle `end` of its end, seen along the unit vector `along`."""
+    """A cylinder along the approach with a flat, rounded end.
+
+    Attributes
+    ----------
+    end
+        The middle of its end.
+    along
+        Unit vector of the approach, out of the end.
+    edge
+        Radius of the rounding.
+    """
 
     end: Array
     along: Array

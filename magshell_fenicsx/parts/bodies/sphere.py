@@ -22,16 +22,16 @@ class SphereSection(BodySection):
     """Its radius [the shell's length; over R if that has no unit]"""
 
     @property
-    def ahead(self) -> float:
+    def front_offset(self) -> float:
         return self.radius
 
-    def distance(self, placed: PlacedBody) -> Distance:
-        return Sphere(placed.centre, self.radius / placed.R)
+    def distance(self, placed_body: PlacedBody) -> Distance:
+        return Sphere(placed_body.centre, self.radius / placed_body.R)
 
 
 @dataclass(frozen=True)
 class Sphere(Distance):
-    """From the centre, less the radius."""
+    """A ball: the distance from its centre, less its radius."""
 
     centre: Array
     radius: float

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.parts.contact.contact_section import WHOLE_SHELL
-from magshell_fenicsx.parts.observables import Observables, ModelView
+from magshell_fenicsx.parts.observables import ModelView, Observables
 from magshell_fenicsx.quantities.quantity import POINT_FORCE, THICKNESS, Quantity
 
 if TYPE_CHECKING:

@@ -14,11 +14,11 @@ from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.own_term import OwnTerm, symbolic_functions
-from magshell_fenicsx.parts.step_course import SizingContext, LoadStart, Target, Until
 from magshell_fenicsx.parts.ability import Context, Formulas, Modelled, Scales
+from magshell_fenicsx.parts.observables import ModelView, Observables
 from magshell_fenicsx.parts.path_step import Count, PathStep
-from magshell_fenicsx.parts.observables import Observables, ModelView
 from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.parts.step_course import LoadStart, SizingContext, Target, Until
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.shape.meridian_chart import (
@@ -272,7 +272,9 @@ class DeadSection(PathStep):
         return [load.at for load in self.loads if load.at]
 
     @classmethod
-    def mesh_features(cls, loads: Sequence[Self], place: Array, sizing: SizingContext) -> list[Feature]:
+    def mesh_features(
+        cls, loads: Sequence[Self], place: Array, sizing: SizingContext
+    ) -> list[Feature]:
         x, y = map(float, place)
         return [DiscFeature((x, y), 0.0, sizing.h, loads[0].growth(sizing))]
 
@@ -290,7 +292,9 @@ class DeadSection(PathStep):
             for name in ("per_length", "per_area", "pressure"):
                 value = getattr(load, name)
                 values = value if isinstance(value, list) else [value]
-                most = MAX_COMPONENT * (scales.E * scales.h / (scales.R if name != "per_length" else 1.0))
+                most = MAX_COMPONENT * (
+                    scales.E * scales.h / (scales.R if name != "per_length" else 1.0)
+                )
                 yield Formulas(f"{key}.loads.{i}.{name}", values, -most, most, scales.R, load=True)
             if load.potential:  # of the deformed place: the undeformed one is looked at
                 most = MAX_COMPONENT * scales.E * scales.h
@@ -422,7 +426,5 @@ class ForcesObservables(Observables):
         if name in view.loads.forces:
             return view.model.force_unit * view.h
         return (
-            view.model.load_size.get(name, 0.0) / view.length
-            if name in view.loads.dead
-            else None
+            view.model.load_size.get(name, 0.0) / view.length if name in view.loads.dead else None
         )

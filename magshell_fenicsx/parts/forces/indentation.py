@@ -12,10 +12,10 @@ from magshell_fenicsx.input.section import Direction, over_size
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.mesh.mirror import ROUNDING
-from magshell_fenicsx.parts.step_course import SizingContext, LoadStart, Target, Until
 from magshell_fenicsx.parts.ability import Context, Modelled
 from magshell_fenicsx.parts.path_step import Count, PathStep
 from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.parts.step_course import LoadStart, SizingContext, Target, Until
 from magshell_fenicsx.quantities.quantity import POINT_FORCE, THICKNESS
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, tilted
 
@@ -136,7 +136,9 @@ class IndentationSection(PathStep):
             )
 
     @classmethod
-    def mesh_features(cls, loads: Sequence[Self], place: Array, sizing: SizingContext) -> list[Feature]:
+    def mesh_features(
+        cls, loads: Sequence[Self], place: Array, sizing: SizingContext
+    ) -> list[Feature]:
         """The dent too: by mirror buckling the radius of its ridge is about sqrt(2 R w)."""
         h, (x, y) = sizing.h, map(float, place)
         patch = min(load.patch for load in loads)

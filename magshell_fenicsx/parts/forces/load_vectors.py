@@ -29,11 +29,16 @@ from magshell_fenicsx.models.shell.parameters import (
     PointForce,
     Potential,
 )
-from magshell_fenicsx.models.shell.spatial_fields import ADDED_LOAD_DEGREE, Pattern, pattern_field, pattern_on_edge
+from magshell_fenicsx.models.shell.spatial_fields import (
+    ADDED_LOAD_DEGREE,
+    Pattern,
+    pattern_field,
+    pattern_on_edge,
+)
 from magshell_fenicsx.models.shell.thickness import patch_of
+from magshell_fenicsx.parts.ability import Account, Context, Modelled
 from magshell_fenicsx.parts.forces.dead_load_step import DeadLoadSection, potential
 from magshell_fenicsx.parts.loads import Loads
-from magshell_fenicsx.parts.ability import Account, Context, Modelled
 from magshell_fenicsx.platform import compat
 
 Entries = tuple[NDArray[np.int32], NDArray[np.float64]]

@@ -12,7 +12,7 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.models.axisymmetric.meridian import Meridian
-from magshell_fenicsx.models.domains import IntegrationDomain, Energy, Facets
+from magshell_fenicsx.models.domains import Energy, Facets, IntegrationDomain
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.models.shell.kinematics import Jet
 from magshell_fenicsx.models.shell.parameters import (

@@ -15,8 +15,8 @@ from magshell_fenicsx.models.shell.spatial_fields import (
     Pattern,
     body_cell_geometry,
     body_positions_and_normals,
-    refuse_unbounded,
     project_pattern,
+    refuse_unbounded,
 )
 from magshell_fenicsx.models.shell.thickness import patch_of
 from magshell_fenicsx.parts.forces.load_vectors import Entries, Weighted, averaged, smooth, within

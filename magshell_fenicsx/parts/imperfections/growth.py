@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 from pydantic import Field
 
-from magshell_fenicsx.parts.step_course import Target
 from magshell_fenicsx.parts.ability import Context, Modelled
-from magshell_fenicsx.parts.path_step import LoadStep
 from magshell_fenicsx.parts.observables import Observables
+from magshell_fenicsx.parts.path_step import LoadStep
 from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.parts.step_course import Target
 from magshell_fenicsx.quantities.quantity import Quantity
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ class GrowingObservables(Observables):
         ),
     )
 
-    def named(self, loads: "Loads") -> tuple[str, ...]:
+    def free_amplitudes(self, loads: "Loads") -> tuple[str, ...]:
         return tuple(loads.growing)
 
 

@@ -16,8 +16,8 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.grading import DiscFeature, Feature
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import Deviation
-from magshell_fenicsx.parts.step_course import SizingContext
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry, Local
+from magshell_fenicsx.parts.step_course import SizingContext
 from magshell_fenicsx.shape.meridian_chart import ANGLES
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.reference_shell import AngularDistance, StraightDistance

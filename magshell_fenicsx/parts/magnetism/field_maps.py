@@ -13,14 +13,14 @@ from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import Lengths, Section
 from magshell_fenicsx.mesh.mirror import rotation
+from magshell_fenicsx.parts.ability import Context, KeyAbility
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.magnetism.sensors import (
     refuse_unfit_reading,
     refuse_unknown_field,
     units,
 )
-from magshell_fenicsx.parts.ability import Context, KeyAbility
-from magshell_fenicsx.parts.observables import MapGrid, Observables, ModelView
+from magshell_fenicsx.parts.observables import MapGrid, ModelView, Observables
 from magshell_fenicsx.shape.reference_shell import Coordinates
 
 if TYPE_CHECKING:

@@ -9,11 +9,19 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from magshell_fenicsx.input.section import Direction, in_units
-from magshell_fenicsx.parts.step_course import ExpectedEnd, StepCourse, Curves, Drive, StepStart, LoadStart, Target
-from magshell_fenicsx.parts.magnetism.fields import ANGLE, MagneticSection, strength
 from magshell_fenicsx.parts.ability import Context
+from magshell_fenicsx.parts.magnetism.fields import ANGLE, MagneticSection, strength
 from magshell_fenicsx.parts.path_step import FactorStep
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
+from magshell_fenicsx.parts.step_course import (
+    Curves,
+    Drive,
+    ExpectedEnd,
+    LoadStart,
+    StepCourse,
+    StepStart,
+    Target,
+)
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
 if TYPE_CHECKING:

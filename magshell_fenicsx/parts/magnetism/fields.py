@@ -14,9 +14,9 @@ from magshell_fenicsx.input.messages import shown_value
 from magshell_fenicsx.input.section import Direction, FluxDensity, Section
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import UserField
+from magshell_fenicsx.parts.ability import Ability, Context, Formulas, InTime, Modelled
 from magshell_fenicsx.parts.kinds import Sources
 from magshell_fenicsx.parts.magnetism.remanent import RemanentSection, layer_average
-from magshell_fenicsx.parts.ability import Ability, Context, Formulas, InTime, Modelled
 from magshell_fenicsx.quantities.quantity import CaseSizes
 from magshell_fenicsx.shape.revolution_sections import SurfaceSection
 from magshell_fenicsx.shape.shell_sections import MeshSurface

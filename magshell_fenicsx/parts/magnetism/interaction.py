@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 from pydantic import Field
 
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.step_course import StepCourse, Target
-from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
 from magshell_fenicsx.parts.ability import Context
-from magshell_fenicsx.parts.path_step import FactorStep
+from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
 from magshell_fenicsx.parts.observables import Observables
+from magshell_fenicsx.parts.path_step import FactorStep
 from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.parts.step_course import StepCourse, Target
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.shape.shell_sections import MeshSurface
 
@@ -133,5 +133,5 @@ def refuse_unfit_interaction(context: Context) -> None:
 class InteractionObservables(Observables):
     """The factor of the interaction."""
 
-    def named(self, loads: "Loads") -> Sequence[str]:
+    def free_amplitudes(self, loads: "Loads") -> Sequence[str]:
         return (AMPLITUDE,) if loads.interaction else ()

@@ -24,6 +24,7 @@ from magshell_fenicsx.models.shell.spatial_fields import (
     radial,
     tangential,
 )
+from magshell_fenicsx.parts.ability import Account, Context, Modelled
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.field_maps import field_maps
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection, RotationSection
@@ -35,7 +36,6 @@ from magshell_fenicsx.parts.magnetism.sensors import is_read, sensors, units
 from magshell_fenicsx.parts.magnetism.soft_magnet import SoftMagnet
 from magshell_fenicsx.parts.magnetism.sources.field import in_space, turns, values
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
-from magshell_fenicsx.parts.ability import Account, Context, Modelled
 from magshell_fenicsx.shape.meridian_chart import (
     field_is_axisymmetric,
     scalar_is_axisymmetric,

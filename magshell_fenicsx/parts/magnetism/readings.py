@@ -14,7 +14,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.parts.magnetism.fields import MU_0
 from magshell_fenicsx.parts.magnetism.sensors import Sensor
-from magshell_fenicsx.parts.observables import Observables, ModelView, Slope
+from magshell_fenicsx.parts.observables import ModelView, Observables, Slope
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.quantities.registry import register
 

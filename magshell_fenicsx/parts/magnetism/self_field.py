@@ -16,7 +16,11 @@ from numpy.typing import NDArray
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import Image, rotation
-from magshell_fenicsx.models.shell.spatial_fields import Uniform, pattern_field, positions_and_normals
+from magshell_fenicsx.models.shell.spatial_fields import (
+    Uniform,
+    pattern_field,
+    positions_and_normals,
+)
 from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.charges import (

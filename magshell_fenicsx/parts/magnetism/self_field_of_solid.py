@@ -10,7 +10,7 @@ from dolfinx import fem
 from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.hexahedra import QUADRATURE_DEGREE
-from magshell_fenicsx.models.shell.spatial_fields import field_in_body, body_positions_and_normals
+from magshell_fenicsx.models.shell.spatial_fields import body_positions_and_normals, field_in_body
 from magshell_fenicsx.parts.magnetism.charges import ChargedElements
 from magshell_fenicsx.parts.magnetism.charges_of_solid import (
     CellFaces,

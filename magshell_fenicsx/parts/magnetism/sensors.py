@@ -12,8 +12,8 @@ from pydantic import Field
 from magshell_fenicsx.input.section import Section
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
-from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
 from magshell_fenicsx.parts.ability import Context, KeyAbility
+from magshell_fenicsx.parts.magnetism.fields import MU_0, MagneticSection
 from magshell_fenicsx.shape.reference_shell import Coordinates
 from magshell_fenicsx.shape.shell_sections import MeshSurface, ShellSection, Surface
 

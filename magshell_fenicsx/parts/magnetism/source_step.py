@@ -7,14 +7,14 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import AboutAxis, Lengths, Name
-from magshell_fenicsx.parts.step_course import LoadStart, Target
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.magnetism.field_step import FieldSection
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
 from magshell_fenicsx.parts.magnetism.sources.source import SourceSection
-from magshell_fenicsx.parts.ability import Context
+from magshell_fenicsx.parts.observables import ModelView, Observables
 from magshell_fenicsx.parts.path_step import Count, LoadStep
-from magshell_fenicsx.parts.observables import Observables, ModelView
 from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.parts.step_course import LoadStart, Target
 from magshell_fenicsx.quantities.quantity import DISTANCE, FORCE, TORQUE, TURN, WORK, Quantity
 from magshell_fenicsx.quantities.registry import QUANTITIES, RESERVED_NAMES
 
@@ -204,7 +204,7 @@ class SourcesObservables(Observables):
     def conjugates(self, loads: "Loads") -> dict[str, str]:
         return source_columns(loads)
 
-    def ways(self, loads: "Loads") -> dict[str, tuple[bool, float]]:
+    def motions(self, loads: "Loads") -> dict[str, tuple[bool, float]]:
         motions = [
             motion
             for field in (loads.magnetic.driven if loads.magnetic else ())

@@ -8,7 +8,7 @@ from pydantic import Field, model_validator
 from magshell_fenicsx.input.expressions import Formula
 from magshell_fenicsx.input.section import Section, in_units
 from magshell_fenicsx.mesh.mirror import Mirror
-from magshell_fenicsx.parts.step_course import ExpectedEnd, Errors
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.motion.history import (
     History,
     Level,
@@ -17,8 +17,8 @@ from magshell_fenicsx.parts.motion.history import (
     measured,
     times_of,
 )
-from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.step import BALANCE, ProgrammeStep, Step
+from magshell_fenicsx.parts.step_course import Errors, ExpectedEnd
 from magshell_fenicsx.shape.meridian_chart import vector_function, vector_is_axisymmetric
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, equal_to_rounding
 
@@ -135,7 +135,9 @@ class TimeSection(Step):
     def motion(self) -> "TimeSection":
         return self
 
-    def expected_end(self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float) -> ExpectedEnd:
+    def expected_end(
+        self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float
+    ) -> ExpectedEnd:
         return ExpectedEnd("the end", steps=self.points)
 
     @property
@@ -214,7 +216,10 @@ class TimeSection(Step):
 def _factors_of_sections(context: Context) -> set[str]:
     """Return the amplitudes of what sections ask for and no step drives, such as "interaction"."""
     from magshell_fenicsx.parts.path_step import FactorStep
-    from magshell_fenicsx.parts.registered import KINDS_BEFORE_LOAD, STEPS  # which has this step too
+    from magshell_fenicsx.parts.registered import (  # which has this step too
+        KINDS_BEFORE_LOAD,
+        STEPS,
+    )
 
     steps = [STEPS[kind] for kind in KINDS_BEFORE_LOAD]
     return {

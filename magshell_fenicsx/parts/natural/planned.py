@@ -9,10 +9,10 @@ from magshell_fenicsx.input.expressions import FormulaVectors, formula_function
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.models.shell.spatial_fields import InsideRim, Pattern, WithinRims
+from magshell_fenicsx.parts.ability import Account, Context
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.natural.section import NaturalSection, components
 from magshell_fenicsx.parts.natural.shape import Natural, Varying, meridians
-from magshell_fenicsx.parts.ability import Account, Context
 from magshell_fenicsx.shape.meridian_chart import scalar_is_axisymmetric
 from magshell_fenicsx.shape.outline import Outline
 from magshell_fenicsx.shape.shell_sections import MeshSurface, PlateSurface, ShellSection

@@ -9,11 +9,11 @@ from pydantic import BeforeValidator, Field, model_validator
 from magshell_fenicsx.input.expressions import Formula, formula
 from magshell_fenicsx.input.section import _NUMBER, OrInMemory, Section, in_units
 from magshell_fenicsx.mesh.patch import UserField
-from magshell_fenicsx.parts.step_course import Target
 from magshell_fenicsx.parts.ability import Ability, Context, Formulas, Modelled, Offer
-from magshell_fenicsx.parts.path_step import LoadStep
 from magshell_fenicsx.parts.observables import Observables
+from magshell_fenicsx.parts.path_step import LoadStep
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
+from magshell_fenicsx.parts.step_course import Target
 from magshell_fenicsx.quantities.quantity import Quantity
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint
 
@@ -269,7 +269,7 @@ class NaturalObservables(Observables):
         ),
     )
 
-    def named(self, loads: "Loads") -> tuple[str, ...]:
+    def free_amplitudes(self, loads: "Loads") -> tuple[str, ...]:
         return tuple(loads.natural.amplitudes) if loads.natural else ()
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:

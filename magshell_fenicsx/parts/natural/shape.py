@@ -36,12 +36,12 @@ from magshell_fenicsx.models.shell.energy import Constants, Density, Parameter
 from magshell_fenicsx.models.shell.formula_projection import CellGeometry, project_formula
 from magshell_fenicsx.models.shell.kinematics import Forms, Jet
 from magshell_fenicsx.models.shell.spatial_fields import (
-    PlacementField,
     Pattern,
-    by_patch,
-    cell_geometry,
+    PlacementField,
     body_cell_geometry,
     body_positions_and_normals,
+    by_patch,
+    cell_geometry,
 )
 
 Array = NDArray[np.float64]

@@ -9,11 +9,19 @@ from pydantic import Field
 
 from magshell_fenicsx.input.section import over_size
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.step_course import StepCourse, SizingContext, GasSection, StepStart, LoadStart, Target, Until
 from magshell_fenicsx.parts.ability import Account, Context, Modelled
+from magshell_fenicsx.parts.observables import ModelView, Observables
 from magshell_fenicsx.parts.path_step import PathStep
-from magshell_fenicsx.parts.observables import Observables, ModelView
 from magshell_fenicsx.parts.step import ProgrammeStep, Step
+from magshell_fenicsx.parts.step_course import (
+    GasSection,
+    LoadStart,
+    SizingContext,
+    StepCourse,
+    StepStart,
+    Target,
+    Until,
+)
 from magshell_fenicsx.quantities.quantity import PRESSURE, VOLUME
 from magshell_fenicsx.shape.revolution_sections import CapSurface
 from magshell_fenicsx.shape.shell_sections import MeshSurface, ShellSection, Surface
@@ -87,7 +95,9 @@ class PressureSection(PathStep):
             step_start.context.shell.rubber is not None and course.drive.first < 0
         ):  # blown up far beyond p_c
             finer = partial(_longer, BLOWN / step_start.h)
-            course = replace(course, drive=replace(course.drive, scale=1 / step_start.h), finer=finer)
+            course = replace(
+                course, drive=replace(course.drive, scale=1 / step_start.h), finer=finer
+            )
         return course
 
     def on_perfect(self, *, last: bool) -> Step:

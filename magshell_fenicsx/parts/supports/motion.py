@@ -10,10 +10,10 @@ from pydantic import Field, model_validator
 from magshell_fenicsx.assembly.rigid_motion import RigidMotion
 from magshell_fenicsx.input.section import AboutAxis, Lengths, Name, Section, or_number
 from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, rotation
-from magshell_fenicsx.parts.step_course import LoadStart, Target, Until
 from magshell_fenicsx.parts.ability import Context, Modelled
 from magshell_fenicsx.parts.path_step import Count, PathStep
 from magshell_fenicsx.parts.step import ProgrammeStep
+from magshell_fenicsx.parts.step_course import LoadStart, Target, Until
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.quantities.registry import QUANTITIES, RESERVED_NAMES
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.mesh.mirror import Mirror, rotation
 from magshell_fenicsx.parts.ability import Account, Context
-from magshell_fenicsx.parts.observables import Observables, ModelView
+from magshell_fenicsx.parts.observables import ModelView, Observables
 from magshell_fenicsx.quantities.quantity import DISTANCE, MOMENT, REACTION, TURN, Quantity
 
 if TYPE_CHECKING:
@@ -83,7 +83,7 @@ class ReactionsObservables(Observables):
             column for name, column in motion_columns(loads).items() if only_turns(loads, name)
         )
 
-    def ways(self, loads: "Loads") -> dict[str, tuple[bool, float]]:
+    def motions(self, loads: "Loads") -> dict[str, tuple[bool, float]]:
         return {
             name: (only_turns(loads, name), motion_size(loads, name))
             for name in motion_columns(loads)

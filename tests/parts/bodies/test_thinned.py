@@ -14,7 +14,7 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.models.axisymmetric.meridian import make_meridian
 from magshell_fenicsx.models.shell.parameters import Material
 from magshell_fenicsx.models.shell.thickness import Thickness
-from magshell_fenicsx.parts.bodies.body_contact import Contact
+from magshell_fenicsx.parts.bodies.body_contact import ContactBody
 from magshell_fenicsx.parts.bodies.plane import Plane
 from magshell_fenicsx.parts.bodies.sphere import Sphere
 from magshell_fenicsx.parts.loads import Loads
@@ -26,8 +26,8 @@ DOWN, H = np.array([0.0, 0.0, -1.0]), 0.05
 NATURAL = Natural(np.array([0.3, -0.2, 0.1]), np.array([0.1, -0.05, 0.08]), meridians)
 
 
-def pressing(distance: Any) -> Contact:
-    return Contact("ball", "a_ball", distance, DOWN, np.array([0.0, 0.0, 1.0]), 1e3, 1.0, 0.5)
+def pressing(distance: Any) -> ContactBody:
+    return ContactBody("ball", "a_ball", distance, DOWN, np.array([0.0, 0.0, 1.0]), 1e3, 1.0, 0.5)
 
 
 BALL = pressing(

@@ -29,8 +29,8 @@ from magshell_fenicsx.output.pictures.field_maps import (
     with_holes,
 )
 from magshell_fenicsx.output.pictures.plot import PicturedRun, plot
-from magshell_fenicsx.parts.registered import OBSERVABLES
 from magshell_fenicsx.parts.observables import MapGrid
+from magshell_fenicsx.parts.registered import OBSERVABLES
 
 MM = 1e-3
 CAP = {"geometry": "cap", "radius": "20 mm", "thickness": "1 mm", "polar": 45, "youngs_modulus": "1 MPa",

@@ -11,12 +11,12 @@ import numpy as np
 from magshell_fenicsx.assembly.rigid_motion import RigidMotion, apply_motions
 from magshell_fenicsx.input.expressions import FormulasInSpace, formula_with_derivatives
 from magshell_fenicsx.mesh.mirror import rotation
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.magnetism.field_step import RotationSection, turn_name
 from magshell_fenicsx.parts.magnetism.fields import AppliedSection, MagneticSection
 from magshell_fenicsx.parts.magnetism.moving_source import FieldInSpace, MovingField
 from magshell_fenicsx.parts.magnetism.source_step import SourceStep
 from magshell_fenicsx.parts.magnetism.sources.source import Array, PlacedSource
-from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.step import ProgrammeStep
 
 HALFWAY = 0.371  # of a motion: no symmetric place
