@@ -1,6 +1,6 @@
-"""Shells that overlap undeformed, and edges that are not on the shell that they join.
+"""Refusal of shells that overlap undeformed, and of edges off the shell that they join.
 
-They are found without the equations of a scene, which refuses them in the same words.
+It needs no equations, as a scene does, which refuses the same in the same words.
 """
 
 from dataclasses import replace
@@ -22,11 +22,11 @@ from magshell_fenicsx.shells.t_junctions import (
 )
 from magshell_fenicsx.simulate.scene import build_meridian, build_midsurface
 
-MAX_CELLS = 20_000  # cells in which they are looked for: some seconds
+MAX_CELLS = 20_000  # of larger meshes nothing is looked for: it would take more than seconds
 
 
 def refuse_overlap(problem: Problem, cells: int) -> None:
-    """See that no shells that may touch overlap, and that edges of T-junctions are on their shells.
+    """Check that shells that may touch do not overlap, and T-junctions are on their shells.
 
     Of shells that get thinner, and of images of a half, a scene does.
 
@@ -73,8 +73,9 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
 
 
 def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:
-    """See that no mid-surfaces of magnetised parts are in each other, between which forces were no
-    numbers.
+    """Check that no mid-surfaces of magnetised parts are in each other.
+
+    Forces between them would be no numbers.
 
     Raises
     ------
@@ -90,8 +91,6 @@ def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:
     for number in np.unique(part)[1:]:
         own_nodes = np.unique(nodes[part == number])
         others = np.flatnonzero(part < number)
-        if (
-            surfaces.nearest_places(surfaces.r0[own_nodes], others)[2].min(initial=np.inf)
-            < OVERLAP_DISTANCE * h
-        ):
+        distances = surfaces.nearest_places(surfaces.r0[own_nodes], others)[2]
+        if distances.min(initial=np.inf) < OVERLAP_DISTANCE * h:
             raise CaseError(TOO_NEAR)

@@ -1,5 +1,6 @@
-"""The modes of the perfect shell that a problem has as imperfections: computed once, before a scene
-is built.
+"""Modes of the perfect shell that a problem has as imperfections.
+
+They are computed once, before a scene is built.
 """
 
 import json
@@ -43,7 +44,7 @@ _known: dict[str, tuple[Mode, ...]] = {}  # a sweep has many cases with one perf
 
 
 def with_modes(problem: Problem, comm: MPI.Comm) -> Problem:
-    """The problem with the modes that it has as imperfections; collective.
+    """Return the problem with the modes that it has as imperfections; collective.
 
     Raises
     ------
@@ -62,8 +63,9 @@ def with_modes(problem: Problem, comm: MPI.Comm) -> Problem:
 
 
 def perfect_modes(problem: Problem, count: int, comm: MPI.Comm) -> tuple[Mode, ...]:
-    """The lowest modes of a shell at its first instability, or at the end of its history without
-    one; collective.
+    """Return the lowest modes of a shell at its first instability; collective.
+
+    Without an instability they are those at the end of its history.
     """
     scene = Scene(problem, comm)
     state = scene.unloaded()
@@ -86,65 +88,74 @@ def perfect_modes(problem: Problem, count: int, comm: MPI.Comm) -> tuple[Mode, .
         ) from None
     if len(modes) < count:
         raise CaseError(
-            f"shell.imperfections: amplitudes: the perfect shell has only {len(modes)} modes, not {count}"
+            f"shell.imperfections: amplitudes: the perfect shell has only {len(modes)} modes, not "
+            f"{count}"
         )
     return tuple(_shape(scene, mode) for mode in modes)
 
 
 def _shape(scene: Scene, mode: ShellMode) -> Mode:
-    """One function of the place, or of several shells one for each that it moves."""
+    """Return a mode as a function of the place.
+
+    Of several shells it has one function for each that it moves.
+    """
     model, mirror = scene.model, None
     if model.axisymmetric:
-        (x, w), order = (
-            _along_meridian(model, mode),
-            np.argsort(model.V.tabulate_dof_coordinates()[:, 0]),
-        )
-        inside = [of[order] for of in nodes_of_shells(scene)]
+        x, w = _along_meridian(model, mode)
+        order = np.argsort(model.V.tabulate_dof_coordinates()[:, 0])
+        is_of_shell = [is_own[order] for is_own in nodes_of_shells(scene)]
     else:
         assert model.thin
-        (x, w), inside = _at_nodes(scene, model, mode), all_nodes_of_shells(scene)
+        x, w = _at_nodes(scene, model, mode)
+        is_of_shell = all_nodes_of_shells(scene)
         mirror = model.mirror if model.multiplicity > 1 else None
-    own, sign = len(x), -1.0 if mode.label == "antisymmetric" else 1.0
+    node_count, sign = len(x), -1.0 if mode.label == "antisymmetric" else 1.0
     if mirror:
         x, w = np.vstack([x, mirror.image(x)]), np.concatenate([w, sign * w])
     w = over_largest(x, w)
 
-    def part(of: NDArray[np.int64]) -> Shape:
+    def shape_of_shell(nodes: NDArray[np.int64]) -> Shape:
         if model.axisymmetric:
-            return on_meridian(x[of], w[of], int(mode.label.removeprefix("m = ") or 0))
+            return on_meridian(x[nodes], w[nodes], int(mode.label.removeprefix("m = ") or 0))
         if not mirror:
-            return on_surface(x[of], w[of], x[of])
-        nodes_and_images = np.concatenate([of, own + of])
-        function = on_surface(x[nodes_and_images], w[nodes_and_images], x[of])
+            return on_surface(x[nodes], w[nodes], x[nodes])
+        nodes_and_images = np.concatenate([nodes, node_count + nodes])
+        function = on_surface(x[nodes_and_images], w[nodes_and_images], x[nodes])
         return in_frame(Mirrored(function, mirror, sign), -scene.problem.azimuth)
 
-    of_each = [np.flatnonzero(of) for of in inside]
-    if len(of_each) < 2:
-        return part(of_each[0])
-    names_and_nodes = zip(scene.problem.context.sections["shells"], of_each, strict=True)
+    nodes_of_shell = [np.flatnonzero(is_own) for is_own in is_of_shell]
+    if len(nodes_of_shell) < 2:
+        return shape_of_shell(nodes_of_shell[0])
+    names = scene.problem.context.sections["shells"]
     return OfShells(
-        {name: part(of) for name, of in names_and_nodes if np.abs(w[of]).max() > MIN_DISPLACEMENT}
+        {
+            name: shape_of_shell(nodes)
+            for name, nodes in zip(names, nodes_of_shell, strict=True)
+            if np.abs(w[nodes]).max() > MIN_DISPLACEMENT
+        }
     )
 
 
 def _along_meridian(model: "MeridianModel", mode: ShellMode) -> tuple[Array, Array]:
-    """All nodes (n, 3) and the inward displacements (n,) there, in their order along it.
+    """Return all nodes (n, 3) and the inward displacements (n,) there, in their order along it.
 
-    From the coefficients (U + V, V, W) of a wave, or (U, W) of an axisymmetric mode.
+    They are from the coefficients (U + V, V, W) of a wave, or (U, W) of an axisymmetric mode.
     """
     V = model.waves.V if mode.label else model.V
-    order, own = (np.argsort(space.tabulate_dof_coordinates()[:, 0]) for space in (V, model.V))
-    values = mode.vector.reshape(len(order), -1)[order]
-    in_plane = (
-        np.column_stack([values[:, 0] - values[:, 1], values[:, 2]]) if mode.label else values
+    order, order_of_model = (
+        np.argsort(space.tabulate_dof_coordinates()[:, 0]) for space in (V, model.V)
     )
-    normal = nodal_normals(model.r0)[own][:, [0, 2]]
-    rho, z = model.r0.x.array.reshape(-1, 2)[own].T
+    values = mode.vector.reshape(len(order), -1)[order]
+    in_plane = values
+    if mode.label:
+        in_plane = np.column_stack([values[:, 0] - values[:, 1], values[:, 2]])
+    normal = nodal_normals(model.r0)[order_of_model][:, [0, 2]]
+    rho, z = model.r0.x.array.reshape(-1, 2)[order_of_model].T
     return np.column_stack([rho, 0 * z, z]), -np.einsum("ij,ij->i", in_plane, normal)
 
 
 def _at_nodes(scene: Scene, model: "ShellModel", mode: ShellMode) -> tuple[Array, Array]:
-    """All nodes (n, 3) and the inward displacements (n,) there, on every rank."""
+    """Return all nodes (n, 3) and the inward displacements (n,) there, on every rank."""
     V, comm = model.V, scene.comm
     dofs = V.dofmap.list[: V.mesh.topology.index_map(2).size_local]
     numbers = V.dofmap.index_map.local_to_global(dofs.ravel().astype(np.int32))

@@ -1,4 +1,4 @@
-"""Compile kernels ahead of time, for images and clusters without a compiler at run time.
+"""Compilation of kernels ahead of time, for images and clusters without a compiler at run time.
 
 These are the kernels of hemispheres, of their solids, and of any mid-surface under dead loads.
 Remanences by formula, fields with a gradient, approximate energies, surfaces with kinks and loads
@@ -62,6 +62,7 @@ def precompile(degree: int, make_problem: Callable[[Source], Problem]) -> float:
 
 
 def _cases(degree: int) -> Iterator[dict[str, Any]]:
+    """Yield data of cases that need the kernels, of shells of a degree and of solids."""
     for symmetry, loading in SCENES:
         yield {
             **HEMISPHERE,

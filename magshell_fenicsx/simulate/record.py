@@ -1,4 +1,4 @@
-"""A point of a history and its origin."""
+"""Records of a history: its points, and where each comes from."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -36,19 +36,21 @@ class Record:
         0 on the path itself, 1 and 2 in the two directions of the branch at its first bifurcation;
         of a solution its number.
     excluded_pivots
-        Number of unstable directions that the model excludes; see `continuation.stability_monitor.StabilityMonitor`.
+        Number of unstable directions that the model excludes; see
+        `continuation.stability_monitor.StabilityMonitor`.
     step
         Number of the programme's step, from 1; 0 at the start.
     clock
-        Of a step in time: the columns time, kinetic, dissipated and work, since its begin.
+        Columns of a step in time: time, kinetic, dissipated and work, since its begin.
     reached
         False at the end of a `trace` that has not come to its last target.
     shown
-        What makes `u`.
+        Function that makes `u` of a state.
     scene
-        Of the point: another than that of a run's begin where a mode has led out of its model.
+        Scene of the point: another than that of a run's begin where a mode has led out of its
+        model.
     said
-        What the point must not be read without, in a sentence.
+        A sentence that the point must not be read without.
     """
 
     label: Label

@@ -1,5 +1,4 @@
-"""From a reduced model to the smallest one that has a mode which it excludes, and the branch of
-that mode.
+"""Switch from a reduced model to the smallest one with a mode that it excludes; that mode's branch.
 
 Waves cos(m theta) around a meridian have two planes of symmetry at 180/m degrees: they are followed
 in that sector, where a part has not these planes in a half, and else in the whole shell. A mode
@@ -42,11 +41,12 @@ from magshell_fenicsx.simulate.stage import LONGEST, Stage
 from magshell_fenicsx.simulate.transfer import nodes_by_shell
 
 Array = NDArray[np.float64]
-WAVES = "m = "
+WAVES = "m = "  # begin of the name of a mode of waves around a meridian
 NEIGHBOURS = 24  # nodes through which a cubic polynomial runs
 MAX_CONTACT_CHANGES = 10  # times that a carried state gets stiffer penalties or new cuts
 FIRST_STEP = 0.1  # step of a branch by arc length
-TINY = 1e-300
+TINY = 1e-300  # avoids a division by zero
+PLANE_TOLERANCE = 1e-9  # over R: distance of a place in a mirror plane
 
 
 @dataclass(frozen=True)
@@ -56,14 +56,14 @@ class SymmetrySwitch:
     Attributes
     ----------
     stage
-        The solver of the step there.
+        The stage of the step there.
     path
-        By arc length, in the amplitude of the step.
+        A path by arc length, in the amplitude of the step.
     point
         The bifurcation, as a point of that path; its direction is the mode, in lengths of the
         system.
     said
-        What handing over has changed, in words; "" where the model is the same.
+        Changes by the switch, in words; "" where the model is the same.
     unstable
         Number of unstable directions that the model excludes, without those that are neutral here.
     """
@@ -76,30 +76,33 @@ class SymmetrySwitch:
 
     @property
     def scene(self) -> Scene:
+        """Scene of the model."""
         return self.stage.scene
 
     def record(self, number: int) -> Record:
-        """The point in the model's own amplitudes and displacements."""
-        own = self.stage.point(self.point)
-        point = replace(own, state=self.scene.model.system.advance(own.state, own.state.mu))
-        of = {
-            "branch": number,
-            "excluded_pivots": self.unstable,
-            "said": self.said,
-            "scene": self.scene,
-        }
-        return Record("step", self.path.name, point, **of)  # type: ignore[arg-type]
+        """Return the point in the model's own amplitudes and displacements."""
+        point = self.stage.point(self.point)
+        state = self.scene.model.system.advance(point.state, point.state.mu)
+        return Record(
+            "step",
+            self.path.name,
+            replace(point, state=state),
+            branch=number,
+            excluded_pivots=self.unstable,
+            scene=self.scene,
+            said=self.said,
+        )
 
 
 def switch_symmetry(stage: Stage, bifurcation: Record, scale: float) -> SymmetrySwitch:
-    """The bifurcation of a record in the smallest model that has its mode; collective.
+    """Return the bifurcation of a record in the smallest model that has its mode; collective.
 
     Parameters
     ----------
     stage
-        The solver of the step that has found it.
+        The stage of the step that has found it.
     scale
-        That of the path.
+        See `continuation.path.Path`.
 
     Raises
     ------
@@ -108,19 +111,9 @@ def switch_symmetry(stage: Stage, bifurcation: Record, scale: float) -> Symmetry
     """
     stage.scene.progress.doing("handing over to the model that has the mode")
     if bifurcation.mode in OWN_MODES:
-        path = _arc_length_path(stage, bifurcation.amplitude, scale)
-        state = stage.enter(bifurcation.point.state)
-        try:
-            phi = critical_mode(stage.newton, state).vector
-        except NoEigenpair as e:
-            raise Stopped(f"the mode of the bifurcation is not found: {e}") from None
-        excluded = bifurcation.point
-        point = _point_along(
-            path, state, phi, excluded.negative_pivots, excluded.error, excluded.load_error
-        )
-        return SymmetrySwitch(stage, path, point, unstable=bifurcation.excluded_pivots)
+        return _switch_in_same_model(stage, bifurcation, scale)
     new = model_with_mode(stage.scene, bifurcation.mode)
-    other = stage.on(new)
+    new_stage = stage.on(new)
     try:
         mode = ShellModes(stage.scene.model).null_vector(bifurcation.point.state, bifurcation.mode)
     except ModesNotFound as e:
@@ -129,23 +122,34 @@ def switch_symmetry(stage: Stage, bifurcation: Record, scale: float) -> Symmetry
         ) from None
     u, phi = _carried_over(stage.scene, new, bifurcation, mode)
     mu = {**new.unloaded().mu, **bifurcation.point.state.mu}
-    path = _arc_length_path(other, bifurcation.amplitude, scale)
-    guess = _settled_contact(other, path, State(u, mu), phi)
-    located = (
-        guess
-        if isinstance(guess, str)
-        else path.recorded(partial(_located, other, path, guess, phi))
-    )
+    path = _arc_length_path(new_stage, bifurcation.amplitude, scale)
+    located: Point | State | str = _settled_contact(new_stage, path, State(u, mu), phi)
+    if isinstance(located, State):
+        located = path.recorded(partial(_located, new_stage, path, located, phi))
     if isinstance(located, str):
         raise Stopped(
-            f"the bifurcation ({bifurcation.mode}) is not found in the {new.problem.included[0]}: {located}"
+            f"the bifurcation ({bifurcation.mode}) is not found in the {new.problem.included[0]}: "
+            f"{located}"
         )
-    departure = SymmetrySwitch(other, path, located, unstable=bifurcation.excluded_pivots)
-    return replace(departure, said=_differences(stage.scene, bifurcation, departure))
+    switch = SymmetrySwitch(new_stage, path, located, unstable=bifurcation.excluded_pivots)
+    return replace(switch, said=_differences(stage.scene, bifurcation, switch))
+
+
+def _switch_in_same_model(stage: Stage, bifurcation: Record, scale: float) -> SymmetrySwitch:
+    """Return the bifurcation of a record whose mode the model has."""
+    path = _arc_length_path(stage, bifurcation.amplitude, scale)
+    state = stage.enter(bifurcation.point.state)
+    try:
+        phi = critical_mode(stage.newton, state).vector
+    except NoEigenpair as e:
+        raise Stopped(f"the mode of the bifurcation is not found: {e}") from None
+    point = bifurcation.point
+    located = _point_along(path, state, phi, point.negative_pivots, point.error, point.load_error)
+    return SymmetrySwitch(stage, path, located, unstable=bifurcation.excluded_pivots)
 
 
 def model_with_mode(scene: Scene, mode: str) -> Scene:
-    """The smallest model that has a mode which a model excludes; collective.
+    """Return the smallest model that has a mode which a model excludes; collective.
 
     Raises
     ------
@@ -172,38 +176,41 @@ def model_with_mode(scene: Scene, mode: str) -> Scene:
 def follow_switched_branch(
     stage: Stage, bifurcation: Record, goal: ContinuationGoal, scale: float, number: int
 ) -> Records:
-    """The records of the branch at a bifurcation in the model that has its mode; its value is the
-    state at their end.
+    """Yield the records of the branch at a bifurcation, in the model that has its mode.
 
-    One direction is followed: the other is the same shape, turned about e3 or mirrored.
+    The return value is the state at their end. One direction is followed: the other is the same
+    shape, turned about e3 or mirrored.
 
     Parameters
     ----------
     number
-        `Record.branch`.
+        See `Record.branch`.
 
     Raises
     ------
     Stopped
         If the branch is not found, or lost.
     """
-    departure = switch_symmetry(stage, bifurcation, scale)
-    yield departure.record(number)
-    crossing = switch_branch(departure.path, departure.point, partial(passes, departure.stage))
+    switch = switch_symmetry(stage, bifurcation, scale)
+    yield switch.record(number)
+    new_stage, at_switch = switch.stage, switch.point
+    crossing = switch_branch(switch.path, at_switch, partial(passes, new_stage))
     if crossing is None:
         raise Stopped(f"the branch at the bifurcation ({bifurcation.mode}) is not found")
-    comm, u, phi = departure.scene.model.system.comm, departure.point.state.u, departure.point.du
-    start = max(crossing.starts, key=lambda point: dot(comm, point.state.u - u, phi))
-    records = RecordStream(follow_branch(departure.stage, departure.path, start, goal, number))
-    earlier_mu, advance = departure.point.state.mu, departure.scene.model.system.advance
+    system, u, phi = switch.scene.model.system, at_switch.state.u, at_switch.du
+    start = max(crossing.starts, key=lambda point: dot(system.comm, point.state.u - u, phi))
+    records = RecordStream(follow_branch(new_stage, switch.path, start, goal, number))
+    earlier_mu = at_switch.state.mu
     for record in records:
-        point = departure.stage.point(record.point)
-        earlier_mu = (state := advance(point.state, earlier_mu)).mu
-        yield replace(record, point=replace(point, state=state), scene=departure.scene)
-    return advance(departure.stage.leave(records.end), earlier_mu)
+        point = new_stage.point(record.point)
+        state = system.advance(point.state, earlier_mu)
+        earlier_mu = state.mu
+        yield replace(record, point=replace(point, state=state), scene=switch.scene)
+    return system.advance(new_stage.leave(records.end), earlier_mu)
 
 
 def _arc_length_path(stage: Stage, name: str, scale: float) -> Path:
+    """Return a path by arc length with the steps of a branch."""
     return stage.path(
         name, "arc", StepOptions(FIRST_STEP, LONGEST * FIRST_STEP, 1e-5 * FIRST_STEP), scale
     )
@@ -217,14 +224,17 @@ def _point_along(
     error: float = 0.0,
     load_error: float = 0.0,
 ) -> Point:
-    comm = path.system.comm
-    along = np.asarray(phi * path.system.length / max_abs(comm, phi))
-    return Point(state, 0.0, along, 0.0, unstable, unstable, error=error, load_error=load_error)
+    """Return a point of a path whose direction is a mode, in lengths of the system."""
+    direction = np.asarray(phi * path.system.length / max_abs(path.system.comm, phi))
+    return Point(state, 0.0, direction, 0.0, unstable, unstable, error=error, load_error=load_error)
 
 
 def _settled_contact(stage: Stage, path: Path, guess: State, phi: Vector) -> State | str:
-    """A carried state of shells that touch, at rest but for a force along the mode, with contact of the model's own:
-    cuts there, and penalties that hold its nodes apart. Without contact the guess itself."""
+    """Return a state that was carried over at rest, but for a force along the mode.
+
+    Shells that touch have cuts and penalties of the model's own then. Without contact it is the
+    guess itself. If there is none, the result is the reason.
+    """
     scene = stage.scene
     if not scene.model.shell_contacts:
         return guess
@@ -234,26 +244,26 @@ def _settled_contact(stage: Stage, path: Path, guess: State, phi: Vector) -> Sta
         if isinstance(point, str):
             return point
         state = stage.leave(point.state)
-        if (own := with_own_contact(scene, state)) is None:
+        changed_state = with_own_contact(scene, state)
+        if changed_state is None:
             return state
-        state = own
+        state = changed_state
     return "the shells that touch have no cuts and penalties that last"
 
 
 def _at_rest(stage: Stage, path: Path, guess: State, mode: Vector) -> Point | str:
+    """Return the point near a guess that a force along a mode holds at rest; or why there is none."""
     try:
-        path_point = held_along(stage.newton, stage.enter(guess), mode)
+        held = held_along(stage.newton, stage.enter(guess), mode)
     except np.linalg.LinAlgError:
-        path_point = None
-    return (
-        _point_along(path, path_point[0], mode, 0)
-        if path_point
-        else "shells that touch do not come to rest there; take a finer mesh"
-    )
+        held = None
+    if held is None:
+        return "shells that touch do not come to rest there; take a finer mesh"
+    return _point_along(path, held[0], mode, 0)
 
 
 def _located(stage: Stage, path: Path, guess: State, phi: Vector) -> Point | str:
-    """The bifurcation near a guess, by its mode, in the system of a step."""
+    """Return the bifurcation near a guess, by its mode, in a step's system; or why there is none."""
     state, mode = stage.enter(guess), stage.padded(phi)
     try:
         located = find_bifurcation(stage.newton, state, mode, path.name)
@@ -267,56 +277,64 @@ def _located(stage: Stage, path: Path, guess: State, phi: Vector) -> Point | str
     return replace(point, iterations=located.iterations, factorisations=located.factorisations)
 
 
-def _differences(old: Scene, event: Record, departure: SymmetrySwitch) -> str:
-    """What handing over has changed, in words; collective."""
-    new, name = departure.scene, event.amplitude
-    state = departure.stage.point(departure.point).state
-    one, two = old.observe(event.point.state), new.observe(state)
-    a, b = (amount_of(scene, name, s) for scene, s in ((old, event.point.state), (new, state)))
-    energy = abs(two["energy"] - one["energy"]) / max(abs(one["energy"]), TINY)
-    counted = ""
+def _differences(old: Scene, event: Record, switch: SymmetrySwitch) -> str:
+    """Return what a switch has changed, in words; collective."""
+    new, name = switch.scene, event.amplitude
+    state = switch.stage.point(switch.point).state
+    old_row, new_row = old.observe(event.point.state), new.observe(state)
+    a, b = amount_of(old, name, event.point.state), amount_of(new, name, state)
+    load_change = abs(b - a) / max(abs(a), TINY)
+    old_energy = old_row["energy"]
+    energy_change = abs(new_row["energy"] - old_energy) / max(abs(old_energy), TINY)
+    deflection_change = abs(new_row["w_over_h"] - old_row["w_over_h"])
+    count_text = ""
     if new.problem.is_half:
-        besides = ", but for its turning about e3" if new.problem.turns else ""
-        counted = f"; its excluded_pivots are those of all other modes of the shell{besides}"
+        exception = ", but for its turning about e3" if new.problem.turns else ""
+        count_text = f"; its excluded_pivots are those of all other modes of the shell{exception}"
     return (
-        f"the branch of the mode ({event.mode}) is followed in the {new.problem.included[0]}, {new.model.system.dofs} "
-        f"unknowns: its bifurcation is at {amount(new, name, b)}, by {abs(b - a) / max(abs(a), TINY):.2g} of it beside "
-        f"that of the {old.problem.included[0]}; the energy there differs by {energy:.2g} of it, w/h by "
-        f"{abs(two['w_over_h'] - one['w_over_h']):.2g}{counted}"
+        f"the branch of the mode ({event.mode}) is followed in the {new.problem.included[0]}, "
+        f"{new.model.system.dofs} unknowns: its bifurcation is at {amount(new, name, b)}, by "
+        f"{load_change:.2g} of it beside that of the {old.problem.included[0]}; the energy there "
+        f"differs by {energy_change:.2g} of it, w/h by {deflection_change:.2g}{count_text}"
     )
 
 
 def amount_of(scene: Scene, name: str, state: State) -> float:
-    """The value of an amplitude of a state, or of a step that drives several."""
+    """Return the value of an amplitude of a state, or of a step that drives several."""
     return state.mu.get(name, state.mu.get("lambda_m", 0.0))
 
 
 def _carried_over(
     old: Scene, new: Scene, bifurcation: Record, mode: Vector
 ) -> tuple[Vector, Vector]:
-    """Displacement and mode of a model in the unknowns of one with less symmetry; collective."""
+    """Return displacement and mode in the unknowns of a model with less symmetry; collective."""
     system, u = new.model.system, bifurcation.point.state.u
     if old.model.axisymmetric:
         s, theta = _along_meridian(old, new)
-        both = _revolved(old.model, s, theta, u, mode, int(bifurcation.mode.removeprefix(WAVES)))
+        m = int(bifurcation.mode.removeprefix(WAVES))
+        displacement, new_mode = _revolved(old.model, s, theta, u, mode, m)
     else:
-        both = _mirrored(old, new, u, mode)
-    return system.zero_at_supports(both[0].ravel()), system.zero_at_supports(both[1].ravel())
+        displacement, new_mode = _mirrored(old, new, u, mode)
+    return (
+        system.zero_at_supports(displacement.ravel()),
+        system.zero_at_supports(new_mode.ravel()),
+    )
 
 
 def _along_meridian(old: Scene, new: Scene) -> tuple[Array, Array]:
-    """Parameter of the meridian and azimuth (rad) of the nodes of a surface, in its model's frame."""
-    span = old.problem.meridian
-    assert span
-    s, theta = np.array([span.locate(x) for x in new.model.chart()]).reshape(-1, 2).T
+    """Return meridian parameters and azimuths (rad) of a surface's nodes, in its model's frame."""
+    chart = old.problem.meridian
+    assert chart
+    s, theta = np.array([chart.locate(x) for x in new.model.chart()]).reshape(-1, 2).T
     return s, theta
 
 
 def _revolved(
     model: MeridianModel, s: Array, theta: Array, u: Vector, wave: Vector, m: int
 ) -> tuple[Array, Array]:
-    """u(s) and the wave U cos e_rho + V sin e_theta + W cos e_z at places, (n, 3) each; the crest
-    of u . n inwards.
+    """Return displacement and wave of a meridian at places of a surface, (n, 3) each.
+
+    The wave is U cos e_rho + V sin e_theta + W cos e_z, with the crest of u . n inwards.
     """
     radial, axial = _evaluated(model, model.V, u, s).T
     U_and_V, V, W = _evaluated(model, model.symmetry_breaking_modes.waves.V, wave, s).T
@@ -328,22 +346,22 @@ def _revolved(
             a[:, None] * e_rho + b[:, None] * e_theta + np.column_stack([zero, zero, c])
         )
 
-    waved = in_space(
+    wave_in_space = in_space(
         (U_and_V - V) * np.cos(m * theta), V * np.sin(m * theta), W * np.cos(m * theta)
     )
-    return in_space(radial, zero, axial), _sign(model, wave) * waved
+    return in_space(radial, zero, axial), _sign(model, wave) * wave_in_space
 
 
 def _sign(model: MeridianModel, wave: Vector) -> float:
-    """Of a wave whose largest crest at azimuth 0 is inwards."""
+    """Return the sign with which a wave's largest crest at azimuth 0 is inwards."""
     V = model.symmetry_breaking_modes.waves.V
     values = wave.reshape(-1, 3)[np.argsort(V.tabulate_dof_coordinates()[:, 0])]
-    along = values[:, 0] - values[:, 1] + 1e-3 * values[:, 2]
-    return 1.0 if along[np.argmax(np.abs(along))] < 0 else -1.0
+    crests = values[:, 0] - values[:, 1] + 1e-3 * values[:, 2]
+    return 1.0 if crests[np.argmax(np.abs(crests))] < 0 else -1.0
 
 
 def _evaluated(model: MeridianModel, V: fem.FunctionSpace, x: Vector, s: Array) -> Array:
-    """Components (n, k) of a field on the meridian at its parameters s."""
+    """Return components (n, k) of a field on the meridian at its parameters s (n,)."""
     domain = model.meridian.mesh
     ends = domain.geometry.x[compat.geometry_dofs(domain), 0]
     begin = ends.min(axis=1)
@@ -356,47 +374,50 @@ def _evaluated(model: MeridianModel, V: fem.FunctionSpace, x: Vector, s: Array) 
 
 
 def _mirrored(old: Scene, new: Scene, u: Vector, mode: Vector) -> tuple[Array, Array]:
-    """u and its antisymmetric mode of a half at the nodes of the whole shell, (n, 3) each;
-    collective.
+    """Return displacement and antisymmetric mode of a half at the nodes of the whole shell.
+
+    Each has shape (n, 3). Collective.
     """
     comm, size = old.model.system.comm, old.model.system.size
     mirror = old.problem.mirror
     assert isinstance(mirror, Mirror)
     parts = [old.model.r0.x.array[:size], u[:size], mode[:size]]
     places, *fields = (np.concatenate(comm.allgather(part.reshape(-1, 3))) for part in parts)
-    off = mirror.signed_distance(places) > 1e-9
+    has_image = mirror.signed_distance(places) > PLANE_TOLERANCE
     S = mirror.reflection
-    x = np.concatenate([places, mirror.image(places[off])])
-    both = [
-        np.concatenate([f, sign * f[off] @ S]) for f, sign in zip(fields, (1.0, -1.0), strict=True)
-    ]
-    Q = (
-        rotation(old.problem.azimuth) @ rotation(new.problem.azimuth).T
-    )  # from the new frame to the old one
-    places = new.model.r0.x.array[: new.model.system.size].reshape(-1, 3) @ Q.T
-    values, at_nodes = np.hstack(both), np.zeros((len(places), 6))
-    for inside, own in nodes_by_shell(old, new):
-        if own.any():
-            from_own = np.concatenate([inside, inside[off]])
-            at_nodes[own] = interpolated_on_surface(x[from_own], values[from_own], places[own])
-    return at_nodes[:, :3] @ Q, at_nodes[:, 3:] @ Q
+    x = np.concatenate([places, mirror.image(places[has_image])])
+    values = np.hstack(
+        [
+            np.concatenate([field, sign * field[has_image] @ S])
+            for field, sign in zip(fields, (1.0, -1.0), strict=True)
+        ]
+    )
+    # from the new frame to the old one
+    Q = rotation(old.problem.azimuth) @ rotation(new.problem.azimuth).T
+    new_places = new.model.r0.x.array[: new.model.system.size].reshape(-1, 3) @ Q.T
+    new_values = np.zeros((len(new_places), 6))
+    for old_nodes, new_nodes in nodes_by_shell(old, new):
+        if new_nodes.any():
+            nodes = np.concatenate([old_nodes, old_nodes[has_image]])
+            new_values[new_nodes] = interpolated_on_surface(
+                x[nodes], values[nodes], new_places[new_nodes]
+            )
+    return new_values[:, :3] @ Q, new_values[:, 3:] @ Q
 
 
 def interpolated_on_surface(x: Array, values: Array, places: Array) -> Array:
-    """Values (n, k) on a smooth surface at places (n, 3) near nodes x, by cubic polynomials of the
-    tangent plane.
+    """Return values (n, k) on a smooth surface at places (n, 3) near nodes x.
+
+    They are those of cubic polynomials in the tangent plane.
     """
     count = min(NEIGHBOURS, len(x))
     neighbours = scipy.spatial.cKDTree(x).query(places, count)[1].reshape(len(places), count)
     offsets = x[neighbours] - places[:, None]
     size = np.linalg.norm(offsets, axis=2).max(axis=1)
-    axes = np.linalg.svd(offsets - offsets.mean(axis=1, keepdims=True), full_matrices=False)[2][
-        :, :2
-    ]
+    centred = offsets - offsets.mean(axis=1, keepdims=True)
+    axes = np.linalg.svd(centred, full_matrices=False)[2][:, :2]
     a, b = np.moveaxis(np.einsum("nki,nji->nkj", offsets, axes) / size[:, None, None], 2, 0)
     basis = np.stack([a**i * b**j for i in range(4) for j in range(4 - i)], axis=2)
-    weight = np.exp(-4 * (a**2 + b**2))
-    coefficients = np.linalg.pinv(weight[..., None] * basis) @ (
-        weight[..., None] * values[neighbours]
-    )
+    weight = np.exp(-4 * (a**2 + b**2))[..., None]
+    coefficients = np.linalg.pinv(weight * basis) @ (weight * values[neighbours])
     return np.asarray(coefficients[:, 0])

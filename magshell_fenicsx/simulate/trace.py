@@ -30,8 +30,9 @@ Amount = float | str
 def target_values(
     scene: Scene, name: str, key: str, amounts: Sequence[Amount] | Amount, *, of_load: bool
 ) -> list[float]:
-    """Amounts of an amplitude, or of its conjugate -Pi_i(u), as numbers; one alone is a list of
-    one.
+    """Return amounts of an amplitude, or of its conjugate -Pi_i(u), as numbers.
+
+    One amount alone gives a list of one.
 
     Parameters
     ----------
@@ -45,28 +46,25 @@ def target_values(
     ValueError
         If one is neither a number nor text with a unit that this quantity has in this case.
     """
-    alone = isinstance(amounts, str | Real) or amounts is None
-    several: Sequence[Any] = [amounts] if alone else cast(Sequence[Any], amounts)
-    return [
-        _number(scene, name, f"trace: {key}: {amount!r}", amount, of_load) for amount in several
-    ]
+    is_single = isinstance(amounts, str | Real) or amounts is None
+    listed: Sequence[Any] = [amounts] if is_single else cast(Sequence[Any], amounts)
+    return [_number(scene, name, f"trace: {key}: {amount!r}", amount, of_load) for amount in listed]
 
 
 def _number(scene: Scene, name: str, place: str, amount: Any, of_load: bool) -> float:
+    """Return an amount as a number; `place` is the begin of a message."""
     if isinstance(amount, Real):
         return float(amount)
     if not isinstance(amount, str):
         raise ValueError(f'{place}: must be a number, or text with a unit such as "100 Pa"')
-    amplitude_varied = amplitude(name)
-    column = amplitude_varied.column if of_load else amplitude_varied.conjugate
+    column = amplitude(name).column if of_load else amplitude(name).conjugate
     unit, scale = scene.sizes.unit(column), quantity(column).scale
-    sized = (
-        of_load or name == "pressure" or name in (*scene.model.loads.forces, *scene.model.contacts)
-    )
-    text = unit.text if unit else next((amount.text for amount in quantity(column).units), "")
-    if not (text and sized):
-        of = name if of_load else f"the conjugate of {name}"
-        raise ValueError(f"{place}: {of} has no unit here: give a number")
+    forces = (*scene.model.loads.forces, *scene.model.contacts)
+    may_have_unit = of_load or name == "pressure" or name in forces
+    text = unit.text if unit else next((other.text for other in quantity(column).units), "")
+    if not (text and may_have_unit):
+        what = name if of_load else f"the conjugate of {name}"
+        raise ValueError(f"{place}: {what} has no unit here: give a number")
     if unit is None:
         needed = "youngs_modulus and lengths of the shell with units"
         raise ValueError(f"{place}: has a unit: that needs {needed}; a number is in {scale}")
@@ -77,7 +75,7 @@ def _number(scene: Scene, name: str, place: str, amount: Any, of_load: bool) -> 
     return number if of_load else number * scene.conjugate_unit(name)
 
 
-def trace(
+def trace(  # noqa: PLR0913
     scene: Scene,
     name: str,
     start: Record | State | None = None,
@@ -156,38 +154,37 @@ def trace(
         displacement = scene.newton.response(
             rest.state, name, PrescribedLoad(name, 0.0), exact=True
         ).du
-        if (
-            max_abs(scene.newton.system.comm, displacement) * abs(first)
-            < ZERO_DISPLACEMENT * scene.newton.system.length
-        ):
+        system = scene.newton.system
+        largest = max_abs(system.comm, displacement) * abs(first)
+        if largest < ZERO_DISPLACEMENT * system.length:
             raise Stopped(
-                f"{name} moves nothing at the start, so nothing is conjugate to it: follow it by arc length"
+                f"{name} moves nothing at the start, so nothing is conjugate to it: follow it by "
+                "arc length"
             )
     path, first_point = load_stage(scene).begin(name, control, rest.state, first, 10 * first)
     if targets and control == "conjugate":
         step = abs(targets[-1] - first_point.s) / 10
         path = path.with_step_options(StepOptions(step, 2 * step, 1e-5 * step))
     sense = float(np.copysign(1.0, first * first_point.dmu))
-    records_of_path = follow_path(
-        load_stage(scene),
-        path,
-        first_point,
-        ContinuationGoal(until, targets, quantity, steps, sense),
-    )
+    goal = ContinuationGoal(until, targets, quantity, steps, sense)
+    records_of_path = follow_path(load_stage(scene), path, first_point, goal)
     records = chain([Record("start", "", first_point)], records_of_path)
-    yield from _marked(
+    yield from _with_reached(
         (replace(record, shown=scene.displacement) for record in records), name, targets
     )
 
 
-def _marked(records: Iterator[Record], name: str, targets: Sequence[float]) -> Iterator[Record]:
-    """The records; the last one says if it is not at the last target."""
+def _with_reached(
+    records: Iterator[Record], name: str, targets: Sequence[float]
+) -> Iterator[Record]:
+    """Yield the records; the last one says if it is not at the last target."""
     last, missed = next(records), len(targets)
     for record in records:
         yield last
         last, missed = record, missed - (record.label == "target")
     if missed > 0:
-        place = f"{last.label}{f' ({last.mode})' if last.mode else ''} at {name} = {last.point.state.mu[name]:.6g}"
+        mode = f" ({last.mode})" if last.mode else ""
+        place = f"{last.label}{mode} at {name} = {last.point.state.mu[name]:.6g}"
         warnings.warn(
             f"trace: {name}: ends at a {place}, before its target {targets[-1]:.6g}", stacklevel=2
         )

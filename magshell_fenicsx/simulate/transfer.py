@@ -20,7 +20,7 @@ ROUNDING = 1e-9
 
 
 def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
-    """A displacement of one scene in the unknowns of another; collective.
+    """Return a displacement of one scene in the unknowns of another; collective.
 
     On the same mesh it is copied. Otherwise it is interpolated in the chart and scaled with the
     thickness or, on dimpled spheres, like a shallow shell, see `_Stretch`.
@@ -50,41 +50,48 @@ def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
     else:
         scale = system.length / source.model.system.length
         displacement = np.zeros((len(chart_places), values.shape[1]))
-        for inside, owned in nodes_by_shell(source, target):
-            if owned.any():
-                displacement[owned] = scale * _interpolated(
-                    nodes[inside], values[inside], chart_places[owned], np.inf
+        for source_nodes, target_nodes in nodes_by_shell(source, target):
+            if target_nodes.any():
+                displacement[target_nodes] = scale * _interpolated(
+                    nodes[source_nodes], values[source_nodes], chart_places[target_nodes], np.inf
                 )
     return system.zero_at_supports(displacement.ravel())
 
 
 def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
-    """Values at x (n, 1 or 2); derivatives jump at the rim, so each side uses only its own nodes."""
-    values_at: Array = np.zeros((len(x), values.shape[1]))
-    from_pole, polar = np.linalg.norm(nodes, axis=1), np.linalg.norm(x, axis=1)
-    inside = from_pole < rim * (1 + ROUNDING), polar < rim * (1 + ROUNDING)
-    outside = from_pole > rim * (1 - ROUNDING), polar > rim * (1 - ROUNDING)
-    for side, chart_places in (inside, outside):
-        if chart_places.any():
-            dim = nodes.shape[1]
-            kernel, degree = (
-                ("quintic", 3) if dim < 3 else ("linear", 0)
-            )  # cubic polynomials may vanish on a surface in space
+    """Return values at x (n, 1 or 2).
+
+    Derivatives jump at the rim, so each side uses only its own nodes.
+    """
+    values_at_x: Array = np.zeros((len(x), values.shape[1]))
+    polar_of_nodes, polar = np.linalg.norm(nodes, axis=1), np.linalg.norm(x, axis=1)
+    within_rim = polar_of_nodes < rim * (1 + ROUNDING), polar < rim * (1 + ROUNDING)
+    beyond_rim = polar_of_nodes > rim * (1 - ROUNDING), polar > rim * (1 - ROUNDING)
+    dim = nodes.shape[1]
+    # cubic polynomials may vanish on a surface in space
+    kernel, degree = ("quintic", 3) if dim < 3 else ("linear", 0)
+    for is_source, is_target in (within_rim, beyond_rim):
+        if is_target.any():
             field = scipy.interpolate.RBFInterpolator(
-                nodes[side], values[side], neighbors=NEIGHBOURS[dim], kernel=kernel, degree=degree
+                nodes[is_source],
+                values[is_source],
+                neighbors=NEIGHBOURS[dim],
+                kernel=kernel,
+                degree=degree,
             )
-            values_at[chart_places] = field(x[chart_places])
-    return values_at
+            values_at_x[is_target] = field(x[is_target])
+    return values_at_x
 
 
 def same_mesh(source: Scene, target: Scene) -> bool:
-    """Whether both have the same nodes, in any order and on any ranks; collective."""
+    """Return whether both have the same nodes, in any order and on any ranks; collective."""
     return _matching(source, target) is not None
 
 
 def _matching(source: Scene, target: Scene) -> NDArray[np.int64] | None:
-    """The number of each node of this rank among all nodes of the source; None on all ranks if the
-    nodes differ.
+    """Return the number of each node of this rank among all nodes of the source.
+
+    None on all ranks if the nodes differ.
     """
     return matching(_all_nodes(source), chart(target), source.model.system.comm)
 
@@ -92,8 +99,9 @@ def _matching(source: Scene, target: Scene) -> NDArray[np.int64] | None:
 def matching(
     nodes: Array, chart_places: Array, comm: MPI.Comm = MPI.COMM_SELF
 ) -> NDArray[np.int64] | None:
-    """The number of each of this rank's places `chart_places` among all `nodes`; None on all ranks if
-    they differ.
+    """Return the number of each of this rank's places among all nodes.
+
+    None on all ranks if they differ.
     """
     distance, number = scipy.spatial.cKDTree(nodes).query(chart_places)
     equal = (
@@ -118,46 +126,42 @@ class _Stretch:
     edge: float
 
     def place(self, x: Array) -> Array:
-        """The points of the source that correspond to points x (n, 1 or 2) of the target."""
+        """Return the points of the source that correspond to points x (n, 1 or 2) of the target."""
         polar = np.linalg.norm(x, axis=1, keepdims=True)
         return np.asarray(x * self._polar(polar) / np.maximum(polar, TINY))
 
     def turn(self, u: Array, x: Array) -> Array:
-        """Displacements u (n, 2 or 3) of the source, rotated and scaled for points x of the target."""
+        """Return displacements u (n, 2 or 3) of the source, rotated and scaled for points x."""
         polar = np.linalg.norm(x, axis=1, keepdims=True)
         azimuth = x / np.maximum(polar, TINY) if x.shape[1] == 2 else np.ones_like(polar)
         from_frame, to_frame = _frame(self._polar(polar), azimuth), _frame(polar, azimuth)
         normal_part, meridian_part = (np.sum(u * e, axis=1, keepdims=True) for e in from_frame)
         sideways = u - normal_part * from_frame[0] - meridian_part * from_frame[1]
         ratio = self.rim / self.source_rim
-        return np.asarray(
-            ratio**2
-            * (
-                normal_part * to_frame[0]
-                + (meridian_part * to_frame[1] + sideways) / self._slope(polar)
-            )
-        )
+        tangential = (meridian_part * to_frame[1] + sideways) / self._slope(polar)
+        return np.asarray(ratio**2 * (normal_part * to_frame[0] + tangential))
 
     def _polar(self, polar: Array) -> Array:
+        """Return polar angles of the source from those of the target."""
         t = self._part_beyond_rim(polar)
         ratio = self.source_rim / self.rim
         return np.asarray(np.clip(ratio * polar + (1 - ratio) * self.edge * t**2, 0, self.edge))
 
     def _slope(self, polar: Array) -> Array:
-        ratio = self.source_rim / self.rim
-        slope = ratio + (1 - ratio) * self.edge * 2 * self._part_beyond_rim(polar) / (
-            self.edge - self.rim
-        )
+        """Return the derivative of the source's polar angles by those of the target."""
+        ratio, t = self.source_rim / self.rim, self._part_beyond_rim(polar)
+        slope = ratio + (1 - ratio) * self.edge * 2 * t / (self.edge - self.rim)
         return np.asarray(np.maximum(slope, 0.5))
 
     def _part_beyond_rim(self, polar: Array) -> Array:
-        """Grows linearly from 0 at the rim to 1 at the edge."""
+        """Return a function that grows linearly from 0 at the rim to 1 at the edge."""
         return np.asarray(np.maximum((polar - self.rim) / (self.edge - self.rim), 0.0))
 
 
 def _frame(polar: Array, azimuth: Array) -> tuple[Array, Array]:
-    """Unit vectors normal to the sphere and along its meridians, for unit vectors (n, 1 or 2) of
-    the azimuth.
+    """Return unit vectors normal to the sphere and along its meridians.
+
+    `azimuth` (n, 1 or 2) are unit vectors of the azimuth.
     """
     return np.hstack([np.sin(polar) * azimuth, np.cos(polar)]), np.hstack(
         [np.cos(polar) * azimuth, -np.sin(polar)]
@@ -165,7 +169,7 @@ def _frame(polar: Array, azimuth: Array) -> tuple[Array, Array]:
 
 
 def _stretch(source: Scene, target: Scene) -> _Stretch | None:
-    """The map between dimpled spheres; None for other surfaces."""
+    """Return the map between dimpled spheres; None for other surfaces."""
     rims, edges = [], []
     for scene in (target, source):
         embedding, shape = scene.problem.embedding, scene.problem.shape
@@ -187,8 +191,7 @@ def _stretch(source: Scene, target: Scene) -> _Stretch | None:
 def nodes_by_shell(
     source: Scene, target: Scene
 ) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
-    """Of each shell, which of all nodes of a scene are its own, and which of this rank's nodes of
-    another one.
+    """Yield for each shell its nodes among all of a scene, and among this rank's of another one.
 
     Shells that touch are near each other, and move in different ways. Collective.
     """
@@ -196,13 +199,13 @@ def nodes_by_shell(
 
 
 def all_nodes_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
-    """Which of the nodes of all ranks are of each shell; collective."""
+    """Return for each shell which nodes of all ranks are its own; collective."""
     comm = scene.model.system.comm
-    return [np.concatenate(comm.allgather(inside)) for inside in nodes_of_shells(scene)]
+    return [np.concatenate(comm.allgather(is_own)) for is_own in nodes_of_shells(scene)]
 
 
 def nodes_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
-    """Which of this rank's nodes are of each shell, one for all of a shell alone."""
+    """Return for each shell which of this rank's nodes are its own; of one shell all are."""
     model = scene.model
     nodes, count = model.V.dofmap.list, model.system.size // model.V.dofmap.bs
     return [
@@ -212,7 +215,10 @@ def nodes_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
 
 
 def cells_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
-    """Which of this rank's cells, with ghosts, are of each shell, one for all of a shell alone."""
+    """Return for each shell which of this rank's cells are its own, ghosts included.
+
+    Of one shell all are.
+    """
     model, names = scene.model, list(scene.problem.context.sections.get("shells") or {})
     if len(names) < 2:
         return [np.ones(len(model.V.dofmap.list), dtype=bool)]
@@ -227,12 +233,12 @@ def cells_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
 
 
 def _all_nodes(scene: Scene) -> Array:
-    """The nodes of all ranks in the chart."""
+    """Return the nodes of all ranks in the chart."""
     return np.concatenate(scene.model.system.comm.allgather(chart(scene)))
 
 
 def chart(scene: Scene) -> Array:
-    """Coordinates (n, 1 or 2) of this rank's nodes in the chart, independent of a defect.
+    """Return coordinates (n, 1 or 2) of this rank's nodes in the chart, independent of a defect.
 
     For a solid with the height in its thickness: its displacements are carried to the same mesh
     only. For a mesh file these are positions (n, 3).
