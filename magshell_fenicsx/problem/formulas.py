@@ -25,10 +25,18 @@ from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh, space_embedding
 from magshell_fenicsx.mesh.patch import PatchMesh
 from magshell_fenicsx.mesh.shapes import DiscShape, PlaneShape, StripShape
-from magshell_fenicsx.models.shell.formula_projection import CellGeometry, project_formula, sampling_points
+from magshell_fenicsx.models.shell.formula_projection import (
+    CellGeometry,
+    project_formula,
+    sampling_points,
+)
 from magshell_fenicsx.models.shell.thickness import MIN_THICKNESS_FACTOR, MAX_THICKNESS_FACTOR
-from magshell_fenicsx.models.shell.adaptive_sampling import Lattice, RefinedParts, SubCells
-from magshell_fenicsx.models.shell.adaptive_sampling import refine_where_hidden as leaves_of
+from magshell_fenicsx.models.shell.adaptive_sampling import (
+    Lattice,
+    RefinedParts,
+    SubCells,
+    refine_where_hidden,
+)
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry
 from magshell_fenicsx.parts.ability import Context, Formulas
 from magshell_fenicsx.shape.outline import ANY_GRADING, Outline
@@ -229,7 +237,7 @@ def adaptive_cells(formulas: FormulaGroup, outline: Outline) -> RefinedParts:
 
     reference = SubCells(np.zeros(1, np.int64), np.zeros((1, 2)), np.ones((1, 2)))
     first = reference.of(np.arange(len(triangles)))
-    return leaves_of(formulas, first, places_and_areas, lattice, len(triangles))
+    return refine_where_hidden(formulas, first, places_and_areas, lattice, len(triangles))
 
 
 def _chart_triangles(shape: PlaneShape | Grid) -> Array:
@@ -248,7 +256,9 @@ def narrow_places(leaves: Sequence[RefinedParts]) -> Array:
     places: list[Array] = [np.zeros((0, 3))]
     for cells in leaves:
         narrow_cells = np.flatnonzero(cells.size < NARROW_SIZE)
-        by_variance = narrow_cells[np.argsort(-cells.area[narrow_cells] * cells.away[narrow_cells])]
+        by_variance = narrow_cells[
+            np.argsort(-cells.area[narrow_cells] * cells.variance[narrow_cells])
+        ]
         stride = max(1, len(by_variance) // MAX_NARROW_PLACES)
         places.append(cells.centre[by_variance[:MAX_NARROW_PLACES]])
         places.append(cells.centre[by_variance[MAX_NARROW_PLACES::stride]])
@@ -269,7 +279,7 @@ def polynomial_sizes(values: Callable[[Array], Array], leaves: RefinedParts | No
         See `adaptive_cells`; None where there is nothing between samples.
     """
     variance: float = 0.0
-    variance_of_leaves: float = float(leaves.area @ leaves.away) if leaves else 0.0
+    variance_of_leaves: float = float(leaves.area @ leaves.variance) if leaves else 0.0
     mean: Array | None = None
 
     def sizes(x: Array, on_chart: Masks, side: float) -> Array:
@@ -316,7 +326,7 @@ def _unsampled_variance(leaves: RefinedParts, middle: Array, side: float, sample
     tree = scipy.spatial.cKDTree(middle)
     distance, square = tree.query(leaves.centre, distance_upper_bound=side)
     in_square = np.isfinite(distance) & (leaves.size < side)
-    of_leaves = (leaves.area * leaves.away)[in_square]
+    of_leaves = (leaves.area * leaves.variance)[in_square]
     total = np.bincount(square[in_square], of_leaves, len(middle))
     return np.where(sampled < SAMPLED_SHARE * total, total, 0.0)
 
@@ -481,7 +491,9 @@ def _unresolved_formula(
     return messages
 
 
-def _stiffness_error(values: Callable[[Array, Array], Array], cells: CellGeometry, nodal: Array) -> float:
+def _stiffness_error(
+    values: Callable[[Array, Array], Array], cells: CellGeometry, nodal: Array
+) -> float:
     """Return the error of the stiffness t^3 or the compliance 1/t^3 of the cells; collective.
 
     It is over the exact value of all cells. Parts of a shell that carry side by side add their

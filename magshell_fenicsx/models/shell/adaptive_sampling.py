@@ -1,5 +1,5 @@
-"""SubCells of cells in which a formula has values that samples do not show, however small these
-parts are.
+"""Adaptive sampling: parts of cells in which formulas have values that samples do not show, however
+small these parts are.
 
 The ranges of a formula and of its derivatives in a box (`input/enclosure.py`) are compared with
 values at a few places. A part is divided while what the ranges leave open between these may change
@@ -23,9 +23,8 @@ BATCH_SIZE = 4096  # parts that are evaluated together
 MAX_OPEN_VARIATION = 5e-3  # of the integral of the variation: what ranges may leave open
 # of the integral of |f|: so little may be open whatever the variation, as of a step at a rim
 MAX_OPEN_INTEGRAL = 1e-4
-STEP_SHARE = (
-    0.9  # of the difference of values: both sides of a step are seen, and little is left open
-)
+# of the difference of values: both sides of a step are seen, and little is left open
+STEP_SHARE = 0.9
 SLOPE_RATIO = 8.0  # times what values show: derivatives that differ less hide nothing
 DIVIDED_SHARE = 0.03  # of the largest part of that: what is divided now, before others
 VALUE_TOLERANCE = 1e-9  # of the largest value
@@ -45,7 +44,7 @@ CHILDREN: dict[int, list[tuple[tuple[float, ...], tuple[float, ...]]]] = {
 
 @dataclass(frozen=True)
 class SubCells:
-    """Images of the reference cell in it, X = corner + sides * X', each of a cell."""
+    """Parts of cells: images X = corner + sides * X' of the reference cell, each in a cell."""
 
     cell: Numbers
     corner: Array
@@ -70,11 +69,11 @@ class SubCells:
         )
 
     def batches(self) -> "list[SubCells]":
-        """A few at a time."""
+        """Return these parts in groups of at most `BATCH_SIZE`."""
         return [self[i : i + BATCH_SIZE] for i in range(0, len(self.cell), BATCH_SIZE)]
 
     def divided(self) -> "SubCells":
-        """The parts of the first, those of the second, and so on."""
+        """Return the children of the first part, those of the second, and so on."""
         children = CHILDREN[self.corner.shape[1]]
         corners, scales = (np.array(v, dtype=float) for v in zip(*children, strict=True))
         d = self.corner.shape[1]
@@ -86,14 +85,13 @@ class SubCells:
         )
 
     def rule(self, points: Array, weights: Array) -> tuple[Array, Array]:
-        """Points (parts, q, d) and weights (parts, q)."""
+        """Return points (parts, q, d) and weights (parts, q) of a rule on each part."""
         X = self.corner[:, None] + self.sides[:, None] * points
         return X, np.abs(self.sides.prod(axis=1))[:, None] * weights
 
 
-PlacesOfParts = Callable[
-    [SubCells], tuple[Array, Array]
-]  # places (parts, q, 3), the corners first, and areas (parts,)
+# parts -> places (parts, q, 3), the corners first, and areas (parts,)
+PlacesOfParts = Callable[[SubCells], tuple[Array, Array]]
 
 
 @dataclass(frozen=True)
@@ -131,25 +129,25 @@ class Lattice:
 
 @dataclass(frozen=True)
 class RefinedParts:
-    """SubCells that are not divided any more, on this rank.
+    """Parts that need no further division, on this rank.
 
     Attributes
     ----------
     area, centre, size
         (n,), (n, 3) and the largest side of their boxes (n,).
-    away
-        The mean of |f - mean of f|^2 in each (n,).
+    variance
+        (n,) mean of |f - mean of f|^2 in each part.
     variation
-        The integral of |f - mean of f|.
+        Integral of |f - mean of f|.
     open
-        The part of that which may not be seen, where too many parts would be needed; else 0.
+        Part of the variation that samples may miss, where too many parts would be needed; else 0.
     """
 
     parts: SubCells
     area: Array
     centre: Array
     size: Array
-    away: Array
+    variance: Array
     variation: float
     open: float
 
@@ -162,14 +160,16 @@ def refine_where_hidden(
     owned: int,
     comm: MPI.Comm = MPI.COMM_SELF,
 ) -> RefinedParts:
-    """The first parts, divided where that is needed; collective.
+    """Return the first parts, divided where samples may miss values; collective.
 
     Parameters
     ----------
+    places_of
+        Function from parts to their places and areas.
     lattice
-        The places of each part.
+        Places in each part.
     owned
-        The cells with smaller numbers count in sums.
+        Number of this rank's own cells, which come first and alone count in sums.
     """
     parts, samples = first_parts, _sample(formulas, first_parts, places_of, lattice)
     part_count = 0
@@ -177,35 +177,30 @@ def refine_where_hidden(
         is_own = parts.cell < owned
         part_count = max(part_count, comm.allreduce(int(is_own.sum())))
         area = samples.area * is_own
-        mean = comm.allreduce(area @ samples.values.mean(axis=1)) / comm.allreduce(
-            float(area.sum())
-        )
+        integral = comm.allreduce(area @ samples.values.mean(axis=1))
+        mean = integral / comm.allreduce(float(area.sum()))
         f = samples.values - mean
         size = np.linalg.norm(f, axis=-1)
         variation = comm.allreduce(float((area * size.mean(axis=1)).sum()))
         largest = comm.allreduce(float(np.abs(samples.values).max(initial=0.0)), MPI.MAX)
-        matters = (samples.between > VALUE_TOLERANCE * largest) & (samples.size > MIN_SIZE)
-        hidden_integrals = np.where(matters, samples.area * samples.between, 0.0)
+        matters = (samples.hidden > VALUE_TOLERANCE * largest) & (samples.size > MIN_SIZE)
+        hidden_integrals = np.where(matters, samples.area * samples.hidden, 0.0)
         largest_hidden = comm.allreduce(float(hidden_integrals[is_own].max(initial=0.0)), MPI.MAX)
         hidden_integral = comm.allreduce(float(hidden_integrals[is_own].sum()))
-        negligible = MAX_OPEN_INTEGRAL * comm.allreduce(
-            float(area @ np.linalg.norm(samples.values, axis=-1).mean(axis=1))
-        )
+        own_size = float(area @ np.linalg.norm(samples.values, axis=-1).mean(axis=1))
+        negligible = MAX_OPEN_INTEGRAL * comm.allreduce(own_size)
         threshold = MAX_OPEN_VARIATION * variation / max(comm.allreduce(int(is_own.sum())), 1)
         to_divide = (hidden_integrals > threshold) & (
             hidden_integrals >= DIVIDED_SHARE * min(largest_hidden, np.finfo(float).max)
         )
-        if (
-            hidden_integral <= max(MAX_OPEN_VARIATION * variation, negligible)
-            or part_count > MAX_PARTS
-            or not comm.allreduce(int((to_divide & is_own).sum()))
-        ):
+        if hidden_integral <= max(MAX_OPEN_VARIATION * variation, negligible):
+            break
+        if part_count > MAX_PARTS or not comm.allreduce(int((to_divide & is_own).sum())):
             break
         smaller = parts[to_divide].divided()
         parts = SubCells.concatenate([parts[~to_divide], smaller])
-        samples = _Samples.concatenate(
-            [samples.select(~to_divide), _sample(formulas, smaller, places_of, lattice)]
-        )
+        new_samples = _sample(formulas, smaller, places_of, lattice)
+        samples = _Samples.concatenate([samples.select(~to_divide), new_samples])
     variances = (size**2).mean(axis=1)
     share = hidden_integral / max(variation, np.finfo(float).tiny)
     return RefinedParts(
@@ -236,7 +231,7 @@ class _Samples:
     area: Array
     centre: Array
     size: Array
-    between: Array
+    hidden: Array
     values: Array
 
     def select(self, selection: NDArray[np.bool_]) -> "_Samples":
@@ -255,12 +250,13 @@ class _Samples:
 def _sample(
     formulas: FormulaGroup, parts: SubCells, places_of: PlacesOfParts, lattice: Lattice
 ) -> _Samples:
-    """A look at each part, with the box of its places and of what bulges between them."""
+    """Sample formulas in each part; ranges are those in the box of its places and of what bulges
+    between them.
+    """
     x, area = places_of(parts)
     low, high = x.min(axis=1), x.max(axis=1)
-    bulge = np.abs(x.mean(axis=1) - x[:, : lattice.corners].mean(axis=1)).max(axis=1, initial=0.0)[
-        :, None
-    ]
+    off_centre = np.abs(x.mean(axis=1) - x[:, : lattice.corners].mean(axis=1))
+    bulge = off_centre.max(axis=1, initial=0.0)[:, None]
     bulge = np.where(bulge > VALUE_TOLERANCE, bulge, 0.0)
     lower, upper, bent = formulas.bounds(low - bulge, high + bulge)
     values = formulas.values(x.reshape(-1, 3))

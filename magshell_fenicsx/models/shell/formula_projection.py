@@ -98,7 +98,7 @@ class CellGeometry:
         return x, m / size[..., None], size
 
     def sum_over_ranks(self, of_cells: Array) -> Array:
-        """The sum over the cells of all ranks; collective."""
+        """Return the sum over the cells of all ranks; collective."""
         return np.asarray(self.comm.allreduce(of_cells[: self.owned].sum(axis=0)))
 
 
@@ -109,19 +109,19 @@ class ProjectedFormula:
     Attributes
     ----------
     nodal
-        (cells, nodes, components): as they were where the formula is smooth.
+        (cells, nodes, components) values; those that were given where the formula is smooth.
     smooth
-        Whether it is everywhere, on all ranks.
+        Whether the formula is smooth everywhere, on all ranks.
     size
-        The integral of |f|.
+        Integral of |f|.
     missed
         Error that integrals of f may still have, over that of |f|.
     rest
-        The root of the integral of |f - p|^2 over that of |f|^2, of all cells.
+        Root of the integral of |f - p|^2 over that of |f|^2, of all cells.
     widest
-        The largest side of a cell that misses a visible part of that.
+        Largest side of the cells that have a visible part of that.
     open
-        The part of the integral of |f| that may not have been seen, if more than it should be.
+        Part of the integral of |f| that samples may have missed, if it is more than allowed.
     """
 
     nodal: Array
@@ -143,7 +143,7 @@ def project_formula(
     bounded: bool = False,
     formulas: FormulaGroup | None = None,
 ) -> ProjectedFormula:
-    """A formula whose values at the nodes of each cell are known; collective.
+    """Return a formula on cells, from its values and those at the nodes of each cell; collective.
 
     Parameters
     ----------
@@ -157,23 +157,18 @@ def project_formula(
     formulas
         Formulas that vary, whose ranges show what is between the places.
     """
-    d, parts = cells.dimension, _uniform_parts(cells)
     X, w = (v.reshape(-1, *v.shape[2:]) for v in sampling_points(cells))
-    x, normals, area = cells.evaluate(X)
+    x, normals, area_ratio = cells.evaluate(X)
     f = values(x, normals)
-    interpolation_error = np.linalg.norm(
-        np.matmul(element.tabulate(0, X)[0, :, :, 0], nodal) - f, axis=-1
-    )
-    magnitude, area = np.linalg.norm(f, axis=-1), area * w
-    square_of = (area * magnitude**2).sum(axis=1)
-    sums = cells.sum_over_ranks(
-        np.stack(
-            [*((area * v).sum(axis=1) for v in (magnitude, interpolation_error)), square_of],
-            axis=-1,
-        )
-    )
-    size, differs, square = map(float, sums)
-    scale, sizes = area.sum(axis=1) / w.sum(), (area * magnitude).sum(axis=1)
+    interpolated = np.matmul(element.tabulate(0, X)[0, :, :, 0], nodal)
+    interpolation_error = np.linalg.norm(interpolated - f, axis=-1)
+    magnitude, area = np.linalg.norm(f, axis=-1), area_ratio * w
+    sizes = (area * magnitude).sum(axis=1)
+    errors = (area * interpolation_error).sum(axis=1)
+    squares = (area * magnitude**2).sum(axis=1)
+    sums = cells.sum_over_ranks(np.stack([sizes, errors, squares], axis=-1))
+    size, total_error, total_square = map(float, sums)
+    scale = area.sum(axis=1) / w.sum()
     if formulas:
         detail = _find_hidden_detail(values, formulas, cells, np.einsum("q,cqi->ci", w, f))
     else:
@@ -181,21 +176,20 @@ def project_formula(
     hidden_by_cell = scale * detail.hidden
     hidden_integral = float(cells.sum_over_ranks(hidden_by_cell))
     size += hidden_integral
-    if not (
-        differs + hidden_integral > INTERPOLATION_TOLERANCE * size
-        or hidden_integral > INTERPOLATION_TOLERANCE * detail.variation
-    ):
+    is_off = total_error + hidden_integral > INTERPOLATION_TOLERANCE * size
+    hides_detail = hidden_integral > INTERPOLATION_TOLERANCE * detail.variation
+    if not (is_off or hides_detail):
         return ProjectedFormula(nodal, smooth=True, size=size, open=detail.open)
     largest = cells.comm.allreduce(float(magnitude.max(initial=0.0)), MPI.MAX)
     projected_cells = np.flatnonzero(
         (interpolation_error @ w > SMOOTH_CELL_TOLERANCE * largest * w.sum())
         | (hidden_by_cell > PART_TOLERANCE * size)
     )
-    first_parts = detail.parts_of(projected_cells, parts)
+    first_parts = detail.parts_of(projected_cells, _uniform_parts(cells))
     space = basix.create_element(
         basix.ElementFamily.P, element.cell_type, degree, basix.LagrangeVariant.gll_warped
     )
-    integrals = _moments(
+    moments, sizes[projected_cells], reference_squares, missed = _moments(
         values,
         cells,
         projected_cells,
@@ -205,38 +199,40 @@ def project_formula(
         space,
         nodal.shape[-1],
     )
-    moments, sizes[projected_cells], squares, missed = integrals
     Y, v = basix.make_quadrature(element.cell_type, 2 * degree)
     phi = space.tabulate(0, Y)[0, :, :, 0]
     p = np.linalg.solve(phi.T @ (v[:, None] * phi), moments)
     residual_squares = np.zeros(len(scale))
-    lost_squares = squares - np.einsum("q,cqi->c", v, np.matmul(phi, p) ** 2)
+    lost_squares = reference_squares - np.einsum("q,cqi->c", v, np.matmul(phi, p) ** 2)
     residual_squares[projected_cells] = scale[projected_cells] * np.maximum(lost_squares, 0.0)
-    size, rest = float(cells.sum_over_ranks(sizes)), float(cells.sum_over_ranks(residual_squares))
-    side = np.sqrt(2.0) * scale ** (1 / min(d, 2))
-    widest = cells.comm.allreduce(
-        float(side[residual_squares > VISIBLE_SHARE * rest].max(initial=0.0)), MPI.MAX
-    )
+    size = float(cells.sum_over_ranks(sizes))
+    total_residual = float(cells.sum_over_ranks(residual_squares))
+    side = np.sqrt(2.0) * scale ** (1 / min(cells.dimension, 2))
+    visible_sides = side[residual_squares > VISIBLE_SHARE * total_residual]
+    widest = cells.comm.allreduce(float(visible_sides.max(initial=0.0)), MPI.MAX)
     at_nodes = np.matmul(space.tabulate(0, element.points)[0, :, :, 0], p)
     if bounded:
         mean = np.einsum("q,cqi->ci", v, np.matmul(phi, p))[:, None] / v.sum()
-        at_nodes = _bounded(
-            at_nodes, mean, np.matmul(space.tabulate(0, X)[0, :, :, 0], p), f[projected_cells]
-        )
-    new = nodal.copy()
-    new[projected_cells] = at_nodes
-    smallest_positive = np.finfo(float).tiny  # a formula that is zero but on a line
-    square_of[projected_cells] = scale[projected_cells] * squares
-    share = float(
-        np.sqrt(rest / max(square, float(cells.sum_over_ranks(square_of)), smallest_positive))
-    )
+        at_samples = np.matmul(space.tabulate(0, X)[0, :, :, 0], p)
+        at_nodes = _bounded(at_nodes, mean, at_samples, f[projected_cells])
+    new_nodal = nodal.copy()
+    new_nodal[projected_cells] = at_nodes
+    squares[projected_cells] = scale[projected_cells] * reference_squares
+    smallest_positive = np.finfo(float).tiny  # for a formula that is zero but on a line
+    largest_square = max(total_square, float(cells.sum_over_ranks(squares)), smallest_positive)
     return ProjectedFormula(
-        new, False, size, missed / max(size, smallest_positive), share, widest, detail.open
+        new_nodal,
+        smooth=False,
+        size=size,
+        missed=missed / max(size, smallest_positive),
+        rest=float(np.sqrt(total_residual / largest_square)),
+        widest=widest,
+        open=detail.open,
     )
 
 
 def _uniform_parts(cells: CellGeometry) -> SubCells:
-    """The parts in which every cell is looked at first."""
+    """Return the parts in which every cell is sampled at first."""
     d = cells.dimension
     parts = SubCells(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d)))
     for _ in range(FIRST_DIVISIONS[d]):
@@ -263,7 +259,7 @@ class _HiddenDetail:
         (cells,) difference of integrals over the reference cell from those of the places.
     variation
         The integral of |f - its mean|.
-    leaves, deep
+    parts, is_divided
         Parts of divided cells, and whether each cell is one (cells,).
     open
         See `ProjectedFormula`.
@@ -271,8 +267,8 @@ class _HiddenDetail:
 
     hidden: Array
     variation: float
-    refine_where_hidden: SubCells
-    deep: NDArray[np.bool_]
+    parts: SubCells
+    is_divided: NDArray[np.bool_]
     open: float
 
     @classmethod
@@ -284,46 +280,46 @@ class _HiddenDetail:
         """Return the parts of some cells: uniform ones, but those that the search made of divided
         cells; none is larger than the uniform.
         """
-        deep = self.deep[cells]
-        if not deep.any():
+        is_divided = self.is_divided[cells]
+        if not is_divided.any():
             return uniform_parts.in_each_cell(cells)
-        parts = self.leaves[np.isin(self.leaves.cell, cells)]
+        parts = self.parts[np.isin(self.parts.cell, cells)]
         largest = 1.001 * np.abs(uniform_parts.sides[0, 0])
         small_parts, too_wide = list[SubCells](), np.abs(parts.sides[:, 0]) > largest
         while too_wide.any():
             small_parts.append(parts[~too_wide])
             parts = parts[too_wide].divided()
             too_wide = np.abs(parts.sides[:, 0]) > largest
-        return SubCells.concatenate([uniform_parts.in_each_cell(cells[~deep]), *small_parts, parts])
+        parts_of_others = uniform_parts.in_each_cell(cells[~is_divided])
+        return SubCells.concatenate([parts_of_others, *small_parts, parts])
 
 
 def _find_hidden_detail(
     values: Values, formulas: FormulaGroup, cells: CellGeometry, sampled_integrals: Array
 ) -> _HiddenDetail:
-    """Integrals (cells, components) compared with those over leaves, see
-    `adaptive_sampling.leaves`; collective.
+    """Compare integrals (cells, components) from samples with those over the parts that
+    `adaptive_sampling.refine_where_hidden` makes; collective.
     """
     d, kind = cells.dimension, cells.element.cell_type
     lattice = Lattice.make(kind, LATTICE_DIVISIONS[d])
-    (points, weights) = basix.make_quadrature(kind, RULE_DEGREE[d])
+    points, weights = basix.make_quadrature(kind, RULE_DEGREE[d])
 
     def places_of(parts: SubCells) -> tuple[Array, Array]:
-        X, w = parts.rule(
-            lattice.places, np.full(len(lattice.places), weights.sum() / len(lattice.places))
-        )
+        place_count = len(lattice.places)
+        X, w = parts.rule(lattice.places, np.full(place_count, weights.sum() / place_count))
         x, _, area = cells.evaluate(X, parts.cell)
         return x, (area * w).sum(axis=1)
 
-    whole_cells = SubCells(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d))).in_each_cell(
-        np.arange(len(cells.nodal))
-    )
+    reference_cell = SubCells(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d)))
+    whole_cells = reference_cell.in_each_cell(np.arange(len(cells.nodal)))
     refined = refine_where_hidden(
         formulas, whole_cells, places_of, lattice, cells.owned, cells.comm
     )
-    deep = np.zeros(len(cells.nodal), bool)
-    divided = np.abs(refined.parts.sides[:, 0]) < 1
-    deep[refined.parts.cell[divided]] = True
-    integrals, parts = np.where(deep[:, None], 0.0, sampled_integrals), refined.parts[divided]
+    is_divided = np.zeros(len(cells.nodal), bool)
+    is_smaller = np.abs(refined.parts.sides[:, 0]) < 1
+    is_divided[refined.parts.cell[is_smaller]] = True
+    integrals = np.where(is_divided[:, None], 0.0, sampled_integrals)
+    parts = refined.parts[is_smaller]
     for batch in parts.batches():
         X, w = batch.rule(points, weights)
         x, normals, _ = cells.evaluate(X, batch.cell)
@@ -331,7 +327,7 @@ def _find_hidden_detail(
     differences = np.linalg.norm(integrals - sampled_integrals, axis=1)
     if not cells.sum_over_ranks(differences) > 0:
         return _HiddenDetail.none(len(differences), refined.variation, refined.open)
-    return _HiddenDetail(differences, refined.variation, parts, deep, refined.open)
+    return _HiddenDetail(differences, refined.variation, parts, is_divided, refined.open)
 
 
 def _moments(
@@ -344,10 +340,19 @@ def _moments(
     space: Element,
     components: int,
 ) -> tuple[Array, Array, Array, float]:
-    """Integrals of f times each function (cells, functions, components), of |f| and |f|^2 (cells,),
-    and their error.
+    """Integrate f over parts of cells that are divided until each agrees with its own parts.
 
-    Over the reference cell, but of |f| and the error over the surface; collective.
+    Collective.
+
+    Returns
+    -------
+    moments
+        (cells, functions, components): integrals of f times each function of the space, over the
+        reference cell.
+    sizes, squares
+        (cells,): integral of |f| over the surface, and of |f|^2 over the reference cell.
+    error
+        Estimated error of the integrals over the surface, of all ranks.
     """
     points, weights = basix.make_quadrature(space.cell_type, RULE_DEGREE[cells.dimension])
     number = np.zeros(len(cells.nodal), np.int64)
@@ -408,8 +413,8 @@ def _moments(
 
 
 def _bounded(at_nodes: Array, mean: Array, inner_values: Array, f: Array) -> Array:
-    """Polynomials (cells, nodes, components) drawn towards their means until they have no values
-    that f has not.
+    """Return polynomials (cells, nodes, components) that are contracted towards their means until
+    they have no values that f has not.
     """
     low, high = f.min(axis=1, keepdims=True), f.max(axis=1, keepdims=True)
     all_values = np.concatenate([at_nodes, inner_values], axis=1)
