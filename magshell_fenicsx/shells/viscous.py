@@ -126,7 +126,7 @@ class Viscosity:
         self._force = np.zeros(model.system.size)
 
     def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
-        """The forces at a part of the step from u0 to u1, with the velocity v there."""
+        """Return the forces at a part of the step from u0 to u1, with the velocity v there."""
         displacement = u0 + part * (u1 - u0)
         if self.creep_time:
             stress = self.creep_time * self._strain_rate(displacement, v)
@@ -364,13 +364,13 @@ def _strains(j: Jet, u: Jet) -> tuple[Expr, Expr]:
 
 
 def mirrored_jump(r0: Jet, m: Expr, normal: Expr) -> Callable[[Jet], Expr]:
-    """Half of the jump across a plane with that normal."""
+    """Return half of the jump across a plane with that normal, as a function of the deformed jet."""
     nu1, nu2, _ = kin.conormal(r0, m)
     return lambda r: ufl.dot(kin.normal(r), normal) * ufl.dot(normal, r.r1 * nu1 + r.r2 * nu2)
 
 
 def held_jump(r0: Jet, m: Expr, n0: Expr) -> Callable[[Jet], Expr]:
-    """The jump to the normal that an edge holds."""
+    """Return the jump to the normal n0 that an edge holds, as a function of the deformed jet."""
     nu1, nu2, _ = kin.conormal(r0, m)
     return lambda r: -ufl.dot(n0 - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
 
@@ -386,37 +386,52 @@ def _jump_of(edge: HeldEdge, r0: Jet, m: Expr) -> Callable[[Jet], Expr]:
 def _works(
     model: "ShellModel | MeridianModel", given: _PrescribedStress | _StrainRates
 ) -> list[ufl.Form]:
-    """The work of given stresses on the strains of u, and on edges as in C0 interior penalty; its
-    gradient are forces.
+    """Return the work of given stresses on the strains of u, and on edges as in C0 interior penalty.
 
-    Smooth surfaces have no jumps, so that these need no memory: each step closes the edges that it
-    opens.
+    Its gradient is the viscous forces. Smooth surfaces have no jumps, so that these need no memory:
+    each step closes the edges that it opens.
     """
-    factory, domain = model.factory, model.factory.domain
-    r0, u, t, m = domain.j0, domain.jet(model.u), factory.thickness, domain.covector
+    inside = _work_in_cells(model, given) + _work_on_interior_edges(model, given)
+    return [inside, *_works_on_held_edges(model, given)]
 
-    def law(j: Jet, side: str = "") -> Law:
-        """Law of the shell at small strains, which a viscous stress follows too."""
-        of_shell = densities.law_at(model.material.law.linear, j)
-        materials = factory.cell_materials
-        of_shell = of_shell if t is None else of_shell.thicker((t(side) if side else t)[0])
-        if materials is None:
-            return of_shell
-        return of_shell.with_material(
-            *((materials(side) if side else materials)[i] for i in (0, 1, 3))
-        )
 
+def _small_strain_law(model: "ShellModel | MeridianModel", j: Jet, side: str = "") -> Law:
+    """Return the law of the shell at small strains, which a viscous stress follows too.
+
+    `side` is that of an interior edge, "" elsewhere.
+    """
+    thickness, materials = model.factory.thickness, model.factory.cell_materials
+    law = densities.law_at(model.material.law.linear, j)
+    if thickness is not None:
+        law = law.thicker((thickness(side) if side else thickness)[0])
+    if materials is None:
+        return law
+    numbers = materials(side) if side else materials
+    return law.with_material(*(numbers[i] for i in (0, 1, 3)))
+
+
+def _work_in_cells(
+    model: "ShellModel | MeridianModel", given: _PrescribedStress | _StrainRates
+) -> ufl.Form:
+    """Return the work of given stresses and moments in the cells."""
+    domain = model.factory.domain
+    r0, u = domain.j0, domain.jet(model.u)
     E, K = _strains(r0, u)
     strain, bend = given.strain(r0, "")
-    up = kin.inverse_metric(r0)
-    law_here = law(r0)
-    stretching = work(law_here.stress(strain, up), E)
-    bending = work(law_here.moment(strain, bend, up), K)
-    coupled = work(
-        law_here.moment(E, 0 * K, up), bend
-    )  # of plies: a viscous bend makes membrane stress
-    works = [(stretching + bending + coupled) * kin.area_ratio(r0) * domain.dx()]
+    up, law = kin.inverse_metric(r0), _small_strain_law(model, r0)
+    stretching = work(law.stress(strain, up), E)
+    bending = work(law.moment(strain, bend, up), K)
+    # of plies: a viscous bend makes membrane stress
+    coupling = work(law.moment(E, 0 * K, up), bend)
+    return (stretching + bending + coupling) * kin.area_ratio(r0) * domain.dx()
 
+
+def _work_on_interior_edges(
+    model: "ShellModel | MeridianModel", given: _PrescribedStress | _StrainRates
+) -> ufl.Form:
+    """Return the work on the jumps between cells."""
+    factory, domain = model.factory, model.factory.domain
+    r0, u, m = domain.j0, domain.jet(model.u), domain.covector
     sides = ("+", "-")
     r0s, us = ([j.side(s) for s in sides] for j in (r0, u))
     conormals = [kin.conormal(j, m(s)) for j, s in zip(r0s, sides, strict=True)]
@@ -427,31 +442,36 @@ def _works(
             return ufl.atan2(*edges.fold_angle(plus, minus, m("+")))
         return edges.fold_jump(plus, minus, conormals[0][:2], conormals[1][:2])
 
-    given_moment, bent, stiff = 0, 0, 0
+    given_moment, moment, stiffness = 0, 0, 0
     for j, v, side, (nu1, nu2, _) in zip(r0s, us, sides, conormals, strict=True):
-        edge = kin.inverse_metric(j), (nu1, nu2), 1
-        given_moment += law(j, side).edge_moment(*given.strain(j, side), *edge) / 2
-        bent += law(j, side).edge_moment(*_strains(j, v), *edge) / 2
-        stiff += (
-            law(j, side).edge_stiffness(kin.membrane_strain(j, v), *edge)
-            / 2
-            * model.sigma
-            / domain.widths[0]
-        )
-    S_J, J = given.stiff_opening(domain, jump_of), jump_of(r0 + u)
+        edge, law = (kin.inverse_metric(j), (nu1, nu2), 1), _small_strain_law(model, j, side)
+        given_moment += law.edge_moment(*given.strain(j, side), *edge) / 2
+        moment += law.edge_moment(*_strains(j, v), *edge) / 2
+        side_stiffness = law.edge_stiffness(kin.membrane_strain(j, v), *edge)
+        stiffness += side_stiffness / 2 * model.sigma / domain.widths[0]
+    opening, jump = given.stiff_opening(domain, jump_of), jump_of(r0 + u)
     stretch = (conormals[0][2] + conormals[1][2]) / 2
-    works[0] += (given_moment * J + S_J * (bent + stiff * J)) * stretch * domain.dS()
+    return (given_moment * jump + opening * (moment + stiffness * jump)) * stretch * domain.dS()
 
+
+def _works_on_held_edges(
+    model: "ShellModel | MeridianModel", given: _PrescribedStress | _StrainRates
+) -> list[ufl.Form]:
+    """Return the works on edges that hold the normal, or lie on mirror planes, one by one."""
+    factory, domain = model.factory, model.factory.domain
+    r0, u, m = domain.j0, domain.jet(model.u), domain.covector
+    E, K = _strains(r0, u)
     nu1, nu2, stretch = kin.conormal(r0, m)
-    edge = up, (nu1, nu2), 1
-    M, bent = (law_here.edge_moment(*strains, *edge) for strains in ((strain, bend), (E, K)))
-    stiff = law_here.edge_stiffness(E, *edge) * model.sigma / domain.widths[1]
+    edge, law = (kin.inverse_metric(r0), (nu1, nu2), 1), _small_strain_law(model, r0)
+    given_moment = law.edge_moment(*given.strain(r0, ""), *edge)
+    moment = law.edge_moment(E, K, *edge)
+    stiffness = law.edge_stiffness(E, *edge) * model.sigma / domain.widths[1]
+    works = []
     for held_edge in factory.held_edges:
-        jump, modelled_sides = _jump_of(held_edge, r0, m), 1 if held_edge.plane is None else 2
-        S_J, J = given.stiff_opening(domain, jump), jump(r0 + u)
-        works.append(
-            (M * J + S_J * (bent + modelled_sides * stiff * J))
-            * stretch
-            * domain.ds(held_edge.facets)
-        )
+        jump_of = _jump_of(held_edge, r0, m)
+        modelled_sides = 1 if held_edge.plane is None else 2
+        opening, jump = given.stiff_opening(domain, jump_of), jump_of(r0 + u)
+        response = moment + modelled_sides * stiffness * jump
+        density = given_moment * jump + opening * response
+        works.append(density * stretch * domain.ds(held_edge.facets))
     return works

@@ -93,7 +93,7 @@ class Waves:
         self.largest = largest
         self._nodes = largest * np.sin(np.pi / 4 * np.array([0, 1, 2, -1, -2]))
         self._weights = _lagrange_weights(self._nodes, np.arange(largest + 1))
-        self._pieces = [_WaveRange(2, largest, self._nodes)]
+        self._ranges = [_WaveRange(2, largest, self._nodes)]
 
     def _set_system(self, system: FiniteElementSystem) -> None:
         self._system, self._matrices = system, dict[str, PETSc.Mat]()
@@ -109,7 +109,7 @@ class Waves:
         return other
 
     def tangent(self, state: State, m: int) -> PETSc.Mat:
-        """The matrix of Q_m at an axisymmetric state; it is reused by the next call."""
+        """Return the matrix of Q_m at an axisymmetric state; it is reused by the next call."""
         (entries,) = self._system.at_state(state).evaluate_forms(lambda: self._entries(state, [m]))
         return self._with_nonlocal_entries(state, self._filled("tangent", entries.ravel(), m), m)
 
@@ -120,14 +120,14 @@ class Waves:
         entries = self._system.at_state(state).evaluate(
             lambda: [term.entries_of_waves(m) for term in self.nonlocal_terms]
         )
-        rows, columns, values = (np.concatenate(term) for term in zip(*entries, strict=True))
+        rows, columns, values = (np.concatenate(parts) for parts in zip(*entries, strict=True))
         fixed = np.zeros(K.getSize()[0], dtype=bool)
         fixed[self._rows(m)] = True
         return with_entries(K, (rows, columns, values), fixed)
 
     def energies_along(self, phi: NDArray[np.float64], m: int) -> list[FormTerm]:
-        """Q_m(phi), summand by summand as energies of the axisymmetric displacement, for one phi
-        and m at a time.
+        """Return Q_m(phi) as energies of the axisymmetric displacement, one for each energy of the
+        shell; for one phi and m at a time.
         """
         self._phi.x.array[:], self._m.value = phi, m
         if not self._energies:
@@ -154,7 +154,7 @@ class Waves:
         return self._factorisation
 
     def counts(self, state: State) -> list[int]:
-        """Number of unstable directions among the waves 1, 2, ... `largest`.
+        """Return the number of unstable directions of each wave m = 1, 2, ... `largest`.
 
         A jet of a wave is quadratic in m, and so Q_m is a polynomial of degree 4: its matrices are
         interpolated between five, of m = 0, +-a and +-b. Q_-m is Q_m of the mirrored wave (U, -V,
@@ -172,7 +172,7 @@ class Waves:
         return unstable
 
     def sampled_matrices(self, state: State) -> NDArray[np.float64]:
-        """(5, entries) of the matrices at the five m."""
+        """Return the entries (5, entries) of the matrices at the five m."""
         of_nodes = self._system.at_state(state).evaluate_forms(
             lambda: self._entries(state, self._nodes[:3])
         )
@@ -189,11 +189,11 @@ class Waves:
         """m - 1 of the waves whose matrices, as `sampled_matrices` gives them, are not positive
         definite.
         """
-        ranges = self._pieces
+        ranges = self._ranges
         try:
             return {m - 1 for m in self._indefinite(values)}
         finally:
-            self._pieces = ranges  # fit for states of the path
+            self._ranges = ranges  # fit for states of the path
 
     def _entries(
         self, state: State, waves: Sequence[float] | NDArray[np.float64]
@@ -247,7 +247,7 @@ class Waves:
         first, rest = once.bands([self._weights[1] @ values]), twice.bands(values)
         definite = cache(lambda m: twice.is_positive_definite(rest, self._weights[m]))
         indefinite = set[int]() if once.is_positive_definite(first, np.ones(1)) else {1}
-        open_ranges, self._pieces = [*self._pieces], []  # of others of the same terms too
+        open_ranges, self._ranges = [*self._ranges], []  # of others of the same terms too
         while open_ranges:
             wave_range = open_ranges.pop()
             ends = definite(wave_range.first) and definite(wave_range.last)
@@ -261,7 +261,7 @@ class Waves:
             ):
                 open_ranges += wave_range.halves(self._nodes)
                 continue
-            self._pieces.append(wave_range)
+            self._ranges.append(wave_range)
         return sorted(indefinite)
 
     def _interpolated_pivots(self, m: int, values: NDArray[np.float64]) -> int:
