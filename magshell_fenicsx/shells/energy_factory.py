@@ -153,7 +153,7 @@ class EnergyFactory:
         )
         if self.creases:
             zero = self._constant(0.0)
-            density = self.creases.added(
+            density = self.creases.replace_at_joints(
                 density, self.free_constants.setdefault(FOLD, zero) if self.creases.grow else zero
             )
         return self.domain.energy(INTERIOR, density, column="bending")

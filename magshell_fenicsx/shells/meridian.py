@@ -225,7 +225,7 @@ class MeridianModel(ThinModel):
             free_constants,
             meridian.largest_fold(self.r0) > FOLD_ANGLE,
             pressed=pressed_cells,
-            creases=Creases.of(loads.joints, meridian) if loads.joints else None,
+            creases=Creases.of_joints(loads.joints, meridian) if loads.joints else None,
             cell_materials=self.cell_materials,
         )
 

@@ -278,7 +278,7 @@ class ShellModel(ThinModel):
         is_folded = midsurface.kinked and largest_fold(self.r0, self.degree) > FOLD_ANGLE
         initial_placement = self.growing and self.growing.initial_placement
         domain = surface_domain(self.r0, initial_placement)
-        creases = Creases.of(self.loads.joints, midsurface) if loads.joints else None
+        creases = Creases.of_joints(self.loads.joints, midsurface) if loads.joints else None
         return EnergyFactory(
             domain,
             self.u,

@@ -64,12 +64,12 @@ class Meridian:
 
     @property
     def order(self) -> NDArray[np.int64]:
-        """The cells along the parameter."""
+        """Numbers of the cells, sorted along the parameter."""
         return np.argsort(self._cell_ends.mean(axis=1))
 
     @property
     def cells(self) -> Array:
-        """(cells, 2) parameters at the ends of the cells, along it."""
+        """Parameters (cells, 2) at the ends of the cells, sorted along the meridian."""
         return self._cell_ends[self.order]
 
     @property
@@ -91,7 +91,7 @@ class Meridian:
         return bool(np.isclose(self._cell_ends.min(axis=1), self.parameter(end)).any())
 
     def facets_at(self, point: str) -> NDArray[np.int32]:
-        """The point of the axis at a named place, or next to it."""
+        """Return the facet on the axis at a named place, or next to it."""
         distances = np.abs(self._parameters_of(self.axis) - self.points[point][0])
         return np.asarray(self.axis[distances == distances.min(initial=inf)][:1])
 
@@ -103,10 +103,9 @@ class Meridian:
             begin = self._cell_ends[:, :1] - PARAMETER_TOLERANCE
             end = self._cell_ends[:, 1:] + PARAMETER_TOLERANCE
             touched_cells = ((begin < tied_parameters) & (tied_parameters < end)).any(axis=1)
-            connected = [of for of in bodies if (of & touched_cells).any()]
-            bodies = [of for of in bodies if all(of is not part for part in connected)] + [
-                np.any(connected, axis=0)
-            ]
+            connected = [body for body in bodies if (body & touched_cells).any()]
+            others = [body for body in bodies if not (body & touched_cells).any()]
+            bodies = [*others, np.any(connected, axis=0)]
         return bodies
 
     @property
@@ -128,7 +127,7 @@ class Meridian:
         return np.sort(self.mesh.geometry.x[compat.geometry_dofs(self.mesh), 0], axis=1)
 
     def _parameters_of(self, facets: NDArray[np.int32]) -> Array:
-        """Parameters of facets, of which dolfinx wants one at least."""
+        """Return the parameters of facets; dolfinx takes at least one."""
         if not len(facets):
             return np.empty(0)
         return np.asarray(
@@ -136,18 +135,18 @@ class Meridian:
         )
 
     def section(self, s: Array) -> Array:
-        """(n, 2) rho and z at some parameters."""
+        """Return rho and z (n, 2) at some parameters."""
         return np.asarray(self.embedding(np.column_stack([s, 0 * s]))[:, [0, 2]])
 
     def placement(self, V: fem.FunctionSpace) -> fem.Function:
-        """(rho, z) in the Lagrange space `V` of two components, so that axial motions are exact."""
+        """Return (rho, z) in the Lagrange space `V` of two components: axial motions are exact."""
         s = V.tabulate_dof_coordinates()[:, 0]
         r0 = fem.Function(V, name="r0")
         r0.x.array[:] = self.section(s).ravel()
         return r0
 
     def largest_fold(self, r0: fem.Function) -> float:
-        """The largest angle (rad) between the undeformed normals at a joint of two edges."""
+        """Return the largest angle (rad) between the undeformed normals at a joint of two edges."""
         nodes, normals, angles = r0.function_space.dofmap.list, positions_and_normals(r0)[1], [0.0]
         for marks in self.joints:
             if marks is not None:
@@ -218,25 +217,29 @@ def make_meridian(
     axis = np.sort(np.concatenate([np.empty(0, np.int32), *poles]))
     ends = {name: end for name, end in zip(names, facets, strict=True) if name}
     if points is None or (shell_intervals and "pole" not in points):
-        positions = embedding(np.column_stack([vertices, 0 * vertices]))
         supported = [
             end for name, end in zip(names, np.ravel(parts), strict=True) if name in supported_ends
         ]
-        is_unsupported = (
-            np.abs(np.subtract.outer(vertices, supported)).min(axis=1, initial=inf)
-            > PARAMETER_TOLERANCE
-        )
-        highest = np.argmax(positions[:, 2])
-        if not is_unsupported[highest] and is_unsupported.any():
-            on_axis = is_unsupported & (np.abs(positions[:, 0]) < PARAMETER_TOLERANCE)
-            highest = np.argmax(
-                np.where(on_axis if on_axis.any() else is_unsupported, positions[:, 2], -inf)
-            )
-        s = float(vertices[highest]) if shell_intervals else 0.0
+        s = _highest_parameter(embedding, vertices, supported) if shell_intervals else 0.0
         points = {**(points or {}), "pole": (s, 0.0)}
     middles = domain.geometry.x[compat.geometry_dofs(domain), 0].mean(axis=1)
     patches = {name: (begin < middles) & (middles < end) for name, (begin, end) in shell_intervals}
     return Meridian(domain, axis, ends, embedding, points, curvature, patches, tied)
+
+
+def _highest_parameter(embedding: Embedding, vertices: Array, supported: Sequence[float]) -> float:
+    """Return the parameter of the highest vertex; if that is supported, of the highest free one, on
+    the axis if there is one.
+    """
+    positions = embedding(np.column_stack([vertices, 0 * vertices]))
+    distances = np.abs(np.subtract.outer(vertices, supported)).min(axis=1, initial=inf)
+    is_free = distances > PARAMETER_TOLERANCE
+    highest = np.argmax(positions[:, 2])
+    if not is_free[highest] and is_free.any():
+        is_free_on_axis = is_free & (np.abs(positions[:, 0]) < PARAMETER_TOLERANCE)
+        candidates = is_free_on_axis if is_free_on_axis.any() else is_free
+        highest = np.argmax(np.where(candidates, positions[:, 2], -inf))
+    return float(vertices[highest])
 
 
 def graded_vertices(
@@ -250,8 +253,10 @@ def graded_vertices(
     contact_size: tuple[float, float] | None = None,
     everywhere: float | None = None,
 ) -> Array:
-    """Vertices for 1e-7 in k_d at degree 4: cells of a fraction of sqrt(h), finer on the axis, if 0
-    is there.
+    """Return the vertices (n,) of a meridian: cells of a fraction of sqrt(h), finer on the axis, if
+    0 is there.
+
+    At degree 4 they give k_d to 1e-7.
 
     Parameters
     ----------
@@ -265,9 +270,9 @@ def graded_vertices(
     largest
         Largest size of the cells, whatever the thickness.
     contact_size
-        Cells of a size up to a distance from the start, where bodies press.
+        Distance from the start within which bodies press, and size of the cells there.
     everywhere
-        The size of all cells, over the refinement, in place of all these.
+        Size of all cells, over the refinement, in place of all these.
 
     Raises
     ------

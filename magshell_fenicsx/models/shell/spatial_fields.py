@@ -6,7 +6,7 @@ from typing import ClassVar
 
 import basix
 import numpy as np
-from dolfinx import fem
+from dolfinx import fem, mesh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
@@ -334,54 +334,63 @@ def pattern_on_edge(
     field, _ = pattern_field(InterpolatedPattern(pattern), r0, finer)
     field.rebuild = lambda r: pattern_on_edge(pattern, r, facets, finer)[0]
     Q, topology = field.function_space, V.mesh.topology
-    topology.create_connectivity(1, 2)
-    topology.create_connectivity(2, 1)
-    cells = np.array([topology.connectivity(1, 2).links(f)[0] for f in facets], dtype=np.int64)
-    pairs = zip(cells, facets, strict=True)
-    local = [int(np.flatnonzero(topology.connectivity(2, 1).links(c) == f)[0]) for c, f in pairs]
+    cells, local_sides = _cells_at_facets(topology, facets)
     element, placement_element = Q.element.basix_element, V.element.basix_element
-    corners, ends = basix.geometry(element.cell_type), basix.topology(element.cell_type)[1]
-    family = basix.ElementFamily.P
-    interval = basix.CellType.interval
-    variant = basix.LagrangeVariant.gll_warped
-    edge_placement_element, edge_element = (
-        basix.create_element(family, interval, cell_element.degree, variant)
-        for cell_element in (placement_element, element)
-    )
-
-    def points_on_side(points: Array, number: int) -> Array:
-        a, b = corners[ends[number]]
-        return np.asarray(a + points * (b - a))
-
-    place_tables = np.array(
-        [
-            placement_element.tabulate(0, points_on_side(edge_placement_element.points, i))[
-                0, :, :, 0
-            ]
-            for i in range(3)
-        ]
-    )
-    nodal = np.matmul(place_tables[local], r0.x.array.reshape(-1, 3)[V.dofmap.list[cells]]).reshape(
-        len(cells), -1, 3
-    )
+    edge_element = _interval_element(element.degree)
+    edge_placement_element = _interval_element(placement_element.degree)
+    points_by_side = [
+        _points_on_side(element.cell_type, side, edge_placement_element.points) for side in range(3)
+    ]
+    place_tables = [placement_element.tabulate(0, X)[0, :, :, 0] for X in points_by_side]
+    cell_places = r0.x.array.reshape(-1, 3)[V.dofmap.list[cells]]
+    nodal = np.matmul(np.array(place_tables)[local_sides], cell_places).reshape(len(cells), -1, 3)
     owned = int(np.sum(facets < topology.index_map(1).size_local))
     edge = CellGeometry(edge_placement_element, nodal, owned, V.mesh.comm)
     x, normals, _ = edge.evaluate(edge_element.points)
     projection = project_pattern(pattern, edge, pattern(inside_cells(x), normals), edge_element)
-    nodes = element.points
-    nodes_on_side = [
-        [
-            int(np.argmin(np.linalg.norm(nodes - p, axis=1)))
-            for p in points_on_side(edge_element.points, i)
-        ]
-        for i in range(3)
+    if projection.smooth:
+        return field, None
+    nodes_by_side = [
+        _nearest_nodes(element, _points_on_side(element.cell_type, side, edge_element.points))
+        for side in range(3)
     ]
     values = field.x.array.reshape(-1, 3)
-    for cell, number, vectors in (
-        zip(cells, local, projection.nodal, strict=True) if not projection.smooth else ()
-    ):
-        values[Q.dofmap.list[cell][nodes_on_side[number]]] = vectors
-    return field, None if projection.smooth else projection.size
+    for cell, side, vectors in zip(cells, local_sides, projection.nodal, strict=True):
+        values[Q.dofmap.list[cell][nodes_by_side[side]]] = vectors
+    return field, projection.size
+
+
+def _cells_at_facets(
+    topology: mesh.Topology, facets: NDArray[np.int32]
+) -> tuple[NDArray[np.int64], list[int]]:
+    """Return the cells with some boundary facets, and the number of the facet in each."""
+    topology.create_connectivity(1, 2)
+    topology.create_connectivity(2, 1)
+    to_cell, to_facet = topology.connectivity(1, 2), topology.connectivity(2, 1)
+    cells = np.array([to_cell.links(facet)[0] for facet in facets], dtype=np.int64)
+    local_sides = [
+        int(np.flatnonzero(to_facet.links(cell) == facet)[0])
+        for cell, facet in zip(cells, facets, strict=True)
+    ]
+    return cells, local_sides
+
+
+def _interval_element(degree: int) -> Element:
+    """Return the Lagrange element of an edge."""
+    return basix.create_element(
+        basix.ElementFamily.P, basix.CellType.interval, degree, basix.LagrangeVariant.gll_warped
+    )
+
+
+def _points_on_side(cell_type: basix.CellType, side: int, points: Array) -> Array:
+    """Return the points (n, 2) of a triangle's side, from those (n, 1) of the interval."""
+    a, b = basix.geometry(cell_type)[basix.topology(cell_type)[1][side]]
+    return np.asarray(a + points * (b - a))
+
+
+def _nearest_nodes(element: Element, points: Array) -> list[int]:
+    """Return the numbers of an element's nodes that are nearest to some points."""
+    return [int(np.argmin(np.linalg.norm(element.points - p, axis=1))) for p in points]
 
 
 @dataclass(frozen=True)
