@@ -22,7 +22,7 @@ from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.mesh.user_mesh import MeshPart, UserMesh
 from magshell_fenicsx.models.shell.own_term import OwnTerm
-from magshell_fenicsx.parts.registered import STEPS
+from magshell_fenicsx.parts.registered import FORMER_KINDS, STEPS
 from magshell_fenicsx.platform.input_files import Files
 from magshell_fenicsx.problem import problem
 from magshell_fenicsx.shape.shell_sections import ShellSection, Surface
@@ -30,9 +30,11 @@ from magshell_fenicsx.shape.shell_sections import ShellSection, Surface
 Keys = dict[str, Any]
 Vector: TypeAlias = Sequence[float | str] | fem.Function | Mapping[str, Any] | str
 NAME = "Problem"  # in messages, in place of a file
-FAR_FROM_ONE = 50.0  # times the radius, or a part of it: a mesh as long as that is not in metres
-THICKEST, THINNEST = 3.0, 1e4  # a mesh's extent over the thickness, where metres are not asked for
-MESH = "the mesh"  # the same, of a mesh
+MESH = "the mesh"  # in messages, in place of a mesh file
+# a mesh so many times as long as the radius, or such a part of it, is not in metres
+MAX_EXTENT_OVER_RADIUS = 50.0
+# extents of a mesh in metres that is not said to be in metres
+MIN_EXTENT_OVER_THICKNESS, MAX_EXTENT_OVER_THICKNESS = 3.0, 1e4
 SHAPES: Mapping[str, type[BaseModel]] = {  # geometry -> its section
     geometry: section
     for section in (ShellSection, *get_args(Surface))
@@ -95,77 +97,80 @@ class Shell:
         remanent: Mapping[str, Any] | None = None,
         **keys: Any,
     ) -> None:
-        self.home: UserMesh | None = None
-        self.name, self._own = (
-            name,
-            {"place": place, "points": points, "mesh": mesh, "remanent": remanent},
-        )
+        self.user_mesh: UserMesh | None = None
+        self.name = name
+        self._member_keys = {"place": place, "points": points, "mesh": mesh, "remanent": remanent}
         self.files = Files()
         self._keys = keys | ({} if radius is None else {"radius": radius})
         geometry = surface if isinstance(surface, str) else "mesh"
         if geometry not in SHAPES:
             raise CaseError(f"{NAME}: {geometry}: {unknown(geometry, SHAPES, 'geometry')}")
         of_mesh = ("edges", "patches", "facet_tags", "cell_tags") if geometry == "mesh" else ()
-        refuse_unknown(keys, SHAPES[geometry], f"{NAME}: shell", ("name", *self._own, *of_mesh))
+        refuse_unknown(keys, SHAPES[geometry], f"{NAME}: shell", ("name", *self._member_keys, *of_mesh))
         if isinstance(surface, str):
-            given = {
+            mesh_keys = {
                 "edges": edges,
                 "patches": patches,
                 "facet_tags": facet_tags,
                 "cell_tags": cell_tags,
                 "unit": unit,
             }
-            if strange := next((name for name, value in given.items() if value is not None), None):
+            unfit = next((key for key, value in mesh_keys.items() if value is not None), None)
+            if unfit:
                 raise CaseError(
-                    f"{NAME}: shell.{strange}: is of a mesh; a {surface} has its own edges"
+                    f"{NAME}: shell.{unfit}: is of a mesh; a {surface} has its own edges"
                 )
             self._keys |= {"geometry": surface}
             return
-        if strange := next((key for key in ("geometry", "file") if key in keys), None):
-            raise CaseError(f"{NAME}: shell.{strange}: the surface is the mesh; leave it out")
-        self.home = UserMesh(surface)
-        triangles = self.home.triangles(edges or {}, patches or {}, facet_tags, cell_tags)
+        if unfit := next((key for key in ("geometry", "file") if key in keys), None):
+            raise CaseError(f"{NAME}: shell.{unfit}: the surface is the mesh; leave it out")
+        self.user_mesh = UserMesh(surface)
+        triangles = self.user_mesh.triangles(edges or {}, patches or {}, facet_tags, cell_tags)
         self.files.given[Path(MESH).absolute()] = triangles
         self._keys |= {"geometry": "mesh", "file": MESH}
-        measured = isinstance(keys.get("thickness"), str)
-        if measured or unit is not None:
+        has_units = isinstance(keys.get("thickness"), str)
+        if has_units or unit is not None:
             self._keys["unit"] = unit or "m"
         extents = np.ptp(triangles.nodes, axis=0)
-        if measured and unit is None:
+        if has_units and unit is None:
             _refuse_metres(extents, radius, keys["thickness"])
         if radius is None:
-            half = float(extents.max()) / 2
-            self._keys["radius"] = f"{half!r} {unit or 'm'}" if measured else half
+            half_extent = float(extents.max()) / 2
+            self._keys["radius"] = f"{half_extent!r} {unit or 'm'}" if has_units else half_extent
 
     def one_of_several(self) -> Keys:
-        """What a case has under `shells` and its name."""
-        own = {key: self.plain(value, key) for key, value in self._own.items() if value is not None}
-        return {"shell": self.section(), "boundary": {}, **own}
+        """Return the keys of a case under `shells` and the shell's name."""
+        keys = {
+            key: self.plain_value(value, key)
+            for key, value in self._member_keys.items()
+            if value is not None
+        }
+        return {"shell": self.section(), "boundary": {}, **keys}
 
     def section(self) -> Keys:
-        """What a case has under `shell`."""
-        if self.name is None and (
-            strange := next((key for key, value in self._own.items() if value is not None), None)
-        ):
+        """Return the keys of a case under `shell`."""
+        member_keys = [key for key, value in self._member_keys.items() if value is not None]
+        if self.name is None and member_keys:
             raise CaseError(
-                f"{NAME}: shell.{strange}: is of one of several shells, which have names: give it to Problem"
+                f"{NAME}: shell.{member_keys[0]}: is of one of several shells, which have names: "
+                "give it to Problem"
             )
-        return {key: self.plain(value, f"shell.{key}") for key, value in self._keys.items()}
+        return {key: self.plain_value(value, f"shell.{key}") for key, value in self._keys.items()}
 
-    def plain(self, value: Any, key: str) -> Any:
-        """A value as a case file has it, or a function on the mesh."""
+    def plain_value(self, value: Any, key: str) -> Any:
+        """Return a value as a case file has it, or a function on the mesh."""
         if isinstance(value, fem.Function):
-            return self.given(value, key)
+            return self.user_field(value, key)
         if isinstance(value, np.ndarray | np.generic):
             return value.tolist()
         if isinstance(value, Mapping):
-            return {name: self.plain(each, f"{key}.{name}") for name, each in value.items()}
+            return {name: self.plain_value(item, f"{key}.{name}") for name, item in value.items()}
         if isinstance(value, list | tuple):
-            return [self.plain(each, key) for each in value]
+            return [self.plain_value(item, key) for item in value]
         return value
 
-    def given(self, function: fem.Function, key: str) -> UserField:
-        """A function on the mesh.
+    def user_field(self, function: fem.Function, key: str) -> UserField:
+        """Return a function on the mesh as a case has it.
 
         Raises
         ------
@@ -174,28 +179,28 @@ class Shell:
         CaseError
             If the shell has no mesh.
         """
-        if self.home is None:
+        if self.user_mesh is None:
             raise CaseError(f"{NAME}: {key}: is a function; that needs a shell on a dolfinx mesh")
-        return self.home.field(function, key)
+        return self.user_mesh.field(function, key)
 
 
 @dataclass(frozen=True)
-class Piece:
-    """What `Problem` is made of: keys of a section of a case, or a step of its programme.
+class ProblemPart:
+    """Part that `Problem` is made of: a section of a case, or a step of its programme.
 
     Attributes
     ----------
     key
-        "loading" of a step.
+        Key of the section; "loading" of a step.
     keys
-        Those of the section, of a shell.
+        Shell -> the keys of the section.
     """
 
     key: str
     keys: Callable[[Shell], Keys] = field(repr=False)
 
 
-def Section(key: str, **keys: Any) -> Piece:
+def Section(key: str, **keys: Any) -> ProblemPart:
     """Any section of a case, in its words: `Section("foundation", stiffness=0.02)`,
     `Section("natural", ...)`.
 
@@ -209,14 +214,14 @@ def Section(key: str, **keys: Any) -> Piece:
     if key not in Case.model_fields:
         raise CaseError(f"{NAME}: {key}: {unknown(key, Case.model_fields, 'section')}")
     annotation = Case.model_fields[key].annotation
-    members = [each for each in (annotation, *get_args(annotation)) if isinstance(each, type)]
-    sections = [each for each in members if issubclass(each, BaseModel)]
+    types = [member for member in (annotation, *get_args(annotation)) if isinstance(member, type)]
+    sections = [member for member in types if issubclass(member, BaseModel)]
     if len(sections) == 1:  # others are lists, and names with sections
         refuse_unknown(keys, sections[0], f"{NAME}: {key}")
-    return Piece(key, lambda shell: shell.plain(keys, key))
+    return ProblemPart(key, lambda shell: shell.plain_value(keys, key))
 
 
-def Step(kind: str, **keys: Any) -> Piece:
+def Step(kind: str, **keys: Any) -> ProblemPart:
     """A step of the programme, of any kind of a case: "dead", "indentation", "field", "natural",
     "contact", ...
 
@@ -225,51 +230,51 @@ def Step(kind: str, **keys: Any) -> Piece:
     CaseError
         If the kind or a key of it is none of a case.
     """
+    kind = dict(FORMER_KINDS).get(kind, kind)
     if kind not in STEPS:
         raise CaseError(f"{NAME}: {kind}: {unknown(kind, STEPS, 'kind of step')}")
     refuse_unknown(keys, STEPS[kind], f"{NAME}: loading")
-    return Piece("loading", lambda shell: shell.plain({"kind": kind, **keys}, "loading"))
+    return ProblemPart("loading", lambda shell: shell.plain_value({"kind": kind, **keys}, "loading"))
 
 
-def Pressure(**keys: Any) -> Piece:
+def Pressure(**keys: Any) -> ProblemPart:
     """A live pressure; by default up to the first instability."""
     return Step("pressure", **keys)
 
 
-def Force(at: Mapping[str, Any] | str, **keys: Any) -> Piece:
+def Force(at: Mapping[str, Any] | str, **keys: Any) -> ProblemPart:
     """A force along the inward normal, at a named point, or at angles as in a case."""
     return Step("indentation", at={"point": at} if isinstance(at, str) else at, **keys)
 
 
-def Clamped(*names: str) -> Piece:
+def Clamped(*names: str) -> ProblemPart:
     """Edges or patches without displacement and rotation."""
     return _supports("clamped", names)
 
 
-def Hinged(*names: str) -> Piece:
+def Hinged(*names: str) -> ProblemPart:
     """Edges or patches without displacement."""
     return _supports("hinged", names)
 
 
-def Held(name: str, components: str) -> Piece:
-    """An edge, a patch or a named point without the displacements along these axes, such as "xz"."""
+def Held(name: str, components: str) -> ProblemPart:
+    """An edge, a patch or a named point without displacements along some axes, such as "xz"."""
     return _supports({"held": list(components)}, [name])
 
 
-def OnPlane(*names: str) -> Piece:
+def OnPlane(*names: str) -> ProblemPart:
     """Edges in a mirror plane of a shape of which the shell is a part."""
     return _supports("symmetry", names)
 
 
-def _supports(condition: Any, names: Sequence[str]) -> Piece:
-    return Piece("boundary", lambda shell: dict.fromkeys(names, condition))
+def _supports(condition: Any, names: Sequence[str]) -> ProblemPart:
+    return ProblemPart("boundary", lambda shell: dict.fromkeys(names, condition))
 
 
 def Field(
     remanent: Vector, applied: Vector, *, lambda_m: float | None = None, **keys: Any
-) -> Piece:
-    """What is magnetised, and the applied field; in tesla, or with `lambda_m` over their
-    magnitudes.
+) -> ProblemPart:
+    """Remanence and applied field; in tesla, or with `lambda_m` over their magnitudes.
 
     Parameters
     ----------
@@ -284,26 +289,24 @@ def Field(
         What else a case has under `magnetic`.
     """
 
-    def made(shell: Shell) -> Keys:
+    def magnetic_keys(shell: Shell) -> Keys:
         dimensionless = lambda_m is not None
-        both = {
+        section: Keys = {
             "remanent": _flux(remanent, shell, "magnetic.remanent", dimensionless=dimensionless),
             "applied": _flux(applied, shell, "magnetic.applied", dimensionless=dimensionless),
+            **shell.plain_value(keys, "magnetic"),
         }
-        others: Keys = shell.plain(keys, "magnetic")
-        return (
-            both
-            | others
-            | ({"lambda_m": shell.plain(lambda_m, "magnetic.lambda_m")} if dimensionless else {})
-        )
+        if dimensionless:
+            section["lambda_m"] = shell.plain_value(lambda_m, "magnetic.lambda_m")
+        return section
 
-    return Piece("magnetic", made)
+    return ProblemPart("magnetic", magnetic_keys)
 
 
 def _refuse_metres(
     extents: NDArray[np.float64], radius: float | str | None, thickness: str
 ) -> None:
-    """See that the bounds of a mesh without a unit are those of a shell in metres.
+    """Check that the bounds of a mesh without a unit are those of a shell in metres.
 
     Parameters
     ----------
@@ -318,18 +321,19 @@ def _refuse_metres(
         If they are far from the radius, or from what a thickness goes with.
     """
     extent = float(extents.max())
-    metres = [_in_metres(length) for length in (radius, thickness)]
-    bounds = " x ".join(f"{each:.4g}" for each in extents)
-    if metres[0] and not 1 / FAR_FROM_ONE <= extent / metres[0] <= FAR_FROM_ONE:
-        raise CaseError(
-            f"{NAME}: shell.unit: is not given, so the mesh is {bounds} m, {extent / metres[0]:.4g} times as long as "
-            f'radius, {radius}: give unit="mm", for instance, or unit="m" if that is right'
-        )
-    if metres[1] and not THICKEST <= extent / metres[1] <= THINNEST:
-        raise CaseError(
-            f"{NAME}: shell.unit: is not given, so the mesh is {bounds} m, {extent / metres[1]:.4g} times as long as "
-            f'thickness, {thickness}: give unit="mm", for instance, or unit="m" if that is right'
-        )
+    bounds = " x ".join(f"{length:.4g}" for length in extents)
+    limits = {
+        "radius": (radius, 1 / MAX_EXTENT_OVER_RADIUS, MAX_EXTENT_OVER_RADIUS),
+        "thickness": (thickness, MIN_EXTENT_OVER_THICKNESS, MAX_EXTENT_OVER_THICKNESS),
+    }
+    for name, (length, least, most) in limits.items():
+        metres = _in_metres(length)
+        if metres and not least <= extent / metres <= most:
+            raise CaseError(
+                f"{NAME}: shell.unit: is not given, so the mesh is {bounds} m, "
+                f"{extent / metres:.4g} times as long as {name}, {length}: give "
+                'unit="mm", for instance, or unit="m" if that is right'
+            )
 
 
 def _in_metres(length: Any) -> float | None:
@@ -342,25 +346,25 @@ def _in_metres(length: Any) -> float | None:
 
 
 def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys:
-    """A flux density in the words of a case."""
+    """Return a flux density in the words of a case."""
 
     def of_size(tesla: float) -> Keys:
         return {} if dimensionless else {"flux_density": f"{tesla!r} T"}
 
     kind = {"kind": "expression"} if key.endswith("remanent") else {}
     if isinstance(value, Mapping):
-        return {name: shell.plain(each, f"{key}.{name}") for name, each in value.items()}
+        return {name: shell.plain_value(item, f"{key}.{name}") for name, item in value.items()}
     if isinstance(value, str):
         return {"kind": value}
     if isinstance(value, fem.Function):
-        given = shell.given(value, key)
-        size = 1.0 if dimensionless else float(np.linalg.norm(given.largest)) or 1.0
-        return {**kind, "components": given.mapped(lambda B: np.asarray(B / size)), **of_size(size)}
-    components = shell.plain(value, key)
+        field = shell.user_field(value, key)
+        size = 1.0 if dimensionless else float(np.linalg.norm(field.largest)) or 1.0
+        return {**kind, "components": field.mapped(lambda B: np.asarray(B / size)), **of_size(size)}
+    components = shell.plain_value(value, key)
     if not isinstance(components, list) or len(components) != 3:
         raise CaseError(f"{NAME}: {key}: {components}: a vector has three components")
-    directed = any(components) or not dimensionless  # zero has a size, and no direction
-    if not directed or any(isinstance(each, str) for each in components):
+    has_direction = any(components) or not dimensionless  # zero has a size, and no direction
+    if not has_direction or any(isinstance(item, str) for item in components):
         return {**kind, "components": list(map(str, components)), **of_size(1.0)}
     try:
         x, y, z = map(float, components)
@@ -374,7 +378,7 @@ def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys
 
 def Problem(
     shell: Shell | Sequence[Shell],
-    *parts: Piece | OwnTerm,
+    *parts: ProblemPart | OwnTerm,
     points: Mapping[str, Sequence[Any]] | None = None,
     degree: int | None = None,
     symmetry: Literal["auto", "none", "half", "axisymmetric"] | None = None,
@@ -412,19 +416,18 @@ def Problem(
         _refuse_unfit_shells(several)
     if not isinstance(shell, Shell):
         raise CaseError(f"{NAME}: {shell!r}: the first argument is what ms.Shell gives")
-    own = (
-        {"shells": {each.name: each.one_of_several() for each in several}}
-        if several
-        else {"shell": shell.section()}
-    )
-    data: Keys = {**own, "boundary": {}, **shell.plain(sections, "case")}
+    data: Keys = {"shell": shell.section()}
+    if several:
+        data = {"shells": {member.name: member.one_of_several() for member in several}}
+    data = {**data, "boundary": {}, **shell.plain_value(sections, "case")}
     steps, terms = list[Keys](), list[OwnTerm]()
     for part in parts:
         if isinstance(part, OwnTerm):
             terms.append(_on_mesh(part, shell))
-        elif not isinstance(part, Piece):
+        elif not isinstance(part, ProblemPart):
             raise CaseError(
-                f"{NAME}: {part!r}: allowed are what ms.Clamped, ms.Field, ms.Step, ... give, and OwnTerm"
+                f"{NAME}: {part!r}: allowed are what ms.Clamped, ms.Field, ms.Step, ... give, and "
+                "OwnTerm"
             )
         elif part.key == "loading":
             steps.append(part.keys(shell))
@@ -434,34 +437,42 @@ def Problem(
         raise CaseError(f"{NAME}: loading: is given twice, as steps and as a section")
     if steps:
         data["loading"] = steps[0] if len(steps) == 1 else steps
-    _join(data, "points", shell.plain(points or {}, "points"))
+    _join(data, "points", shell.plain_value(points or {}, "points"))
     if several:
         _distribute(data)
     if degree is not None:
         _join(data, "mesh", {"degree": degree})
-    if symmetry or shell.home:
+    if symmetry or shell.user_mesh:
         data["symmetry"] = symmetry or "none"
     return Case.from_source(Source(NAME, data, files=shell.files)).with_terms(terms).problem()
 
 
 def _refuse_unfit_shells(several: Sequence[Any]) -> None:
-    for each in several:
-        if not isinstance(each, Shell) or not each.name:
-            told = "a shell without a name" if isinstance(each, Shell) else repr(each)
+    """Check that several shells have names of their own, and geometries.
+
+    Raises
+    ------
+    CaseError
+        If one has not.
+    """
+    for shell in several:
+        if not isinstance(shell, Shell) or not shell.name:
+            words = "a shell without a name" if isinstance(shell, Shell) else repr(shell)
             raise CaseError(
-                f"{NAME}: {told}: of several shells each is what ms.Shell gives, with a name"
+                f"{NAME}: {words}: of several shells each is what ms.Shell gives, with a name"
             )
-        if each.home:
+        if shell.user_mesh:
             raise CaseError(
-                f"{NAME}: {each.name}: of several shells each has a geometry: write its mesh to a file"
+                f"{NAME}: {shell.name}: of several shells each has a geometry: write its mesh to a "
+                "file"
             )
-    names = [each.name for each in several]
-    if twice := next((name for name in names if names.count(name) > 1), None):
-        raise CaseError(f"{NAME}: {twice}: two shells have this name")
+    names = [shell.name for shell in several]
+    if doubled := next((name for name in names if names.count(name) > 1), None):
+        raise CaseError(f"{NAME}: {doubled}: two shells have this name")
 
 
 def _distribute(data: Keys) -> None:
-    """Give each of several shells its own of what is held and named.
+    """Give each of several shells its own supports and points.
 
     Raises
     ------
@@ -470,16 +481,17 @@ def _distribute(data: Keys) -> None:
     """
     for key in ("boundary", "points"):
         for name, value in data.pop(key).items():
-            shell, dot, own = name.partition(".")
+            shell, dot, own_name = name.partition(".")
             if not dot or shell not in data["shells"]:
                 raise CaseError(
-                    f"{NAME}: {key}.{name}: begins with the name of a shell: {next(iter(data['shells']))}.rim"
+                    f"{NAME}: {key}.{name}: begins with the name of a shell: "
+                    f"{next(iter(data['shells']))}.rim"
                 )
-            _join(data["shells"][shell], key, {own: value})
+            _join(data["shells"][shell], key, {own_name: value})
 
 
-def _join(data: Keys, key: str, more: Keys) -> None:
-    """Add what a section has, in which nothing may be given twice.
+def _join(data: Keys, key: str, added: Keys) -> None:
+    """Add keys to a section, in which nothing may be given twice.
 
     Raises
     ------
@@ -489,18 +501,18 @@ def _join(data: Keys, key: str, more: Keys) -> None:
     section = data.get(key, {})
     if not isinstance(section, dict):
         raise CaseError(f"{NAME}: {key}: {section!r}: must be a section, with keys below it")
-    for name, value in more.items():
+    for name, value in added.items():
         if name in section and section[name] != value:
             raise CaseError(
                 f"{NAME}: {key}.{name}: is given twice, as {section[name]} and as {value}"
             )
-    data[key] = {**section, **more}
+    data[key] = {**section, **added}
 
 
 def _on_mesh(term: OwnTerm, shell: Shell) -> OwnTerm:
-    """One's own energy with functions of parameters known in all triangles."""
+    """Return a user-defined energy whose functions of parameters are known in all triangles."""
     parameters = tuple(
-        shell.given(p, f"terms.{term.name}") if isinstance(p, fem.Function) else p
+        shell.user_field(p, f"terms.{term.name}") if isinstance(p, fem.Function) else p
         for p in term.parameters
     )
     return replace(term, parameters=parameters) if term.varying else term

@@ -7,7 +7,7 @@ from pydantic import Discriminator, Field, Tag
 
 from magshell_fenicsx.input.section import ChosenByKey
 from magshell_fenicsx.parts.ability import Context
-from magshell_fenicsx.parts.registered import KINDS_BEFORE_LOAD, STEPS
+from magshell_fenicsx.parts.registered import FORMER_KINDS, KINDS_BEFORE_LOAD, STEPS
 from magshell_fenicsx.parts.step import LEAST_TARGET, ProgrammeStep, Step
 from magshell_fenicsx.parts.step_course import Gas
 from magshell_fenicsx.shape.shell_sections import MeshSurface, ShellSection, Surface
@@ -15,7 +15,7 @@ from magshell_fenicsx.shape.shell_sections import MeshSurface, ShellSection, Sur
 if TYPE_CHECKING:
     OneStep: TypeAlias = Step
 else:
-    OneStep = Annotated[Union[tuple(STEPS.values())], ChosenByKey("kind")]  # noqa: UP007
+    OneStep = Annotated[Union[tuple(STEPS.values())], ChosenByKey("kind", FORMER_KINDS)]  # noqa: UP007
 PROGRAMME = "programme"  # tag of a list of steps
 Loading: TypeAlias = Annotated[
     Annotated[OneStep, Tag("one")]
@@ -33,10 +33,10 @@ def loads_by_key(loading: Any) -> dict[str, Any]:
 
 def programme(loading: Step | Sequence[Step] | None, context: Context) -> tuple[ProgrammeStep, ...]:
     """Return the steps of a case: those of a list, or what comes before one load, and then that."""
-    before: list[tuple[str, Step]] = []
+    implied_steps: list[tuple[str, Step]] = []
     if not isinstance(loading, Sequence):
-        before = [pair for kind in KINDS_BEFORE_LOAD for pair in STEPS[kind].steps_before_load(context, loading)]
-    keyed = [*before, *loads_by_key(loading).items()]
+        implied_steps = [pair for kind in KINDS_BEFORE_LOAD for pair in STEPS[kind].steps_before_load(context, loading)]
+    keyed = [*implied_steps, *loads_by_key(loading).items()]
     loads, places_of = [load for _, load in keyed], dict[str, list[Any]]()
     steps = []
     for number, (key, load) in enumerate(keyed, 1):

@@ -331,9 +331,15 @@ class ChosenByKey:
     """An annotation of a union of sections, one of which is chosen by a key.
 
     Each section has the values that choose it as the key's `Literal`.
+
+    Attributes
+    ----------
+    former_values
+        Values of the key in older case files, each with the one that stands for it now.
     """
 
     key: str
+    former_values: tuple[tuple[str, str], ...] = ()
 
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
@@ -343,7 +349,18 @@ class ChosenByKey:
             for section in get_args(source)
             for tag in get_args(section.model_fields[self.key].annotation)
         }
-        return core_schema.tagged_union_schema(choices, self.key)
+        union = core_schema.tagged_union_schema(choices, self.key)
+        if not self.former_values:
+            return union
+        return core_schema.no_info_before_validator_function(self._with_present_value, union)
+
+    def _with_present_value(self, data: Any) -> Any:
+        """Return the data of a section with the present value of its key."""
+        value = data.get(self.key) if isinstance(data, dict) else None
+        present_values = dict(self.former_values)
+        if not isinstance(value, str) or value not in present_values:
+            return data
+        return {**data, self.key: present_values[value]}
 
 
 @dataclass(frozen=True)

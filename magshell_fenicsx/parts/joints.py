@@ -1,10 +1,9 @@
-"""Joints: edges of shells that meet, joined rigidly, by a hinge, or by a rotational spring, as
-creases are.
+"""Joints: edges of shells that meet, joined rigidly, by a hinge, or by a spring, as creases are.
 
 The vertices of both edges are glued, so that displacements agree. What is left is the energy of the
 edge between two cells, which C0 interior penalty has on every one: of a rigid joint it is that, of
 a hinge there is none, and of a spring it is (k/2) (theta - theta_0)^2 per undeformed length, with
-the angle theta between the normals.
+the angle theta between the normals. docs/theory.md.
 """
 
 from collections.abc import Sequence
@@ -32,10 +31,9 @@ if TYPE_CHECKING:
     from magshell_fenicsx.parts.loads import Loads
     from magshell_fenicsx.shape.outline import Outline
 
-AMPLITUDE = "fold"
-STIFFEST = (
-    1e6  # over E h²/(12 (1 - ν²)), D/h: within 1e-6 of a rigid joint, and rounding costs as much
-)
+AMPLITUDE = "fold"  # a column of path.csv, which keeps the word
+# of a spring over E h²/(12 (1 - ν²)), D/h: within 1e-6 of a rigid joint, and rounding costs as much
+MAX_RELATIVE_STIFFNESS = 1e6
 
 
 class JointSection(Section):
@@ -51,7 +49,7 @@ class JointSection(Section):
     angle: float | None = Field(default=None, ge=-179, le=179)
     """Of kind: spring: the angle at which it rests, from flat; positive where the shells are folded towards their
     normals. By default that of the shells where they are; else it grows from there before the load, or as a step of
-    kind: fold [degree]"""
+    kind: crease [degree]"""
 
     @model_validator(mode="after")
     def _of_a_spring(self) -> Self:
@@ -73,6 +71,8 @@ class Joint:
 
     Attributes
     ----------
+    edges
+        Names of both.
     rigid
         Whether the edge is as one within a shell; else it is a spring.
     stiffness
@@ -87,7 +87,7 @@ class Joint:
     angle: float | None = None
 
 
-class Joined(KeyAbility[Sequence[JointSection]]):
+class CaseJoints(KeyAbility[Sequence[JointSection]]):
     """All joints of a case."""
 
     key = "joints"
@@ -100,7 +100,7 @@ class Joined(KeyAbility[Sequence[JointSection]]):
         if not shells:
             raise ValueError("joints: join edges of several shells: give shells")
         context.needs("joints", "a mid-surface", "a material without viscosity")
-        taken = set[str]()
+        joined_edges = set[str]()
         for i, section in enumerate(self.given):
             if section.stiffness:
                 context.has_modulus(f"joints.{i}.stiffness")
@@ -118,14 +118,14 @@ class Joined(KeyAbility[Sequence[JointSection]]):
             for name in section.edges:
                 if name in shells:
                     continue  # on which several edges may be
-                if name in taken:
+                if name in joined_edges:
                     raise ValueError(
                         f"joints.{i}: {name}: an edge that is joined twice; an edge joins one other"
                     )
-                taken.add(name)
+                joined_edges.add(name)
 
     def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
-        """Planes that cross each joint: its edges are their own mirror images."""
+        """Return the planes that cross each joint: its edges are their own mirror images."""
         names = [name for section in self.given for name in section.edges]
         return [
             SymmetryConstraint(
@@ -148,27 +148,27 @@ class Joined(KeyAbility[Sequence[JointSection]]):
 
 
 def _refuse_too_stiff(number: int, section: JointSection, context: Context) -> None:
-    """See that a spring is not stiffer than rounding allows, beside the softer of its two
-    shells."""
-    shells, softest = context.sections["shells"], inf
+    """See that a spring is not stiffer than rounding allows, beside the softer of its two shells."""
+    shells, least_stiffness = context.sections["shells"], inf
     for edge in section.edges:
         owners = [name for name in shells if edge == name or edge.startswith(f"{name}_")]
         for shell in (shells[name].shell for name in sorted(owners, key=len)[-1:]):
             thickness = shell.reference / shell.R_over_h
-            softest = min(
-                softest, (shell.modulus or inf) * thickness**2 / (12 * (1 - shell.poisson_ratio**2))
+            least_stiffness = min(
+                least_stiffness,
+                (shell.modulus or inf) * thickness**2 / (12 * (1 - shell.poisson_ratio**2)),
             )
     stiffness = section.stiffness or 0.0
-    if stiffness > STIFFEST * softest:
+    if stiffness > MAX_RELATIVE_STIFFNESS * least_stiffness:
         raise ValueError(
-            f"joints.{number}.stiffness: {stiffness:g}: is {stiffness / softest:.2g} times that of the shell over its "
-            f"thickness, E h²/(12 (1 - ν²)) = {softest:.4g}; allowed up to {STIFFEST:g} times, "
-            f"{STIFFEST * softest:.4g}: a joint so stiff is rigid, use kind: rigid"
+            f"joints.{number}.stiffness: {stiffness:g}: is {stiffness / least_stiffness:.2g} times that of the shell over its "
+            f"thickness, E h²/(12 (1 - ν²)) = {least_stiffness:.4g}; allowed up to {MAX_RELATIVE_STIFFNESS:g} times, "
+            f"{MAX_RELATIVE_STIFFNESS * least_stiffness:.4g}: a joint so stiff is rigid, use kind: rigid"
         )
 
 
 def account(context: Context, loads: "Loads") -> Account:
-    """Which edges are joined."""
+    """Return which edges are joined."""
     return Account([_words(joint) for joint in loads.joints])
 
 
@@ -179,9 +179,9 @@ def _words(joint: Joint) -> str:
     return f"{' and '.join(joint.edges)} joined {kind}"
 
 
-class FoldStep(FactorStep):
+class CreaseStep(FactorStep):
     """The angles at which springs of joints rest grow from those of the shells where they are (0)
-    to their own (1).
+    to their own (1). Older case files have `kind: fold` for it.
     """
 
     amplitude: ClassVar[str] = AMPLITUDE
@@ -190,33 +190,33 @@ class FoldStep(FactorStep):
     quantities: ClassVar[tuple[Quantity, ...]] = (
         Quantity(
             AMPLITUDE,
-            "fold",
+            "crease",
             "How far the rest angles of joints have grown to those of the case.",
             "load",
         ),
     )
-    kind: Literal["fold"]
+    kind: Literal["crease"]
     factor: float | None = Field(default=None, ge=-1e3, le=1e3)
     """Target of the factor, 1 by default"""
 
     @classmethod
     def asked_for(cls, context: Context) -> bool:
-        """Whether a spring has an angle of its own."""
+        """Return whether a spring has an angle of its own."""
         return any(section.angle is not None for section in context.sections.get("joints") or ())
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         if not self.asked_for(context):
-            raise ValueError(f"{step.key}.kind: fold: needs a joint with an angle")
+            raise ValueError(f"{step.key}.kind: crease: needs a joint with an angle")
 
     def unstable_alone(self, value: float, course: StepCourse, what: str) -> str:
         return (
             f"the springs of joints alone make the shells unstable at {value:.9g} of their angles "
-            f"({what}): to go on, take these as a load, kind: fold"
+            f"({what}): to go on, take these as a load, kind: crease"
         )
 
 
-class FoldObservables(Observables):
-    """How far the angles have grown."""
+class CreaseObservables(Observables):
+    """The observable of creases: how far their angles have grown."""
 
     def free_amplitudes(self, loads: "Loads") -> Sequence[str]:
         return (AMPLITUDE,) if any(joint.angle is not None for joint in loads.joints) else ()
@@ -230,44 +230,59 @@ class Creases:
     ----------
     marks
         (n,) in each cell: of each joint 1 beside its one edge, -1 beside the other, 0 elsewhere.
-    stiffness, angle, given
-        (n,) of each: the angle at which it rests where the last is 1, else 0 and the placement's.
+    stiffness, angle, has_angle
+        (n,) of each joint: the angle at which the spring rests where the last is 1, else 0 and
+        that of the placement.
     """
 
     marks: "fem.Function"
     stiffness: "fem.Constant"
     angle: "fem.Constant"
-    given: "fem.Constant"
+    has_angle: "fem.Constant"
 
     @classmethod
-    def of(cls, joints: Sequence[Joint], midsurface: "Midsurface | Meridian") -> "Creases | None":
-        """Those of some joints; None if all are rigid."""
+    def of_joints(
+        cls, joints: Sequence[Joint], midsurface: "Midsurface | Meridian"
+    ) -> "Creases | None":
+        """Return the creases of joints; None if all are rigid."""
         import numpy as np
         from dolfinx import fem
 
-        pairs = zip(joints, midsurface.joints, strict=True)
-        some = [(joint, of) for joint, of in pairs if not (joint.rigid or of is None)]
-        if not some:
+        creases, marks_of_cells = list[Joint](), list[Any]()
+        for joint, marks_of_joint in zip(joints, midsurface.joints, strict=True):
+            if not (joint.rigid or marks_of_joint is None):
+                creases.append(joint)
+                marks_of_cells.append(marks_of_joint)
+        if not creases:
             return None
-        Q = fem.functionspace(midsurface.mesh, ("DG", 0, (len(some),)))
+        count = len(creases)
+        Q = fem.functionspace(midsurface.mesh, ("DG", 0, (count,)))
         marks = fem.Function(Q, name="joints")
-        marks.x.array.reshape(-1, len(some))[Q.dofmap.list[:, 0]] = np.column_stack(
-            [of for _, of in some]
-        )
-        numbers = [(j.stiffness, j.angle or 0.0, float(j.angle is not None)) for j, _ in some]
+        cells = Q.dofmap.list[:, 0]
+        marks.x.array.reshape(-1, count)[cells] = np.column_stack(marks_of_cells)
+
+        def constant(values: list[float]) -> fem.Constant:
+            return fem.Constant(midsurface.mesh, np.array(values))
+
         return cls(
             marks,
-            *(fem.Constant(midsurface.mesh, np.array(each)) for each in zip(*numbers, strict=True)),
+            constant([joint.stiffness for joint in creases]),
+            constant([joint.angle or 0.0 for joint in creases]),
+            constant([float(joint.angle is not None) for joint in creases]),
         )
 
     @property
     def grow(self) -> bool:
         """Whether an angle grows."""
-        return bool(self.given.value.any())
+        return bool(self.has_angle.value.any())
 
-    def added(self, density: "Density", factor: "fem.Constant") -> "Density":
-        """The density of edges between cells, with springs in its place at joints, whose angles
-        have grown so far.
+    def replace_at_joints(self, density: "Density", factor: "fem.Constant") -> "Density":
+        """Return the density of edges between cells, with springs in its place at joints.
+
+        Parameters
+        ----------
+        factor
+            How far the angles at which springs rest have grown.
         """
         import ufl
 
@@ -276,27 +291,26 @@ class Creases:
 
         count, grow = self.marks.ufl_shape[0], self.grow
 
-        def of(*arguments: Any, **options: Any) -> Any:
-            *given, (plus, minus), k, angle, has, grown = arguments
-            r0, u, m = given[:3]
-            within, springs, joined = density.function(*given, **options), 0, 0
-            stretch = (
-                sum(kin.conormal(j, covector)[2] for j, covector in zip(r0, m, strict=True)) / 2
-            )
-            first = fold_angle(r0[0], r0[1], m[0])
+        def with_springs(*arguments: Any, **options: Any) -> Any:
+            *of_edges, (plus, minus), k, angle, has_angle, growth = arguments
+            r0, u, m = of_edges[:3]
+            within_shell, springs, is_joint = density.function(*of_edges, **options), 0, 0
+            conormals = zip(r0, m, strict=True)
+            stretch = sum(kin.conormal(jet, covector)[2] for jet, covector in conormals) / 2
+            undeformed = fold_angle(r0[0], r0[1], m[0])
             sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
             for i in range(count):
                 product = plus[i] * minus[i]
                 at_joint = product * (product - 1) / 2  # 1 between its edges, 0 elsewhere
-                s0, c0 = first
+                s0, c0 = undeformed
                 if grow:
-                    placed = ufl.atan2(first[0], first[1])
-                    rest = placed + grown * has[i] * (angle[i] - placed)
+                    of_placement = ufl.atan2(undeformed[0], undeformed[1])
+                    rest = of_placement + growth * has_angle[i] * (angle[i] - of_placement)
                     s0, c0 = ufl.sin(rest), ufl.cos(rest)
-                turned = ufl.atan2(sine * c0 - cosine * s0, cosine * c0 + sine * s0)
-                springs += at_joint * k[i] / 2 * turned**2 * stretch
-                joined += at_joint
-            return (1 - joined) * within + springs
+                rotation = ufl.atan2(sine * c0 - cosine * s0, cosine * c0 + sine * s0)
+                springs += at_joint * k[i] / 2 * rotation**2 * stretch
+                is_joint += at_joint
+            return (1 - is_joint) * within_shell + springs
 
-        more = (self.marks, self.stiffness, self.angle, self.given, factor)
-        return replace(density, function=of, parameters=(*density.parameters, *more))
+        added = self.marks, self.stiffness, self.angle, self.has_angle, factor
+        return replace(density, function=with_springs, parameters=(*density.parameters, *added))

@@ -37,11 +37,12 @@ KINDS_OF_STEPS: dict[str, str] = {
     "spin": "spin.SpinStep",
     "gravity": "gravity.GravityStep",
     "interaction": "magnetism.interaction.InteractionStep",
-    "fold": "joints.FoldStep",
+    "crease": "joints.CreaseStep",
 }
+FORMER_KINDS = (("fold", "crease"),)  # of older case files, with the present ones
 KINDS_BEFORE_LOAD = (
     "natural",
-    "fold",
+    "crease",
     "interaction",
     "field",
 )  # kinds of steps that may come before the one load, in order
@@ -58,7 +59,7 @@ ABILITIES = (  # module here and class in it, of those without a key and a line 
     "motion.history.Viscosity",
     "bodies.body.RigidBodies",
     "contact.contact_section.ShellContact",
-    "joints.Joined",
+    "joints.CaseJoints",
 )
 OBSERVABLE_CLASSES = (  # module here and class in it, in the order of columns
     "natural.section.NaturalObservables",
@@ -74,7 +75,7 @@ OBSERVABLE_CLASSES = (  # module here and class in it, in the order of columns
     "magnetism.field_maps.FieldMapsObservables",
     "bodies.contact_step.BodiesObservables",
     "contact.contact_observables.ContactObservables",
-    "joints.FoldObservables",
+    "joints.CreaseObservables",
 )
 ACCOUNTS = (  # modules here with a function `account`, in the order of `magshell check`
     "magnetism.magnetisation",
@@ -159,6 +160,13 @@ class WithOwnTerms(Section):
     def term_digests(self) -> dict[str, str | None]:
         """Hashes of the energies, by which a run is recognised that is resumed."""
         return {f"terms.{term.name}": term.digest for term in self._own_terms}
+
+
+def step_class(name: str) -> type[Step]:
+    """Return the class of the steps with a kind, or an amplitude, of this name."""
+    if name in STEPS:
+        return STEPS[name]
+    return next(each for each in STEPS.values() if getattr(each, "amplitude", None) == name)
 
 
 def parts_of(context: Context) -> dict[str, Part]:

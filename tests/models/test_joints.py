@@ -11,6 +11,7 @@ import pytest
 import yaml
 from conftest import CASES
 
+import magshell_fenicsx as ms
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.check import describe
 from magshell_fenicsx.input.source import CaseError
@@ -107,6 +108,25 @@ def test_angle_of_a_crease() -> None:
     *_, last = follow(scene)
     along = 2 * x + scene.observe(last.point.state)["right_end_ux"]
     assert along == pytest.approx(2 * np.cos(at), rel=1e-4)
+
+
+def test_a_crease_grows_by_both_words() -> None:
+    """`kind: fold` of older case files gives the case of `kind: crease`; so does `ms.Step`."""
+    joint = {"edges": ["left.right", "right.left"], "kind": "spring", "stiffness": D, "angle": -20}
+    data = {
+        "shells": {"left": plate([0, 0, 0]), "right": plate([1, 0, 0])},
+        "joints": [joint],
+        "mesh": {"degree": 2, "size": 0.5},
+    }
+    steps = {kind: [{"kind": kind, "factor": 0.5}] for kind in ("crease", "fold")}
+    cases = [Case.from_source(data | {"loading": loading}) for loading in steps.values()]
+    assert cases[0].model_dump() == cases[1].model_dump()
+    assert cases[0].model_dump()["loading"][0]["kind"] == "crease"
+    programmes = [[(s.name, s.kind, s.key) for s in case.programme] for case in cases]
+    assert programmes[0] == programmes[1] == [("fold", "crease", "loading.0")]
+    assert [ms.Step(kind, factor=0.5).key for kind in steps] == ["loading", "loading"]
+    with pytest.raises(CaseError, match="kind: 'folds'"):
+        Case.from_source(data | {"loading": [{"kind": "folds"}]})
 
 
 def test_messages() -> None:

@@ -228,16 +228,16 @@ def _factors_of_sections(context: Context) -> set[str]:
 
 
 def level_in(context: Context, name: str, level: Level) -> float:
-    """A value of the history of a load as a number, as a target of that load would be.
+    """Return a value of the history of a load as a number, as a target of that load would be.
 
     Raises
     ------
     ValueError
         If it has a unit that the load has not in this case.
     """
-    from magshell_fenicsx.parts.registered import STEPS  # which has this step too
+    from magshell_fenicsx.parts.registered import step_class  # which has this step too
 
     if not isinstance(level, str):
         return level
-    own = next((type(step.load) for step in context.steps if step.name == name), None)
-    return (own or STEPS[name]).level(level, context)
+    driving = next((type(step.load) for step in context.steps if step.name == name), None)
+    return (driving or step_class(name)).level(level, context)
