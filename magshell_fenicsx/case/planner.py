@@ -689,7 +689,7 @@ def _thickness(case: Case, turn: float) -> Thickness | None:
     if isinstance(factor, dict):
         return Thickness(patches=factor)
     if isinstance(factor, UserField):
-        return Thickness(given=factor)
+        return Thickness(user_field=factor)
     if not factor:
         return None
     in_case_frame, Q = formula(factor), rotation(turn)

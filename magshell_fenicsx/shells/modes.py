@@ -96,7 +96,7 @@ class _Family:
 
     label: str
     tangent: Callable[[State], Tangent]
-    held: list[fem.DirichletBC]
+    constraints: list[fem.DirichletBC]
     product: tuple[str, ufl.Form]
     projection: Projection | None = None
     contains: Callable[[Vector], bool] = lambda vector: True
@@ -163,7 +163,7 @@ class ShellModes:
     def _lowest(self, families: Iterable[_Family], state: State, count: int) -> list[ShellMode]:
         of_families = []
         for family in families:
-            M = mass_matrix(self._product(family), family.held)
+            M = mass_matrix(self._product(family), family.constraints)
             M = family.projection.mass(M) if family.projection else M
             modes = lowest_modes(symmetric_part(family.tangent(state)), M, count, family.rigid)
             if family.contains is _turns:  # of a kernel with the motion along the axis

@@ -265,9 +265,9 @@ class ShellModel(ThinModel):
         """Return h(x)/h; None for 1."""
         if thickness is None:
             return None
-        if thickness.given:
-            values = user_field_polynomials(thickness.given, self.midsurface, cells)
-            thickness = replace(thickness, carried=values)
+        if thickness.user_field:
+            values = user_field_polynomials(thickness.user_field, self.midsurface, cells)
+            thickness = replace(thickness, polynomials=values)
         return thickness_field(thickness, self.r0, self.midsurface.patches)
 
     def _make_factory(self, cells: CellGeometry) -> EnergyFactory:

@@ -72,7 +72,7 @@ class BodyHessianIntegral:
         parts = [cells[i : i + size] for i in range(0, len(cells), size)]
         self._batches = [EntityBatch((part,), rule, np.empty((len(part), 0))) for part in parts]
         self._points = PointStorage(max([1, *(batch.size for batch in self._batches)]))
-        place = terms[0].density.where
+        place = terms[0].density.support
         self._geometry = [
             _geometry(self._jets(batch, X.x.array), place, facet) for batch in self._batches
         ]
@@ -144,7 +144,7 @@ class BodyHessianIntegral:
             return ufl.dot(ufl.diff(W, z), v) / 2 if density.work else W
 
         parameters = [vector(v, 0), *at_points] if density.work else at_points
-        if density.where == "outer":
+        if density.support == "outer":
             return hessian_density(
                 function(*(vector(f, 3 * part) for f in (g, z) for part in range(3)), *parameters)
             )
@@ -152,7 +152,7 @@ class BodyHessianIntegral:
             [[z[3 * part + c] for part in range(1, JET_PARTS)] for c in range(3)]
         )
         inverse = ufl.as_matrix([[g[INVERSE + 3 * i + j] for j in range(3)] for i in range(3)])
-        frame = [vector(g, NORMAL), vector(g, TANGENT)] if density.where == "end" else []
+        frame = [vector(g, NORMAL), vector(g, TANGENT)] if density.support == "end" else []
         W = function(
             vector(g, 0), vector(z, 0), ufl.dot(by_reference, inverse), *frame, *parameters
         )
@@ -172,16 +172,16 @@ def body_hessian_integrals(
     V = X.function_space
     nonlinear = [t for t in terms if isinstance(t, SolidTerm) and not t.linear]
     sites = []
-    for degree in sorted({t.density.degree for t in nonlinear if t.density.where == "body"}):
+    for degree in sorted({t.density.degree for t in nonlinear if t.density.support == "body"}):
         points, w = basix.make_quadrature(basix.CellType.hexahedron, degree)
         cells = np.arange(V.mesh.topology.index_map(3).size_local, dtype=np.int32)
         counted_cells = cells if cell_mask is None else cells[cell_mask[cells]]
         of_degree = [
-            t for t in nonlinear if t.density.where == "body" and t.density.degree == degree
+            t for t in nonlinear if t.density.support == "body" and t.density.degree == degree
         ]
         sites.append(BodyHessianIntegral(X, counted_cells, _rule(V, points, w), of_degree, log))
     for term in nonlinear:
-        if term.density.where == "body":
+        if term.density.support == "body":
             continue
         cells_at_facets, numbers = _cells_at(body, term.density.facets)
         points, w = term.density.rule

@@ -262,11 +262,11 @@ class EdgeOnShell:
         (3, n, functions): shape functions of the edge's cells at the points, and their derivatives.
     x
         The points, undeformed.
-    along
+    directions
         (n, 2) the edge's direction in the coordinates of its cell.
     weight, length
         (n,) the length for which a point stands, and that of its cell's side.
-    Y, apart
+    Y, distances
         (n, 2) the places in their cells, and (n,) their distances, inf without a cell.
     clearance
         Greatest distance from the other shell of all nodes of a cell beside the edge, the least of
@@ -276,12 +276,12 @@ class EdgeOnShell:
     cell: Longs
     on_edge: Array
     x: Array
-    along: Array
+    directions: Array
     weight: Array
     length: Array
     other_cell: Longs
     Y: Array
-    apart: Array
+    distances: Array
     clearance: float
 
     def refuse_misplaced(self, comm: MPI.Comm, h: float, key: str, joint: Joint) -> None:
@@ -292,7 +292,7 @@ class EdgeOnShell:
         MeshError
             On every rank, with the place and how far it is.
         """
-        _refuse_apart(comm, self.apart, self.x, h, key, joint)
+        _refuse_apart(comm, self.distances, self.x, h, key, joint)
         if min(comm.allgather(self.clearance)) < MAX_DISTANCE_IN_THICKNESSES * h:
             edge, other = joint.edges
             raise MeshError(
@@ -562,7 +562,7 @@ def _tied_points(surfaces: MidSurfaces, edge: EdgeOnShell, ties: Array) -> TiedP
         (3 * nodes_of_pairs[:, :, None] + np.arange(3)).reshape(points, unknown_count),
         gap.reshape(points, 3, unknown_count),
         tangents.reshape(points, TANGENT_COMPONENTS, unknown_count),
-        edge.along,
+        edge.directions,
         ties,
     )
 
@@ -623,12 +623,13 @@ def _cell_sides(V: fem.FunctionSpace, facets: NDArray[np.int32], owned: int) -> 
     return np.array(cells, dtype=np.int64), np.array(ends).reshape(-1, 2, 2)
 
 
-def _angle(tangents: fem.Function, moved: fem.Function, edge_direction: fem.Function) -> Expr:
+def _angle(tangents: fem.Function, increments: fem.Function, edge_direction: fem.Function) -> Expr:
     """Sine and cosine of the angle between both normals about the edge, whose direction is the
     first two of `edge_direction`.
     """
     a1, a2, b1, b2 = (
-        ufl.as_vector([tangents[3 * i + c] + moved[3 * i + c] for c in range(3)]) for i in range(4)
+        ufl.as_vector([tangents[3 * i + c] + increments[3 * i + c] for c in range(3)])
+        for i in range(4)
     )
 
     def unit(v: Expr) -> Expr:

@@ -194,7 +194,10 @@ class Viscosity:
         prescribed, system = self._prescribed, self._model.system
         self._field.x.array.reshape(-1, STRAIN_SIZE)[self._places] = stress
         prescribed.stiffness.value = stiffness
-        for field, displacement in ((prescribed.before, u0), (prescribed.after, u1)):
+        for field, displacement in (
+            (prescribed.first_displacement, u0),
+            (prescribed.last_displacement, u1),
+        ):
             field.x.array[:] = system.with_ghosts(displacement, self._mu)
         return system.at_state(State(u1, self._mu)).gradient(self._forms)
 
@@ -319,8 +322,8 @@ class _PrescribedStress:
     """
 
     field: fem.Function
-    before: fem.Function
-    after: fem.Function
+    first_displacement: fem.Function
+    last_displacement: fem.Function
     stiffness: fem.Constant
 
     def strain(self, j: Jet, side: str) -> tuple[Expr, Expr]:
@@ -333,7 +336,8 @@ class _PrescribedStress:
     def stiff_opening(self, domain: IntegrationDomain, jump: Callable[[Jet], Expr]) -> Expr:
         """The stiffness times the change of an edge's jump, a given number."""
         jump_after, jump_before = (
-            jump(domain.j0 + domain.jet(field)) for field in (self.after, self.before)
+            jump(domain.j0 + domain.jet(field))
+            for field in (self.last_displacement, self.first_displacement)
         )
         return self.stiffness * (jump_after - jump_before)
 

@@ -63,10 +63,9 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
     refuse_misplaced_edges(problem.loads.joints, surface, r0, h)
     if problem.loads.interaction:
         _refuse_parts_in_each_other(r0, h)
-    if factor and factor.given:
-        factor = replace(
-            factor, carried=user_field_polynomials(factor.given, surface, cell_geometry(r0))
-        )
+    if factor and factor.user_field:
+        polynomials = user_field_polynomials(factor.user_field, surface, cell_geometry(r0))
+        factor = replace(factor, polynomials=polynomials)
     thickness = thickness_field(factor, r0, surface.patches) if factor else None
     rule = surface_domain(r0).contact_rule
     surface_contacts(pairs, ModelSurface(r0, fem.Function(V), surface.patches, h, rule, thickness))

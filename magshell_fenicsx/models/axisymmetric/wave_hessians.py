@@ -177,7 +177,7 @@ class _WaveBatch:
         kernels = []
         for e, (parameters, _) in zip(self._energies, self._given, strict=True):
             assert e.density
-            if self._is_drawn(e):
+            if self._counts_from_initial(e):
                 start, shift = (
                     initial_jets,
                     [a - b for a, b in zip(r0, initial_jets, strict=True)],
@@ -194,7 +194,7 @@ class _WaveBatch:
             kernels.append(full_hessian(f"{e.name} waves", W, self._wave, self._log))
         return kernels
 
-    def _is_drawn(self, e: Energy) -> bool:
+    def _counts_from_initial(self, e: Energy) -> bool:
         return e.from_initial and self._domain.initial_placement is not None
 
     def _edge(self, r0: Sequence[Jet]) -> tuple[list[Expr], Expr] | None:

@@ -419,13 +419,13 @@ def _bounded(at_nodes: Array, mean: Array, inner_values: Array, f: Array) -> Arr
     low, high = f.min(axis=1, keepdims=True), f.max(axis=1, keepdims=True)
     all_values = np.concatenate([at_nodes, inner_values], axis=1)
     share = np.ones_like(mean)
-    for bound, extreme in (
+    for limit, extreme in (
         (low, all_values.min(axis=1, keepdims=True)),
         (high, all_values.max(axis=1, keepdims=True)),
     ):
         excess = extreme - mean
         share = np.minimum(
             share,
-            np.where(np.abs(excess) > 0, (bound - mean) / np.where(excess == 0, 1.0, excess), 1.0),
+            np.where(np.abs(excess) > 0, (limit - mean) / np.where(excess == 0, 1.0, excess), 1.0),
         )
     return np.asarray(mean + np.clip(share, 0.0, 1.0) * (at_nodes - mean))

@@ -98,15 +98,15 @@ class WithinRims:
     overlap counts.
     """
 
-    within: tuple[tuple[InsideRim, Array], ...]
-    outside: Array
+    inner_vectors: tuple[tuple[InsideRim, Array], ...]
+    outer_vector: Array
 
     def __call__(self, r0: Array, n0: Array) -> Array:
         centre = r0.mean(axis=1)
-        vectors = np.tile(self.outside, (len(r0), 1))
-        for is_inside, vector in reversed(self.within):
+        vectors = np.tile(self.outer_vector, (len(r0), 1))
+        for is_inside, vector in reversed(self.inner_vectors):
             vectors[is_inside(centre)] = vector
-        return np.broadcast_to(vectors[:, None], (*r0.shape[:-1], len(self.outside)))
+        return np.broadcast_to(vectors[:, None], (*r0.shape[:-1], len(self.outer_vector)))
 
 
 @dataclass(frozen=True)

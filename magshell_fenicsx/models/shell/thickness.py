@@ -1,4 +1,4 @@
-"""A thickness that varies over the surface: what multiplies h, and the densities with it."""
+"""A thickness that varies over the surface: its factor of h, and densities weighted with it."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -28,31 +28,40 @@ MIN_THICKNESS_FACTOR, MAX_THICKNESS_FACTOR = 1e-3, 1e3
 
 @dataclass(frozen=True)
 class Thickness:
-    """h(x)/h: a function of x, y, z over R, or for each named patch of a mesh a number or a
-    function (1 in the rest).
+    """h(x)/h, which multiplies the thickness.
 
-    `formulas` is what varies in the function; `given` is a field on the triangles of a mesh in
-    place of it, which is `carried` in the cells of a model.
+    Attributes
+    ----------
+    of_position
+        Function of arrays of x, y, z over R; None for 1.
+    patches
+        Patch of a mesh -> a number or the thickness of a shell; the rest has 1.
+    formulas
+        Formulas that vary in the function.
+    user_field
+        A field on the triangles of a mesh in place of the function.
+    polynomials
+        The same in the cells of a model.
     """
 
     of_position: Callable[[Array, Array, Array], Array] | None = None
     patches: "Mapping[str, float | PlacedFactor] | None" = None
     formulas: FormulaGroup | None = None
-    given: UserField | None = None
-    carried: CellPolynomials | None = None
+    user_field: UserField | None = None
+    polynomials: CellPolynomials | None = None
 
     def values_at(self, x: Array) -> Array:
         """Return the values at places (..., 3), without patches; for a user's field at places
         (cells, n, 3) in cells.
         """
-        if self.carried:
-            return np.array(self.carried(x)[..., 0])
+        if self.polynomials:
+            return np.array(self.polynomials(x)[..., 0])
         if self.of_position:
             return np.array(self.of_position(*np.moveaxis(x, -1, 0)))
         return np.ones(x.shape[:-1])
 
     def values_in_cells(self, cells: CellGeometry, nodal: Array) -> Array:
-        """The values (cells, nodes) of a formula as `project_formula`; collective."""
+        """Return the values (cells, nodes), of a formula by `project_formula`; collective."""
         if self.of_position is None:
             return nodal
         element = cells.element
@@ -91,7 +100,7 @@ class PlacedFactor:
 
 
 def refuse_unfit(factors: Array, x: Array, comm: MPI.Comm) -> None:
-    """Look at what multiplies the thickness at places (..., 3); collective.
+    """Refuse factors of the thickness at places (..., 3) that are too small or large; collective.
 
     Raises
     ------
@@ -109,7 +118,7 @@ def refuse_unfit(factors: Array, x: Array, comm: MPI.Comm) -> None:
 def thickness_field(
     thickness: Thickness, r0: fem.Function, patches: Mapping[str, NDArray[np.bool_]] | None = None
 ) -> fem.Function:
-    """h(x)/h at the nodes of every cell, free to jump from cell to cell; shape (1,).
+    """Return h(x)/h at the nodes of every cell, free to jump from cell to cell; shape (1,).
 
     Raises
     ------
@@ -120,8 +129,8 @@ def thickness_field(
     nodes, _ = positions_and_normals(r0)
     values = thickness.values_at(nodes)
     refuse_unfit(values, nodes, V.mesh.comm)
-    if thickness.carried:
-        between_nodes, sampled = thickness.carried.values_between_nodes()
+    if thickness.polynomials:
+        between_nodes, sampled = thickness.polynomials.values_between_nodes()
         refuse_unfit(between_nodes[..., 0], sampled, V.mesh.comm)
     values = thickness.values_in_cells(cell_geometry(r0), values)
     for name, factor in (thickness.patches or {}).items():
