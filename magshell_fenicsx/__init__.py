@@ -90,7 +90,7 @@ __all__ = [
     "trace",
 ]
 
-_ROOMS = {
+_NAMES_OF_MODULES = {
     "case.case": "Case",
     "input.source": "CaseError",
     "mesh.patch": "MeshError",
@@ -108,17 +108,21 @@ _ROOMS = {
     "simulate.sensitivity": "fold_at sensitivities",
     "simulate.trace": "trace",
 }
-_WHERE = {name: f"{__name__}.{room}" for room, names in _ROOMS.items() for name in names.split()}
+_MODULE_OF_NAME = {
+    name: f"{__name__}.{module}"
+    for module, names in _NAMES_OF_MODULES.items()
+    for name in names.split()
+}
 
 load_mpi_first()
 
 
 def __getattr__(name: str) -> Any:
-    """A public name, imported when it is asked for: dolfinx takes long."""
-    if name not in _WHERE:
+    """Return a public name, imported when it is asked for: dolfinx takes long."""
+    if name not in _MODULE_OF_NAME:
         raise AttributeError(f"{__name__}.{name}")
-    room = import_module(_WHERE[name])
-    return getattr(room, name, None) or import_module(f"{_WHERE[name]}.{name}")
+    module = import_module(_MODULE_OF_NAME[name])
+    return getattr(module, name, None) or import_module(f"{_MODULE_OF_NAME[name]}.{name}")
 
 
 def __dir__() -> list[str]:

@@ -34,14 +34,21 @@ app = Commands(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
 )
-PETSC = ("-snes_", "-ksp_", "-mat_", "-magshell_", "-log_", "-options_")  # how its options begin
+PETSC_PREFIXES = (
+    "-snes_",
+    "-ksp_",
+    "-mat_",
+    "-magshell_",
+    "-log_",
+    "-options_",
+)  # how its options begin
 
 
 def _hand_over_to_petsc(words: list[str]) -> None:
     """Take PETSc's options, which come last, off the words of a command; PETSc reads them when it
     is imported.
     """
-    first = next((i for i, word in enumerate(words) if word.startswith(PETSC)), len(words))
+    first = next((i for i, word in enumerate(words) if word.startswith(PETSC_PREFIXES)), len(words))
     for word in words[first:]:
         if word.startswith("--") or word.endswith((".yaml", ".yml")):
             sys.exit(
@@ -56,30 +63,28 @@ def _hand_over_to_petsc(words: list[str]) -> None:
     del words[first:]
 
 
-def _made(source: Any) -> Any:
-    """The case of a source."""
+def case_of_source(source: Any) -> Any:
+    """Return the case of a source."""
     from magshell_fenicsx.case.case import Case
 
     return Case.from_source(source)
 
 
-def _shared(source: Any) -> Any:
-    """The same on all ranks, which share its files; collective."""
+def shared_case_of_source(source: Any) -> Any:
+    """Return the case of a source on all ranks, which share its files; collective."""
     from magshell_fenicsx.case.case_variants import with_same_files
 
-    return with_same_files(_made(source), world())
+    return with_same_files(case_of_source(source), world())
 
 
 def main() -> None:
     """Run the program."""
     open_standard_streams()
-    os.environ["PETSC_OPTIONS"] = (
-        f"-no_signal_handler {os.environ.get('PETSC_OPTIONS', '')}"  # it would report a crash
-    )
+    # PETSc's signal handler would report a crash
+    os.environ["PETSC_OPTIONS"] = f"-no_signal_handler {os.environ.get('PETSC_OPTIONS', '')}"
     _hand_over_to_petsc(sys.argv)
-    gc.set_threshold(
-        300_000, 5, 5
-    )  # a small run looks for no garbage; Python's own would do so two hundred times
+    # a small run looks for no garbage; Python's own would do so two hundred times
+    gc.set_threshold(300_000, 5, 5)
     signal.signal(signal.SIGPIPE, signal.SIG_DFL)  # sent by `magshell ... | head`
     try:
         app(prog_name="magshell")  # the same name however it was started: completion depends on it
@@ -97,6 +102,7 @@ def main() -> None:
 
 
 def _print_version(requested: bool) -> None:
+    """Print the version and end the program, if that is requested."""
     if requested:
         print_line(f"magshell_fenicsx {__version__}")
         raise typer.Exit
@@ -148,9 +154,8 @@ def run(
     }
     with exit_codes():
         read = open_case(case, world(), set_ or [])
-    from magshell_fenicsx.output.report.verdict import (
-        sentence_of,
-    )  # what solves: a refused case does without
+    # what solves: a refused case does without
+    from magshell_fenicsx.output.report.verdict import sentence_of
     from magshell_fenicsx.output.store.folder import DiskError
     from magshell_fenicsx.platform.terminal import live_line
     from magshell_fenicsx.public import run as run_case
@@ -206,7 +211,7 @@ def sweep(
             over,
             set_ or [],
             folder,
-            make_case=_made,
+            make_case=case_of_source,
             result=result,
             full_paths=full_paths,
             part=part,
@@ -230,7 +235,8 @@ def boundary(
         list[str],
         typer.Option(
             metavar="KEY=A:B",
-            help="the key that varies, and its range; A:B:STEPS is finer; a second one, KEY=A:B:COUNT, makes a map",
+            help="the key that varies, and its range; A:B:STEPS is finer; a second one, "
+            "KEY=A:B:COUNT, makes a map",
         ),
     ],
     from_: Annotated[
@@ -253,7 +259,7 @@ def boundary(
 
     folder = chosen_folder(out, f"{case.stem}_boundary")
     with exit_codes(stopped=(DiskError, Stopped)):
-        done = boundary_map(case, over, set_ or [], folder, make_case=_made, start=from_)
+        done = boundary_map(case, over, set_ or [], folder, make_case=case_of_source, start=from_)
     print_line(f"results in {folder}/")
     if done.stopped:
         raise failure(f"stopped early: {'; '.join(done.stopped)}", STOPPED)
@@ -290,7 +296,7 @@ def study(
             over,
             set_ or [],
             result=result,
-            make_case=_made,
+            make_case=case_of_source,
             reference=reference,
             ranks=parse_ranks(ranks),
             repeat=repeat,
@@ -350,7 +356,7 @@ def ensemble(  # noqa: PLR0913 - what a user gives
             set_ or [],
             samples=samples,
             seed=seed,
-            make_case=_made,
+            make_case=case_of_source,
             result=result,
             out=folder,
             part=part,
@@ -363,7 +369,8 @@ def ensemble(  # noqa: PLR0913 - what a user gives
     print_line(f"results in {folder}/")
     if done.without_result:
         raise failure(
-            f"{done.without_result} of {len(done.rows)} samples have no {result}; samples.csv says why",
+            f"{done.without_result} of {len(done.rows)} samples have no {result}; samples.csv says "
+            "why",
             STOPPED,
         )
 
@@ -386,7 +393,9 @@ def design(
 
     folder = chosen_folder(out, f"{case.stem}_design")
     with exit_codes(stopped=(DiskError, Missed)):
-        run_design(case, set_ or [], folder, make_case=_shared, resume=resume, say=print_line)
+        run_design(
+            case, set_ or [], folder, make_case=shared_case_of_source, resume=resume, say=print_line
+        )
     print_line(f"results in {folder}/")
 
 
@@ -409,7 +418,7 @@ def identify(
     folder = chosen_folder(out, f"{case.stem}_identify")
     with exit_codes(stopped=(DiskError, Stopped)):
         done = identify_parameters(
-            case, data, set_ or [], folder, make_case=_shared, say=print_line
+            case, data, set_ or [], folder, make_case=shared_case_of_source, say=print_line
         )
     print_line(f"results in {folder}/")
     if done.fit.ended != "converged":
@@ -448,14 +457,15 @@ def compare(
             set_ or [],
             refinements=refinements,
             out=folder,
-            make_case=_made,
+            make_case=case_of_source,
             result=result,
             say=print_line,
         )
     difference = done.content["difference"]
     if difference is not None:
         print_line(
-            f"{done.content['result']}: the solid differs from the shell by {100 * difference:+.3f} %"
+            f"{done.content['result']}: the solid differs from the shell by "
+            f"{100 * difference:+.3f} %"
         )
     print_line(f"results in {folder}/")
 

@@ -1,4 +1,4 @@
-"""What all commands share: options, completion in the shell, messages of rank 0, exit codes.
+"""Common parts of all commands: options, completion in the shell, messages, exit codes.
 
 Typer is imported without rich where no help is asked for: the import of rich takes 0.15 s of every
 command.
@@ -19,20 +19,20 @@ from magshell_fenicsx.platform.disk_cache import UnsafeCache
 from magshell_fenicsx.platform.packages import Unusable
 from magshell_fenicsx.platform.processes import world
 
-_absent = "rich" not in sys.modules and "--help" not in sys.argv and len(sys.argv) > 1
-if _absent:
+_without_rich = "rich" not in sys.modules and "--help" not in sys.argv and len(sys.argv) > 1
+if _without_rich:
     # an import of it fails, as where it is not installed
     sys.modules["rich"] = None  # type: ignore[assignment]
 try:
     import typer as typer
 finally:
-    if _absent:
+    if _without_rich:
         del sys.modules["rich"]
 
-INVALID, STOPPED = 2, 3
-FAILED = 32101  # tag of the messages between ranks that fail
-PATIENCE = 5.0  # s in which an error of all ranks reaches the last of them
-DELIVERED = 0.2  # s in which a message is on its way to the terminal
+INVALID, STOPPED = 2, 3  # exit codes
+FAILURE_TAG = 32101  # tag of the messages between ranks that fail
+MAX_DELAY_OF_ERRORS = 5.0  # s in which an error of all ranks reaches the last of them
+DELIVERY_TIME = 0.2  # s in which a message is on its way to the terminal
 UNWRITTEN = "kernels cannot be compiled into"
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -55,8 +55,9 @@ class Commands(typer.Typer):
 
 
 def case_files(incomplete: str) -> list[str]:
-    """Case files with this beginning, here or one folder deeper; without any, the shell offers its
-    own files.
+    """Return case files with this beginning, here or one folder deeper.
+
+    Without any, the shell offers its own files.
     """
     begin = escape(incomplete)
     files = glob(f"{begin}*.yaml") + glob(f"{begin}*/*.yaml")  # noqa: PTH207 - a Path would lose the ./ that was typed
@@ -64,8 +65,9 @@ def case_files(incomplete: str) -> list[str]:
 
 
 def left_to_the_shell() -> list[str]:
-    """No completions of ours, so that the shell completes files; by default it would only add a
-    blank.
+    """Return no completions, so that the shell completes files.
+
+    By default it would only add a blank.
     """
     return []
 
@@ -86,11 +88,12 @@ Over = Annotated[
 ]
 
 
-def result_option(before: str = "") -> Any:
+def result_option(begin: str = "") -> Any:
+    """Return the option that names a result; `begin` is that of its help."""
     return typer.Option(
         "--result",
         metavar="NAME",
-        help=f"{before}knockdown, critical_field, force@w_over_h=10, energy@end, ...",
+        help=f"{begin}knockdown, critical_field, force@w_over_h=10, energy@end, ...",
     )
 
 
@@ -116,7 +119,7 @@ Runs = Annotated[
 
 
 def points_of(text: str | None) -> list[int]:
-    """The numbers of points in `--shapes`.
+    """Return the numbers of points in `--shapes`.
 
     Raises
     ------
@@ -132,11 +135,12 @@ def points_of(text: str | None) -> list[int]:
 
 
 def folder_option(default: str) -> Any:
+    """Return the option that names the output folder."""
     return typer.Option(help=f"output folder; default {default}", autocompletion=left_to_the_shell)
 
 
 def chosen_folder(out: str | None, default: str) -> Path:
-    """The folder of an option, or the default one in results/."""
+    """Return the folder of an option, or the default one in results/."""
     from magshell_fenicsx.output.store.folder import user_folder
 
     with exit_codes():
@@ -151,78 +155,75 @@ def picture_options(
     camera: str | None,
     ranges: Sequence[str],
 ) -> dict[str, Any]:
-    """The options that are given, as keys of the section.
+    """Return the options that a command has, as keys of the section `output`.
 
     Raises
     ------
     CaseError
         If a camera or a range cannot be read.
     """
-    given: dict[str, Any] = {"width": width, "dpi": dpi, "font_size": font_size}
-    given["formats"] = formats.split(",") if formats else None
+    keys: dict[str, Any] = {"width": width, "dpi": dpi, "font_size": font_size}
+    keys["formats"] = formats.split(",") if formats else None
     if camera:
         angles = _numbers(
             camera,
             ",",
             f"--camera {camera}: write it as POLAR,AZIMUTH in degrees, for example 55,-60",
         )
-        given["camera"] = dict(zip(("polar", "azimuth"), angles, strict=True))
+        keys["camera"] = dict(zip(("polar", "azimuth"), angles, strict=True))
     if ranges:
-        given["ranges"] = {}
+        keys["ranges"] = {}
     for text in ranges:
         name, _, limits = text.partition("=")
-        said = f"--range {text}: write it as FIELD=LOW:HIGH, for example w_over_h=-2:2"
-        given["ranges"][name] = list(_numbers(limits, ":", said))
-    return {key: value for key, value in given.items() if value is not None}
+        message = f"--range {text}: write it as FIELD=LOW:HIGH, for example w_over_h=-2:2"
+        keys["ranges"][name] = list(_numbers(limits, ":", message))
+    return {key: value for key, value in keys.items() if value is not None}
 
 
-def _numbers(text: str, between: str, said: str) -> tuple[float, float]:
+def _numbers(text: str, separator: str, message: str) -> tuple[float, float]:
+    """Return two numbers; `message` is that of a refusal."""
     try:
-        first, second = map(float, text.split(between))
+        first, second = map(float, text.split(separator))
     except ValueError:
-        raise CaseError(said) from None
+        raise CaseError(message) from None
     return first, second
 
 
 def print_line(line: str) -> None:
+    """Print a line on rank 0."""
     if world().rank == 0:
         terminal.print_line(line)
 
 
 def failure(message: str, code: int) -> typer.Exit:
-    """Print the message of an error once, and return the end of this rank; ends all if the others
-    have no error.
+    """Print the message of an error once, and return the end of this rank.
+
+    All ranks are ended if the others have no error.
     """
     comm = world()
     if comm.size > 1 and not _all_fail(comm):
         print(f"rank {comm.rank}: {message}", file=sys.stderr, flush=True)
-        time.sleep(DELIVERED)
+        time.sleep(DELIVERY_TIME)
         comm.Abort(code)  # the other ranks would wait for this one for ever
     if comm.rank:
-        return (
-            typer.Exit()
-        )  # mpirun ends the job at the first failing rank, and may lose the message of rank 0
+        # mpirun ends the job at the first failing rank, and may lose the message of rank 0
+        return typer.Exit()
     with suppress(OSError):  # a full disk: the exit code says it
         print(message, file=sys.stderr, flush=True)
     return typer.Exit(code)
 
 
 def _all_fail(comm: Any) -> bool:
-    """Whether all ranks come here, as they do with an error of all, before those that have come
-    lose patience.
-    """
+    """Return whether all ranks come here within a delay, as they do with an error of all."""
     from mpi4py import MPI
 
-    others, end = (
-        [rank for rank in range(comm.size) if rank != comm.rank],
-        time.monotonic() + PATIENCE,
-    )
+    others = [rank for rank in range(comm.size) if rank != comm.rank]
+    end = time.monotonic() + MAX_DELAY_OF_ERRORS
     for rank in others:
-        comm.Isend(bytearray(1), rank, FAILED)
-    came = [
-        comm.Irecv(bytearray(1), rank, FAILED) for rank in others
-    ]  # no collective: others may be in one
-    while not MPI.Request.Testall(came):
+        comm.Isend(bytearray(1), rank, FAILURE_TAG)
+    # no collective: others may be in one
+    requests = [comm.Irecv(bytearray(1), rank, FAILURE_TAG) for rank in others]
+    while not MPI.Request.Testall(requests):
         if time.monotonic() > end:
             return False
         time.sleep(0.01)

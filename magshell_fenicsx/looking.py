@@ -1,5 +1,7 @@
-"""Commands that solve nothing: pictures and the report of a run, what a case means, examples, the
-schema, versions.
+"""Commands that solve nothing.
+
+They draw pictures and the report of a run, say what a case means, and print examples, the schema
+and versions.
 """
 
 from collections.abc import Iterator
@@ -106,49 +108,51 @@ def check(case: CaseFile, set_: Settings = None) -> None:
 
     with exit_codes():
         source = read_together(case, world(), set_ or [])
-        read = with_same_files(Case.from_source(source), world())
-        from magshell_fenicsx.case.check import (
-            describe,
-        )  # only now: the solver takes long to import
+        read_case = with_same_files(Case.from_source(source), world())
+        # only now: the solver takes long to import
+        from magshell_fenicsx.case.check import describe
         from magshell_fenicsx.public import problem_of
         from magshell_fenicsx.simulate.perfect import with_modes
 
-        problem = with_modes(problem_of(read, world()), world())
-        print_line(describe(read, problem))
-        if read.gradients or read.design:
+        problem = with_modes(problem_of(read_case, world()), world())
+        print_line(describe(read_case, problem))
+        if read_case.gradients or read_case.design:
             from magshell_fenicsx.simulate.gradients.results import refuse_unknown_results
 
-            with _placed(read):
-                refuse_unknown_results(problem, read.design.named_results if read.design else {})
-        if read.ensemble:
+            with placing_messages(read_case):
+                refuse_unknown_results(
+                    problem, read_case.design.named_results if read_case.design else {}
+                )
+        if read_case.ensemble:
             from magshell_fenicsx.studies.samples import refuse_unknown_keys
 
-            refuse_unknown_keys(source, read.ensemble, Case.from_source)
-        if read.design:
+            refuse_unknown_keys(source, read_case.ensemble, Case.from_source)
+        if read_case.design:
             from magshell_fenicsx.studies.design_variables import refuse_unfit_numbers
 
-            with _placed(read):
-                refuse_unfit_numbers(source, read, read.design)
-        if read.identify:
+            with placing_messages(read_case):
+                refuse_unfit_numbers(source, read_case, read_case.design)
+        if read_case.identify:
             from magshell_fenicsx.studies.identify_data import refuse_unfit_section
             from magshell_fenicsx.studies.identify_programmes import refuse_unfit_programmes
 
-            with _placed(read):
-                refuse_unfit_section(source, read, read.identify)
-                refuse_unfit_programmes(source, read, read.identify, Case.from_source)
+            with placing_messages(read_case):
+                refuse_unfit_section(source, read_case, read_case.identify)
+                refuse_unfit_programmes(source, read_case, read_case.identify, Case.from_source)
     refuse_lost()
 
 
 @contextmanager
-def _placed(case: "Case") -> Iterator[None]:
-    """Messages of the block get the place of their key in the case file."""
+def placing_messages(case: "Case") -> Iterator[None]:
+    """Give messages of the block the place of their key in the case file."""
     try:
         yield
     except CaseError as e:
         raise CaseError(case.with_place(str(e))) from None
 
 
-def _names() -> list[str]:
+def _example_names() -> list[str]:
+    """Return the names of the examples, for completion in the shell."""
     from magshell_fenicsx.case.examples import examples
 
     return list(examples())
@@ -158,7 +162,7 @@ def _names() -> list[str]:
 def example(
     name: Annotated[
         str | None,
-        typer.Argument(metavar="NAME", help="name of the example", autocompletion=_names),
+        typer.Argument(metavar="NAME", help="name of the example", autocompletion=_example_names),
     ] = None,
     file: Annotated[
         Path | None,
@@ -173,15 +177,15 @@ def example(
     from magshell_fenicsx.case.examples import examples, title, write_example
 
     if name is None:
-        for name_of_example, where in examples().items():
-            print_line(f"{name_of_example:24} {title(where)}")
+        for name_of_example, example_file in examples().items():
+            print_line(f"{name_of_example:24} {title(example_file)}")
         refuse_lost()
         return
     if world().rank:
         return
     with exit_codes():
-        written = write_example(name, file)
-    print_line(f"wrote {', '.join(map(str, written))}")
+        files = write_example(name, file)
+    print_line(f"wrote {', '.join(map(str, files))}")
 
 
 @app.command()

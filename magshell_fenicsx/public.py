@@ -1,5 +1,6 @@
-"""What programs call: a run and a scene of a problem, or of what makes one, as a case or the path
-of its file.
+"""Functions that programs call: a run and a scene of a problem, or of what makes one.
+
+That is a case, a mapping like a case file, or the path of a file.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -27,15 +28,14 @@ if TYPE_CHECKING:
     from magshell_fenicsx.studies.boundary import StabilityBoundary
     from magshell_fenicsx.studies.identify import Identified
 
-Given: TypeAlias = Problem | Case | Mapping[str, Any] | str | Path
+ProblemSource: TypeAlias = Problem | Case | Mapping[str, Any] | str | Path
 Say = Callable[[str], None]
 
 
 def problem_of(
-    given: Given, comm: MPI.Comm = MPI.COMM_WORLD, terms: Sequence[OwnTerm] = ()
+    source: ProblemSource, comm: MPI.Comm = MPI.COMM_WORLD, terms: Sequence[OwnTerm] = ()
 ) -> Problem:
-    """The problem itself, or that of a case, of a mapping like a case file, or of the file at a
-    path; collective.
+    """Return the problem itself, or that of a case, a mapping or the file at a path; collective.
 
     Parameters
     ----------
@@ -47,23 +47,25 @@ def problem_of(
     CaseError, MeshError
         If it is none of these, or no problem can be made of it.
     """
-    if isinstance(given, Problem):
+    if isinstance(source, Problem):
         if terms:
             raise CaseError(
                 "terms: a problem has its energies already: give them to what makes the problem"
             )
-        return given
-    case = open_case(given, comm)
+        return source
+    case = open_case(source, comm)
     try:
         return (case.with_terms([*case.own_terms, *terms]) if terms else case).problem()
     except (CaseError, MeshError) as e:
         raise type(e)(case.with_place(str(e))) from None
 
 
-def processes(given: Any, comm: MPI.Comm | None = None) -> MPI.Comm:
-    """Those that were asked for; else those of the mesh of a problem, or all."""
-    problem = given.mesh_file if isinstance(given, Problem) else None
-    return comm or (problem.user_mesh.comm if problem and problem.user_mesh else MPI.COMM_WORLD)
+def processes(source: Any, comm: MPI.Comm | None = None) -> MPI.Comm:
+    """Return the processes of a run: by default those of a problem's mesh, or all."""
+    mesh_file = source.mesh_file if isinstance(source, Problem) else None
+    if comm:
+        return comm
+    return mesh_file.user_mesh.comm if mesh_file and mesh_file.user_mesh else MPI.COMM_WORLD
 
 
 class Scene(SceneOfProblem):
@@ -83,7 +85,7 @@ class Scene(SceneOfProblem):
 
     def __init__(
         self,
-        case: Given,
+        case: ProblemSource,
         comm: MPI.Comm | None = None,
         plan: Problem | None = None,
         *,
@@ -99,7 +101,7 @@ class Scene(SceneOfProblem):
 
     @property
     def case(self) -> Case:
-        """The case that was given, as in earlier versions."""
+        """The case that the scene was made of, as in earlier versions."""
         warn(
             "Scene.case is now Scene.problem, which has all that is computed",
             DeprecationWarning,
@@ -110,11 +112,14 @@ class Scene(SceneOfProblem):
 
 
 def follow(
-    given: SceneOfProblem | Given, *, search: bool = True, remark: Callable[[str], None] = warn_of
+    given: SceneOfProblem | ProblemSource,
+    *,
+    search: bool = True,
+    remark: Callable[[str], None] = warn_of,
 ) -> Iterator[Record]:
-    """Compute the history of a scene, or of a problem or what makes one; yields every accepted
-    point.
+    """Compute the history of a scene, or of a problem or what makes one.
 
+    It yields every accepted point.
     A problem on a mesh of a program is solved by the processes of that mesh. For all else see
     `simulate.follow.follow`.
     """
@@ -170,7 +175,7 @@ def identify(
 
 
 def run(  # noqa: PLR0913 - what a user gives
-    case: Given,
+    case: ProblemSource,
     out: Path | str | None = None,
     comm: MPI.Comm | None = None,
     say: Say = lambda line: None,

@@ -106,7 +106,9 @@ class Shell:
         if geometry not in SHAPES:
             raise CaseError(f"{NAME}: {geometry}: {unknown(geometry, SHAPES, 'geometry')}")
         of_mesh = ("edges", "patches", "facet_tags", "cell_tags") if geometry == "mesh" else ()
-        refuse_unknown(keys, SHAPES[geometry], f"{NAME}: shell", ("name", *self._member_keys, *of_mesh))
+        refuse_unknown(
+            keys, SHAPES[geometry], f"{NAME}: shell", ("name", *self._member_keys, *of_mesh)
+        )
         if isinstance(surface, str):
             mesh_keys = {
                 "edges": edges,
@@ -234,7 +236,9 @@ def Step(kind: str, **keys: Any) -> ProblemPart:
     if kind not in STEPS:
         raise CaseError(f"{NAME}: {kind}: {unknown(kind, STEPS, 'kind of step')}")
     refuse_unknown(keys, STEPS[kind], f"{NAME}: loading")
-    return ProblemPart("loading", lambda shell: shell.plain_value({"kind": kind, **keys}, "loading"))
+    return ProblemPart(
+        "loading", lambda shell: shell.plain_value({"kind": kind, **keys}, "loading")
+    )
 
 
 def Pressure(**keys: Any) -> ProblemPart:
@@ -416,10 +420,7 @@ def Problem(
         _refuse_unfit_shells(several)
     if not isinstance(shell, Shell):
         raise CaseError(f"{NAME}: {shell!r}: the first argument is what ms.Shell gives")
-    data: Keys = {"shell": shell.section()}
-    if several:
-        data = {"shells": {member.name: member.one_of_several() for member in several}}
-    data = {**data, "boundary": {}, **shell.plain_value(sections, "case")}
+    data = {**_shell_data(shell, several), "boundary": {}, **shell.plain_value(sections, "case")}
     steps, terms = list[Keys](), list[OwnTerm]()
     for part in parts:
         if isinstance(part, OwnTerm):
@@ -445,6 +446,13 @@ def Problem(
     if symmetry or shell.user_mesh:
         data["symmetry"] = symmetry or "none"
     return Case.from_source(Source(NAME, data, files=shell.files)).with_terms(terms).problem()
+
+
+def _shell_data(shell: Shell, several: Sequence[Shell]) -> Keys:
+    """Return the data of a case of a shell, or of several."""
+    if not several:
+        return {"shell": shell.section()}
+    return {"shells": {member.name: member.one_of_several() for member in several}}
 
 
 def _refuse_unfit_shells(several: Sequence[Any]) -> None:

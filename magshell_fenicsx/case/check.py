@@ -182,8 +182,8 @@ def _count(problem: Problem, patch: PatchMesh | None) -> tuple[int, int]:
     if patch is None:
         assert problem.meridian
         chart = problem.meridian
-        joined = sum(first == second for first, second in chart.joints)
-        piece_count = max(len(chart.shell_meridians) - joined, 1)
+        joined_count = sum(first == second for first, second in chart.joints)
+        piece_count = max(len(chart.shell_meridians) - joined_count, 1)
         count = len(meridian_vertices(problem)) - piece_count
         return count, 2 * (degree * count + piece_count)
     cells, corners = patch.corners, len(np.unique(patch.corners))

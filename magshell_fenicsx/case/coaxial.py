@@ -77,28 +77,28 @@ class CoaxialShell:
 
     def places_at(self, s: Array) -> Array:
         """Return places (n, 3) in the plane of e1 and e3 at parameters (n,)."""
-        own = self.own_parameter(s)
-        places = self.chart.embedding(np.column_stack([own, 0 * own]))
+        own_s = self.own_parameter(s)
+        places = self.chart.embedding(np.column_stack([own_s, 0 * own_s]))
         return self._in_common_frame(self.place.scale * places) + self._translation
 
     def normal(self, s: Array) -> Array:
         """Return outward normals (n, 3) at parameters (n,)."""
-        own = self.own_parameter(s)
-        return self._in_common_frame(self.chart.normal(np.column_stack([own, 0 * own])))
+        own_s = self.own_parameter(s)
+        return self._in_common_frame(self.chart.normal(np.column_stack([own_s, 0 * own_s])))
 
     def deviation(self, s: Array) -> Array:
         """Return w0 (n, 1) of the imperfect shell at parameters (n,), over R."""
-        own, embedding = self.own_parameter(s), self.chart.embedding
-        w0 = 0 * own
+        own_s, embedding = self.own_parameter(s), self.chart.embedding
+        w0 = 0 * own_s
         if isinstance(embedding, DeviatedEmbedding):
-            w0 = embedding.w0(np.column_stack([own, 0 * own]))
+            w0 = embedding.w0(np.column_stack([own_s, 0 * own_s]))
         return np.asarray(self.place.scale * w0[:, None])
 
     def foot(self, x: Array) -> tuple[float, float]:
         """Return parameter and azimuth (rad) of the nearest place to a place x in space."""
         in_shell_frame = self.place.to_shell_frame(np.asarray(x)[:3])
-        own, _ = self.chart.locate(self.outline.inverse(in_shell_frame))
-        return float(self.parameter(np.array(own))), float(np.arctan2(x[1], x[0]))
+        own_s, _ = self.chart.locate(self.outline.inverse(in_shell_frame))
+        return float(self.parameter(np.array(own_s))), float(np.arctan2(x[1], x[0]))
 
     def vertices(self, body_contacts: Sequence[tuple[float, float]]) -> Array:
         """Return the parameters of the vertices, see `ShellMeridian`.
@@ -108,8 +108,8 @@ class CoaxialShell:
         scale = self.place.scale
         own_contacts = tuple((size / scale, reach / scale) for size, reach in body_contacts)
         body_contacts = (*self.problem.body_contacts, *own_contacts)
-        own = meridian_vertices(replace(self.problem, body_contacts=body_contacts))
-        s = self.parameter(own)
+        own_s = meridian_vertices(replace(self.problem, body_contacts=body_contacts))
+        s = self.parameter(own_s)
         return np.asarray(s if self.upright else s[::-1])
 
     @property

@@ -1,5 +1,4 @@
-"""Where shells that may come into contact are nearest to each other: their elements are smaller
-there.
+"""Mesh sizes at contact: elements are smaller where shells that may touch are nearest.
 
 Distances are between the undeformed shells.
 """
@@ -75,8 +74,10 @@ def contact_places(
         if a == b or a not in places or b not in places:
             continue
         gaps_between = {
-            one: _gaps(places[one], places[other], half_thickness[one], half_thickness[other])
-            for one, other in ((a, b), (b, a))
+            first: _gaps(
+                places[first], places[second], half_thickness[first], half_thickness[second]
+            )
+            for first, second in ((a, b), (b, a))
         }
         gaps, number = gaps_between[a]
         nearest = int(np.argmin(gaps))
@@ -117,7 +118,7 @@ class ChartedShell:
     ----------
     outline
         Its outline, in its own frame.
-    place, own
+    place, to_own_frame
         Maps from its own frame to that of all, and back.
     half
         Half the thickness at its own places (n, 3), over the length of all; None where it is the
@@ -126,12 +127,12 @@ class ChartedShell:
 
     outline: Outline
     place: Callable[[Array], Array]
-    own: Callable[[Array], Array]
+    to_own_frame: Callable[[Array], Array]
     half: Callable[[Array], Array] | None = None
 
     def chart(self, x: Array) -> Array:
         """Return the chart of a place."""
-        return self.outline.inverse(self.own(x))
+        return self.outline.inverse(self.to_own_frame(x))
 
     def place_of(self, chart: Array) -> Array:
         """Return the place of a chart, or of the nearest one that the shell has."""
@@ -139,7 +140,7 @@ class ChartedShell:
 
     def depth(self, x: Array) -> float:
         """Return the depth of a place below the face, less the uniform one."""
-        return float(self.half(self.own(x)[None])[0]) if self.half else 0.0
+        return float(self.half(self.to_own_frame(x)[None])[0]) if self.half else 0.0
 
 
 def _nearest(x: Array, y: Array, of_x: ChartedShell, of_y: ChartedShell) -> tuple[Array, Array]:

@@ -35,7 +35,11 @@ def programme(loading: Step | Sequence[Step] | None, context: Context) -> tuple[
     """Return the steps of a case: those of a list, or what comes before one load, and then that."""
     implied_steps: list[tuple[str, Step]] = []
     if not isinstance(loading, Sequence):
-        implied_steps = [pair for kind in KINDS_BEFORE_LOAD for pair in STEPS[kind].steps_before_load(context, loading)]
+        implied_steps = [
+            pair
+            for kind in KINDS_BEFORE_LOAD
+            for pair in STEPS[kind].steps_before_load(context, loading)
+        ]
     keyed = [*implied_steps, *loads_by_key(loading).items()]
     loads, places_of = [load for _, load in keyed], dict[str, list[Any]]()
     steps = []

@@ -72,11 +72,11 @@ def merge_shells(
     joined_edges = _joined_edges(_with_mesh_names(data.get("joints"), sections))
     several = SeveralShells(parts, joined_edges, _pairs(data.get("contact")))
     common_keys = _common_shell(parts)
-    merged = {
+    merged_data = {
         key: _with_mesh_names(value, sections) if key in SECTIONS_WITH_NAMES else value
         for key, value in data.items()
     }
-    merged |= {
+    merged_data |= {
         "shells": sections,
         "shell": {"geometry": "mesh", "file": several.file, **common_keys},
         "boundary": {
@@ -87,8 +87,8 @@ def merge_shells(
         "points": _points(several),
     }
     if any(section.remanent for section in sections.values()):
-        merged["magnetic"] = _with_remanences(merged.get("magnetic"), several)
-    return merged, several
+        merged_data["magnetic"] = _with_remanences(merged_data.get("magnetic"), several)
+    return merged_data, several
 
 
 def without_merged_keys(data: Keys, shells: Mapping[str, OneOfShells] | None) -> Keys:
@@ -121,7 +121,7 @@ def _case(name: str, section: OneOfShells, data: Keys, context: Keys, case: "typ
     shell_data = data["shells"][name]
     if isinstance(shell_data, BaseModel):
         shell_data = shell_data.model_dump(exclude_unset=True)
-    own: Keys = {
+    own_data: Keys = {
         "shell": shell_data["shell"],
         "boundary": shell_data.get("boundary") or {},
         "points": shell_data.get("points") or {},
@@ -131,15 +131,15 @@ def _case(name: str, section: OneOfShells, data: Keys, context: Keys, case: "typ
     for key, value in (shell_data.get("mesh") or {}).items():
         sizes[key] = value * sizes.get(key, 1.0) if key == "refinement" else value
     # loads that mesh sizes follow
-    points = own["points"] if isinstance(own["points"], dict) else {}
+    points = own_data["points"] if isinstance(own_data["points"], dict) else {}
     loads = [load for load in _forces_on(name, data) if load["at"]["point"] in points]
     if _presses(data.get("loading"), name):
         loads.append({"kind": "pressure"})
     if loads:
-        own["loading"] = loads
+        own_data["loading"] = loads
     try:
         shell_case = case.model_validate(
-            {**own, "mesh": sizes, "symmetry": "none"}, context=context
+            {**own_data, "mesh": sizes, "symmetry": "none"}, context=context
         )
     except ValidationError as e:
         error = e.errors()[0]
@@ -321,8 +321,12 @@ def _remanences_of(part: MemberCase, several: SeveralShells, size: float | None)
     if size is not None and remanent.flux_density is not None:
         factor = remanent.flux_density / size
     patches: dict[str, Any] = {}
-    for name, own in (remanent.patches or {"": remanent}).items():
-        section = own if isinstance(own, RemanentSection) else RemanentSection(**own.model_dump())
+    for name, remanence in (remanent.patches or {"": remanent}).items():
+        section = (
+            remanence
+            if isinstance(remanence, RemanentSection)
+            else RemanentSection(**remanence.model_dump())
+        )
         patch = part.name if name in ("", "rest") else f"{part.name}_{name}"
         patches[patch] = section.placed(several.place(part), factor)
     return patches

@@ -129,13 +129,13 @@ def in_words_of_shells(message: str, data: Any) -> str:
         return message
     texts = {*_texts(data)}
     for name in map(str, shells):
-        named = {
+        names_in_text = {
             text.removeprefix(f"{name}.")
             for text in texts
             if re.fullmatch(rf"{re.escape(name)}\.\w+", text)
         }
         members = "|".join(
-            sorted({*EDGE_NAMES, *named, *filter(str.isidentifier, _texts(shells[name]))})
+            sorted({*EDGE_NAMES, *names_in_text, *filter(str.isidentifier, _texts(shells[name]))})
         )
         shell = re.escape(name)
         message = re.sub(
@@ -151,7 +151,7 @@ def _texts(data: Any) -> Iterator[str]:
         for key, value in data.items():
             yield from (str(key), *_texts(value))
     elif isinstance(data, list | tuple):
-        yield from (text for each in data for text in _texts(each))
+        yield from (text for item in data for text in _texts(item))
     elif isinstance(data, str):
         yield data
 
@@ -262,12 +262,12 @@ class SeveralShells:
         factors: dict[str, Any] = {}
         for part in self.parts:
             with part.naming():
-                own = part.case.problem().thickness
+                own_thickness = part.case.problem().thickness
             ratio = self.ratio(part)
             factors[part.name] = ratio
-            if own and own.of_position:
-                factors[part.name] = PlacedFactor(own, self.place(part), ratio)
-            for name, factor in ((own and own.patches) or {}).items():
+            if own_thickness and own_thickness.of_position:
+                factors[part.name] = PlacedFactor(own_thickness, self.place(part), ratio)
+            for name, factor in ((own_thickness and own_thickness.patches) or {}).items():
                 assert isinstance(factor, float)  # a shell of its own has no shells in it
                 factors[f"{part.name}_{name}"] = ratio * factor
         return (
@@ -329,14 +329,14 @@ class SeveralShells:
         lines = [f"scales: {scales} are those of the shell {self.parts[0].name}"]
         words = self.assembly.laws
         for part in self.parts[1:]:
-            said = f"h {self.ratio(part):.4g} times" + (
+            line = f"h {self.ratio(part):.4g} times" + (
                 "" if part.case.thickness_factor is None else " its factor"
             )
-            if own := (self.materials or {}).get(part.name):
-                said += f", E {own.modulus:.4g} times, nu = {own.nu:.4g}"
-                said += f", density {own.density:.4g} times" if has_density else ""
-            said += f", law: {words[part.name]}" if len({*words.values()}) > 1 else ""
-            lines.append(f"  {part.name}: {said}")
+            if material := (self.materials or {}).get(part.name):
+                line += f", E {material.modulus:.4g} times, nu = {material.nu:.4g}"
+                line += f", density {material.density:.4g} times" if has_density else ""
+            line += f", law: {words[part.name]}" if len({*words.values()}) > 1 else ""
+            lines.append(f"  {part.name}: {line}")
         return lines
 
     def ratio(self, part: MemberCase) -> float:

@@ -79,8 +79,9 @@ def _on_planes(x: Array, plane: Mirror | None) -> Array:
 
 
 def on_features(chart: Array, outline: Outline, points: Mapping[str, Array]) -> Array:
-    """Return the chart (2 | 3,) of a place, moved onto a point, a pole or an edge that it is nearly
-    on.
+    """Return the chart (2 | 3,) of a place, moved onto what it is nearly on.
+
+    That is a point, a pole or an edge.
 
     Parameters
     ----------
@@ -102,8 +103,8 @@ def on_features(chart: Array, outline: Outline, points: Mapping[str, Array]) -> 
     if outline.disc and is_at(np.zeros(CHART)):
         return np.zeros(CHART)
     for edge in edges_near(chart, outline):  # one after the other: of two that meet at a corner too
-        on = edges_near(chart, outline)[edge]
-        chart = on if is_at(on) else chart
+        on_edge = edges_near(chart, outline)[edge]
+        chart = on_edge if is_at(on_edge) else chart
     return chart
 
 
@@ -111,19 +112,15 @@ def edges_near(chart: Array, outline: Outline) -> dict[str, Array]:
     """Return the nearest places (2,) on edges by name, the nearest of opposite edges."""
     shape = outline.chart(None, Grading([], 1.0))
     if isinstance(shape, DiscShape):
-        away = float(np.hypot(*chart))
-        return {shape.edge: chart * (shape.radius / away)} if away else {}
+        distance = float(np.hypot(*chart))
+        return {shape.edge: chart * (shape.radius / distance)} if distance else {}
     if isinstance(shape, StripShape):
         low, high = np.array([0.0, -shape.width / 2]), np.array([1.0, shape.width / 2])
         names, glued = ("root", "tip", "sides", "sides"), (False, False)
     else:
         assert isinstance(shape, Grid)
-        low, high, names, glued = (
-            np.array(shape.low),
-            np.array(shape.high),
-            shape.sides,
-            shape.glued,
-        )
+        low, high = np.array(shape.low), np.array(shape.high)
+        names, glued = shape.sides, shape.glued
     is_high = chart - low >= high - chart
     nearest = np.where(is_high, high, low)
     return {
@@ -149,7 +146,7 @@ class Vertices:
         Angle of the model's frame about e3, rad.
     R, unit
         The reference length in messages, and their unit of lengths, empty without.
-    named
+    names_in_case
         The names that are in `points` of the case.
     """
 
@@ -159,24 +156,20 @@ class Vertices:
     turn: float
     R: float
     unit: str
-    named: Collection[str]
+    names_in_case: Collection[str]
 
     @classmethod
     def of_case(
         cls, case: "Case", points: Mapping[str, Array], outline: Outline, size: Grading, turn: float
     ) -> "Vertices":
         """Return the vertices of a case."""
-        R, unit = (
-            (1e3 * case.shell.reference, " mm")
-            if case.shell.with_units
-            else (case.shell.reference, "")
-        )
-        order = sorted(
-            points, key=lambda name: name not in case.points
-        )  # "pole" may be one of them
-        return cls(
-            {name: points[name] for name in order}, outline, size, turn, R, unit, case.points
-        )
+        R, unit = case.shell.reference, ""
+        if case.shell.with_units:
+            R, unit = 1e3 * R, " mm"
+        # named ones first: "pole" may be one of them
+        ordered_names = sorted(points, key=lambda name: name not in case.points)
+        ordered = {name: points[name] for name in ordered_names}
+        return cls(ordered, outline, size, turn, R, unit, case.points)
 
     def refuse_near(self, shape: Chart | RimmedGrid, plane: Mirror | None) -> None:
         """Check that points are far enough from each other, from edges and from planes of symmetry.
@@ -192,16 +185,16 @@ class Vertices:
             self._refuse_beside_edges(name, shape, plane)
         places = list(self.points.values())
         vertices = shape.vertices_of(places) if isinstance(shape, Grid) else None
-        for (i, one), (j, other) in combinations(enumerate(self.points), 2):
-            apart = float(np.hypot(*(places[i] - places[j])))
-            near = (
-                (vertices[i] == vertices[j]).all()
-                if vertices is not None
-                else apart < MIN_VERTEX_DISTANCE * self._size_of_elements(places[i], shape)
-            )
-            if near and not np.array_equal(places[i], places[j]):
+        for (i, name), (j, other) in combinations(enumerate(self.points), 2):
+            if vertices is not None:
+                is_near = (vertices[i] == vertices[j]).all()
+            else:
+                distance = float(np.hypot(*(places[i] - places[j])))
+                size = self._size_of_elements(places[i], shape)
+                is_near = distance < MIN_VERTEX_DISTANCE * size
+            if is_near and not np.array_equal(places[i], places[j]):
                 self._refuse(
-                    one,
+                    name,
                     self._place(places[j]),
                     f"{self._key(other)}: [{{}}]",
                     "give one of them",
@@ -217,18 +210,15 @@ class Vertices:
         size = self._size_of_elements(chart, shape)
         (place,) = self.outline.embedding(chart[None])
         for side in plane.planes.values() if plane else ():
-            off = float(side.signed_distance(place))
-            if ROUNDING < abs(off) < factor * size:
-                on, hint = (
-                    self._in_case_frame(place - off * side.normal),
-                    "put it there, or take symmetry: none",
-                )
-                self._refuse(name, on, "the plane of symmetry at [{}]", hint, factor)
-        for edge, on in edges_near(chart, self.outline).items():
-            if ROUNDING < float(np.hypot(*(on - chart))) < factor * size:
-                self._refuse(
-                    name, self._place(on), f"the edge {edge} at [{{}}]", "put it there", factor
-                )
+            distance = float(side.signed_distance(place))
+            if ROUNDING < abs(distance) < factor * size:
+                on_plane = self._in_case_frame(place - distance * side.normal)
+                hint = "put it there, or take symmetry: none"
+                self._refuse(name, on_plane, "the plane of symmetry at [{}]", hint, factor)
+        for edge, on_edge in edges_near(chart, self.outline).items():
+            if ROUNDING < float(np.hypot(*(on_edge - chart))) < factor * size:
+                words, place_on_edge = f"the edge {edge} at [{{}}]", self._place(on_edge)
+                self._refuse(name, place_on_edge, words, "put it there", factor)
 
     def _size_of_elements(self, chart: Array, shape: Grid | PlaneShape) -> float:
         """Return the size of the elements at a place (2,): none is wider than the shape."""
@@ -239,24 +229,28 @@ class Vertices:
             )
         return min(self.size(chart), shape.area / shape.reach)
 
-    def _refuse(self, name: str, other: Array, what: str, hint: str, factor: float) -> None:
+    def _refuse(self, name: str, other_place: Array, what: str, hint: str, factor: float) -> None:
         """Refuse a point beside a place (3,) of the case, which is in the words `what`."""
-        chart = self.points[name]
-        one, two = self._place(chart), other
-        here, there = (
-            ", ".join(f"{c}{self.unit}" for c in told.split(", "))
-            for told in distinguishable_texts(one, two)
+        chart, unit = self.points[name], self.unit
+        place = self._place(chart)
+        text, other_text = (
+            ", ".join(f"{coordinate}{unit}" for coordinate in coordinates.split(", "))
+            for coordinates in distinguishable_texts(place, other_place)
         )
-        apart, size = float(np.linalg.norm(one - two)), self.size(chart) * self.R
+        distance, size = float(np.linalg.norm(place - other_place)), self.size(chart) * self.R
+        fit_size = GRID_FACTOR * distance / factor
         raise CaseError(
-            f"{self._key(name)}: [{here}]: is {apart:.3g}{self.unit} from {what.format(there)}, "
-            f"too near for elements of {size:.3g}{self.unit}: {hint}, or take elements below {GRID_FACTOR * apart / factor:.2g}{self.unit}"
+            f"{self._key(name)}: [{text}]: is {distance:.3g}{unit} from {what.format(other_text)}, "
+            f"too near for elements of {size:.3g}{unit}: {hint}, or take elements below "
+            f"{fit_size:.2g}{unit}"
         )
 
     def _key(self, name: str) -> str:
-        return f"points.{name}" if name in self.named else f"the point {name}"
+        """Return the key of a point in messages."""
+        return f"points.{name}" if name in self.names_in_case else f"the point {name}"
 
     def _place(self, chart: Array) -> Array:
+        """Return the place (3,) of a chart in the case's frame and length."""
         return self._in_case_frame(self.outline.embedding(chart[None])[0])
 
     def _in_case_frame(self, x: Array) -> Array:

@@ -191,7 +191,7 @@ def better_cuts(scene: Scene, state: State) -> dict[str, float]:
 
 
 def with_cuts_here(scene: Scene, state: State) -> State:
-    """Return a state of another model with the cuts of shells at its own displacement; collective."""
+    """Return a state of another model with cuts at its own displacement; collective."""
     evaluation = scene.model.system.at_state(state)
     return State(
         state.u,
@@ -276,8 +276,8 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
             int(np.sum((side * distance_before > 2 * undeformed) & (side * distance_after < half)))
         ):
             raise PathStopped(
-                "the shell touches its mirror image behind a plane of boundary: symmetry, which it does not feel: "
-                "model both sides",
+                "the shell touches its mirror image behind a plane of boundary: symmetry, which it "
+                "does not feel: model both sides",
                 low,
                 final=True,
             )
@@ -407,8 +407,9 @@ def penetration_message(scene: Scene, state: State, *, moving: bool = False) -> 
         if deep > contact.bound:
             k = state.mu.get(contact.setting, contact.stiffness)
             return (
-                f"the penetration of the body {contact.body} is {deep:.3g} h, more than bodies.{contact.body}."
-                f"penetration: {contact.bound:g}; its stiffness is {k:.4g}: give four times as much"
+                f"the penetration of the body {contact.body} is {deep:.3g} h, more than "
+                f"bodies.{contact.body}.penetration: {contact.bound:g}; its stiffness is {k:.4g}: "
+                "give four times as much"
             )
     for pair, deep in shell_penetrations(scene, state):
         largest = pair.bound * (IMPACT_BOUND_RATIO if moving else 1.0)

@@ -1,4 +1,4 @@
-"""Rows of a motion: its states at given times, from the journal where it has them, and their errors.
+"""Rows of a motion: its states at given times, from the journal if it has them, and their errors.
 
 Departures from unstable states magnify the errors of steps, by a factor that the end of the motion
 alone shows. So where the error at the rows is asked for, a motion is computed with longer steps

@@ -76,8 +76,8 @@ def follow_path(
     to the target.
 
     With `until: bifurcation` an excluded instability ends the path. With `until: limit` the path
-    continues to the first instability of the model itself, up to `MAX_RATIO_TO_EXCLUDED` times the load of the
-    first excluded one.
+    continues to the first instability of the model itself, up to `MAX_RATIO_TO_EXCLUDED` times the
+    load of the first excluded one.
 
     Raises
     ------
@@ -223,7 +223,8 @@ def _records_in_stage(stage: Stage, walk: ContinuationRun, branches: int) -> Rec
                         else ""
                     )
                 if label == "fold":
-                    fold = f"; the last fold is at {amount(stage.scene, path.name, point.state.mu[path.name])}"
+                    value = amount(stage.scene, path.name, point.state.mu[path.name])
+                    fold = f"; the last fold is at {value}"
                 remark = cluster_remark(stage.scene, walk, point)
                 yield Record(
                     label, path.name, point, mode, excluded_pivots=monitor.unstable, said=remark
@@ -263,7 +264,10 @@ def _records_in_stage(stage: Stage, walk: ContinuationRun, branches: int) -> Rec
             f"load control cannot pass the fold at {at}, before its target, {target}; {stop_reason}"
         )
     if monitor.unlocated:
-        why = f"a mode that the reduced model excludes is unstable from an unknown point on: {monitor.unlocated}"
+        why = (
+            "a mode that the reduced model excludes is unstable from an unknown point on: "
+            f"{monitor.unlocated}"
+        )
         stop_reason = f"{stop_reason}; {why}" if stop_reason else why
     if stop_reason:
         raise Stopped(stop_reason)
@@ -469,8 +473,14 @@ def cluster_remark(scene: Scene, walk: ContinuationRun, point: Point) -> str:
     name, count = walk.path.name, abs(other_end.negative_pivots - point.negative_pivots)
     first, last = (amount(scene, name, end.state.mu[name]) for end in (point, other_end))
     if count > 1:
-        return f"instabilities in {count} directions between {first} and {last} are too close to be located one by one"
-    return f"a fold and another instability between {first} and {last} are too close to be located one by one"
+        return (
+            f"instabilities in {count} directions between {first} and {last} are too close to be "
+            "located one by one"
+        )
+    return (
+        f"a fold and another instability between {first} and {last} are too close to be located "
+        "one by one"
+    )
 
 
 def amount(scene: Scene, name: str, value: float) -> str:

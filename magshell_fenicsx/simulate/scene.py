@@ -482,8 +482,8 @@ class Scene:
     def to_magpylib(self, record: "Record", parts: int = 8) -> Any:
         """Return the magnetised shell of a record as a source of magpylib; collective.
 
-        It is of charged triangles, in m and T; of a case without units over R and |Br|. Each side of a cell is divided into
-        `parts`.
+        It is of charged triangles, in m and T; of a case without units over R and |Br|. Each side
+        of a cell is divided into `parts`.
 
         Raises
         ------

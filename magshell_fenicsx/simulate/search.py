@@ -182,7 +182,8 @@ def solutions(
 ) -> Iterator[Record]:
     """Find further equilibria at the amplitudes of a known one, such as snapped shapes.
 
-    All amplitudes are loads. Every one is confirmed by Newton's method, and differs from all others. There may be more.
+    All amplitudes are loads. Every one is confirmed by Newton's method, and differs from all
+    others. There may be more.
 
     Parameters
     ----------

@@ -291,7 +291,7 @@ def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
 
 
 def _load_change(stage: Stage, fold: Fold, other: Scene) -> float:
-    """Return -(left . R)/(left . R_mu) of a fold's state in a scene with a slightly different shell.
+    """Return -(left . R)/(left . R_mu) of a fold's state in a scene with a slightly other shell.
 
     Both scenes have the same mesh. What touches there is what touches in the state, see
     `expand_contact`.

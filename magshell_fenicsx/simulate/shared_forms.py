@@ -67,7 +67,7 @@ class SharedForms:
 
     @staticmethod
     def of_scene(scene: Scene) -> "SharedForms | None":
-        """Return the forms of a scene; None if what differs between cases is not in numbers alone."""
+        """Return the forms of a scene; None if cases do not differ in numbers alone."""
         model = scene.model
         if not model.axisymmetric:
             return None

@@ -107,7 +107,7 @@ def _within_support_limits(
 
 
 def _with_step_options(scene: Scene, path: Path, course: StepCourse, drive: Drive) -> Path:
-    """Return a path with the lengths of steps that its course and contact between shells ask for."""
+    """Return a path with lengths of steps for its course and for contact between shells."""
     if drive.step is not None:
         path = path.with_step_options(StepOptions(drive.step, 2 * drive.step, 1e-4 * drive.step))
     if course.finer:

@@ -252,7 +252,7 @@ def _settled_contact(stage: Stage, path: Path, guess: State, phi: Vector) -> Sta
 
 
 def _at_rest(stage: Stage, path: Path, guess: State, mode: Vector) -> Point | str:
-    """Return the point near a guess that a force along a mode holds at rest; or why there is none."""
+    """Return the point near a guess that a force along a mode holds at rest, or why not."""
     try:
         held = held_along(stage.newton, stage.enter(guess), mode)
     except np.linalg.LinAlgError:
@@ -263,7 +263,7 @@ def _at_rest(stage: Stage, path: Path, guess: State, mode: Vector) -> Point | st
 
 
 def _located(stage: Stage, path: Path, guess: State, phi: Vector) -> Point | str:
-    """Return the bifurcation near a guess, by its mode, in a step's system; or why there is none."""
+    """Return the bifurcation near a guess by its mode, in a step's system, or why not."""
     state, mode = stage.enter(guess), stage.padded(phi)
     try:
         located = find_bifurcation(stage.newton, state, mode, path.name)
