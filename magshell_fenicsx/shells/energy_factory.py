@@ -452,21 +452,20 @@ class EnergyFactory:
         body_contact = BodyContact(
             contact, self.material.h, domain.r0, self.u, approach, rule, self.thickness, thins_at
         )
+        parameters = body_contact.parameters
         if thins:
-            contact_density, parts = (thinned_energy, VALUE_AND_FIRST)
+            density = self._thinning(
+                Density(per_area(thinned_energy), parameters, VALUE_AND_FIRST, quadrature=rule)
+            )
         else:
-            contact_density, parts = (contact_energy, ("r",))
-        density = Density(
-            per_area(contact_density), body_contact.parameters, parts, quadrature=rule
-        )
-        density = self._thinning(density) if thins else density
+            density = Density(per_area(contact_energy), parameters, ("r",), quadrature=rule)
         of_radius = radius_density(self._constant(contact.front), self._constant(contact.direction))
         density_functions: dict[str, Callable[..., Expr]] = {
             "pressure": contact_pressure,
             "radius": of_radius,
         }
         by_name = {
-            name: Density(per_area(density_function), body_contact.parameters, quadrature=rule)
+            name: Density(per_area(density_function), parameters, quadrature=rule)
             for name, density_function in density_functions.items()
         }
         integrals = {name: self._over_area(density) for name, density in by_name.items()}

@@ -31,12 +31,12 @@ from magshell_fenicsx.models.shell.edges import FOLD_ANGLE
 from magshell_fenicsx.models.shell.parameters import Condition, Material, default_penalty
 from magshell_fenicsx.models.shell.spatial_fields import cell_geometry, formula_field
 from magshell_fenicsx.models.shell.thickness import Thickness, material_field, thickness_field
-from magshell_fenicsx.parts.forces.meridian_loads import Around, dead_loads, pole_force
+from magshell_fenicsx.parts.forces.meridian_loads import RevolutionIntegrals, dead_loads, pole_force
 from magshell_fenicsx.parts.joints import Creases
 from magshell_fenicsx.parts.loads import Loads, forces
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
-from magshell_fenicsx.parts.pressure.openings import meridian_openings, on_cells, side_of
+from magshell_fenicsx.parts.pressure.openings import meridian_openings, side_field, side_of
 from magshell_fenicsx.parts.supports.on_meridian import RigidMotions, supports
 from magshell_fenicsx.parts.supports.support_motion import (
     PRESSURE,
@@ -210,7 +210,7 @@ class MeridianModel(ThinModel):
     def _make_factory(self) -> EnergyFactory:
         """Return what makes the energies of this shell."""
         meridian, loads = self.meridian, self.loads
-        pressed_cells = on_cells(loads.pressed, meridian) if loads.pressed else None
+        pressed_cells = side_field(loads.pressed, meridian) if loads.pressed else None
         free_constants: dict[str, fem.Constant] = {}
         natural_shape = self._natural_shape(free_constants)
         initial_placement = self.growing and self.growing.initial_placement
@@ -274,7 +274,7 @@ class MeridianModel(ThinModel):
 
     def _add_forces(self) -> None:
         """Add the energies of forces at the pole, then those of dead loads."""
-        measures = Around(self.meridian, self.domain)
+        measures = RevolutionIntegrals(self.meridian, self.domain)
         for name, force in self.loads.forces.items():
             energy = pole_force(name, force, self.force_unit, measures, self.kernels)
             self.energies.append(energy)

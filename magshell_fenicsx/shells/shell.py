@@ -60,7 +60,12 @@ from magshell_fenicsx.parts.joints import Creases
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.natural.shape import Shape, natural_field
-from magshell_fenicsx.parts.pressure.openings import beside, on_cells, on_each, openings
+from magshell_fenicsx.parts.pressure.openings import (
+    edge_openings,
+    pressed_parts,
+    side_field,
+    sides_of_cells,
+)
 from magshell_fenicsx.parts.supports.support_motion import (
     enclosed,
     motions_of,
@@ -289,7 +294,7 @@ class ShellModel(ThinModel):
             natural_shape,
             free_constants,
             is_folded,
-            pressed=on_cells(loads.pressed, midsurface) if loads.pressed else None,
+            pressed=side_field(loads.pressed, midsurface) if loads.pressed else None,
             creases=creases,
             cell_materials=self.cell_materials,
         )
@@ -316,8 +321,8 @@ class ShellModel(ThinModel):
         Sets `without_potential`.
         """
         edges, pressed_cells = self.midsurface.edges, self.factory.pressed
-        opening_edges = beside(edges, pressed_cells) if pressed_cells else edges
-        free_edges, self.without_potential = openings(self.r0, opening_edges, self._conditions)
+        opening_edges = pressed_parts(edges, pressed_cells) if pressed_cells else edges
+        free_edges, self.without_potential = edge_openings(self.r0, opening_edges, self._conditions)
         return opening_edges, enclosed(self.loads, free_edges, self.without_potential)
 
     def _volume_form(self, origin: NDArray[np.float64] | None, *, is_enclosed: bool) -> ufl.Form:
@@ -400,7 +405,7 @@ class ShellModel(ThinModel):
             for name, condition in self._conditions.items()
             if condition in ("symmetry", "plane")
         }
-        cell_sides = pressed_cells and on_each(pressed_cells)
+        cell_sides = pressed_cells and sides_of_cells(pressed_cells)
         curves = {
             name: EdgeCurve.from_facets(self.V, facets, triangle_sides(), cell_sides)
             for name, facets in opening_edges.items()

@@ -43,7 +43,7 @@ from magshell_fenicsx.parts.loads import Loads, moments, potentials
 from magshell_fenicsx.parts.magnetism.applied import field_parameters
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.parts.natural.shape import Shape, body_shape, growth_in_body
-from magshell_fenicsx.parts.pressure.openings import openings
+from magshell_fenicsx.parts.pressure.openings import edge_openings
 from magshell_fenicsx.parts.supports.support_motion import (
     enclosed,
     motions_of,
@@ -53,7 +53,7 @@ from magshell_fenicsx.parts.supports.support_motion import (
 from magshell_fenicsx.parts.supports.supports import ROUNDING, closing_point, in_middle, supports
 from magshell_fenicsx.shells.model_base import ModelBase
 from magshell_fenicsx.shells.solid_hessians import body_hessian_integrals
-from magshell_fenicsx.shells.solid_terms import SolidDensity, TermFactory
+from magshell_fenicsx.shells.solid_terms import SolidDensity, TermFactory, unchanged
 
 Array = NDArray[np.float64]
 MIRRORS = ("symmetry", "plane")
@@ -123,7 +123,7 @@ class SolidModel(ModelBase):
         self._held, planes, self.supports = supports(body, self.r0, conditions)
         origin = closing_point([mirror, *planes] if self.multiplicity == 2 else planes)
         ends = {name: facets for name, facets in body.faces.items() if name != OUTER_FACE}
-        free_ends, self.without_potential = openings(
+        free_ends, self.without_potential = edge_openings(
             self.r0, ends, conditions, in_middle(body, self.V)
         )
         is_enclosed = enclosed(self.loads, free_ends, self.without_potential)
@@ -163,10 +163,10 @@ class SolidModel(ModelBase):
     def _make_factory(self) -> TermFactory:
         """Return what makes the terms of this body."""
         free_constants: dict[str, fem.Constant] = {}
-        growth: dict[str, Callable[[SolidDensity], SolidDensity]] = {}
+        grown: Callable[[SolidDensity], SolidDensity] = unchanged
         if self.loads.natural:
             shape = body_shape(self.loads.natural, self.body, self.V, free_constants)
-            growth["grown"] = partial(grown_in_body, shape=shape)
+            grown = partial(grown_in_body, shape=shape)
         return TermFactory(
             self.body,
             self.u,
@@ -174,8 +174,8 @@ class SolidModel(ModelBase):
             self.material.h,
             self.kernels,
             self._hinged,
-            free_constants=free_constants,
-            **growth,
+            grown,
+            free_constants,
         )
 
     def _field_and_pressure_terms(self) -> list[Term]:

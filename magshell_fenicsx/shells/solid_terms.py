@@ -94,9 +94,28 @@ class EndMoment(AngleTerm, SolidTerm):
     """A moment on an end."""
 
 
+def unchanged(density: SolidDensity) -> SolidDensity:
+    """Return the density: the body grows nowhere."""
+    return density
+
+
 @dataclass(frozen=True)
 class TermFactory:
-    """Makes the terms of one body."""
+    """Factory of the terms of one body.
+
+    Attributes
+    ----------
+    hinged
+        Ends whose middle line alone is held.
+    grown
+        Function that takes a density to the body's natural shape.
+    free_constants
+        Constants of the free parameters, by name.
+    fields
+        Applied fields, known by values, that were made.
+    saturated
+        Magnetisation state of a soft material that saturates, if it was made.
+    """
 
     body: BodyMesh
     u: fem.Function
@@ -104,14 +123,10 @@ class TermFactory:
     h: float
     log: KernelLog
     hinged: tuple[str, ...] = ()
-    grown: Callable[[SolidDensity], SolidDensity] = lambda density: (
-        density
-    )  # takes the body's natural shape
-    free_constants: Constants = field(default_factory=dict)  # of parameters that enter freely
-    fields: list[AppliedField] = field(default_factory=list)  # those made
-    saturated: list[PointField] = field(
-        default_factory=list
-    )  # of a soft material, when it was made
+    grown: Callable[[SolidDensity], SolidDensity] = unchanged
+    free_constants: Constants = field(default_factory=dict)
+    fields: list[AppliedField] = field(default_factory=list)
+    saturated: list[PointField] = field(default_factory=list)
 
     def distortions(self) -> list[SolidTerm]:
         """Return the terms of distortion, without change of volume; a neo-Hookean body has one."""
@@ -410,20 +425,16 @@ class TermFactory:
         parameters = self._constants(
             unit, *([origin] if origin is not None and origin.any() else [])
         )
+        face_density: Callable[..., Expr] = body_densities.pressure
+        end_density: Callable[..., Expr] = body_densities.sealing
         if moves_straight:
-            face_density, end_density = (
-                body_densities.swept_volume,
-                body_densities.swept_volume_on_end,
-            )
-        else:
-            face_density, end_density = (body_densities.pressure, body_densities.sealing)
-        if potential:
-            face_work, end_work = (None, None)
-        else:
-            face_work, end_work = (
-                body_densities.follower_pressure_work,
-                body_densities.follower_pressure_work_on_end,
-            )
+            face_density = body_densities.swept_volume
+            end_density = body_densities.swept_volume_on_end
+        face_work: Callable[..., Expr] | None = None
+        end_work: Callable[..., Expr] | None = None
+        if not potential:
+            face_work = body_densities.follower_pressure_work
+            end_work = body_densities.follower_pressure_work_on_end
         of_faces = {
             "pressure": SolidDensity(
                 face_density,

@@ -457,7 +457,7 @@ class MeridianTJunction(TieTerm):
         cosine = np.array([[[1, 0, 0], [0, 0, 0], [0, 0, 1]], [[0, 0, 0], [1, m, 0], [0, 0, 0]]])
         sine = np.array([[[0, 0, 0], [0, 1, 0], [0, 0, 0]], [[-m, -1, 0], [0, 0, 0], [0, 0, -m]]])
         U_from_P = np.array([[1, -1, 0], [0, 1, 0], [0, 0, 1]])
-        H = sum(self._second(*self._maps(part @ U_from_P)) for part in (cosine, sine))
+        H = sum(self._second_variation(*self._maps(part @ U_from_P)) for part in (cosine, sine))
         return _entries(self._numbers(3), np.asarray(H / 2))
 
     def _numbers(self, size: int) -> Longs:
@@ -573,12 +573,11 @@ def _tie_stiffness(
     """(n, 2) stiffness of both ties at points that stand for a length `weight`, of cells with sides
     of that length.
     """
+    turning_stiffness: Array | float = joint.stiffness
     if joint.rigid:
         turning_stiffness = (
             TIE_STIFFNESS_RATIO * factors[:, 1] * material.bending_stiffness / length
         )
-    else:
-        turning_stiffness = joint.stiffness
     return np.column_stack(
         [weight * TIE_STIFFNESS_RATIO * factors[:, 0] / length, weight * turning_stiffness]
     )

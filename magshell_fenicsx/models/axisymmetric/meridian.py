@@ -218,7 +218,9 @@ def make_meridian(
     ends = {name: end for name, end in zip(names, facets, strict=True) if name}
     if points is None or (shell_intervals and "pole" not in points):
         supported = [
-            end for name, end in zip(names, np.ravel(parts), strict=True) if name in supported_ends
+            float(end)
+            for name, end in zip(names, np.ravel(parts), strict=True)
+            if name in supported_ends
         ]
         s = _highest_parameter(embedding, vertices, supported) if shell_intervals else 0.0
         points = {**(points or {}), "pole": (s, 0.0)}

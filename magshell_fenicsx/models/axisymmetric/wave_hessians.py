@@ -364,14 +364,13 @@ def _batches(domain: IntegrationDomain, density: Density | None) -> Iterable[Ent
         return
     topology.create_connectivity(0, 1)
     links, corners = topology.connectivity(0, 1), topology.connectivity(1, 0).array.reshape(-1, 2)
-    if density.facets is None:
-        inner = np.flatnonzero(np.diff(links.offsets) == 2)
-    else:
-        inner = density.facets
-    cells_at_vertex = np.array([links.links(vertex) for vertex in inner], dtype=np.int32).reshape(
-        len(inner), -1
-    )
-    local = (corners[cells_at_vertex] != np.asarray(inner)[:, None, None]).argmin(
+    vertices: NDArray[np.integer] = np.flatnonzero(np.diff(links.offsets) == 2)
+    if density.facets is not None:
+        vertices = density.facets
+    cells_at_vertex = np.array(
+        [links.links(vertex) for vertex in vertices], dtype=np.int32
+    ).reshape(len(vertices), -1)
+    local = (corners[cells_at_vertex] != np.asarray(vertices)[:, None, None]).argmin(
         axis=2
     )  # the vertex's number in each cell
     for kind in np.unique(local, axis=0):

@@ -80,10 +80,9 @@ class HessianIntegral:
             )
             for t in terms
         }
+        self._prestress: Kernel | None = None
         if prestress:
             self._prestress = Kernel("prestress", prestress, self._points, batches, of_v=True)
-        else:
-            self._prestress = None
         self._replaced = False
         for kernel in [*self._kernels.values(), *([self._prestress] if self._prestress else [])]:
             kernel.begin(self._u, self._r0, self._geometry, sides, log)

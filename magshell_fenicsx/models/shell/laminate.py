@@ -152,7 +152,7 @@ class Laminated(Law):
         ).bending_stiffness
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
-        strain = _Frame(self.direction, up).strain(E)
+        strain = _Frame(self.direction, up).strain_components(E)
         return (
             self.modulus_factor * self.thickness_factor / 2 * _work(_stress(self.A, strain), strain)
         )

@@ -126,7 +126,7 @@ def test_residual_and_tangent(kind: dict[str, bool]) -> None:
     model = shell(0.2, **kind)
     mu = {
         name: MU[name]
-        for name in {t.amplitude for t in model.system.terms} | set(model.factory.free)
+        for name in {t.amplitude for t in model.system.terms} | set(model.factory.free_constants)
         if name
     }
     u = random_displacement(model, 2e-3)
