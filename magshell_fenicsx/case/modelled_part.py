@@ -17,7 +17,7 @@ from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, HeldComponents
 from magshell_fenicsx.parts.imperfections.imperfection import flaws
 from magshell_fenicsx.parts.imperfections.symmetry import leaves
-from magshell_fenicsx.parts.laminate import Laminated
+from magshell_fenicsx.parts.laminate import ShellLaminate
 from magshell_fenicsx.parts.supports.boundary import BoundarySection, EdgeCondition, HeldSection
 from magshell_fenicsx.shape.outline import Outline, reference_shell_of
 from magshell_fenicsx.shape.shell_sections import MeshSurface
@@ -140,7 +140,7 @@ def own_mirror(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | 
         shape_constraint(case.shell, perfect),
         *leaves(imperfections, perfect, one_by_one=one_by_one),
     ]
-    if plies := Laminated.from_laminate(case.context):
+    if plies := ShellLaminate.from_laminate(case.context):
         constraints += plies.leaves(case.context, perfect)
     vectors = [unit(v) for constraint in constraints for v in constraint.vectors]
     if perfect.round and plane.through_e3:

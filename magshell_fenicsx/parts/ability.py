@@ -94,7 +94,7 @@ class Context:
         return missing
 
     def needs(self, key: str, *offers: "Offer", hint: str = "") -> None:
-        """See that the case has what a key needs.
+        """Check that the case has what a key needs.
 
         Parameters
         ----------
@@ -126,7 +126,7 @@ class Context:
         }
 
     def has_modulus(self, what: str) -> None:
-        """See that there is a modulus, which something needs.
+        """Check that there is a modulus, which something needs.
 
         Raises
         ------
@@ -137,7 +137,7 @@ class Context:
             raise ValueError(f"shell.youngs_modulus is needed for {what}")
 
     def has_point(self, key: str, name: str | None) -> None:
-        """See that a point has a place.
+        """Check that a point has a place.
 
         Raises
         ------
@@ -149,7 +149,7 @@ class Context:
             raise ValueError(f"{key}: {name}: name it in points, with its place; there are {named}")
 
     def on_shell(self, key: str, polar: float) -> None:
-        """See that a direction from the centre of a sphere is a degree from its edge at least.
+        """Check that a direction from the centre of a sphere is a degree from its edge at least.
 
         Raises
         ------
@@ -174,7 +174,8 @@ class Context:
 
     @property
     def time_unit(self) -> float | None:
-        """R √(ρ/E), the unit of times: in seconds where the case has units; None without a density."""
+        """R √(ρ/E), the unit of times: in seconds where the case has units; None without a density.
+        """
         density, modulus = self.shell.density, self.shell.youngs_modulus
         return (
             float(self.shell.reference * np.sqrt(density / modulus))
@@ -291,7 +292,7 @@ class Ability:
         return context.section_of(cls)
 
     def refuse_unfit(self, context: Context) -> None:
-        """See that it goes with all else in the case.
+        """Check that it goes with all else in the case.
 
         Raises
         ------
@@ -330,7 +331,7 @@ class Ability:
         return {}
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:
-        """See that it has values at places (n, 3) over R of the undeformed shell.
+        """Check that it has values at places (n, 3) over R of the undeformed shell.
 
         Raises
         ------

@@ -24,7 +24,7 @@ else:
 
 Number = Annotated[float, Field(gt=0)]
 Stiffness = Annotated[float, or_number("newton/metre**3", Number), Field(gt=0)]
-MOST_FACTOR = 1e6
+MAX_FACTOR = 1e6
 
 
 class Foundation(Part):
@@ -78,7 +78,7 @@ class Foundation(Part):
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
         return (
-            [Formulas("foundation.factor", [self.factor], 0.0, MOST_FACTOR, 1.0)]
+            [Formulas("foundation.factor", [self.factor], 0.0, MAX_FACTOR, 1.0)]
             if self.factor
             else []
         )
@@ -94,30 +94,30 @@ class Foundation(Part):
         return springs
 
     def account(self, scales: Scales) -> str:
-        of = ", ".join(
+        stiffnesses = ", ".join(
             f"{name} R²/(E h) = {value:.6g}" for name, value in self._dimensionless(scales).items()
         )
-        return f"Winkler foundation, {of}{', times a formula' if self.factor else ''}"
+        return f"Winkler foundation, {stiffnesses}{', times a formula' if self.factor else ''}"
 
     def _dimensionless(self, scales: Scales) -> dict[str, float]:
-        given = {"k": self.stiffness, "k_t": self.tangential}
+        stiffnesses = {"k": self.stiffness, "k_t": self.tangential}
         return {
             name: k * scales.R**2 / (scales.E * scales.h)
-            for name, k in given.items()
+            for name, k in stiffnesses.items()
             if k is not None
         }
 
 
 def energy(r0: Jet, u: Jet, force: "Expr", factor: "Expr | float" = 1.0) -> "Expr":
-    """The energy density for k = 1."""
+    """Return the energy density for k = 1."""
     return factor * ufl.dot(u.r, kin.normal(r0)) ** 2 / 2
 
 
 def reaction(r0: Jet, u: Jet, force: "Expr", factor: "Expr | float" = 1.0) -> "Expr":
-    """The density of the reaction for k = 1, over the unit of the force."""
+    """Return the density of the reaction for k = 1, over the unit of the force."""
     return -factor * ufl.dot(u.r, kin.normal(r0)) / force
 
 
 def tangential_energy(r0: Jet, u: Jet, factor: "Expr | float" = 1.0) -> "Expr":
-    """The energy density for k_t = 1."""
+    """Return the energy density for k_t = 1."""
     return factor * (ufl.dot(u.r, u.r) - ufl.dot(u.r, kin.normal(r0)) ** 2) / 2

@@ -70,23 +70,23 @@ class GravityStep(BodyForceStep):
         return tuple(self.direction)
 
     @property
-    def _along(self) -> NDArray[np.float64]:
-        """The unit vector (3,)."""
+    def _unit_direction(self) -> NDArray[np.float64]:
+        """The unit vector (3,) of the acceleration."""
         return unit(np.array(self.direction))
 
     def leaves(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
-        return [SymmetryConstraint(vectors=[self._along])]
+        return [SymmetryConstraint(vectors=[self._unit_direction])]
 
     def terms(self, step: ProgrammeStep, context: Context) -> list[OwnTerm]:
-        return [OwnTerm(step.name, energy, (self._along,), of_volume=True)]
+        return [OwnTerm(step.name, weight_energy, (self._unit_direction,), of_volume=True)]
 
     def account(self, step: ProgrammeStep, context: Context) -> str:
-        along = ", ".join(f"{c + 0.0:.3g}" for c in self._along)
-        return f"the shell's weight along [{along}], amplitude {step.name} = ρ g R/E"
+        components = ", ".join(f"{c + 0.0:.3g}" for c in self._unit_direction)
+        return f"the shell's weight along [{components}], amplitude {step.name} = ρ g R/E"
 
 
-def energy(r0: Jet, u: Jet, along: "Expr") -> "Expr":
-    """The energy density for ρ g R/E = 1, zero where nothing has moved."""
-    return -ufl.dot(u.r, along)
+def weight_energy(r0: Jet, u: Jet, direction: "Expr") -> "Expr":
+    """Return the energy density for ρ g R/E = 1, zero where nothing has moved."""
+    return -ufl.dot(u.r, direction)

@@ -93,7 +93,7 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
     key = "joints"
 
     def refuse_unfit(self, context: Context) -> None:
-        """See that the edges are of several shells, each joined once, and that all else goes with
+        """Check that the edges are of several shells, each joined once, and that all else goes with
         joints.
         """
         shells = context.sections.get("shells")
@@ -148,7 +148,8 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
 
 
 def _refuse_too_stiff(number: int, section: JointSection, context: Context) -> None:
-    """See that a spring is not stiffer than rounding allows, beside the softer of its two shells."""
+    """Check that a spring is not stiffer than rounding allows, beside the softer of its two shells.
+    """
     shells, least_stiffness = context.sections["shells"], inf
     for edge in section.edges:
         owners = [name for name in shells if edge == name or edge.startswith(f"{name}_")]

@@ -1,5 +1,4 @@
-"""The kinds of bodies, imperfections and sources: each is a file of its room, with its section and
-what that makes.
+"""The kinds of bodies, imperfections and sources: each is a file of its package, with its section.
 
 A new kind is such a file, named after it, and its name here.
 """
@@ -29,14 +28,14 @@ REGISTERED: dict[str, tuple[str, ...]] = {
 
 
 def section_of(room: str, kind: str) -> type[Section]:
-    """The section of a kind: the one class in its file with this value of the key `kind`."""
+    """Return the section of a kind: the one class in its file with this value of the key `kind`."""
     module = import_module(f"{__package__}.{room}.{kind}")
-    own = (
-        each for each in vars(module).values() if getattr(each, "__module__", "") == module.__name__
+    module_members = (
+        member for member in vars(module).values() if getattr(member, "__module__", "") == module.__name__
     )
-    sections = [each for each in own if isinstance(each, type) and issubclass(each, Section)]
+    sections = [member for member in module_members if isinstance(member, type) and issubclass(member, Section)]
     (section,) = (
-        each for each in sections if kind in get_args(each.model_fields["kind"].annotation)
+        member for member in sections if kind in get_args(member.model_fields["kind"].annotation)
     )
     return section
 
@@ -61,7 +60,7 @@ Sources = Annotated[list[Source], Field(min_length=1, max_length=1000)]
 
 
 class ShellKeys(LawKeys):
-    """What parts add to the keys of every shell."""
+    """The keys of every shell that parts add."""
 
     laminate: LaminateSection | None = None
     """Plies in place of one isotropic material, with law: koiter"""
@@ -89,5 +88,5 @@ class ShellKeys(LawKeys):
         *,
         with_units: bool,
     ) -> None:
-        """See `imperfection.note_sizes`; a shell calls it before its own validation."""
+        """Call `imperfection.note_sizes`, before a shell's own validation."""
         note_sizes(data, handler, info, with_units=with_units)

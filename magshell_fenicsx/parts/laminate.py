@@ -1,5 +1,5 @@
-"""Plies of a shell: their section, the stiffnesses of a laminate, the symmetry that it leaves, and
-its words.
+"""Plies of a shell: their section, the stiffnesses of a laminate, and the symmetry that it
+preserves.
 
 Classical lamination theory (R. M. Jones, *Mechanics of Composite Materials*, 1999, chapters 2 and
 4): each ply is in plane stress and orthotropic, and the layer at the height z above the middle has
@@ -28,10 +28,10 @@ Positive = Annotated[float, Field(gt=0)]
 Modulus = Annotated[float, or_number("pascal", Positive), Field(gt=0)]
 MERIDIAN = "meridian"
 FLAT = ("strip", "plate", "mesh")
-NONE = 1e-12  # of the largest stiffness: what is left where plies cancel
-KEPT = ([0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2])  # 11, 12, 22, 16, 26, 66
-TWISTING = [3, 4]  # of these
-LEAST, MOST = 1e-9, 1e9  # of a modulus over E
+STIFFNESS_TOLERANCE = 1e-12  # over the largest stiffness: what is left where plies cancel
+VOIGT_INDICES = ([0, 0, 1, 0, 1, 2], [0, 1, 1, 2, 2, 2])  # of the entries 11, 12, 22, 16, 26, 66
+TWISTING_ENTRIES = [3, 4]  # 16 and 26
+MIN_MODULUS_RATIO, MAX_MODULUS_RATIO = 1e-9, 1e9  # of a modulus over E
 
 
 class PlySection(Section):
@@ -75,16 +75,16 @@ class PlySection(Section):
     def stiffness(self) -> Array:
         """Q (3, 3) with S = Q (E_11, E_22, 2 E_12) in the directions of `along` and across it."""
         nu21 = self.nu12 * self.E2 / self.E1
-        own = np.array([[self.E1, nu21 * self.E1, 0], [nu21 * self.E1, self.E2, 0], [0, 0, 0]]) / (
+        in_ply_axes = np.array([[self.E1, nu21 * self.E1, 0], [nu21 * self.E1, self.E2, 0], [0, 0, 0]]) / (
             1 - self.nu12 * nu21
         )
-        own[2, 2] = self.G12
+        in_ply_axes[2, 2] = self.G12
         c, s = np.cos(np.radians(self.angle)), np.sin(np.radians(self.angle))
         c, s = (0.0 if abs(v) < 1e-15 else float(v) for v in (c, s))  # 90 degrees are exact
         strain = np.array(
             [[c * c, s * s, c * s], [s * s, c * c, -c * s], [-2 * c * s, 2 * c * s, c * c - s * s]]
         )
-        return np.asarray(strain.T @ own @ strain)
+        return np.asarray(strain.T @ in_ply_axes @ strain)
 
 
 class LaminateSection(Section):
@@ -121,36 +121,38 @@ class LaminateSection(Section):
     @property
     def twists(self) -> bool:
         """Whether a stretch or a bend along or across `along` shears or twists the shell."""
-        return bool(np.any(self.matrices(1.0)[:, TWISTING]))
+        return bool(np.any(self.matrices(1.0)[:, TWISTING_ENTRIES]))
 
     @property
     def isotropic(self) -> bool:
         """Whether all directions are alike."""
-        every = self.matrices(1.0)
-        off = np.stack([every[:, 0] - every[:, 2], (every[:, 0] - every[:, 1]) / 2 - every[:, 5]])
-        return not self.twists and bool(np.all(np.abs(off) <= NONE * np.abs(every).max()))
+        matrices = self.matrices(1.0)
+        differences = np.stack([matrices[:, 0] - matrices[:, 2], (matrices[:, 0] - matrices[:, 1]) / 2 - matrices[:, 5]])
+        return not self.twists and bool(np.all(np.abs(differences) <= STIFFNESS_TOLERANCE * np.abs(matrices).max()))
 
     def matrices(self, E: float) -> Array:
-        """A, B and D (3, 6) over E h, E h² and E h³ as 11, 12, 22, 16, 26, 66; B of the strain E +
-        z k.
+        """Return A, B and D (3, 6) over E h, E h² and E h³, as 11, 12, 22, 16, 26, 66.
+
+        B is that of the strain E + z k.
         """
         fractions = np.array([ply.fraction for ply in self.plies])
         ends = np.concatenate([[0.0], np.cumsum(fractions) / fractions.sum()]) - 0.5
-        Q = np.array([ply.stiffness[KEPT] for ply in self.plies]) / E
+        Q = np.array([ply.stiffness[VOIGT_INDICES] for ply in self.plies]) / E
         stiffnesses = np.array([np.diff(ends**n) @ Q / n for n in (1, 2, 3)])
         sizes = np.abs(Q).max() / np.array([1, 4, 12])[:, None]
-        return np.where(np.abs(stiffnesses) <= NONE * sizes, 0.0, stiffnesses)
+        return np.where(np.abs(stiffnesses) <= STIFFNESS_TOLERANCE * sizes, 0.0, stiffnesses)
 
     def direction(self, geometry: str) -> Array | None:
-        """The unit vector (3,) along whose part in the surface the angle 0 is; None for the
-        meridians.
+        """Return the unit vector (3,) along whose part in the surface the angle 0 is.
+
+        None for the meridians.
         """
         if self.along == MERIDIAN or (self.along is None and geometry not in FLAT):
             return None
         return unit(np.array([1.0, 0.0, 0.0] if self.along is None else self.along))
 
     def refuse_unfit_sizes(self, E: float) -> None:
-        """See that moduli are of sizes that numbers can have beside Young's modulus.
+        """Check that moduli are of sizes that numbers can have beside Young's modulus.
 
         Raises
         ------
@@ -159,37 +161,37 @@ class LaminateSection(Section):
         """
         for i, ply in enumerate(self.plies):
             for key in ("E1", "E2", "G12"):
-                if not LEAST <= (ratio := getattr(ply, key) / E) <= MOST:
+                if not MIN_MODULUS_RATIO <= (ratio := getattr(ply, key) / E) <= MAX_MODULUS_RATIO:
                     raise ValueError(
-                        f"shell.laminate.plies.{i}.{key}: is {ratio:.4g} times youngs_modulus: allowed {LEAST:g} to "
-                        f"{MOST:g}"
+                        f"shell.laminate.plies.{i}.{key}: is {ratio:.4g} times youngs_modulus: allowed {MIN_MODULUS_RATIO:g} to "
+                        f"{MAX_MODULUS_RATIO:g}"
                     )
 
 
 def laminate_of(shell: Any, turn: float) -> "Laminate | None":
-    """That of a shell in a frame turned about e3 (rad); None without plies."""
+    """Return the laminate of a shell in a frame turned about e3 (rad); None without plies."""
     from magshell_fenicsx.models.shell.laminate import Laminate  # the solver takes long to import
 
     section: LaminateSection | None = shell.laminate
     if section is None:
         return None
     direction = section.direction(shell.geometry)
-    turned = None if direction is None else rotation(turn) @ direction
-    return Laminate(section.matrices(shell.youngs_modulus or 1.0), turned, section.isotropic)
+    direction_in_model = None if direction is None else rotation(turn) @ direction
+    return Laminate(section.matrices(shell.youngs_modulus or 1.0), direction_in_model, section.isotropic)
 
 
 @dataclass(frozen=True)
-class Laminated(Ability):
+class ShellLaminate(Ability):
     """The laminate of a shell."""
 
     section: LaminateSection
 
     @classmethod
-    def from_context(cls, context: Context) -> "Laminated | None":
+    def from_context(cls, context: Context) -> "ShellLaminate | None":
         return cls(context.shell.laminate) if context.shell.laminate else None
 
     def refuse_unfit(self, context: Context) -> None:
-        """See that moduli and youngs_modulus go together, and that a mirror plane mirrors the
+        """Check that moduli and youngs_modulus have units alike, and that mirror planes mirror the
         plies.
         """
         section = self.section
@@ -213,42 +215,43 @@ class Laminated(Ability):
             )
 
     def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
-        """All symmetry of isotropic plies, else that of the directions if nothing twists."""
-        return [] if self.section.isotropic else [_leaves(self.section, context.shell.geometry)]
+        """Return all symmetry of isotropic plies, else that of the directions if nothing twists."""
+        return [] if self.section.isotropic else [_laminate_symmetry(self.section, context.shell.geometry)]
 
 
-def _leaves(section: LaminateSection, geometry: str) -> SymmetryConstraint:
-    along = section.direction(geometry)
+def _laminate_symmetry(section: LaminateSection, geometry: str) -> SymmetryConstraint:
+    """Return the symmetry that the directions of the plies preserve."""
+    direction = section.direction(geometry)
     reason = None
     if section.twists:
         reason = "the laminate is not balanced about the meridian, and twists the shell: lay a ply at -angle for each"
-    elif along is not None and np.hypot(*along[:2]) > NONE:
+    elif direction is not None and np.hypot(*direction[:2]) > STIFFNESS_TOLERANCE:
         reason = (
             "the angle 0 of the plies is not along the meridians: give laminate.along: meridian"
         )
 
-    beside = (
+    azimuths = (
         ()
-        if along is None
-        else tuple(float(np.arctan2(along[1], along[0])) + turn for turn in (0.0, np.pi / 2))
+        if direction is None
+        else tuple(float(np.arctan2(direction[1], direction[0])) + turn for turn in (0.0, np.pi / 2))
     )
     if section.twists:
         return SymmetryConstraint(reason, mirrors=no_plane)
     return SymmetryConstraint(
-        reason, mirrors=lambda mirror: mirror.keeps_lines(along), azimuths=beside
+        reason, mirrors=lambda mirror: mirror.keeps_lines(direction), azimuths=azimuths
     )
 
 
 def laminate_account(section: LaminateSection, shell: Any) -> str:
-    """The words of `magshell check`."""
+    """Return the line of `magshell check` on a laminate."""
     A, B, D = section.matrices(shell.youngs_modulus or 1.0)
     angles = "/".join(f"{ply.angle:g}" for ply in section.plies[:12]) + (
         "/..." if len(section.plies) > 12 else ""
     )
     vector = section.direction(shell.geometry)
-    along = "the meridian" if vector is None else f"[{', '.join(f'{v:g}' for v in vector)}]"
+    direction_words = "the meridian" if vector is None else f"[{', '.join(f'{v:g}' for v in vector)}]"
     coupled = f"B up to {np.abs(B).max():.4g} E h^2 couples both" if B.any() else "not coupled"
     return (
-        f"membrane and bending energy of a laminate [{angles}] with 0 along {along}: A11, A22 = {A[0]:.4g}, {A[2]:.4g} "
+        f"membrane and bending energy of a laminate [{angles}] with 0 along {direction_words}: A11, A22 = {A[0]:.4g}, {A[2]:.4g} "
         f"E h, D11, D22 = {D[0]:.4g}, {D[2]:.4g} E h^3, {coupled}"
     )

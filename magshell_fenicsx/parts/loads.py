@@ -1,4 +1,4 @@
-"""All that loads a shell: what the parts of a problem add up to, dimensionless."""
+"""All loads of a shell: what the parts of a problem add up to, dimensionless."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Loads:
-    """What loads the shell; what is empty, None or False has no term and no kernel.
+    """The loads of a shell; what is empty, None or False has no term and no kernel.
 
     Attributes
     ----------
@@ -39,20 +39,22 @@ class Loads:
         outside.
     forces, dead
         Amplitude -> the force, or the dead loads that grow together.
+    own
+        User-defined energies.
     growing
         Amplitude -> imperfections that grow.
     remanence
-        What is magnetised where no field is applied: it loads nothing, and is drawn.
+        The magnetisation where no field is applied: it loads nothing, and is drawn.
     sensors
-        Where its magnetic field is read.
+        Places where its magnetic field is read.
     field_maps
         Grids on which it is computed.
     interaction
         How strongly its magnetised parts act on each other; None if they do not.
     pairs
-        What may touch: the shell itself, or parts of it.
+        The pairs that may touch: the shell itself, or parts of it.
     joints
-        Which edges are joined.
+        The edges that are joined.
     """
 
     pressure: bool = False
@@ -79,24 +81,23 @@ class Loads:
 
     @property
     def displaced(self) -> str | None:
-        """The amplitude with the displacement that the column w_over_h has; None if that is the
-        pole's.
-        """
+        """The amplitude whose displacement is the column w_over_h; None if that is the pole's."""
         return next(iter((*self.forces, *self.dead)), None)
 
 
 def moments(loads: Iterable[DeadLoad]) -> list[EdgeMoment]:
-    """The moments among dead loads."""
+    """Return the moments among dead loads."""
     return [load for load in loads if isinstance(load, EdgeMoment)]
 
 
 def potentials(loads: Iterable[DeadLoad]) -> list[OwnTerm]:
-    """The energies of the dead loads that depend on the deformed place."""
+    """Return the energies of the dead loads that depend on the deformed place."""
     return [load.term for load in loads if isinstance(load, Potential)]
 
 
 def forces(loads: Iterable[DeadLoad]) -> list[PointForce | EdgeForce | AreaForce]:
-    """The forces among dead loads: each does the work of its size times a displacement along
-    itself.
+    """Return the forces among dead loads: each does the work of its size times a displacement.
+
+    The displacement is along the force.
     """
     return [load for load in loads if isinstance(load, PointForce | EdgeForce | AreaForce)]

@@ -153,7 +153,7 @@ class Observables:
         return ()
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
-        """See that the surface has the patches that it names.
+        """Check that the surface has the patches that it names.
 
         Raises
         ------
@@ -166,7 +166,8 @@ class Observables:
         return {}
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
-        """Return columns besides those of every run; `supports` are those with reported reactions."""
+        """Return columns besides those of every run; `supports` are those with reported reactions.
+        """
         return (*self.amplitudes(loads), *self.conjugates(loads).values())
 
     def moments(self, loads: "Loads") -> Sequence[str]:

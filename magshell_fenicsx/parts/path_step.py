@@ -30,7 +30,7 @@ Count = Annotated[
 
 
 class PathStep(Step):
-    """What every load that is followed along a path has in common.
+    """The base of loads that are followed along a path.
 
     Attributes
     ----------
@@ -64,7 +64,7 @@ class PathStep(Step):
     @model_validator(mode="before")
     @classmethod
     def _control_of_the_target(cls, data: Any) -> Any:
-        """A target that is a load is reached by load control, where the default prescribes its
+        """Reach a target that is a load by load control, where the default prescribes its
         conjugate.
         """
         default = cls.model_fields["control"].default
@@ -73,39 +73,39 @@ class PathStep(Step):
         quantities = {
             each.quantity for key, each in cls.targets.items() if data.get(key) is not None
         }
-        way = "arc" if data.get("until") == "limit" else "load"  # load control passes no fold
-        return {**data, "control": way} if quantities == {"load"} else data
+        control = "arc" if data.get("until") == "limit" else "load"  # load control passes no fold
+        return {**data, "control": control} if quantities == {"load"} else data
 
     @model_validator(mode="after")
     def _target_fits_control(self) -> Self:
-        """One target that fits the control with `until: target`, none elsewhere."""
-        given, by = self._given, self.prescribed
-        fitting = [key for key, (quantity, _) in self.targets.items() if by in ("arc", quantity)]
-        for key, value in given.items():
+        """Allow one target that fits the control with `until: target`, none elsewhere."""
+        targets, prescribed = self._given_targets, self.prescribed
+        fitting = [key for key, (quantity, _) in self.targets.items() if prescribed in ("arc", quantity)]
+        for key, value in targets.items():
             if 0 < abs(value) < LEAST_TARGET:
                 raise ValueError(
                     f"{key} is a target and must be zero, or at least {LEAST_TARGET:g} in size"
                 )
         if self.until == "target" and (
-            len(given) > 1 or not set(given) <= set(fitting) or not (given or self._end)
+            len(targets) > 1 or not set(targets) <= set(fitting) or not (targets or self._end)
         ):
             names = " or ".join(fitting) or "another control"
             raise ValueError(
                 f"until: target with control: {self.control} needs {names} (and nothing else) as target; control: arc "
                 f"takes {' or '.join(self.targets)}"
             )
-        onward = self.until == "bifurcation" and self.then == "follow"
-        if onward and len(given) > 1:
-            raise ValueError(f"{' and '.join(given)}: a branch has one target")
-        if self.until == "zero" and given:
-            raise ValueError(f"{next(iter(given))} is a target: it goes with until: target")
-        if self.until == "bifurcation" and given and not onward:
+        follows_branch = self.until == "bifurcation" and self.then == "follow"
+        if follows_branch and len(targets) > 1:
+            raise ValueError(f"{' and '.join(targets)}: a branch has one target")
+        if self.until == "zero" and targets:
+            raise ValueError(f"{next(iter(targets))} is a target: it goes with until: target")
+        if self.until == "bifurcation" and targets and not follows_branch:
             raise ValueError(
-                f"{next(iter(given))} is a target: it goes with until: target or limit"
+                f"{next(iter(targets))} is a target: it goes with until: target or limit"
             )
-        if self.until == "limit" and given:
-            self._refuse_unfit_bound(list(given), fitting)
-        if self.until in ("points", "zero") and by != "arc":
+        if self.until == "limit" and targets:
+            self._refuse_unfit_bound(list(targets), fitting)
+        if self.until in ("points", "zero") and prescribed != "arc":
             why = (
                 "counts steps by arc length"
                 if self.until == "points"
@@ -120,16 +120,16 @@ class PathStep(Step):
             raise ValueError("snap: goes with then: snap")
         return self
 
-    def _refuse_unfit_bound(self, given: list[str], fitting: list[str]) -> None:
-        """See that a target is the end of a way on which the first instability is looked for."""
+    def _refuse_unfit_bound(self, targets: list[str], fitting: list[str]) -> None:
+        """Check that a target is the end of a path on which the first instability is looked for."""
         if "until" not in self.model_fields_set:
             raise ValueError(
-                f"{given[0]} is a target: it goes with until: target; or write until: limit, for the first instability "
+                f"{targets[0]} is a target: it goes with until: target; or write until: limit, for the first instability "
                 "on the way there"
             )
-        if len(given) > 1 or self.prescribed == "load" or given[0] not in fitting:
+        if len(targets) > 1 or self.prescribed == "load" or targets[0] not in fitting:
             raise ValueError(
-                f"{' and '.join(given)}: beside until: limit stands one target, the end of the way, with control: arc"
+                f"{' and '.join(targets)}: beside until: limit stands one target, the end of the way, with control: arc"
             )
 
     @classmethod
@@ -153,7 +153,7 @@ class PathStep(Step):
         return self.then == "follow"
 
     @property
-    def _given(self) -> dict[str, float]:
+    def _given_targets(self) -> dict[str, float]:
         return {key: value for key in self.targets if (value := getattr(self, key)) is not None}
 
     @property
@@ -163,7 +163,7 @@ class PathStep(Step):
 
     @property
     def prescribed(self) -> Control:
-        """What is prescribed step by step, in the words of the solver."""
+        """The quantity that is prescribed step by step, in the words of the solver."""
         if self.control == self.conjugate_control:
             return "conjugate"
         return "load" if self.control == "load" else "arc"
@@ -172,7 +172,7 @@ class PathStep(Step):
     def target(self) -> tuple[Target, float] | None:
         if self.limit_target:
             return None
-        for key, value in self._given.items():
+        for key, value in self._given_targets.items():
             return self.targets[key], value
         if self._end is None or self.until != "target":
             return None
@@ -180,31 +180,29 @@ class PathStep(Step):
 
     @property
     def limit_target(self) -> tuple[Target, float] | None:
-        """With `until: limit`: where the way ends at the latest, and its direction; None
-        without."""
+        """The latest end of the path with `until: limit`, and its direction; None without."""
         if self.until != "limit":
             return None
-        return next(((self.targets[key], value) for key, value in self._given.items()), None)
+        return next(((self.targets[key], value) for key, value in self._given_targets.items()), None)
 
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
-        """Change of the amplitude in the first step, by default one of equal parts; its sign is
-        that of `change`.
+        """Return the change of the amplitude in the first step, by default one of equal parts.
 
         Parameters
         ----------
         change
-            From here to the target; without one 1.
+            From the begin to the target, whose sign the first one has; without a target 1.
         by_load
             Whether it is a change of the amplitude.
         """
         return change / self.points
 
     def step(self, change: float | None, load_start: LoadStart) -> float | None:
-        """The first step of a prescribed conjugate; None: it follows from `first`."""
+        """Return the first step of a prescribed conjugate; None: it follows from `first_change`."""
         return None
 
     def drive(self, load_start: LoadStart) -> Drive:
-        """How the step drives its amplitude from here.
+        """Return how the step drives its amplitude from its begin.
 
         Targets are equal parts of the way: from zero if the amplitude is driven for the first time,
         without those that earlier steps have passed.
@@ -236,7 +234,7 @@ class PathStep(Step):
         )
 
     def load_start(self, step_start: StepStart) -> LoadStart:
-        """Its amplitude where it begins."""
+        """Return its amplitude where it begins."""
         return step_start.load_start()
 
     @property
@@ -254,17 +252,18 @@ class PathStep(Step):
         )
 
     def begin(self, step_start: float) -> float:
-        """Where the equal parts of the first way to a target begin."""
+        """Return where the equal parts of the first way to a target begin."""
         return 0.0
 
     def scale(self, load_start: LoadStart) -> float:
-        """An amplitude that counts as of order one in the arc length."""
+        """Return an amplitude that counts as of order one in the arc length."""
         return 1.0
 
 
 class LoadStep(PathStep):
-    """The base of loads that the amplitude or the arc length leads to their target: no displacement
-    is prescribed.
+    """The base of loads that the amplitude or the arc length leads to their target.
+
+    No displacement is prescribed.
     """
 
     control: Literal["load", "arc"] = "arc"
@@ -273,7 +272,7 @@ class LoadStep(PathStep):
 
 
 class BodyForceStep(LoadStep):
-    """The base of forces by the shell's own mass: in E/R, such of the order of h² bend it."""
+    """The base of forces by the shell's own mass, in E/R: those of the order of h² bend it."""
 
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
         return change / self.points if self.target or self.limit_target else load_start.h**2
@@ -307,13 +306,13 @@ class FactorStep(LoadStep):
 
     @classmethod
     def asked_for(cls, context: Context) -> bool:
-        """Whether the case has what grows."""
+        """Return whether the case asks for the growth."""
         raise NotImplementedError
 
     @classmethod
     def steps_before_load(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
-        driven = loading is not None and cls.amplitude in (loading.amplitude, *loading.drives)
-        if driven or not cls.asked_for(context):
+        is_driven = loading is not None and cls.amplitude in (loading.amplitude, *loading.drives)
+        if is_driven or not cls.asked_for(context):
             return []
         (kind,) = get_args(cls.model_fields["kind"].annotation)
         step = cls.model_validate({"kind": kind})
@@ -339,5 +338,5 @@ class FactorStep(LoadStep):
         return replace(course, until="limit", forbidden=forbidden, label=self.label)
 
     def unstable_alone(self, value: float, course: StepCourse, what: str) -> str:
-        """What is said of an instability before the load, at a value of the amplitude."""
+        """Return the message about an instability before the load, at a value of the amplitude."""
         raise NotImplementedError

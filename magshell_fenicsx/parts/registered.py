@@ -54,7 +54,7 @@ ABILITIES = (  # module here and class in it, of those without a key and a line 
     "magnetism.field_maps.FieldMapping",
     "natural.section.NaturalSection",
     "imperfections.imperfection.Imperfect",
-    "laminate.Laminated",
+    "laminate.ShellLaminate",
     "rubber.Rubber",
     "motion.history.Viscosity",
     "bodies.body.RigidBodies",
@@ -113,7 +113,8 @@ class WithOwnTerms(Section):
     _origin: Origin = PrivateAttr(default=Origin())
 
     def written_as(self, origin: Origin) -> Self:
-        """Return the case, with the places of its keys for messages that it does not make itself."""
+        """Return the case, with the places of its keys for messages that it does not make itself.
+        """
         self._origin = origin
         return self
 

@@ -1,5 +1,6 @@
-"""The law of a shell's material: small strains, or rubber of three kinds, with what each is not
-for, and its words.
+"""The keys of a shell that choose its law: small strains, or rubber of three kinds.
+
+Each law says what it is not for, and its line of `magshell check`.
 """
 
 from dataclasses import dataclass
@@ -39,10 +40,10 @@ class LawKeys(Section):
                 f"mu, alpha: lists, one as long as the other, of law: ogden alone; here the law is {self.law}, with "
                 f"{len(mu)} and {len(alpha)} numbers"
             )
-        for i, (one, exponent) in enumerate(zip(mu, alpha, strict=True)):
-            if not (isfinite(one) and one * exponent > 0):
+        for i, (modulus, exponent) in enumerate(zip(mu, alpha, strict=True)):
+            if not (isfinite(modulus) and modulus * exponent > 0):
                 raise ValueError(
-                    f"mu.{i}: {one:g}: mu alpha must be positive; here alpha is {exponent:g}"
+                    f"mu.{i}: {modulus:g}: mu alpha must be positive; here alpha is {exponent:g}"
                 )
         if self.law != "koiter" and (nu := getattr(self, "poisson_ratio", 0.5)) != 0.5:
             raise ValueError(
@@ -54,8 +55,8 @@ class LawKeys(Section):
     def rubber(self) -> Rubberlike | None:
         """C01/(C10 + C01); of Ogden's law all mu over E, and all alpha; None of Koiter's law."""
         if self.mu and self.alpha:
-            whole = 3 / 2 * sum(mu * alpha for mu, alpha in zip(self.mu, self.alpha, strict=True))
-            return tuple(mu / whole for mu in self.mu), tuple(self.alpha)
+            young_ratio = 3 / 2 * sum(mu * alpha for mu, alpha in zip(self.mu, self.alpha, strict=True))
+            return tuple(mu / young_ratio for mu in self.mu), tuple(self.alpha)
         ratio = self.mooney or 0.0
         return None if self.law == "koiter" else ratio / (1 + ratio)
 
@@ -68,30 +69,30 @@ class Rubber(Ability):
 
     @classmethod
     def from_context(cls, context: Context) -> "Rubber | None":
-        """The first of several shells that is of rubber."""
+        """Return the first of several shells that is of rubber."""
         laws = (law for law in laws_of(context) if law not in ("koiter", "laminate"))
         return next((cls(law) for law in laws), None)
 
     def refuse_unfit(self, context: Context) -> None:
-        """See that Ogden's law is that of a shell."""
+        """Check that Ogden's law is that of a shell."""
         if self.law == "ogden":
             context.needs("law: ogden", "a mid-surface")
 
     def withdraws(self, context: Context) -> dict[Offer, str]:
-        """Rubber keeps its volume."""
+        """Return that rubber keeps its volume, so that its thickness changes."""
         return {
             "a thickness that does not change": f"shell.law: {self.law} makes the shell thinner: take koiter"
         }
 
 
 def laws_of(context: Context) -> list[str]:
-    """The words for the laws of all shells."""
-    several = getattr(context.shell, "assembly", None)  # of a mesh in pieces alone
-    return [*several.laws.values()] if several else [context.shell.law]
+    """Return the names of the laws of all shells."""
+    assembly = getattr(context.shell, "assembly", None)  # of a mesh in pieces alone
+    return [*assembly.laws.values()] if assembly else [context.shell.law]
 
 
 def law_account(rubber: Rubberlike | None) -> str:
-    """The words of `magshell check`; see `LawKeys.rubber`."""
+    """Return the line of `magshell check` on a law, see `LawKeys.rubber`."""
     if rubber is None:
         return "membrane and bending energy"
     if isinstance(rubber, tuple):

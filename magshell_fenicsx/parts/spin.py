@@ -24,7 +24,7 @@ SQUARED = Unit("E/(ρ R²)", "1/s²", "per_s2", "1/s²", lambda g: g.E / (g.rho 
 
 
 def _of_angles(value: Any) -> Any:
-    """Hertz would be read as radians per second."""
+    """Refuse hertz, which would be read as radians per second."""
     if isinstance(value, str) and "z" in value.lower():
         raise ValueError(f"{value}: give rpm or rad/s, which say what turns")
     return value
@@ -58,7 +58,7 @@ class SpinStep(BodyForceStep):
     """Target of the angular speed ω, as "3000 rpm" or "300 rad/s" where the shell has a density [√(E/ρ)/R]"""
 
     @property
-    def _given(self) -> dict[str, float]:
+    def _given_targets(self) -> dict[str, float]:
         return {} if self.speed is None else {"speed": self.speed**2}
 
     def of_history(self, value: float) -> float:
@@ -77,5 +77,5 @@ class SpinStep(BodyForceStep):
 
 
 def energy(r0: Jet, u: Jet) -> "Expr":
-    """The energy density for ρ ω² R²/E = 1, zero where nothing has moved."""
+    """Return the energy density for ρ ω² R²/E = 1, zero where nothing has moved."""
     return -sum(u.r[i] * (r0.r[i] + u.r[i] / 2) for i in range(2))

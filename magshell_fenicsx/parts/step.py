@@ -42,7 +42,7 @@ Array = NDArray[np.float64]
 
 
 class Step(Section):
-    """What every step has in common.
+    """The base of all steps.
 
     Attributes
     ----------
@@ -90,7 +90,7 @@ class Step(Section):
 
     @property
     def place(self) -> Any:
-        """What distinguishes two loads of the same kind."""
+        """The place or direction that distinguishes two loads of the same kind."""
         return None
 
     @property
@@ -100,12 +100,12 @@ class Step(Section):
 
     @property
     def limit_target(self) -> tuple[Target, float] | None:
-        """Where a way to the first instability ends at the latest, as `target`; None without."""
+        """The latest end of the path to the first instability, as `target`; None without."""
         return None
 
     @property
     def ends(self) -> Until:
-        """Where it ends, in the words of a path."""
+        """The event at which it ends, as a path has it."""
         return "target"
 
     @property
@@ -115,7 +115,7 @@ class Step(Section):
 
     @property
     def drives(self) -> tuple[str, ...]:
-        """Amplitudes of other steps that it drives too."""
+        """The amplitudes of other steps that it drives too."""
         return ()
 
     @property
@@ -125,7 +125,7 @@ class Step(Section):
 
     @property
     def branch_points(self) -> int:
-        """How many steps it follows each direction of a branch; 0 if none is followed."""
+        """The number of steps in each direction of a branch; 0 if none is followed."""
         return 0
 
     @property
@@ -135,16 +135,16 @@ class Step(Section):
 
     @property
     def wants_sensitivities(self) -> bool:
-        """Whether the load at its fold is derived by what is given."""
+        """Whether the load at its fold is derived by the numbers of the case."""
         return False
 
     def size(self, context: Context) -> float:
-        """What a target of one is of the amplitude."""
+        """Return the amplitude at a target of one."""
         return 1.0
 
     @classmethod
     def level(cls, text: str, context: Context) -> float:
-        """A value of a history with a unit as a number, as the target of its load is without one.
+        """Return a value of a history with a unit as a number, as a target of the load would be.
 
         Raises
         ------
@@ -154,38 +154,39 @@ class Step(Section):
         raise ValueError("its values have no unit: give a number")
 
     def of_history(self, value: float) -> float:
-        """The amplitude at a value of a history, which is as the target is."""
+        """Return the amplitude at a value of a history, which is as a target."""
         return value
 
     def in_history(self, amplitude: float) -> float:
-        """The value of a history at an amplitude."""
+        """Return the value of a history at an amplitude."""
         return amplitude
 
     def course(self, step_start: StepStart) -> StepCourse:
-        """How it goes on."""
+        """Return how the step goes on from its begin."""
         raise NotImplementedError
 
     def curves(self, step_start: StepStart) -> tuple[Curves, float] | None:
-        """See `StepCourse`, from any state of the step."""
+        """Return the `curves` of its course, from any state of the step."""
         return None
 
     def expected_end(
         self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float
     ) -> ExpectedEnd | None:
-        """Its end, if its target does not say it."""
+        """Return its end, if its target does not say it."""
         return None
 
     def changes(self, name: str, mu: Iterable[str]) -> set[str]:
-        """Which of all amplitudes it changes as it is given; `name` is its own."""
+        """Return the amplitudes among all that it changes as it is given; `name` is its own."""
         return {name}
 
     def by_conjugate(self, *, at_target: bool) -> bool:
-        """Whether the conjugate is prescribed at its points, or at its target."""
+        """Return whether the conjugate is prescribed at its points, or at its target."""
         return False
 
     def on_perfect(self, *, last: bool) -> "Step | None":
-        """The step on the shell without imperfections, to the first instability if it is the last;
-        None without.
+        """Return the step on the shell without imperfections; None without.
+
+        The last one goes to the first instability.
         """
         return self
 
@@ -196,26 +197,28 @@ class Step(Section):
 
     @property
     def released_by(self) -> SnapSection | None:
-        """How the shell is released at its end; None if it is not."""
+        """The section on how the shell is released at its end; None if it is not."""
         return None
 
     @classmethod
     def steps_before_load(
         cls, context: Context, loading: "Step | None"
     ) -> list[tuple[str, "Step"]]:
-        """The steps of this kind that come before the only load of a case, each with the key that
-        asks for it.
+        """Return the steps of this kind that come before the only load of a case.
+
+        Each has the key that asks for it.
         """
         return []
 
     def name_in(self, context: Context, loads: Sequence["Step"]) -> str | None:
-        """The name of its amplitude beside all loads of a case; None: `amplitude`, with a number
-        from the second on.
+        """Return the name of its amplitude beside all loads of a case.
+
+        None: `amplitude`, with a number from the second on.
         """
         return None
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
-        """See that the case has what the step needs.
+        """Check that the case has what the step needs.
 
         Raises
         ------
@@ -224,30 +227,29 @@ class Step(Section):
         """
 
     def terms(self, step: ProgrammeStep, context: Context) -> list[OwnTerm]:
-        """Energies with its amplitude, from nothing but their densities; see `OwnTerm`."""
+        """Return energies with its amplitude, from nothing but their densities; see `OwnTerm`."""
         return []
 
     def multiplies(self, step: ProgrammeStep, context: Context) -> list[str]:
-        """Keys below `shell` of the imperfections that it multiplies."""
+        """Return keys below `shell` of the imperfections that it multiplies."""
         return []
 
     def account(self, step: ProgrammeStep, context: Context) -> str:
-        """The line of `magshell check`, if nothing else says it."""
+        """Return its line of `magshell check`, if nothing else says it."""
         return ""
 
     def warning(self, step: ProgrammeStep) -> str | None:
-        """What is often meant in another way, with the key; None if nothing is."""
+        """Return a warning with the key, where a different load is often meant; None without."""
         return None
 
     def leaves(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
-        """The symmetry that it leaves of a shell."""
+        """Return the symmetry that it preserves of a shell."""
         return []
 
     def place_on(self, step: ProgrammeStep, context: Context, outline: "Outline") -> Array | None:
-        """The one place (3,) over R where it is, in the frame of the case; None if it is not at
-        one.
+        """Return the one place (3,) over R where it is, in the frame of the case; None without.
 
         Raises
         ------
@@ -257,14 +259,14 @@ class Step(Section):
         return None
 
     def chart_of(self, place: Array, outline: "Outline", turn: float, *, half: bool) -> Array:
-        """That place in the chart of a frame turned about e3 (rad)."""
+        """Return its place in the chart of a frame turned about e3 (rad)."""
         chart = outline.inverse(rotation(turn) @ place)
         return outline.on_half(chart) if half else chart
 
     def refuse_unfit_place(
         self, step: ProgrammeStep, context: Context, outline: "Outline", at: Array
     ) -> None:
-        """See that there is room for it around its place in the chart.
+        """Check that there is room for it around its place in the chart.
 
         Raises
         ------
@@ -273,37 +275,38 @@ class Step(Section):
         """
 
     def named_points(self) -> list[str]:
-        """The named points at which it is concentrated."""
+        """Return the named points at which it is concentrated."""
         return []
 
     @classmethod
     def mesh_features(
         cls, loads: Sequence[Self], place: Array, sizing: "SizingContext"
     ) -> list[Feature]:
-        """Small elements around a place in the chart with these loads of the kind."""
+        """Return small elements around a place in the chart with loads of this kind."""
         return []
 
     def growth(self, sizing: "SizingContext") -> float:
-        """How fast elements may grow away from small ones."""
+        """Return how fast elements may grow away from small ones."""
         return 0.4
 
     def rim(self, sizing: "SizingContext") -> float:
-        """Size of elements along the edge of a curved surface, over sqrt(Rh)."""
+        """Return the size of elements along the edge of a curved surface, over sqrt(Rh)."""
         return 1.4
 
     def largest(self, sizing: "SizingContext") -> float | None:
-        """Largest size of elements on a curved disc, over R; None: as without it."""
+        """Return the largest size of elements on a curved disc, over R; None: as without it."""
         return None
 
     def formulas(self, key: str, context: Context) -> Iterable[Formulas]:
-        """What varies with the undeformed place."""
+        """Return its formulas of the undeformed place."""
         return []
 
     @classmethod
     def implied(cls) -> dict[str, Any]:
-        """The same, where another step holds the amplitude of this kind or drives it in time."""
+        """Return `adds` where another step holds the amplitude of this kind or drives it in time.
+        """
         return {}
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
-        """Fields of the model's `Loads`, to which those of other parts are added."""
+        """Return fields of the model's `Loads`, to which those of other abilities are added."""
         return {}

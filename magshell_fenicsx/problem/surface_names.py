@@ -15,7 +15,7 @@ from magshell_fenicsx.models.shell.parameters import Condition, HeldComponents
 from magshell_fenicsx.models.shell.thickness import Thickness, patch_of
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.ability import Context
-from magshell_fenicsx.parts.pressure.openings import moving, without_potential
+from magshell_fenicsx.parts.pressure.openings import moving_edges, without_potential
 from magshell_fenicsx.parts.registered import OBSERVABLES, parts_of
 from magshell_fenicsx.parts.supports.supports import refuse_unknown
 from magshell_fenicsx.quantities.registry import RESERVED_NAMES
@@ -139,7 +139,7 @@ def open_edges(
             for name, pairs in pairs_of_edges.items()
         }
     return without_potential(
-        moving(pairs_of_edges, conditions),
+        moving_edges(pairs_of_edges, conditions),
         conditions,
         lambda name: patch.embedding(patch.nodes[np.unique(patch.edges[name])]),
     )

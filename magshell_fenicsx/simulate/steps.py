@@ -8,7 +8,7 @@ from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import StepOptions
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.parts.bodies.contact_step import contact_step_options as along_contact
-from magshell_fenicsx.parts.pressure.pressure import Enclosed
+from magshell_fenicsx.parts.pressure.pressure import EnclosedGas
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.step_course import Drive, Gas, GasSection, StepCourse, StepStart
 from magshell_fenicsx.quantities.registry import OWN_MODES
@@ -200,12 +200,12 @@ def held_conjugates_of_step(
     return held
 
 
-def enclosed_gas(scene: Scene, section: GasSection, state: State) -> Enclosed:
+def enclosed_gas(scene: Scene, section: GasSection, state: State) -> EnclosedGas:
     """Return the gas that is closed in at an equilibrium."""
     problem, system, unit = scene.problem, scene.model.system, scene.conjugate_unit("pressure")
     q = -system.potential(state.u, state.mu, "pressure")
     shell, p_c = problem.context.shell, problem.material.classical_pressure
-    return Enclosed(section, shell, p_c, unit, state.mu["pressure"], q)
+    return EnclosedGas(section, shell, p_c, unit, state.mu["pressure"], q)
 
 
 def _drive(scene: Scene, step: ProgrammeStep, state: State) -> Drive:

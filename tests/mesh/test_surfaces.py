@@ -19,7 +19,7 @@ from magshell_fenicsx.input.source import CaseError, Source
 from magshell_fenicsx.mesh.midsurface import Midsurface
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.models.shell import kinematics as kin
-from magshell_fenicsx.parts.pressure.openings import moving
+from magshell_fenicsx.parts.pressure.openings import moving_edges
 from magshell_fenicsx.problem.memory import refuse_beyond_memory
 from magshell_fenicsx.simulate.scene import build_midsurface
 
@@ -472,7 +472,7 @@ def open_to_pressure(shell: dict[str, Any], boundary: dict[str, Any]) -> list[st
         name: {tuple(pair) for pair in np.sort(edge, axis=1).tolist()}
         for name, edge in edges.items()
     }
-    return moving(sides, problem.conditions)
+    return moving_edges(sides, problem.conditions)
 
 
 @pytest.mark.parametrize(("shell", "boundary", "edge"), OPEN)

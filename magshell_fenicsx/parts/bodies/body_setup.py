@@ -260,6 +260,6 @@ def account(context: Context, loads: Loads) -> Account:
     words = [
         f"body {contact.body}: {bodies[contact.body].words(with_units=with_units)} without friction, "
         f"stiffness k R²/(E h) = {contact.stiffness:.4g}"
-        for contact in loads.contact_bodies
+        for contact in loads.contacts
     ]
     return Account(words)

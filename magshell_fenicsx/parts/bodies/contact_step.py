@@ -86,7 +86,7 @@ class ContactSection(PathStep):
         return "load" if self.control == "approach" else super().prescribed
 
     def course(self, step_start: StepStart) -> StepCourse:
-        return replace(super().course(step_start), contact_step_options=contact_step_options)
+        return replace(super().course(step_start), finer=contact_step_options)
 
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
         return change / self.points if by_load else copysign(FIRST_APPROACH, -change)

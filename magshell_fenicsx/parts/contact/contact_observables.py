@@ -55,7 +55,7 @@ class ContactObservables(Observables):
         return tuple(pair.setting for pair in loads.pairs)
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
-        """See that the surface has the patches of all pairs, and that no place is in two pairs.
+        """Check that the surface has the patches of all pairs, and that no place is in two pairs.
 
         Raises
         ------

@@ -151,7 +151,7 @@ def _values_of_shells(name: str, values: Mapping[str, float]) -> list[float]:
 
 
 def refuse_unfit_pairs(sections: Sequence[GivenPair], context: Context) -> None:
-    """See that a model can have these contacts.
+    """Check that a model can have these contacts.
 
     Raises
     ------

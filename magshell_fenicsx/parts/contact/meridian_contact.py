@@ -350,7 +350,7 @@ class MeridianContact(ContactTerm):
         return gap_between_supports(held, self._nodes, self._r0, u, self._half, may_touch)
 
     def refuse_overlap(self) -> None:
-        """See that the shells do not overlap undeformed.
+        """Check that the shells do not overlap undeformed.
 
         Raises
         ------

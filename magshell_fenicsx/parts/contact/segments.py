@@ -504,7 +504,7 @@ class Cuts:
         )
         return points, self._segments.normals(r)
 
-    def number_of(self, u: Array, divisions: int) -> float:
+    def number_of_displacement(self, u: Array, divisions: int) -> float:
         """Return the number of a displacement and its divisions, the same for the same ones."""
         digest = hashlib.blake2b(np.array(u).tobytes(), digest_size=HASH_BYTES).digest()
         number = float(DIVISION_LEVELS * int.from_bytes(digest) + divisions)

@@ -488,7 +488,7 @@ class SurfaceContact(ContactTerm):
             return None
         points, counted = self._with_cuts_at(u, self._divisions)
         is_better = self._astray_share(points, counted) < astray / 2
-        return self._cuts.number_at_key(u, self._divisions) if is_better else None
+        return self._cuts.number_of_displacement(u, self._divisions) if is_better else None
 
     def finer_cuts(self) -> float | None:
         """Return the number of cuts here whose triangles in contact are divided once more.
@@ -499,11 +499,11 @@ class SurfaceContact(ContactTerm):
         places, *_ = self._active_set()
         if divisions == MAX_DIVISIONS or not self._comm.allreduce(len(places.point)):
             return None
-        return self._cuts.number_at_key(u, divisions + 1)
+        return self._cuts.number_of_displacement(u, divisions + 1)
 
     def present_cuts(self) -> float:
         """Return the number of the present displacement, for cuts there; collective."""
-        return self._cuts.number_at_key(self._displacement(), self._divisions)
+        return self._cuts.number_of_displacement(self._displacement(), self._divisions)
 
     @property
     def _divisions(self) -> int:

@@ -1,4 +1,4 @@
-"""Dead loads, which keep their direction."""
+"""The step `kind: dead`: loads that keep their direction, and the observables of forces."""
 
 from collections.abc import Iterable, Sequence
 from math import copysign, sqrt
@@ -51,7 +51,7 @@ MAX_COMPONENT = 1e30
 
 
 def _or_formula(unit: str) -> Any:
-    """A number, text with a unit, or a formula of x, y, z."""
+    """Return a validator of a number, text with a unit, or a formula of x, y, z."""
 
     def read(value: Any) -> Any:
         if isinstance(value, str) and is_formula(value):
@@ -119,19 +119,19 @@ class DeadLoadSection(Section):
                 "a load is at a point, on an edge, or on a part of the surface: give one of at, edge, over"
             )
         quantities = {key for keys in fitting.values() for key in keys}
-        given = sorted(key for key in quantities if getattr(self, key) is not None)
-        if len(given) != 1 or given[0] not in fitting[places[0]]:
+        given_keys = sorted(key for key in quantities if getattr(self, key) is not None)
+        if len(given_keys) != 1 or given_keys[0] not in fitting[places[0]]:
             raise ValueError(f"with {places[0]} goes one of {', '.join(fitting[places[0]])}")
-        value = getattr(self, given[0])
+        value = getattr(self, given_keys[0])
         if not (any(value) if isinstance(value, list) else value):
-            raise ValueError(f"{given[0]}: is zero")
+            raise ValueError(f"{given_keys[0]}: is zero")
         if self.potential is not None and self.over != "all":
             raise ValueError(f"potential: goes with over: all, not with {self.over}")
         return self
 
     @property
     def vector(self) -> list[Varying] | None:
-        """Its components, if it has a direction in space."""
+        """The components of a load with a direction in space; None of others."""
         return next(
             (list(v) for v in (self.force, self.per_length, self.per_area) if v is not None), None
         )
@@ -206,8 +206,8 @@ class DeadSection(PathStep):
             context.has_point(f"{step.key}.loads.{i}.at", load.at)
 
     def warning(self, step: ProgrammeStep) -> str | None:
-        """A pressure by formula keeps its direction, where that of a fluid would turn with the
-        surface."""
+        """Return that a pressure by formula keeps its direction, where that of a fluid would turn.
+        """
         varying = next(
             (i for i, load in enumerate(self.loads) if isinstance(load.pressure, str)), None
         )
@@ -228,17 +228,17 @@ class DeadSection(PathStep):
     def leaves(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
-        R, span = context.shell.reference, outline.meridian
-        fixed = [load for load in self.loads if not load.varies]
+        R, meridian = context.shell.reference, outline.meridian
+        constant_loads = [load for load in self.loads if not load.varies]
         forces = [
-            np.array(v) for load in fixed for v in (load.force, load.per_length, load.per_area) if v
+            np.array(v) for load in constant_loads for v in (load.force, load.per_length, load.per_area) if v
         ]
         places = [np.array(context.points[load.at]) / R for load in self.loads if load.at]
         vectors = [unit(v) for v in (*forces, *places)]
         potentials = [load.potential for load in self.loads if load.potential]
-        x = outline.sample() if potentials or len(fixed) < len(self.loads) else np.zeros((0, 3))
-        whole = {None, "all", *(piece.name for piece in (span.shell_meridians if span else ()))}
-        patches = any(load.over not in whole for load in self.loads)
+        x = outline.sample() if potentials or len(constant_loads) < len(self.loads) else np.zeros((0, 3))
+        all_patches = {None, "all", *(shell_meridian.name for shell_meridian in (meridian.shell_meridians if meridian else ()))}
+        has_patches = any(load.over not in all_patches for load in self.loads)
 
         def mirrors(mirror: Mirror) -> bool:
             on_plane = all(abs(float(mirror.signed_distance(place))) < ROUNDING for place in places)
@@ -249,22 +249,22 @@ class DeadSection(PathStep):
                 any(is_image(a, b, mirror, x, R) for b in self.loads) for a in self.loads
             )
 
-        why = "a patch is loaded" if patches else None
+        reason = "a patch is loaded" if has_patches else None
         if any(tilted(v) for v in vectors):
-            why = "a load is not along e3, or off the axis"
-        around = (
-            all(load_turns(load, span, R) for load in self.loads if load.varies) if span else True
+            reason = "a load is not along e3, or off the axis"
+        is_axisymmetric = (
+            all(load_turns(load, meridian, R) for load in self.loads if load.varies) if meridian else True
         )
-        if span and not (
-            around and all(scalar_is_axisymmetric(text, span, R) for text in potentials)
+        if meridian and not (
+            is_axisymmetric and all(scalar_is_axisymmetric(text, meridian, R) for text in potentials)
         ):
-            why = why or "a load differs around e3"
+            reason = reason or "a load differs around e3"
         energies = [
             potential(f"potential_{i}", text, np.eye(3), context.scales)
             for i, text in enumerate(potentials)
         ]
         return [
-            SymmetryConstraint(why, vectors, mirrors),
+            SymmetryConstraint(reason, vectors, mirrors),
             *(energy.leaves(outline) for energy in energies),
         ]
 
@@ -292,17 +292,17 @@ class DeadSection(PathStep):
             for name in ("per_length", "per_area", "pressure"):
                 value = getattr(load, name)
                 values = value if isinstance(value, list) else [value]
-                most = MAX_COMPONENT * (
+                largest = MAX_COMPONENT * (
                     scales.E * scales.h / (scales.R if name != "per_length" else 1.0)
                 )
-                yield Formulas(f"{key}.loads.{i}.{name}", values, -most, most, scales.R, load=True)
+                yield Formulas(f"{key}.loads.{i}.{name}", values, -largest, largest, scales.R, load=True)
             if load.potential:  # of the deformed place: the undeformed one is looked at
-                most = MAX_COMPONENT * scales.E * scales.h
+                largest = MAX_COMPONENT * scales.E * scales.h
                 yield Formulas(
                     f"{key}.loads.{i}.potential",
                     [load.potential],
-                    -most,
-                    most,
+                    -largest,
+                    largest,
                     scales.R,
                     deformed=True,
                 )
@@ -314,24 +314,24 @@ class DeadSection(PathStep):
 
         mirror = modelled.mirror
         loads = (load for load in self.loads if not mirror or load.edge not in mirror.removed_edges)
-        made = (
+        dead_loads = (
             dead_load(load, f"{step.name}_potential_{i}", context, modelled)
             for i, load in enumerate(loads)
         )
-        return {"dead": {step.name: tuple(made)}}
+        return {"dead": {step.name: tuple(dead_loads)}}
 
 
-def load_turns(load: DeadLoadSection, span: MeridianChart, R: float) -> bool:
-    """Whether a load by formula is the same all around e3."""
+def load_turns(load: DeadLoadSection, meridian: MeridianChart, R: float) -> bool:
+    """Return whether a load by formula is the same all around e3."""
     if load.vector is None:
-        return scalar_is_axisymmetric(str(load.pressure), span, R)
-    return vector_is_axisymmetric([str(v) for v in load.vector], span, R)
+        return scalar_is_axisymmetric(str(load.pressure), meridian, R)
+    return vector_is_axisymmetric([str(v) for v in load.vector], meridian, R)
 
 
 def is_image(
     load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: Array, R: float
 ) -> bool:
-    """Whether the plane mirrors one load to the other; x are places (n, 3) for formulas."""
+    """Return whether the plane mirrors one load to the other; x are places (n, 3) for formulas."""
     if load.varies or other.varies:
         return _mirrored_formula(load, other, mirror, R * x, R * mirror.image(x))
     edge = load.edge and mirror.image_of_edge(load.edge)
@@ -344,12 +344,12 @@ def is_image(
         other.potential is None,
     ):
         return False
-    for own, others in (
+    for vector, other_vector in (
         (getattr(x, key) for x in (load, other)) for key in ("force", "per_length", "per_area")
     ):
-        if (own is None) != (others is None):
+        if (vector is None) != (other_vector is None):
             return False
-        if own and np.abs(mirror.reflection @ own - others).max() > 1e-10 * np.linalg.norm(own):
+        if vector and np.abs(mirror.reflection @ vector - other_vector).max() > 1e-10 * np.linalg.norm(vector):
             return False
     return True
 
@@ -371,25 +371,26 @@ def _mirrored_formula(
 
 
 def potential(name: str, text: str, Q: Array, scales: Scales) -> OwnTerm:
-    """The energy of a load that depends on the deformed place, zero where nothing has moved."""
+    """Return the energy of a load that depends on the deformed place, zero where nothing has moved.
+    """
 
-    def at(r: "Expr", scale: "Expr", size: "Expr") -> "Expr":
+    def energy_at(r: "Expr", scale: "Expr", energy_scale: "Expr") -> "Expr":
         x = [scale * sum(float(Q[j, i]) * r[j] for j in range(3) if Q[j, i]) for i in range(3)]
-        return size * symbolic(text, symbolic_functions(), *x)
+        return energy_scale * symbolic(text, symbolic_functions(), *x)
 
-    def density(r0: Jet, u: Jet, scale: "Expr", size: "Expr") -> "Expr":
-        return at(r0.r + u.r, scale, size) - at(r0.r, scale, size)
+    def density(r0: Jet, u: Jet, scale: "Expr", energy_scale: "Expr") -> "Expr":
+        return energy_at(r0.r + u.r, scale, energy_scale) - energy_at(r0.r, scale, energy_scale)
 
     return OwnTerm(name, density, (scales.R, 1 / (scales.E * scales.h)))
 
 
 def also_displaced(loads: "Loads") -> tuple[str, ...]:
-    """Amplitudes with a displacement besides the one of the column w_over_h."""
+    """Return amplitudes with a displacement besides the one of the column w_over_h."""
     return tuple(name for name in (*loads.forces, *loads.dead) if name != loads.displaced)
 
 
 class ForcesObservables(Observables):
-    """Factors of forces and dead loads, and displacements along them."""
+    """The factors of forces and dead loads, and displacements along them."""
 
     quantities = (
         Quantity("load_factor", "load factor", "Common factor of all dead loads.", "load"),
@@ -406,9 +407,9 @@ class ForcesObservables(Observables):
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
         model, loads = view.model, view.loads
         factors = {amplitude(name).column: state.mu[name] for name in self.amplitudes(loads)}
-        along = also_displaced(loads)
+        displaced = also_displaced(loads)
         return factors | {
-            f"w_{name}_over_h": model.loaded_deflection(state.u, name) / view.h for name in along
+            f"w_{name}_over_h": model.loaded_deflection(state.u, name) / view.h for name in displaced
         }
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
@@ -422,7 +423,7 @@ class ForcesObservables(Observables):
                 patch_of(surface.patches, load.patch)
 
     def conjugate_unit(self, view: ModelView, name: str) -> float | None:
-        """w/h of a force, the shell's length of dead loads."""
+        """Return w/h of a force, the shell's length of dead loads."""
         if name in view.loads.forces:
             return view.model.force_unit * view.h
         return (

@@ -100,8 +100,8 @@ class IndentationSection(PathStep):
             return np.asarray(np.array(context.points[at.point]) / context.shell.reference)
         polar = radians(at.polar)
         if not outline.sphere and polar:
-            where = "at its centre or tip, polar: 0, or at a point of points"
-            raise CaseError(f"{key}.at.polar: {at.polar:g}: a {geometry} is loaded {where}")
+            allowed_places = "at its centre or tip, polar: 0, or at a point of points"
+            raise CaseError(f"{key}.at.polar: {at.polar:g}: a {geometry} is loaded {allowed_places}")
         if outline.highest is None or not (outline.disc or geometry == "strip"):
             raise CaseError(f"{key}.at: a {geometry} has no pole: give {{point: NAME}}, of points")
         if not outline.sphere:
@@ -124,14 +124,14 @@ class IndentationSection(PathStep):
         )
 
     def refuse_unfit_place(
-        self, step: ProgrammeStep, context: Context, outline: "Outline", at: Array
+        self, step: ProgrammeStep, context: Context, outline: "Outline", chart_place: Array
     ) -> None:
         width = getattr(context.shell, "width", None) if context.shell.geometry == "strip" else None
-        room = outline.edge - float(np.hypot(*at[:2])) if outline.sphere else min(1.0, width or 1.0)
-        most = room * context.shell.R_over_h
-        if self.patch and not 0.3 <= self.patch <= most:
+        room = outline.edge - float(np.hypot(*chart_place[:2])) if outline.sphere else min(1.0, width or 1.0)
+        largest = room * context.shell.R_over_h
+        if self.patch and not 0.3 <= self.patch <= largest:
             raise CaseError(
-                f"{step.key}.patch: {self.patch:g}: allowed are 0 for a point, or 0.3 to {most:.4g}, where it "
+                f"{step.key}.patch: {self.patch:g}: allowed are 0 for a point, or 0.3 to {largest:.4g}, where it "
                 "reaches the edge"
             )
 
@@ -139,7 +139,10 @@ class IndentationSection(PathStep):
     def mesh_features(
         cls, loads: Sequence[Self], place: Array, sizing: SizingContext
     ) -> list[Feature]:
-        """The dent too: by mirror buckling the radius of its ridge is about sqrt(2 R w)."""
+        """Return small elements in the dent too.
+
+        By mirror buckling the radius of its ridge is about sqrt(2 R w).
+        """
         h, (x, y) = sizing.h, map(float, place)
         patch = min(load.patch for load in loads)
         depth = max(abs(load.depth) if load.depth else 10.0 for load in loads)
@@ -155,7 +158,9 @@ class IndentationSection(PathStep):
         return 0.5 if sizing.solid else 0.6  # far from the ridge degree 2 needs more than degree 4
 
     def rim(self, sizing: SizingContext) -> float:
-        """Of a hemisphere the edge is far from a dent."""
+        """Return larger elements for a shell than a solid: the edge of a hemisphere is far from a
+        dent.
+        """
         return 2.0 if sizing.solid else 2.8
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:

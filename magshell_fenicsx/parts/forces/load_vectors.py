@@ -1,5 +1,7 @@
-"""Dead loads and forces in the model's terms, over E h R and in its frame: the entries of their
-load vectors.
+"""Dead loads and forces in the model's terms: the entries of their load vectors.
+
+Sizes are over E h R, in the model's frame. A section of a case becomes a load of the model by
+`dead_load`; `assemble_dead_loads` makes vectors l of these with l . u = their work at u.
 """
 
 from collections.abc import Sequence
@@ -43,7 +45,7 @@ from magshell_fenicsx.platform import compat
 
 Entries = tuple[NDArray[np.int32], NDArray[np.float64]]
 Inside = NDArray[np.bool_]
-COARSE = 0.15  # of the integral that a patch has on a plane; at a corner it has a quarter
+MIN_PATCH_SHARE = 0.15  # a patch's integral over that on a plane; at a corner it is a quarter
 Array = NDArray[np.float64]
 
 
@@ -58,35 +60,35 @@ class Weighted:
         return integrand * self.weight * self.measure
 
     def total(self, V: fem.FunctionSpace, log: KernelLog, name: str = "load measure") -> float:
-        """Length, area or whatever it measures; collective."""
+        """Return the length, area or whatever it measures; collective."""
         form = log.compile(name, fem.Constant(V.mesh, 1.0) * self)
         return float(V.mesh.comm.allreduce(fem.assemble_scalar(form)))
 
 
-def entries(
-    V: fem.FunctionSpace, along: Expr, on: Weighted, log: KernelLog, name: str = "load vector"
+def load_entries(
+    V: fem.FunctionSpace, direction: Expr, measure: Weighted, log: KernelLog, name: str = "load vector"
 ) -> Entries:
-    """Owned entries of l with l . u = integral of along . u."""
-    load = fem.assemble_vector(log.compile(name, ufl.dot(along, ufl.TestFunction(V)) * on))
+    """Return the owned entries of l with l . u = integral of direction . u."""
+    load = fem.assemble_vector(log.compile(name, ufl.dot(direction, ufl.TestFunction(V)) * measure))
     load.scatter_reverse(InsertMode.add)
     dofs = np.flatnonzero(load.array[: 3 * V.dofmap.index_map.size_local]).astype(np.int32)
     return dofs, load.array[dofs]
 
 
 def smooth(x: Expr, radius: Expr) -> Expr:
-    """(1 - x.x/radius^2)^2 within the radius: 1 in the middle of a patch, 0 at its rim."""
-    inside = 1 - ufl.dot(x, x) / radius**2
-    return ufl.conditional(ufl.gt(inside, 0), inside**2, 0)
+    """Return (1 - x.x/radius^2)^2 within the radius: 1 in the middle of a patch, 0 at its rim."""
+    depth = 1 - ufl.dot(x, x) / radius**2
+    return ufl.conditional(ufl.gt(depth, 0), depth**2, 0)
 
 
 def averaged(
     V: fem.FunctionSpace,
     direction: NDArray[np.float64],
-    on: Weighted,
+    measure: Weighted,
     log: KernelLog,
     radius: float | None = None,
 ) -> Entries:
-    """l with l . u = average of direction . u; the total is exact on any mesh.
+    """Return l with l . u = average of direction . u; the total is exact on any mesh.
 
     Parameters
     ----------
@@ -98,13 +100,13 @@ def averaged(
     MeshError
         On every rank, if the mesh is too coarse to know the patch.
     """
-    total = on.total(V, log, "patch weight")
-    if radius is not None and not COARSE <= total / (np.pi * radius**2 / 3) <= 1 / COARSE:
+    total = measure.total(V, log, "patch weight")
+    if radius is not None and not MIN_PATCH_SHARE <= total / (np.pi * radius**2 / 3) <= 1 / MIN_PATCH_SHARE:
         raise MeshError(
             f"loading.patch: its radius is {radius:.3g} R, which the mesh is too coarse for: choose a smaller "
             "mesh.size, or 0 for a force at a point"
         )
-    dofs, values = entries(V, fem.Constant(V.mesh, direction), on, log, "patch load")
+    dofs, values = load_entries(V, fem.Constant(V.mesh, direction), measure, log, "patch load")
     return dofs, np.asarray(values / total)
 
 
@@ -112,20 +114,23 @@ def point_entries(
     V: fem.FunctionSpace,
     x: NDArray[np.float64],
     direction: NDArray[np.float64],
-    beside: Inside | None = None,
+    cells: Inside | None = None,
 ) -> Entries:
-    """l with l . u = direction . u(x) for a vertex x: owned degrees of freedom and values.
+    """Return l with l . u = direction . u(x) for a vertex x: owned degrees of freedom and values.
 
-    `beside` are the cells that may have it; None for all.
+    Parameters
+    ----------
+    cells
+        The cells that may have the vertex; None for all.
     """
-    near = fem.locate_dofs_geometrical(
+    dofs_at_x = fem.locate_dofs_geometrical(
         V, lambda points: np.linalg.norm(points.T - x, axis=1) < 1e-9
     )
-    owned = near[near < V.dofmap.index_map.size_local]
-    if beside is not None:
-        owned = owned[np.isin(owned, V.dofmap.list[beside])]
-    dofs = (3 * owned[:, None] + np.arange(3)).ravel().astype(np.int32)
-    return dofs, np.tile(direction, len(owned))
+    owned = dofs_at_x[dofs_at_x < V.dofmap.index_map.size_local]
+    if cells is not None:
+        owned = owned[np.isin(owned, V.dofmap.list[cells])]
+    load_dofs = (3 * owned[:, None] + np.arange(3)).ravel().astype(np.int32)
+    return load_dofs, np.tile(direction, len(owned))
 
 
 def patch_entries(
@@ -135,12 +140,17 @@ def patch_entries(
     direction: NDArray[np.float64],
     degree: int,
     log: KernelLog,
-    beside: Inside | None = None,
+    cells: Inside | None = None,
 ) -> Entries:
-    """l with l . u = average of direction . u around x, with the weight (1 - d^2/radius^2)^2.
+    """Return l with l . u = average of direction . u around x, with weight (1 - d^2/radius^2)^2.
 
-    d is the distance from x in space. The weight's integral is taken with the same
-    quadrature, so that the total force is exact on any mesh.
+    d is the distance from x in space. The weight's integral is taken with the same quadrature, so
+    that the total force is exact on any mesh.
+
+    Parameters
+    ----------
+    cells
+        The cells that the patch may be on; None for all.
 
     Raises
     ------
@@ -152,53 +162,60 @@ def patch_entries(
     centre, a = (fem.Constant(domain, v) for v in (x, radius))
     dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree})
     weight = smooth(r0 - centre, a) * kin.area_ratio(kin.jet(r0, domain))
-    weight = weight if beside is None else weight * within(domain, beside)
+    weight = weight if cells is None else weight * patch_indicator(domain, cells)
     return averaged(V, direction, Weighted(weight, dx), log, radius)
 
 
 def vertex_normal(
-    r0: fem.Function, x: NDArray[np.float64], beside: Inside | None = None
+    r0: fem.Function, x: NDArray[np.float64], cells: Inside | None = None
 ) -> NDArray[np.float64]:
-    """Unit normal of the undeformed mid-surface at a vertex, averaged over its triangles, or those
-    of some cells.
+    """Return the unit normal (3,) of the undeformed mid-surface at a vertex.
+
+    It is averaged over its triangles, or over some of them.
+
+    Parameters
+    ----------
+    cells
+        Flags of the cells that count; None for all.
     """
-    _, near, (a1, a2) = _corners(r0, x, beside)
-    total = r0.function_space.mesh.comm.allreduce(np.cross(a1[near], a2[near]).sum(axis=0))
+    _, is_at_vertex, (a1, a2) = _corners(r0, x, cells)
+    total = r0.function_space.mesh.comm.allreduce(np.cross(a1[is_at_vertex], a2[is_at_vertex]).sum(axis=0))
     return np.asarray(total / np.linalg.norm(total))
 
 
-def by_vertex_normal(r0: fem.Function, x: Array, v: Array, beside: Inside | None = None) -> Array:
-    """Derivatives (own cells, nodes, 3) of its component along v by the places of nodes;
+def by_vertex_normal(r0: fem.Function, x: Array, v: Array, cells: Inside | None = None) -> Array:
+    """Return derivatives (own cells, nodes, 3) of the normal's component along v by nodes;
     collective.
     """
-    table, near, (a1, a2) = _corners(r0, x, beside)
-    total = r0.function_space.mesh.comm.allreduce(np.cross(a1[near], a2[near]).sum(axis=0))
+    table, is_at_vertex, (a1, a2) = _corners(r0, x, cells)
+    total = r0.function_space.mesh.comm.allreduce(np.cross(a1[is_at_vertex], a2[is_at_vertex]).sum(axis=0))
     size = np.linalg.norm(total)
     p = (v - total * (total @ v) / size**2) / size
-    ways = np.stack([np.cross(a2, p), np.cross(p, a1)]) * near[..., None]
-    return np.asarray(np.einsum("dvk,dcvi->cki", table, ways))
+    by_tangents = np.stack([np.cross(a2, p), np.cross(p, a1)]) * is_at_vertex[..., None]
+    return np.asarray(np.einsum("dvk,dcvi->cki", table, by_tangents))
 
 
-def _corners(r0: fem.Function, x: Array, beside: Inside | None) -> tuple[Array, Inside, Array]:
-    """Slopes of functions (2, corners, nodes); which corners of own cells are at a vertex, and
-    tangents at all.
+def _corners(r0: fem.Function, x: Array, cells: Inside | None) -> tuple[Array, Inside, Array]:
+    """Return derivatives of shape functions, corners at a vertex, and tangents at corners.
+
+    They are (2, corners, nodes), flags (own cells, corners) and (2, own cells, corners, 3).
     """
     V = r0.function_space
     corners = basix.geometry(basix.CellType.triangle)
     gradients = V.element.basix_element.tabulate(1, corners)[1:, :, :, 0]
     owned = V.mesh.topology.index_map(2).size_local
     nodes = r0.x.array.reshape(-1, 3)[V.dofmap.list[:owned]]
-    near = (
+    is_at_vertex = (
         np.linalg.norm(V.mesh.geometry.x[compat.geometry_dofs(V.mesh)[:owned]] - x, axis=2) < 1e-9
     )
-    near = near if beside is None else near & beside[:owned, None]
-    return gradients, near, np.einsum("dvk,cki->dcvi", gradients, nodes)
+    is_at_vertex = is_at_vertex if cells is None else is_at_vertex & cells[:owned, None]
+    return gradients, is_at_vertex, np.einsum("dvk,cki->dcvi", gradients, nodes)
 
 
 def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Modelled) -> DeadLoad:
-    """A load as the model takes it; `name` is for its energy, if it has one."""
+    """Return a load as the model takes it; `name` is for its energy, if it has one."""
     mirror = modelled.mirror
-    shared = mirror is not None and (
+    is_shared = mirror is not None and (
         load.edge is None or mirror.image_of_edge(load.edge) == load.edge
     )
     Q, scales = rotation(modelled.turn), context.scales
@@ -211,10 +228,10 @@ def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Mode
         return (
             EdgeForce(load.edge, pattern, total=False)
             if load.edge
-            else AreaForce(_over(load), pattern)
+            else AreaForce(_patch_of_load(load), pattern)
         )
     force = np.asarray(
-        (1 / mirror.copies if mirror and shared else 1.0)
+        (1 / mirror.copies if mirror and is_shared else 1.0)
         * (Q @ (load.force or np.zeros(3)))
         / (E * t * R)
     )
@@ -231,19 +248,20 @@ def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Mode
         )
     if load.pressure is not None:
         assert isinstance(load.pressure, float | int)
-        return AreaForce(_over(load), load.pressure * R / (E * t))
+        return AreaForce(_patch_of_load(load), load.pressure * R / (E * t))
     assert load.per_area is not None
     return AreaForce(
-        _over(load), np.asarray(Q @ np.array(load.per_area, dtype=float) * R / (E * t))
+        _patch_of_load(load), np.asarray(Q @ np.array(load.per_area, dtype=float) * R / (E * t))
     )
 
 
-def _over(load: DeadLoadSection) -> str | None:
+def _patch_of_load(load: DeadLoadSection) -> str | None:
+    """Return the patch of a load; None for all of the surface."""
     return None if load.over == "all" else load.over
 
 
 def _pattern(load: DeadLoadSection, Q: Array, length: float, factor: float) -> Pattern:
-    """The load of a formula in the model's frame; a pressure is against the normal."""
+    """Return the load of a formula in the model's frame; a pressure is against the normal."""
     if load.vector is not None:
         return FormulaVectors(
             [formula_function(v) for v in load.vector], Q, length, factor, vectors=True
@@ -253,19 +271,19 @@ def _pattern(load: DeadLoadSection, Q: Array, length: float, factor: float) -> P
 
 
 def account(context: Context, loads: Loads) -> Account:
-    """Forces and dead loads."""
+    """Return the forces and dead loads."""
     patches = [force.patch * context.shell.R_over_h for force in loads.forces.values()]
-    words = [
+    lines = [
         f"force on a patch of radius {patch:g} h" if patch else "force at a point"
         for patch in patches
     ]
     if dead := loads.all_dead:
-        words.append(f"{len(dead)} dead load{'s' * (len(dead) > 1)}")
-    return Account(words, [] if loads.forces else ["force: none"])
+        lines.append(f"{len(dead)} dead load{'s' * (len(dead) > 1)}")
+    return Account(lines, [] if loads.forces else ["force: none"])
 
 
 class Measures(Protocol):
-    """Where the loads of a model are.
+    """The measures of the points, edges and surfaces of a model, for loads.
 
     Attributes
     ----------
@@ -276,14 +294,14 @@ class Measures(Protocol):
     normal: Expr
 
     def edge(self, name: str) -> Weighted:
-        """Undeformed length of a named edge."""
+        """Return the undeformed length of a named edge."""
 
     def area(self, patch: str | None) -> Weighted:
-        """Undeformed area of a named patch, or of all."""
+        """Return the undeformed area of a named patch, or of all."""
 
     def field(self, pattern: Pattern, edge: str | None) -> tuple[Expr, float | None]:
-        """A pattern on the undeformed mid-surface or an edge, and the integral of its size as of
-        `pattern_field`.
+        """Return a pattern on the undeformed surface or an edge, and its integral
+        (`pattern_field`).
         """
 
     def at_point(self, name: str, force: NDArray[np.float64]) -> Entries:
@@ -315,20 +333,20 @@ class DeadLoads:
 
 
 def assemble_dead_loads(
-    loads: Sequence[DeadLoad], V: fem.FunctionSpace, on: Measures, log: KernelLog
+    loads: Sequence[DeadLoad], V: fem.FunctionSpace, measures: Measures, log: KernelLog
 ) -> DeadLoads:
-    """The load vector of all but the moments; collective."""
+    """Return the load vector of all dead loads but the moments; collective."""
     parts, size = list[Entries](), 0.0
-    everywhere, sizes = list[tuple[Expr, Weighted, bool]](), list[ufl.Form]()
+    densities, sizes = list[tuple[Expr, Weighted, bool]](), list[ufl.Form]()
 
     def constant(value: float | NDArray[np.float64]) -> fem.Constant:
         return fem.Constant(V.mesh, value)
 
     def spread(
-        along: Expr, measure: Weighted, strength: Expr | float, *, total: bool = False
+        direction: Expr, measure: Weighted, strength: Expr | float, *, total: bool = False
     ) -> None:
-        parts.append(entries(V, along, measure, log))
-        everywhere.append((along, measure, total))
+        parts.append(load_entries(V, direction, measure, log))
+        densities.append((direction, measure, total))
         if not total:
             sizes.append(
                 (constant(strength) if isinstance(strength, float) else strength) * measure
@@ -338,20 +356,20 @@ def assemble_dead_loads(
         pattern: Pattern, measure: Weighted, edge: str | None = None, *, part: bool = False
     ) -> float:
         """The integral of its size."""
-        along, whole = on.field(pattern, edge)
-        strength = ufl.sqrt(ufl.dot(along, along))
-        spread(along, measure, strength)
-        if whole is not None and not part:
-            return whole
+        direction, total = measures.field(pattern, edge)
+        strength = ufl.sqrt(ufl.dot(direction, direction))
+        spread(direction, measure, strength)
+        if total is not None and not part:
+            return total
         form = log.compile("load size", strength * measure)
         return float(V.mesh.comm.allreduce(fem.assemble_scalar(form)))
 
     for load in loads:
         if isinstance(load, PointForce):
-            parts.append(on.at_point(load.point, load.force))
+            parts.append(measures.at_point(load.point, load.force))
             size += float(np.linalg.norm(load.force))
         elif isinstance(load, EdgeForce):
-            ds = on.edge(load.edge)
+            ds = measures.edge(load.edge)
             if callable(load.force):
                 size += spread_pattern(load.force, ds, load.edge)
                 continue
@@ -361,15 +379,15 @@ def assemble_dead_loads(
             spread(constant(force), ds, strength, total=load.total)
             size += strength * length
         elif isinstance(load, AreaForce):
-            dx = on.area(load.patch)
+            dx = measures.area(load.patch)
             if callable(load.force):
                 size += spread_pattern(load.force, dx, part=load.patch is not None)
                 continue
             if isinstance(load.force, float):
-                along, strength = -constant(load.force) * on.normal, abs(load.force)
+                direction, strength = -constant(load.force) * measures.normal, abs(load.force)
             else:
-                along, strength = constant(load.force), float(np.linalg.norm(load.force))
-            spread(along, dx, strength)
+                direction, strength = constant(load.force), float(np.linalg.norm(load.force))
+            spread(direction, dx, strength)
             size += strength * dx.total(V, log)
         else:
             assert isinstance(load, EdgeMoment | Potential)  # no load vectors
@@ -377,18 +395,18 @@ def assemble_dead_loads(
     for dofs, values in parts:
         np.add.at(vector, dofs, values)
     dofs = np.flatnonzero(vector).astype(np.int32)
-    return DeadLoads((dofs, vector[dofs]), size, everywhere, sizes)
+    return DeadLoads((dofs, vector[dofs]), size, densities, sizes)
 
 
-def within(domain: mesh.Mesh, patch: NDArray[np.bool_]) -> fem.Function:
-    """One in the cells of a patch, zero in the others."""
+def patch_indicator(domain: mesh.Mesh, patch: NDArray[np.bool_]) -> fem.Function:
+    """Return one in the cells of a patch, zero in the others."""
     indicator = fem.Function(fem.functionspace(domain, ("DG", 0)))
     indicator.x.array[indicator.function_space.dofmap.list[:, 0]] = patch
     return indicator
 
 
 class SurfaceMeasures:
-    """`Measures` of a mid-surface."""
+    """The `Measures` of a mid-surface."""
 
     def __init__(self, r0: fem.Function, midsurface: Midsurface, degree: int) -> None:
         self._V, self._midsurface, self._degree, self._r0 = (
@@ -412,7 +430,7 @@ class SurfaceMeasures:
         dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * self._degree})
         weight = kin.area_ratio(self._j0)
         if patch is not None:
-            weight = weight * within(domain, patch_of(self._midsurface.patches, patch))
+            weight = weight * patch_indicator(domain, patch_of(self._midsurface.patches, patch))
         return Weighted(weight, dx)
 
     def field(self, pattern: Pattern, edge: str | None) -> tuple[Expr, float | None]:

@@ -1,6 +1,4 @@
-"""Loads that keep their direction and leave the rotation, as energies on the meridian that are
-linear in u.
-"""
+"""Loads on a meridian that keep their direction: energies that are linear in u."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -24,14 +22,14 @@ from magshell_fenicsx.models.shell.parameters import (
 )
 from magshell_fenicsx.models.shell.spatial_fields import ADDED_LOAD_DEGREE, pattern_field
 from magshell_fenicsx.models.shell.thickness import patch_of
-from magshell_fenicsx.parts.forces.load_vectors import within
+from magshell_fenicsx.parts.forces.load_vectors import patch_indicator
 from magshell_fenicsx.parts.loads import forces
 
 Integral = Callable[[Expr], ufl.Form]
 
 
 @dataclass(frozen=True)
-class Around:
+class RevolutionIntegrals:
     """Integrals over parts of a surface of revolution, per radian as those of its domain."""
 
     meridian: Meridian
@@ -39,121 +37,126 @@ class Around:
     parts: Sequence[Facets] = ()
     measures: Sequence[ufl.Measure] = ()
 
-    def with_parts(self, loads: Sequence[DeadLoad]) -> "Around":
-        """With one measure for the ends and points of all loads of a form."""
+    def with_parts(self, loads: Sequence[DeadLoad]) -> "RevolutionIntegrals":
+        """Return these integrals with one measure for the ends and points of all loads of a form.
+        """
         parts = list[Facets]()
         for load in forces(loads):
             if isinstance(load, AreaForce):
                 continue
-            of = (
+            facets = (
                 self.meridian.facets_at(load.point)
                 if isinstance(load, PointForce)
                 else self.meridian.ends[load.edge]
             )
-            if not any(np.array_equal(of, part) for part in parts):
-                parts.append(of)
+            if not any(np.array_equal(facets, part) for part in parts):
+                parts.append(facets)
         return replace(self, parts=parts, measures=self.domain.measures_on(parts) if parts else [])
 
     def _ds(self, facets: Facets) -> ufl.Measure:
-        each = zip(self.parts, self.measures, strict=True)
+        pairs = zip(self.parts, self.measures, strict=True)
         return next(
-            (ds for part, ds in each if np.array_equal(part, facets)), None
+            (ds for part, ds in pairs if np.array_equal(part, facets)), None
         ) or self.domain.ds(facets)
 
     def end(self, name: str, *, mean: bool = False) -> Integral:
-        """Along the undeformed circle of an end, or the mean over that."""
+        """Return the integral along the undeformed circle of an end, or the mean over that."""
         ds = self._ds(self.meridian.ends[name])
         return lambda f: f / (2 * np.pi) * ds if mean else f * self.domain.r0[0] * ds
 
     def pole(self, point: str) -> Integral:
-        """The value at a point on the axis, over 2 pi."""
+        """Return the value at a point on the axis, over 2 pi."""
         ds = self._ds(self.meridian.facets_at(point))
         return lambda f: f / (2 * np.pi) * ds
 
     def area(self, load: AreaForce) -> Integral:
-        """Over the undeformed area, or that of one of several shells."""
-        over = self.domain.over_area()
+        """Return the integral over the undeformed area, or that of one of several shells."""
+        integral = self.domain.over_area()
         if load.patch is None:
-            return over
-        marked = within(self.domain.mesh, patch_of(self.meridian.patches, load.patch))
-        return lambda f: over(marked * f)
+            return integral
+        indicator = patch_indicator(self.domain.mesh, patch_of(self.meridian.patches, load.patch))
+        return lambda f: integral(indicator * f)
 
     def patch(self, radius: float, point: str) -> Integral:
-        """Of f (1 - d^2/radius^2)^2, d the distance in space from a point on the axis."""
-        at = np.array([self.meridian.points[point][0]])
-        a, pole = self.domain.constant(radius), self.domain.constant(self.meridian.section(at)[0])
-        inside = 1 - ufl.dot(self.domain.r0 - pole, self.domain.r0 - pole) / a**2
-        weight, over = ufl.conditional(ufl.gt(inside, 0), inside**2, 0), self.domain.over_area()
-        return lambda f: over(weight * f)
+        """Return the integral of f (1 - d^2/radius^2)^2, with d the distance from a point on the
+        axis.
+        """
+        parameter = np.array([self.meridian.points[point][0]])
+        a, pole = self.domain.constant(radius), self.domain.constant(self.meridian.section(parameter)[0])
+        depth = 1 - ufl.dot(self.domain.r0 - pole, self.domain.r0 - pole) / a**2
+        weight, integral = ufl.conditional(ufl.gt(depth, 0), depth**2, 0), self.domain.over_area()
+        return lambda f: integral(weight * f)
 
 
 def dead_loads(
-    name: str, loads: Sequence[DeadLoad], on: Around, log: KernelLog
+    name: str, loads: Sequence[DeadLoad], integrals: RevolutionIntegrals, log: KernelLog
 ) -> tuple[Energy, float, Sequence[ufl.Form]]:
-    """All except the moments, with an amplitude's name; the sum of their sizes over E h R, and its
-    forms.
+    """Return the energy of dead loads without moments, the sum of their sizes, and its forms.
 
-    Vectors are along e3, and points are on the axis.
+    Vectors are along e3, and points are on the axis. Sizes are over E h R.
+
+    Parameters
+    ----------
+    name
+        Of the amplitude.
     """
-    parts, size, sizes, on = (
+    terms, size, sizes, integrals = (
         list[tuple[Expr, Integral]](),
         0.0,
         list[ufl.Form](),
-        on.with_parts(loads),
+        integrals.with_parts(loads),
     )
     for load in forces(loads):
         if isinstance(load, PointForce):
-            over = on.pole(load.point)
+            integral = integrals.pole(load.point)
         elif isinstance(load, EdgeForce):
-            over = on.end(load.edge, mean=load.total)
+            integral = integrals.end(load.edge, mean=load.total)
         else:
-            over = on.area(load)
+            integral = integrals.area(load)
         if not isinstance(load, PointForce) and callable(load.force):
-            along, whole = pattern_field(load.force, on.domain.r0, ADDED_LOAD_DEGREE)
-            parts.append((along, over))
-            fitted = whole is not None and isinstance(load, AreaForce) and load.patch is None
-            per = ufl.sqrt(ufl.dot(along, along))
-            size += whole if fitted and whole is not None else _integral(per, over, log)
-            sizes.append(2 * np.pi * over(per))
+            direction, total = pattern_field(load.force, integrals.domain.r0, ADDED_LOAD_DEGREE)
+            terms.append((direction, integral))
+            is_known = total is not None and isinstance(load, AreaForce) and load.patch is None
+            density = ufl.sqrt(ufl.dot(direction, direction))
+            size += total if is_known and total is not None else _integral(density, integral, log)
+            sizes.append(2 * np.pi * integral(density))
             continue
-        whole = _whole(over, on, log)
+        total = _circumferential_integral(integral, integrals, log)
         if isinstance(load, AreaForce) and isinstance(load.force, float):
-            along, strength = (
-                -kin.normal(on.domain.j0) * on.domain.constant(load.force),
+            direction, strength = (
+                -kin.normal(integrals.domain.j0) * integrals.domain.constant(load.force),
                 abs(load.force),
             )
         else:
             vector = np.asarray(load.force)
-            along, strength = on.domain.constant(vector), float(np.linalg.norm(vector))
-        parts.append((along, over))
-        size += strength * whole
-        sizes.append(2 * np.pi * over(on.domain.constant(strength)))
+            direction, strength = integrals.domain.constant(vector), float(np.linalg.norm(vector))
+        terms.append((direction, integral))
+        size += strength * total
+        sizes.append(2 * np.pi * integral(integrals.domain.constant(strength)))
 
     def energy(u: Jet) -> ufl.Form:
         return sum(
-            (over(-ufl.dot(along, u.r)) for along, over in parts[1:]),
-            parts[0][1](-ufl.dot(parts[0][0], u.r)),
+            (integral(-ufl.dot(direction, u.r)) for direction, integral in terms[1:]),
+            terms[0][1](-ufl.dot(terms[0][0], u.r)),
         )
 
     return Energy(name, energy, name, linear=True), size, sizes
 
 
-def pole_force(name: str, force: Force, unit: float, on: Around, log: KernelLog) -> Energy:
-    """A force against the outward normal at a point on the axis, or spread over a patch of that
-    radius.
-    """
-    over = on.patch(force.patch, force.point) if force.patch else on.pole(force.point)
-    begins = np.isclose(
-        on.meridian.cells[:, 0], on.meridian.points[force.point][0]
+def pole_force(name: str, force: Force, unit: float, integrals: RevolutionIntegrals, log: KernelLog) -> Energy:
+    """Return a force against the outward normal at a point on the axis, or over a patch there."""
+    integral = integrals.patch(force.patch, force.point) if force.patch else integrals.pole(force.point)
+    is_begin = np.isclose(
+        integrals.meridian.cells[:, 0], integrals.meridian.points[force.point][0]
     ).any()  # the normal is e3 there
-    share = on.domain.constant((1.0 if begins else -1.0) * unit / _whole(over, on, log))
-    return Energy(name, lambda u: over(share * u.r[2]), name, linear=True)
+    share = integrals.domain.constant((1.0 if is_begin else -1.0) * unit / _circumferential_integral(integral, integrals, log))
+    return Energy(name, lambda u: integral(share * u.r[2]), name, linear=True)
 
 
-def _whole(over: Integral, on: Around, log: KernelLog) -> float:
-    """The integral of 1, all around."""
-    return _integral(on.domain.constant(1.0), over, log)
+def _circumferential_integral(integral: Integral, integrals: RevolutionIntegrals, log: KernelLog) -> float:
+    """Return the integral of 1, all around."""
+    return _integral(integrals.domain.constant(1.0), integral, log)
 
 
-def _integral(f: Expr, over: Integral, log: KernelLog) -> float:
-    return float(2 * np.pi * fem.assemble_scalar(log.compile("load measure", over(f))))
+def _integral(f: Expr, integral: Integral, log: KernelLog) -> float:
+    return float(2 * np.pi * fem.assemble_scalar(log.compile("load measure", integral(f))))

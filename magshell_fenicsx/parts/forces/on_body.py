@@ -19,15 +19,15 @@ from magshell_fenicsx.models.shell.spatial_fields import (
     refuse_unbounded,
 )
 from magshell_fenicsx.models.shell.thickness import patch_of
-from magshell_fenicsx.parts.forces.load_vectors import Entries, Weighted, averaged, smooth, within
+from magshell_fenicsx.parts.forces.load_vectors import Entries, Weighted, averaged, smooth, patch_indicator
 from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]
-SMOOTH = 8  # quadrature degree of a patch's weight
+WEIGHT_DEGREE = 8  # quadrature degree of a patch's weight
 
 
 class BodyMeasures:
-    """`Measures` of a body: what loads the mid-surface is spread evenly through the thickness.
+    """The `Measures` of a body: a load of the mid-surface is spread evenly through the thickness.
 
     Resultants are the shell's where the mid-surface is flat, else to the order of (h/R)^2.
     """
@@ -49,7 +49,7 @@ class BodyMeasures:
     def area(self, patch: str | None) -> Weighted:
         body, weight = self._body, 1 / self._thickness
         if patch is not None:
-            weight = weight * within(body.mesh, patch_of(body.patches, patch))
+            weight = weight * patch_indicator(body.mesh, patch_of(body.patches, patch))
         return Weighted(
             weight, ufl.Measure("dx", domain=body.mesh, metadata={"quadrature_degree": 4})
         )
@@ -73,40 +73,43 @@ class BodyMeasures:
         return field, None
 
     def at_point(self, name: str, force: Array) -> Entries:
-        """Over a patch of the radius h, or of the elements around the point where these are larger."""
+        """Return a force over a patch of the radius h, or of larger elements around the point."""
         domain, x, n = self._body.mesh, self._body.points[name], self._body.normals[name]
         centre, normal = (fem.Constant(domain, v) for v in (x, n))
         d = ufl.SpatialCoordinate(domain) - centre
         height, h = ufl.dot(d, normal), thickness_at(self._body, x)
         radius = fem.Constant(domain, max(h, self._reach(x, n)))
-        within = ufl.conditional(
+        is_in_shell = ufl.conditional(
             ufl.lt(abs(height), fem.Constant(domain, h)), 1.0, 0.0
         )  # and not through a closed shell
-        dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": SMOOTH})
+        dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": WEIGHT_DEGREE})
         return averaged(
-            self._V, force, Weighted(within * smooth(d - height * normal, radius), dx), self._log
+            self._V, force, Weighted(is_in_shell * smooth(d - height * normal, radius), dx), self._log
         )
 
     def _reach(self, x: Array, n: Array) -> float:
-        """Distance from the normal line at x of the farthest node of the cells around it."""
+        """Return the distance from the normal line at x of the farthest node of the cells around
+        it.
+        """
         X = self._body.mesh.geometry.x[compat.geometry_dofs(self._body.mesh)] - x
-        around = X[(np.linalg.norm(X, axis=2) < 1e-9).any(axis=1)]
-        across = around - (around @ n)[..., None] * n
+        cells_at_x = X[(np.linalg.norm(X, axis=2) < 1e-9).any(axis=1)]
+        from_normal = cells_at_x - (cells_at_x @ n)[..., None] * n
         return float(
-            self._V.mesh.comm.allreduce(np.linalg.norm(across, axis=2).max(initial=0.0), MPI.MAX)
+            self._V.mesh.comm.allreduce(np.linalg.norm(from_normal, axis=2).max(initial=0.0), MPI.MAX)
         )
 
 
 def thickness_at(body: BodyMesh, x: Array) -> float:
-    """h over R at a vertex of the mid-surface; collective."""
-    near = np.linalg.norm(body.mesh.geometry.x - x, axis=1) < 1e-9
-    return float(body.mesh.comm.allreduce(body.thickness[near].max(initial=0.0), MPI.MAX))
+    """Return h over R at a vertex of the mid-surface; collective."""
+    is_at_x = np.linalg.norm(body.mesh.geometry.x - x, axis=1) < 1e-9
+    return float(body.mesh.comm.allreduce(body.thickness[is_at_x].max(initial=0.0), MPI.MAX))
 
 
 def outer_patch(
     body: BodyMesh, V: fem.FunctionSpace, point: str, radius: float, log: KernelLog
 ) -> Entries:
-    """An inward force averaged over the outer face around a point, with the weight `smooth`."""
+    """Return an inward force averaged over the outer face around a point, with the weight `smooth`.
+    """
     x, normal = body.points[point], body.normals[point]
     values = x + thickness_at(body, x) / 2 * normal, radius
     centre, a = (fem.Constant(body.mesh, value) for value in values)

@@ -45,7 +45,7 @@ Level: TypeAlias = Annotated[  # what its unit means depends on the load
 
 
 class RampHistory(Section):
-    """From where the load is to a value, and constant after that."""
+    """A ramp from the present load to a value, constant after that."""
 
     kind: Literal["ramp"]
     to: Level
@@ -185,7 +185,7 @@ Branches = Annotated[list[BranchSection], Field(max_length=20)]
 
 @dataclass(frozen=True)
 class Viscosity(Ability):
-    """Of a shell."""
+    """The viscosity and relaxation of a shell."""
 
     viscosity: float | str | None
     branches: Sequence[BranchSection]
@@ -200,11 +200,11 @@ class Viscosity(Ability):
         )
 
     def withdraws(self, context: Context) -> dict[Offer, str]:
-        """Stress depends on the history of strain."""
+        """Return that stress depends on the history of strain."""
         return {"a material without viscosity": "leave out shell.viscosity and shell.relaxation"}
 
     def refuse_unfit(self, context: Context) -> None:
-        """See that its numbers are positive and that their units have a meaning."""
+        """Check that its numbers are positive and that their units have a meaning."""
         times = {f"relaxation.{i}.time": branch.time for i, branch in enumerate(self.branches)}
         moduli = {
             f"relaxation.{i}.modulus": branch.modulus for i, branch in enumerate(self.branches)

@@ -204,7 +204,7 @@ class TimeSection(Step):
         ]
 
     def with_units(self) -> Iterator[tuple[str, str]]:
-        """Key and text of each time with a unit."""
+        """Yield key and text of each time with a unit."""
         given: dict[str, Any] = {"duration": self.duration, "step": self.step, "drag": self.drag}
         for name, history in self.history.items():
             given |= {f"history.{name} {i}": t for i, t in enumerate(times_of(history))}

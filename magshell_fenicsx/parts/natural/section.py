@@ -220,7 +220,7 @@ class GrowthSection(LoadStep):
 
     @model_validator(mode="after")
     def _one_grows(self) -> Self:
-        said = {self.grows, *self._given} - {None}
+        said = {self.grows, *self._given_targets} - {None}
         if len(said) != 1:
             raise ValueError(
                 "give curvature or stretch, the factor that it grows to, or without a target grows"
@@ -230,7 +230,7 @@ class GrowthSection(LoadStep):
     @property
     def key(self) -> str:
         """The key of `natural` that grows."""
-        return self.grows or "".join(self._given)
+        return self.grows or "".join(self._given_targets)
 
     @property
     def amplitude(self) -> str:  # type: ignore[override]

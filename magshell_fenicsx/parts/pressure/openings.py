@@ -21,8 +21,8 @@ from magshell_fenicsx.models.shell.parameters import Condition, HeldComponents
 Array = NDArray[np.float64]
 
 
-def moving(edges: Mapping[str, Set[Hashable]], conditions: Mapping[str, Condition]) -> list[str]:
-    """Names of the edges with sides that neither are held nor lie in a plane of symmetry.
+def moving_edges(edges: Mapping[str, Set[Hashable]], conditions: Mapping[str, Condition]) -> list[str]:
+    """Return the names of edges with sides that neither are held nor lie in a plane of symmetry.
 
     Parameters
     ----------
@@ -30,13 +30,13 @@ def moving(edges: Mapping[str, Set[Hashable]], conditions: Mapping[str, Conditio
         Name -> sides of cells, in any way that two names share.
     """
     closed = set[Hashable]().union(
-        *(edges[name] for name, c in conditions.items() if name in edges and closes(c))
+        *(edges[name] for name, c in conditions.items() if name in edges and is_closed(c))
     )
     return [name for name, sides in edges.items() if sides - closed]
 
 
-def closes(condition: Condition) -> bool:
-    """Whether an edge is held, or lies in a plane of symmetry."""
+def is_closed(condition: Condition) -> bool:
+    """Return whether an edge is held, or lies in a plane of symmetry."""
     if isinstance(condition, HeldComponents):
         return len(condition.components) == 3
     return condition != "free"
@@ -45,7 +45,7 @@ def closes(condition: Condition) -> bool:
 def without_potential(
     names: Sequence[str], conditions: Mapping[str, Condition], places: Callable[[str], Array]
 ) -> tuple[str, ...]:
-    """Those of some moving edges at which a live pressure has no potential.
+    """Return the moving edges at which a live pressure has no potential.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ def without_potential(
         Name -> places (n, 3) on the undeformed edge.
     """
 
-    def has(name: str) -> bool:
+    def has_potential(name: str) -> bool:
         condition = conditions.get(name, "free")
         if not isinstance(condition, HeldComponents):
             return False
@@ -62,16 +62,16 @@ def without_potential(
             np.ptp(places(name)[:, axes], axis=0).max() < PLANARITY_TOLERANCE
         )
 
-    return tuple(name for name in names if not has(name))
+    return tuple(name for name in names if not has_potential(name))
 
 
-def openings(
+def edge_openings(
     r0: fem.Function,
     edges: Mapping[str, NDArray[np.int32]],
     conditions: Mapping[str, Condition],
     nodes: NDArray[np.bool_] | None = None,
 ) -> tuple[list[str], tuple[str, ...]]:
-    """The moving edges of a model, and those of them without potential; collective.
+    """Return the moving edges of a model, and those of them without potential; collective.
 
     Parameters
     ----------
@@ -89,14 +89,14 @@ def openings(
         return np.concatenate(comm.allgather(by_rank))
 
     by_rank = comm.allgather(
-        moving({name: set(map(int, facets)) for name, facets in edges.items()}, conditions)
+        moving_edges({name: set(map(int, facets)) for name, facets in edges.items()}, conditions)
     )
     names = [name for name in edges if any(name in rank for rank in by_rank)]
     return names, without_potential(names, conditions, places)
 
 
-def on_cells(sides: Mapping[str, float], midsurface: Midsurface | Meridian) -> fem.Function:
-    """Of each cell, (1,): the side on which a pressure acts there, 0 on others.
+def side_field(sides: Mapping[str, float], midsurface: Midsurface | Meridian) -> fem.Function:
+    """Return the side of each cell, (1,), on which a pressure acts; 0 on others.
 
     Parameters
     ----------
@@ -104,75 +104,81 @@ def on_cells(sides: Mapping[str, float], midsurface: Midsurface | Meridian) -> f
         Patch -> 1 from outside, -1 from inside.
     """
     Q = fem.functionspace(midsurface.mesh, ("DG", 0, (1,)))
-    pressed = fem.Function(Q, name="pressed")
+    side_of_cells = fem.Function(Q, name="pressed")
     for name, side in sides.items():
-        pressed.x.array[Q.dofmap.list[midsurface.patches[name]].ravel()] = side
-    return pressed
+        side_of_cells.x.array[Q.dofmap.list[midsurface.patches[name]].ravel()] = side
+    return side_of_cells
 
 
-def on_each(pressed: fem.Function) -> Array:
-    """The same as an array (cells,)."""
-    return np.asarray(pressed.x.array[pressed.function_space.dofmap.list[:, 0]])
+def sides_of_cells(side_of_cells: fem.Function) -> Array:
+    """Return the values of a `side_field` as an array (cells,)."""
+    return np.asarray(side_of_cells.x.array[side_of_cells.function_space.dofmap.list[:, 0]])
 
 
-def beside(
-    edges: Mapping[str, NDArray[np.int32]], pressed: fem.Function
+def pressed_parts(
+    edges: Mapping[str, NDArray[np.int32]], side_of_cells: fem.Function
 ) -> dict[str, NDArray[np.int32]]:
-    """The parts of edges, facets on this rank, whose cells are pressed."""
-    topology, sides = pressed.function_space.mesh.topology, on_each(pressed)
+    """Return the parts of edges, facets on this rank, whose cells are pressed."""
+    topology, sides = side_of_cells.function_space.mesh.topology, sides_of_cells(side_of_cells)
     topology.create_connectivity(1, 2)
     links = topology.connectivity(1, 2)
 
-    def acts(facet: int) -> bool:
+    def is_pressed(facet: int) -> bool:
         return bool(sides[links.links(facet)[0]])
 
     return {
-        name: facets[np.array([acts(f) for f in facets], dtype=bool)]
+        name: facets[np.array([is_pressed(f) for f in facets], dtype=bool)]
         for name, facets in edges.items()
     }
 
 
-def side_of(end: str, on: Mapping[str, float]) -> float:
-    """The side on which a pressure acts on the shell of an end, as of `on_cells`; without `on` all
-    from outside.
+def side_of(end: str, sides: Mapping[str, float]) -> float:
+    """Return the side on which a pressure acts on the shell of an end, see `side_field`.
+
+    Without sides all are pressed from outside.
     """
     return (
-        next((side for shell, side in on.items() if end.startswith(f"{shell}_")), 0.0)
-        if on
+        next((side for shell, side in sides.items() if end.startswith(f"{shell}_")), 0.0)
+        if sides
         else 1.0
     )
 
 
 def ring_openings(
-    ends: Mapping[str, Array], conditions: Mapping[str, Condition], on: Mapping[str, float]
+    ends: Mapping[str, Array], conditions: Mapping[str, Condition], sides: Mapping[str, float]
 ) -> tuple[list[str], tuple[str, ...]]:
-    """The same of a meridian with ends at (rho, z), of shells that a pressure acts on, see
-    `side_of`.
+    """Return `edge_openings` of a meridian with ends at (rho, z).
+
+    Parameters
+    ----------
+    sides
+        Shell -> side on which a pressure acts, see `side_of`.
     """
-    ends = {name: at for name, at in ends.items() if side_of(name, on)}
+    ends = {name: place for name, place in ends.items() if side_of(name, sides)}
 
     def ring(name: str) -> Array:
         rho, z = ends[name]
         return np.array([[rho, 0, z], [0, rho, z], [-rho, 0, z]])
 
-    names = moving({name: {name} for name in ends}, conditions)
+    names = moving_edges({name: {name} for name in ends}, conditions)
     return names, without_potential(names, conditions, ring)
 
 
 def meridian_openings(
-    meridian: Meridian, conditions: Mapping[str, Condition], on: Mapping[str, float]
+    meridian: Meridian, conditions: Mapping[str, Condition], sides: Mapping[str, float]
 ) -> tuple[list[str], tuple[str, ...]]:
-    """The ends that are not held, and those of them where a live pressure has no potential."""
+    """Return the ends that are not held, and those of them where a live pressure has no potential.
+    """
     places = {
         name: meridian.section(np.array([meridian.parameter(name)]))[0] for name in meridian.ends
     }
-    return ring_openings(places, conditions, on)
+    return ring_openings(places, conditions, sides)
 
 
 def no_potential(names: Sequence[str]) -> str:
-    """What is said of such edges."""
-    where = f"edge{'s' * (len(names) > 1)} {', '.join(names)}"
+    """Return the message about edges without a potential."""
+    edges = f"edge{'s' * (len(names) > 1)} {', '.join(names)}"
     return (
-        f"a potential of the pressure, which follows the free {where}: volume_change and the pressure's part of "
+        f"a potential of the pressure, which follows the free {edges}: volume_change and the pressure's part of "
         "energy are those of a straight motion from the undeformed shape; of instabilities, flutter is not looked for"
     )

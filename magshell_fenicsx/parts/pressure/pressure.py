@@ -1,4 +1,5 @@
-"""A live pressure, a gas under the shell as its conjugate, and what is seen of both."""
+"""The step `kind: pressure`, a gas under the shell as its conjugate, and the observables of both.
+"""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -27,7 +28,7 @@ from magshell_fenicsx.shape.revolution_sections import CapSurface
 from magshell_fenicsx.shape.shell_sections import MeshSurface, ShellSection, Surface
 from magshell_fenicsx.shape.symmetry_constraint import SymmetryConstraint, patch_constraint
 
-BLOWN = 10.0  # rubber is blown up by steps so many times as long as E h/R is to p_c
+INFLATION_STEP_FACTOR = 10.0  # of the largest step of blown-up rubber, times E h/R over p_c
 
 if TYPE_CHECKING:
     from magshell_fenicsx.continuation.device import Conjugate
@@ -94,7 +95,7 @@ class PressureSection(PathStep):
         if (
             step_start.context.shell.rubber is not None and course.drive.first < 0
         ):  # blown up far beyond p_c
-            finer = partial(_longer, BLOWN / step_start.h)
+            finer = partial(_longer, INFLATION_STEP_FACTOR / step_start.h)
             course = replace(
                 course, drive=replace(course.drive, scale=1 / step_start.h), finer=finer
             )
@@ -112,7 +113,9 @@ class PressureSection(PathStep):
         return {"pressure": True}
 
     def largest(self, sizing: SizingContext) -> float | None:
-        """Without a local imperfection a sphere buckles anywhere, in waves of about 3.6 sqrt(Rh)."""
+        """Return elements that show buckles, in waves of about 3.6 sqrt(Rh), without a local
+        imperfection.
+        """
         return None if sizing.local else 1.2 * sqrt(sizing.h)
 
     def begin(self, step_start: float) -> float:
@@ -127,7 +130,7 @@ def _longer(factor: float, steps: "StepOptions") -> "StepOptions":
 
 
 class PressureObservables(Observables):
-    """What is conjugate to a live pressure is the change of volume, which every run has."""
+    """The unit of the change of volume, which is conjugate to a live pressure; every run has it."""
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
         from magshell_fenicsx.models.shell.thickness import (
@@ -138,7 +141,7 @@ class PressureObservables(Observables):
             patch_of(surface.patches, name, "loading.on")
 
     def conjugate_unit(self, view: ModelView, name: str) -> float | None:
-        """Of ΔV/R³."""
+        """Return -dPi/dmu of one unit of ΔV/R³."""
         if name != PressureSection.amplitude:
             return None
         return -view.model.material.classical_pressure / view.h / view.model.multiplicity
@@ -153,25 +156,24 @@ class PressureObservables(Observables):
 
 
 def account(context: Context, loads: "Loads") -> Account:
-    """Whether there is a live pressure."""
+    """Return whether there is a live pressure."""
     if not loads.pressure:
         return Account(left_out=["pressure: not loaded by it (the volume is only reported)"])
-    on = ", ".join(
+    faces = ", ".join(
         f"{name} from {'outside' if side > 0 else 'inside'}" for name, side in loads.pressed.items()
     )
     return Account(
         [
             "live pressure on the outer face"
             if context.solid
-            else f"live pressure{on and f' on {on}'}"
+            else f"live pressure{faces and f' on {faces}'}"
         ]
     )
 
 
 @dataclass(frozen=True)
-class Enclosed:
-    """A gas from where it was closed in, an equilibrium: (ambient - p) V stays what it was there
-    (Boyle's law).
+class EnclosedGas:
+    """A gas from where it was closed in, an equilibrium: (ambient - p) V stays (Boyle's law).
 
     Attributes
     ----------
@@ -180,7 +182,7 @@ class Enclosed:
     unit
         -dPi/dp of ΔV/R³ = 1, with p over p_c.
     pressure, conjugate
-        p/p_c and -dPi/dp there.
+        p/p_c and -dPi/dp where it was closed in.
     """
 
     section: GasSection
@@ -191,7 +193,7 @@ class Enclosed:
     conjugate: float
 
     def law(self) -> "Conjugate":
-        """The conjugate as a function of p/p_c.
+        """Return the conjugate as a function of p/p_c.
 
         Raises
         ------
@@ -226,21 +228,23 @@ class Enclosed:
         return conjugate
 
     def by_begin(self, p: float) -> tuple[float, float]:
-        """What the conjugate at p/p_c changes by with that where the gas was closed in, and with p
-        there.
+        """Return derivatives of the conjugate at p/p_c by the conjugate, and p, where it was closed
+        in.
         """
-        at_now, slope = self.law()(p)
+        conjugate, slope = self.law()(p)
         first = self._volume()
-        ahead = (at_now / self.unit + first) / slope * self.unit  # ambient - p
-        share = (ahead + p - self.pressure) / ahead
-        return share, -(self.unit * first + self.conjugate) / ahead
+        pressure_below_ambient = (conjugate / self.unit + first) / slope * self.unit  # ambient - p
+        share = (pressure_below_ambient + p - self.pressure) / pressure_below_ambient
+        return share, -(self.unit * first + self.conjugate) / pressure_below_ambient
 
     def _volume(self) -> float:
-        return self.section.volume or volume(self.shell)
+        return self.section.volume or cap_volume(self.shell)
 
 
-def volume(shell: ShellSection | Surface) -> float:
-    """The volume between a spherical shell without its dimple and the plane of its edge, over R^3.
+def cap_volume(shell: ShellSection | Surface) -> float:
+    """Return the volume between a spherical shell without its dimple and the plane of its edge.
+
+    It is over R^3.
 
     Raises
     ------
