@@ -144,10 +144,10 @@ class ModeFamily(Protocol):
 class FamilyTangents(Protocol):
     """The tangents of several families together, as one array in which they are linear."""
 
-    def numbers(self, state: State) -> Vector:
+    def sampled_tangents(self, state: State) -> Vector:
         """Return the tangents at a state of the model."""
 
-    def counts_of(self, numbers: Vector) -> Sequence[int]:
+    def counts_from(self, numbers: Vector) -> Sequence[int]:
         """Return the numbers of unstable directions of all families."""
 
     def indefinite(self, numbers: Vector) -> set[int]:
@@ -483,12 +483,12 @@ class StabilityMonitor:
         if excluded is None:
             return _InertiaEvaluation(point, distance, ())
         tangents, state = excluded.tangents, self._expand(point.state)
-        numbers = cache(partial(tangents.numbers, state)) if tangents else None
+        numbers = cache(partial(tangents.sampled_tangents, state)) if tangents else None
         start_vector = self._last_evaluation.vector if self._last_evaluation else None
 
         def find() -> RecordedValues:
             if tangents and numbers:
-                counts = [*tangents.counts_of(numbers())]
+                counts = [*tangents.counts_from(numbers())]
                 return RecordedValues({"counts": counts, "softest": np.inf})
             if len(self._families) != 1:
                 return RecordedValues({"counts": [*excluded.counts(state)], "softest": np.inf})

@@ -131,8 +131,8 @@ class Energy:
     column: str = ""
 
     def perturbed_form(self, u: Jet, v: Jet) -> ufl.Form:
-        """A form with the Hessian in v, at v = 0, of the energy of u + v; a work gives its
-        symmetric part.
+        """Return a form whose Hessian in v, at v = 0, is that of the energy of u + v; of a work,
+        its symmetric part.
         """
         if self.work is None:
             return self.form_of(u + v)
@@ -158,7 +158,7 @@ class HeldEdge:
 
 @dataclass(frozen=True)
 class IntegrationDomain:
-    """The mid-surface, or its meridian, with the placement r0 on it.
+    """Domain of a shell's integrals: the mid-surface, or its meridian, with the placement r0 on it.
 
     Attributes
     ----------
@@ -204,7 +204,9 @@ class IntegrationDomain:
         return self.jet(self.r0)
 
     def discontinuous(self, size: int) -> fem.FunctionSpace:
-        """Fields of so many numbers, discontinuous and as rich as the placement."""
+        """Return the space of fields of so many numbers, discontinuous and as rich as the
+        placement.
+        """
         cell, degree = self.mesh.basix_cell(), self.r0.function_space.element.basix_element.degree
         return fem.functionspace(
             self.mesh,
@@ -212,7 +214,7 @@ class IntegrationDomain:
         )
 
     def constant(self, value: float | NDArray[np.float64]) -> fem.Constant:
-        """A number or a vector in a form."""
+        """Return a number or a vector as a constant of forms."""
         return fem.Constant(self.mesh, value)
 
     def dx(self, rule: int | None = None) -> ufl.Measure:
@@ -253,16 +255,16 @@ class IntegrationDomain:
         return {} if self.edge_rule is None else {"quadrature_degree": self.edge_rule}
 
     def over_area(self) -> Callable[[Expr], ufl.Form]:
-        """The integral over the undeformed area."""
+        """Return the integral over the undeformed area, as a function of what is integrated."""
         ratio = kin.area_ratio(self.j0)
         return lambda f: f * ratio * self.dx()
 
     def length(self, facets: Facets) -> ufl.Form:
-        """The undeformed length of some edges."""
+        """Return the undeformed length of some edges."""
         return kin.conormal(self.j0, self.covector)[2] * self.ds(facets)
 
     def jets_from_initial(self, u: Jet) -> tuple[Jet, Jet]:
-        """The jets of the drawn placement and of the displacement from there."""
+        """Return the jets of the initial placement and of the displacement from there."""
         if self.initial_placement is None:
             return self.j0, u
         initial = self.jet(self.initial_placement)
@@ -335,7 +337,7 @@ class IntegrationDomain:
 def surface_domain(
     r0: fem.Function, initial_placement: fem.Function | None = None
 ) -> IntegrationDomain:
-    """The mid-surface, a mesh of triangles."""
+    """Return the domain of a mid-surface, a mesh of triangles."""
     mesh_of_surface, degree = r0.function_space.mesh, r0.function_space.element.basix_element.degree
     interior_width = ufl.avg(ufl.CellVolume(mesh_of_surface)) / ufl.avg(
         ufl.FacetArea(mesh_of_surface)
@@ -357,7 +359,7 @@ def surface_domain(
 def meridian_domain(
     r0: fem.Function, initial_placement: fem.Function | None = None
 ) -> IntegrationDomain:
-    """The meridian, a mesh of intervals."""
+    """Return the domain of a meridian, a mesh of intervals."""
     mesh_of_meridian = r0.function_space.mesh
     degree = r0.function_space.element.basix_element.degree
     tangent = revolved_jet(r0).r1

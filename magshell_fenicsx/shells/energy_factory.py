@@ -136,7 +136,9 @@ class EnergyFactory:
         return self.domain.energy("membrane", density, column="stretching")
 
     def prestress(self) -> Density:
-        """The part of the tangent that membrane stress makes; its first parameter is the strain."""
+        """Return the density of the tangent's part by membrane stress; its first parameter is the
+        strain.
+        """
         strain = fem.Function(fem.functionspace(self.domain.mesh, ("DG", 0, (3,))))
         return self._elastic_density(Density(per_area(densities.prestress), (strain,)))
 
@@ -168,7 +170,7 @@ class EnergyFactory:
         return self.domain.energy(name, density, column="bending")
 
     def mirror_edges(self, facets: Facets, normal: Array, name: str = "mirror edges") -> Energy:
-        """Edges on a mirror plane with that normal."""
+        """Energy of edges on a mirror plane with that normal."""
         plane = self._constant(normal)
         density = self._elastic_density(
             Density(
@@ -179,7 +181,7 @@ class EnergyFactory:
         return self.domain.energy(name, density, column="bending")
 
     def edge_moment(self, name: str, facets: Facets, intensity: float, amplitude: str) -> Energy:
-        """A moment per length about the edge's first tangent; in E h R."""
+        """Energy of a moment per length about the edge's first tangent; in E h R."""
         reference_turn = self._constant(np.array([1.0, 0.0]))
         density = Density(edges.turning, (self._constant(intensity), reference_turn), facets=facets)
         length = fem.assemble_scalar(self.log.compile(f"{name} length", self.domain.length(facets)))
@@ -191,7 +193,9 @@ class EnergyFactory:
     def dead_energies(
         self, name: str, loads: Sequence[DeadLoad], edges_named: Mapping[str, Facets]
     ) -> list[Energy]:
-        """Energies of the moments and of the user's potentials among the dead loads of an amplitude."""
+        """Energies of the moments and of the user's potentials among the dead loads of an
+        amplitude.
+        """
         energies = []
         for i, load in enumerate(moments(loads)):
             moment_name = f"{name} moment {load.edge} {i}"
@@ -243,8 +247,8 @@ class EnergyFactory:
         )
 
     def induced(self, field: Magnetisation) -> dict[str, ufl.Form]:
-        """Integrals of the polarisation over the undeformed volume of the modelled part, over h; and
-        that volume.
+        """Integrals of the polarisation over the undeformed volume of the modelled part, over h;
+        and that volume.
         """
         if field.soft is None:
             return {}
@@ -343,8 +347,8 @@ class EnergyFactory:
         *parameters: Parameter,
         parts: tuple[str, ...] = FIRST_DERIVATIVES,
     ) -> Density:
-        """Return a density of the remanence, weighted with the thickness; where this follows from F,
-        it has the natural shape too.
+        """Return a density of the remanence, weighted with the thickness; where this follows
+        from F, it has the natural shape too.
         """
         density = Density(per_area(density_function), parameters, parts=parts)
         thins = self.material.law.thins_somewhere and field.law == "deformation"
@@ -438,8 +442,8 @@ class EnergyFactory:
         return {column: self._over_area(density) for column, density in by_column.items()}
 
     def contact(self, contact: ContactBody) -> tuple[Energy, BodyContact, dict[str, ufl.Form]]:
-        """Energy and state of the contact with a body, and integrals of the pressure and of pressure
-        times radius.
+        """Energy and state of the contact with a body, and integrals of the pressure and of
+        pressure times radius.
         """
         domain = self.domain
         approach = self.free_constants.setdefault(contact.amplitude, self._constant(0.0))
@@ -490,7 +494,9 @@ class EnergyFactory:
         return density if self.thickness is None else thickness_weighted(density, self.thickness)
 
     def _thinning(self, density: Density) -> Density:
-        """Return a density of a shell that thins, on the natural shape and by the law of each cell."""
+        """Return a density of a shell that thins, on the natural shape and by the law of each
+        cell.
+        """
         law, cell_materials = self.material.law, self.cell_materials
         density = grown(density, self.natural) if self.natural else density
         if cell_materials is None or not isinstance(law, LawByShell):

@@ -33,8 +33,8 @@ Model: TypeAlias = "ShellModel | MeridianModel | SolidModel"
 
 
 def mass(model: Model) -> PETSc.Mat:
-    """The consistent mass of what is modelled, without rotary inertia; zero rows and columns at
-    supports.
+    """Return the consistent mass of the modelled part, without rotary inertia; zero rows and
+    columns at supports.
     """
     M, projection = mass_matrix(_product(model), model.system.clamped), model.system.projection
     return projection.mass(M) if projection else M
@@ -64,7 +64,7 @@ def mass_factor(model: Model) -> Expr | None:
 
 
 def displacement_product(model: Model, factor: Expr | float) -> ufl.Form:
-    """The weighted integral of u . v over the undeformed mid-surface of what is modelled."""
+    """Return the weighted integral of u . v over the undeformed mid-surface of the modelled part."""
     product = factor * ufl.dot(ufl.TrialFunction(model.V), ufl.TestFunction(model.V))
     return _integral(model, model.domain.revolution_factor * product if model.thin else product)
 
@@ -108,7 +108,7 @@ def _integral(model: Model, f: Expr) -> ufl.Form:
 
 
 def mass_matrix(product: fem.Form, constraints: list[fem.DirichletBC]) -> PETSc.Mat:
-    """The matrix of an inner product, with zero rows and columns at held degrees of freedom.
+    """Return the matrix of an inner product, with zero rows and columns at held degrees of freedom.
 
     So held degrees of freedom have no finite eigenvalue, whatever the tangent's diagonal is there.
     """
@@ -177,7 +177,7 @@ class SupportInertia:
         return self._sum([self._moving.rate(mu, name)])
 
     def times(self, x: Vector) -> Vector:
-        """The mass of all nodes times a vector."""
+        """Return the mass of all nodes times a vector."""
         self._x.setArray(x)
         self._mass.mult(self._x, self._y)
         return np.array(self._y.array_r)

@@ -396,7 +396,7 @@ class MeridianModel(ThinModel):
 
     @cached_property
     def symmetry_breaking_modes(self) -> SymmetryBreakingWaves:
-        """The waves around the axis, which an axisymmetric model does not see. Compiles kernels."""
+        """Waves around the axis, which an axisymmetric model cannot have. Compiles kernels."""
         arguments = self.system, self.energies, self.meridian, self.domain, self.held, self.kernels
         return SymmetryBreakingWaves(
             Waves(*arguments, [*self.shell_contacts, *self.t_junction_terms])

@@ -116,7 +116,7 @@ class ModelBase:
 
     @property
     def mirrored_facets(self) -> Facets:
-        """The edges on the mirror planes of a half model or a sector; none of another."""
+        """Edges on the mirror planes of a half model or a sector; none of another."""
         return np.empty(0, dtype=np.int32)
 
     def observe(
@@ -139,7 +139,7 @@ class ModelBase:
         }
 
     def dead_load_term(self, name: str, dead: DeadLoads) -> LinearTerm:
-        """The term of the dead loads of an amplitude, except the moments."""
+        """Return the term of the dead loads of an amplitude, except the moments."""
         self.load_size[name], self.load_sizes[name] = dead.size, dead.sizes
         unity, u = fem.Constant(self.V.mesh, 1.0), self.u
         forms = [
@@ -164,7 +164,9 @@ class ModelBase:
         ]
 
     def free_motion(self, amplitudes: Amplitudes) -> str:
-        """A rigid motion that is left free, as a message; empty if there is none. Collective."""
+        """Return a rigid motion that is left free, as a message; empty if there is none.
+        Collective.
+        """
         return free_motion(self.system, self.r0, amplitudes)
 
     def zero(self) -> Vector:
@@ -192,8 +194,8 @@ class ModelBase:
         return np.asarray(self.system.comm.allreduce(share))
 
     def probe(self, point: str) -> Array:
-        """Rows (3, size) that take the displacement at a named vertex from a vector, each rank its
-        part.
+        """Return rows (3, size), each rank its part, that give the displacement at a named vertex
+        from a vector.
         """
         rows = np.zeros((3, self.system.size))
         dofs = np.asarray(self._probes[point]).reshape(-1, 3)
@@ -209,7 +211,7 @@ class ModelBase:
         return evaluation.evaluate(lambda: body_contact.region(self.system.comm, mean_radius))
 
     def cell_pressures(self, state: State) -> Array | None:
-        """The pressure of all contacts in each local cell, see `BodyContact`; None without
+        """Return the pressure of all contacts in each local cell, see `BodyContact`; None without
         contacts.
         """
         if not (self.contacts or self.shell_contacts):
@@ -238,8 +240,8 @@ class ModelBase:
         return self.system.at_state(state).evaluate(flags_of_cells)
 
     def cell_gaps(self, state: State) -> Array | None:
-        """The least gap over R in each local cell between parts of the shell, see `SurfaceContact`;
-        None without pairs.
+        """Return the least gap over R in each local cell between parts of the shell, see
+        `SurfaceContact`; None without pairs.
         """
         if not self.shell_contacts:
             return None
@@ -310,7 +312,9 @@ class ThinModel(ModelBase):
         return self.factory.law_of_cells
 
     def over_area(self) -> Callable[[Expr], ufl.Form]:
-        """The integral over the undeformed area of what is modelled."""
+        """Return the integral over the undeformed area of the modelled part, as a function of what
+        is integrated.
+        """
         integral = self.domain.over_area()
         return lambda f: self.domain.revolution_factor * integral(f)
 

@@ -1,4 +1,4 @@
-"""The lowest modes of a shell, those that its reduced model excludes included.
+"""The lowest modes of a shell, with those that break the symmetry of its reduced model.
 
 Each solves K phi = lambda M phi with M the inner product of displacements over the undeformed
 mid-surface: lambda is the stiffness per area with which the shell resists phi. Lengths in R and
@@ -55,7 +55,7 @@ class ModeSpace:
     displacement: Callable[[Vector], Vector] = lambda u: u
 
     def state(self, state: State) -> State:
-        """A state of the given model in this one; collective."""
+        """Return a state of the given model in this one; collective."""
         return State(self.displacement(state.u), dict(state.mu))
 
 
@@ -121,7 +121,7 @@ class ShellModes:
     def lowest(
         self, state: State, count: int, *, allows_rigid_motion: bool = False
     ) -> list[ShellMode]:
-        """The lowest modes, ascending: of every family `count`, and all that are negative.
+        """Return the lowest modes, ascending: of every family `count`, and all that are negative.
 
         They are those of the symmetric part, where the tangent is not symmetric.
 
@@ -142,8 +142,8 @@ class ShellModes:
     def vibrations(
         self, state: State, count: int, *, allows_rigid_motion: bool = False
     ) -> list[ShellMode]:
-        """The `count` lowest natural modes, ascending, and all that are unstable; eigenvalues are
-        omega^2 rho R^2/E.
+        """Return the `count` lowest natural modes, ascending, and all that are unstable;
+        eigenvalues are omega^2 rho R^2/E.
 
         The mass is consistent, without rotary inertia, and that of the drawn shell. On the meridian
         vibrations around the axis are among them. Otherwise as `lowest`.
@@ -179,8 +179,8 @@ class ShellModes:
         return sorted(of_families, key=lambda mode: mode.eigenvalue)
 
     def null_vector(self, state: State, label: str) -> Vector:
-        """The vector of the mode whose stiffness is nearest to zero: at a located instability the
-        null vector.
+        """Return the mode whose stiffness is nearest to zero: at a located instability the null
+        vector.
 
         Parameters
         ----------
@@ -206,8 +206,8 @@ class ShellModes:
 def _families(
     model: Model, *, vibrating: bool = False, rest: State | None = None
 ) -> Iterator[_Family]:
-    """The modes that the model sees, then those that it excludes, whose kernels are compiled by
-    then.
+    """Yield the modes that the model has, then those that break its symmetry, whose kernels are
+    compiled by then.
 
     If `vibrating`, the inner product is that of the mass, and torsion is a family of the meridian.
     `rest` is the undeformed state of a shell that is not held, whose rigid motions are counted.
@@ -267,7 +267,7 @@ def _families(
 
 
 def _normalised(vector: Vector, M: PETSc.Mat) -> Vector:
-    """The vector, on one rank, divided so that phi . M phi = 1."""
+    """Return a vector, on one rank, divided so that phi . M phi = 1."""
     phi, product = M.createVecs()
     phi.setArray(vector)
     M.mult(phi, product)

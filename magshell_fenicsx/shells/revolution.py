@@ -16,8 +16,8 @@ ENDS = np.array([[0.0], [1.0]])  # of the reference cell
 
 
 class Revolution:
-    """The vertices of a meridian turned into `sectors` equal angles; at a pole all of them are one
-    node.
+    """Surface that a meridian sweeps: its vertices are turned into `sectors` equal angles; at a
+    pole all of them are one node.
 
     Parameters
     ----------
@@ -65,8 +65,8 @@ class Revolution:
         return self._swept(u.reshape(-1, 2))
 
     def jets(self, f: fem.Function) -> Array:
-        """The jet of a field at the ends of all cells, along (e_rho, e_theta, e_z): (6, cells, 2,
-        3).
+        """Return the jets (6, cells, 2, 3) of a field at the ends of all cells, along (e_rho,
+        e_theta, e_z).
 
         At the pole, where the surface has no second direction, a little off it.
         """
@@ -79,13 +79,13 @@ class Revolution:
         return _revolved(self._derivatives(f, points))
 
     def scalars(self, f: fem.Function, points: Array = ENDS) -> Array:
-        """The values of a field (1,) at the ends of all cells, or other reference points (q, 1):
-        (cells, q).
+        """Return the values (cells, q) of a field (1,) at the ends of all cells, or other reference
+        points (q, 1).
         """
         return self._derivatives(f, points)[0, :, :, 0]
 
     def vertices(self, V: fem.FunctionSpace) -> NDArray[np.int64]:
-        """The nodes of a space on the meridian at all circles."""
+        """Return the nodes of a space on the meridian at all circles."""
         cells, ends = self._at_ends
         return np.asarray(V.dofmap.list[self.order[cells], ends], dtype=np.int64)
 
@@ -96,8 +96,8 @@ class Revolution:
         return np.asarray(circles[is_node])
 
     def _derivatives(self, f: fem.Function, points: Array) -> Array:
-        """(3, cells, q, components) values, first and second derivatives at reference points (q,
-        1).
+        """Return values, first and second derivatives (3, cells, q, components) at reference points
+        (q, 1).
         """
         V = f.function_space
         cells, bs = V.dofmap.list, V.dofmap.bs
@@ -127,8 +127,8 @@ class Revolution:
         return self.at_nodes(circles)
 
     def _means(self, ends: Array, weight: Array) -> Array:
-        """The weighted mean of the cells that meet at each circle, of values (cells, 2, ...) at
-        their ends.
+        """Return the weighted mean of the cells that meet at each circle, of values (cells, 2, ...)
+        at their ends.
         """
         weight = weight.reshape(*weight.shape, *(1,) * (ends.ndim - 2))
 
@@ -140,8 +140,8 @@ class Revolution:
         return np.asarray(sums(weight * ends) / sums(weight))
 
     def _swept(self, nodal: Array) -> Array:
-        """(rho, z) components at the meridian's nodes -> vectors at the poles and on the
-        circles.
+        """Return vectors at the poles and on the circles from (rho, z) components at the meridian's
+        nodes.
         """
         components = nodal[self.vertices(self._model.V)]
         components = np.where(self._poles[:, None], components * [0.0, 1.0], components)[:, None]

@@ -32,7 +32,7 @@ AXISYMMETRY_TOLERANCE = 1e-3  # in lengths: a state that differs less around e3 
 
 
 class SectorModes:
-    """Numbers of the unstable modes that a sector excludes.
+    """Counts of the unstable modes that break a sector's symmetry.
 
     Parameters
     ----------
@@ -53,7 +53,7 @@ class SectorModes:
 
     @cached_property
     def half_model(self) -> "ShellModel":
-        """The model whose tangents are counted."""
+        """Model of the half, whose tangents are counted."""
         sector, patch = self._model.mirror, self._model.midsurface.patch
         assert isinstance(sector, Sector)
         self._folding = unfolding_of(sector, patch)
@@ -72,7 +72,7 @@ class SectorModes:
         return half
 
     def unfold(self, u: Vector) -> Vector:
-        """A displacement of the sector as that of the half; collective."""
+        """Return a displacement of the sector as that of the half; collective."""
         half, system = self.half_model, self._model.system
         sector_values = np.concatenate(system.comm.allgather(u[: system.size].reshape(-1, 3)))
         return np.asarray(
@@ -82,8 +82,8 @@ class SectorModes:
         )
 
     def counts(self, state: State) -> Sequence[int]:
-        """Unstable modes of the half that the sector excludes, and those that are antisymmetric to
-        the half.
+        """Return the number of unstable modes of the half that the sector cannot have, and of those
+        that are antisymmetric to the half.
         """
         half, state_of_half = self.half_model, State(self.unfold(state.u), dict(state.mu))
         self._own.factor(self._model.system.tangent(state.u, state.mu))

@@ -486,7 +486,7 @@ class ShellModel(ThinModel):
 
     @cached_property
     def symmetry_breaking_modes(self) -> AntisymmetricModes | SectorModes | None:
-        """The modes that a half model or a sector does not see; None for a whole one.
+        """Modes that a half model or a sector cannot have; None for a whole one.
 
         Compiles kernels.
         """

@@ -231,8 +231,8 @@ class SolidModel(ModelBase):
 
     @cached_property
     def symmetry_breaking_modes(self) -> AntisymmetricModes | None:
-        """The modes that a half model does not see: moved freely across the mirror plane and not in
-        it.
+        """Modes that a half model cannot have: they move freely across the mirror plane and not in
+        it; None for a whole one.
         """
         if self.multiplicity == 1:
             return None
@@ -241,7 +241,9 @@ class SolidModel(ModelBase):
         )
 
     def over_area(self) -> Callable[[Expr], ufl.Form]:
-        """The integral over the undeformed volume of what is modelled."""
+        """Return the integral over the undeformed volume of the modelled part, as a function of
+        what is integrated.
+        """
         return lambda f: f * ufl.dx(domain=self.V.mesh)
 
     def cells_of_fields(self) -> CellGeometry:
@@ -249,8 +251,8 @@ class SolidModel(ModelBase):
         return body_cell_geometry(self.V)
 
     def places(self, nodes: Array) -> tuple[Array, Array]:
-        """The nodes of every cell, whatever is asked for, and the normals of the surface at their
-        height.
+        """Return the nodes of every cell, whatever `nodes` are, and the normals of the surface at
+        their height.
         """
         return body_positions_and_normals(self.V)
 
@@ -309,7 +311,8 @@ class SolidModel(ModelBase):
 
 
 def _in_cells(field: Magnetisation, body: BodyMesh) -> Magnetisation:
-    """The magnetisation, with a vector for each cell where it is given by patches or by layers.
+    """Return the magnetisation with a vector for each cell, where it is given by patches or by
+    layers.
 
     Raises
     ------
@@ -332,7 +335,7 @@ def _layered(layers: Sequence[tuple[float, Array]], body: BodyMesh) -> ByPatch:
 
 
 def grown_in_body(density: SolidDensity, shape: Shape) -> SolidDensity:
-    """A density that takes a `growth`, of that shape."""
+    """Return a density on a natural shape, from one that takes a `growth`."""
 
     def grown(*arguments: Expr) -> Expr:
         count = len(arguments) - len(shape.parameters)

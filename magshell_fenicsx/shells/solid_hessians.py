@@ -123,12 +123,12 @@ class BodyHessianIntegral:
             element_matrices[batch.cells[0]] += self._contraction.within_side(blocks, 0)
 
     def _jets(self, batch: EntityBatch, field: Array) -> Array:
-        """(cells, points, 4, 3) of a field."""
+        """Return the jets (cells, points, 4, 3) of a field."""
         return batch.rule.tables[0].jets(field.reshape(-1, 3)[self._dofs[batch.cells[0]]])
 
     def _density(self, term: SolidTerm, v: fem.Function) -> Any:
-        """A function of u, or of u and v with the Hessian in v that its virtual work has in
-        symmetric part.
+        """Return a function of u; of a virtual work one of u and v, whose Hessian in v is the
+        symmetric part of its derivative.
         """
         density, g, z = term.density, self._g, self._u
         at_points, varying = parameters_at(self._points, density.parameters, 1)
@@ -166,8 +166,8 @@ def body_hessian_integrals(
     log: KernelLog,
     cell_mask: NDArray[np.bool_] | None = None,
 ) -> list[BodyHessianIntegral]:
-    """The sites of the terms that have a tangent, one for each quadrature, on all or some local
-    cells. Collective.
+    """Return the integrals of terms' Hessians, one for each quadrature, on all or some local cells.
+    Collective.
     """
     V = X.function_space
     nonlinear = [t for t in terms if isinstance(t, SolidTerm) and not t.linear]
@@ -210,7 +210,7 @@ def _on_facet(points: Array, facet: int) -> Array:
 def _cells_at(
     body: BodyMesh, facets: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Owned cells with one of these facets, and its number in each."""
+    """Return the owned cells with one of these facets, and its number in each."""
     topology = body.mesh.topology
     links = topology.connectivity(2, 3)
     cells = links.array[links.offsets[facets]]
@@ -222,7 +222,9 @@ def _cells_at(
 
 
 def _geometry(jets: Array, place: str, facet: int | None) -> Array:
-    """(points, SIZES[where]) from the placement's jets; dX/dxi and n and t by rows."""
+    """Return the geometry (points, SIZES[place]) from the placement's jets; dX/dxi and n and t by
+    rows.
+    """
     flat = jets.reshape(-1, JET_PARTS, 3)
     if place == "outer":
         return flat.reshape(-1, SIZES[place])

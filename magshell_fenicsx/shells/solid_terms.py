@@ -164,7 +164,9 @@ class TermFactory:
         )
 
     def magnetic(self, field: Magnetisation) -> list[SolidTerm]:
-        """The terms, linear in the applied field, with the amplitude lambda_m; and what is soft."""
+        """Return the terms of a remanence, linear in the applied field, with the amplitude
+        lambda_m, and of a soft magnet.
+        """
         applied = None
         if field.in_space:
             X = fem.Function(self.u.function_space)
@@ -192,8 +194,8 @@ class TermFactory:
         return self._bulk(TERM, density, group="magnetic", column="magnetic")
 
     def induced(self, field: Magnetisation) -> dict[str, ufl.Form]:
-        """The integrals of the polarisation over the undeformed volume of what is modelled, and
-        that volume.
+        """Integrals of the polarisation over the undeformed volume of the modelled part, and that
+        volume.
         """
         if field.soft is None:
             return {}
@@ -209,8 +211,9 @@ class TermFactory:
     def _of_sheet(
         self, sheet: Sheet, soft_magnet: SoftMagnet, applied: AppliedField | None
     ) -> "list[fem.Constant | fem.Function]":
-        """The susceptibility, or what is known of what saturates; normals of layers, amplitudes,
-        parts of the field.
+        """Parameters of a sheet's densities: the susceptibility, or the magnetisation state where
+        it saturates; normals of layers, amplitudes, and the vectors of the field or its polynomial
+        in space.
         """
         chi, V = soft_magnet.susceptibility, self.u.function_space
         if callable(chi):
@@ -262,7 +265,9 @@ class TermFactory:
         return sheet.saturated(chi, amplitudes, applied, saturation, followed, places_and_normals)
 
     def remanent(self, field: Magnetisation, applied: AppliedField | None) -> list[SolidTerm]:
-        """The terms, linear in the applied field, with the amplitude lambda_m."""
+        """Return the terms of a remanence, linear in the applied field, with the amplitude
+        lambda_m.
+        """
         pattern = field.remanent
         law = body_densities if field.law == "deformation" else rotation_law
         if callable(pattern):
@@ -303,8 +308,8 @@ class TermFactory:
         return terms
 
     def pressure(self, classical: float, *, potential: bool = True) -> list[SolidTerm]:
-        """Amplitude p/p_c, `classical` being p_c/E; on the outer face, and above the middle line of
-        hinged ends.
+        """Return the terms of a live pressure with the amplitude p/p_c, on the outer face and above
+        the middle line of hinged ends; `classical` is p_c/E.
         """
         v = None if potential else ufl.TestFunction(self.u.function_space)
         return [
@@ -323,7 +328,7 @@ class TermFactory:
         ]
 
     def user_term(self, term: OwnTerm, amplitude: str | None = None) -> SolidTerm:
-        """The energy of a part or one's own on the outer face or of the body, with its own
+        """Return a user's term, or a part's, on the outer face or of the body, with its own
         amplitude or another.
         """
         assert term.density
@@ -356,7 +361,7 @@ class TermFactory:
         }
 
     def _volume_density(self, term: OwnTerm, density_function: Callable[..., Expr]) -> SolidDensity:
-        """A density of the volume, which depends on places alone."""
+        """Return the density of a volume, which depends on places alone."""
         flat = [ufl.zero(3)] * len(ALL_DERIVATIVES)
         count = len(term.parameters)
         at_point = term.at_point(density_function)
@@ -397,7 +402,7 @@ class TermFactory:
         return self._on_faces(list(self._volume_densities(1.0, origin).values()))
 
     def moment(self, name: str, edge: str, intensity: float, amplitude: str) -> EndMoment:
-        """A moment per length in E h R about the first tangent of an edge."""
+        """Return the term of a moment per length, in E h R, about the first tangent of an edge."""
         Q = fem.functionspace(self.body.mesh, ("Lagrange", 2, (1,)))
         weight, reference_turn = fem.Function(Q), self._constants(np.array([1.0, 0.0]))[0]
         body = self.body
@@ -418,8 +423,8 @@ class TermFactory:
     def _volume_densities(
         self, unit: float, origin: Array | None, *, potential: bool = True
     ) -> dict[str, SolidDensity]:
-        """p times the change of the volume under the outer face, down to the middle line where an
-        end is hinged.
+        """Densities of p times the volume's change under the outer face, down to the middle line
+        where an end is hinged.
         """
         moves_straight, faces = origin is None, self.body.faces
         parameters = self._constants(
@@ -486,7 +491,7 @@ class TermFactory:
         return term
 
     def _on_faces(self, densities: Sequence[SolidDensity], v: Expr | None = None) -> ufl.Form:
-        """The sum of energies, or of virtual works of v."""
+        """Return the sum of energies on faces, or of virtual works of v."""
         domain, u = self.body.mesh, self.u
         X, J, H = ufl.SpatialCoordinate(domain), ufl.Jacobian(domain), ufl.grad(u)
         ds, forms = face_measure(domain, [density.facets for density in densities]), []

@@ -171,7 +171,7 @@ class TieTerm:
         add_to_owners(b, residual, self._own, self._comm)
 
     def add_tangent(self, K: object, factor: float, clamped: object) -> None:
-        """None here: what assembles the others adds `entries`."""
+        """Add nothing: what assembles the others adds `entries`."""
 
     def entries(self) -> Entries:
         return _entries(self._unknowns, self._second_variation(self._gaps, self._tangents))
@@ -186,8 +186,8 @@ class TieTerm:
         return 0.0
 
     def _second_variation(self, gap: Array, tangents: Array) -> Array:
-        """(n, k, k) the second variation at the present u, along what these make of any k unknowns;
-        collective.
+        """Return the second variation (n, k, k) at the present u, along any k unknowns from which
+        these maps lead; collective.
         """
         H = np.einsum("n,nck,ncl->nkl", self._tie, gap, gap, optimize=True)
         u = global_values(self._u)
@@ -201,12 +201,12 @@ class TieTerm:
         return np.asarray(H)
 
     def _apply(self, maps: Array, u: Array) -> Array:
-        """(n, c) what maps (n, c, k) make of the values (nodes, components) of all nodes."""
+        """Return maps (n, c, k) applied to the values (nodes, components) of all nodes: (n, c)."""
         return np.asarray(np.einsum("nck,nk->nc", maps, u.ravel()[self._unknowns]))
 
     def _evaluate(self, kernel: str, u: Array) -> Array:
-        """(n, ..) what a kernel gives at the points, with this displacement (nodes, components) of
-        all nodes.
+        """Return a kernel's values (n, ..) at the points, with this displacement (nodes,
+        components) of all nodes.
         """
         count = len(self._unknowns)
         self._present.x.array[: count * TANGENT_COMPONENTS] = (
@@ -570,8 +570,8 @@ def _tied_points(surfaces: MidSurfaces, edge: EdgeOnShell, ties: Array) -> TiedP
 def _tie_stiffness(
     joint: Joint, material: Material, factors: Array, length: Array, weight: Array
 ) -> Array:
-    """(n, 2) stiffness of both ties at points that stand for a length `weight`, of cells with sides
-    of that length.
+    """Return the stiffness (n, 2) of both ties at points that stand for a length `weight`, of cells
+    with sides of that `length`.
     """
     turning_stiffness: Array | float = joint.stiffness
     if joint.rigid:
@@ -604,8 +604,8 @@ def _refuse_apart(
 
 
 def _cell_sides(V: fem.FunctionSpace, facets: NDArray[np.int32], owned: int) -> tuple[Longs, Array]:
-    """Local cells of this rank that have boundary facets, and both ends (n, 2, 2) of each in the
-    reference cell.
+    """Return the local cells of this rank that have boundary facets, and both ends (n, 2, 2) of
+    each in the reference cell.
     """
     topology = V.mesh.topology
     topology.create_connectivity(1, 2)
@@ -703,7 +703,7 @@ def meridian_t_junction_terms(model: "MeridianModel") -> list[MeridianTJunction]
 
 
 def _stiffness_factors(model: "ShellModel | MeridianModel") -> Array:
-    """(cells of this rank, 2) E h and E h^3 of each over those of the first shell."""
+    """Return E h and E h^3 (cells of this rank, 2) of each cell over those of the first shell."""
     cells = model.V.mesh.topology.index_map(model.V.mesh.topology.dim)
     factors = np.ones((cells.size_local + cells.num_ghosts, 2))
     if model.thickness is not None:

@@ -143,8 +143,8 @@ class Viscosity:
         return self._force
 
     def tangent(self, u: Vector, mu: Amplitudes, dt: float, rate: float) -> Tangent:
-        """The system's tangent with that of these forces, which stiffen the shell, but no body that
-        it touches.
+        """Return the system's tangent with that of these forces, which stiffen the shell, but no
+        body that it touches.
         """
         stiffness = self.stiffness(dt, rate)
         if self._viscous_tangent is None:
@@ -164,13 +164,11 @@ class Viscosity:
         )
 
     def begin(self) -> None:
-        """A motion begins or turns a corner: the rate of strain before it says nothing about the
-        next step.
-        """
+        """Forget the last rate of strain: a motion begins or turns a corner."""
         self.memory = Memory(self.memory.strains)
 
     def accept(self, u0: Vector, u1: Vector, dt: float) -> Vector:
-        """Go on from u1; the force that the step was solved with."""
+        """Go on from u1; return the force that the step was solved with."""
         if self._branches:
             self.memory = Memory(
                 self._evolved(u0, u1, dt), np.asarray(self._strain_change(u0, u1) / dt), dt
@@ -178,8 +176,8 @@ class Viscosity:
         return self._force
 
     def error_force(self, u0: Vector, u1: Vector, dt: float) -> Vector | None:
-        """The force at the end by which the curvature of the strain in time counts; None if nothing
-        does.
+        """Return the force at the end by which the curvature of the strain in time counts; None if
+        nothing does.
         """
         rate = self.memory.rate
         if rate is None:
@@ -202,8 +200,8 @@ class Viscosity:
         return system.at_state(State(u1, self._mu)).gradient(self._forms)
 
     def _evolved(self, u0: Vector, u1: Vector, dt: float) -> list[Array]:
-        """q at the end of a step; the strain is quadratic in time through its ends and the begin of
-        the step before.
+        """Return q at the end of a step; the strain is quadratic in time through its ends and the
+        begin of the step before.
         """
         change, rate = self._strain_change(u0, u1), self.memory.rate
         bend = 0.0 if rate is None else change / dt - rate
@@ -242,7 +240,7 @@ class Viscosity:
         return np.asarray((self._strain(u + step * v) - self._strain(u - step * v)) / (2 * step))
 
     def _strain(self, u: Vector) -> Array:
-        """(cells, places, 12): E and K as tensors in space."""
+        """Return E and K (cells, places, 12) as tensors in space."""
         jets = self._jets(self._model.system.with_ghosts(u, self._mu))
         tensors = [
             self._frame.tensor(S)
@@ -276,7 +274,7 @@ class _AddedViscousTangent:
 
     @contextmanager
     def scaled_by(self, stiffness: float) -> Iterator[None]:
-        """Tangents are those with so many times this one."""
+        """Context in which tangents have this one, times a stiffness."""
         self._stiffness.value = stiffness
         try:
             yield
@@ -302,7 +300,7 @@ class _AddedViscousTangent:
 
 
 def _retained_share(branch: Branch, dt: float) -> float:
-    """The part of a strain that grows evenly in a step and that is left in the spring at its
+    """Return the part of a strain, that grows evenly in a step, that is left in the spring at the
     end.
     """
     return float(-np.expm1(-dt / branch.time) * branch.time / dt) if dt else 1.0
@@ -327,14 +325,14 @@ class _PrescribedStress:
     stiffness: fem.Constant
 
     def strain(self, j: Jet, side: str) -> tuple[Expr, Expr]:
-        """The strain and the change of curvature that make the stress, on a side of an edge; ""
-        within a cell.
+        """Return the strain and the change of curvature that make the stress, on a side of an edge;
+        "" within a cell.
         """
         stress = self.field(side) if side else self.field
         return covariant(j, stress, 0), covariant(j, stress, 6)
 
     def stiff_opening(self, domain: IntegrationDomain, jump: Callable[[Jet], Expr]) -> Expr:
-        """The stiffness times the change of an edge's jump, a given number."""
+        """Return the stiffness times the change of an edge's jump, a given number."""
         jump_after, jump_before = (
             jump(domain.j0 + domain.jet(field))
             for field in (self.last_displacement, self.first_displacement)
@@ -368,7 +366,9 @@ def _strains(j: Jet, u: Jet) -> tuple[Expr, Expr]:
 
 
 def mirrored_jump(r0: Jet, m: Expr, normal: Expr) -> Callable[[Jet], Expr]:
-    """Return half of the jump across a plane with that normal, as a function of the deformed jet."""
+    """Return half of the jump across a plane with that normal, as a function of the deformed
+    jet.
+    """
     nu1, nu2, _ = kin.conormal(r0, m)
     return lambda r: ufl.dot(kin.normal(r), normal) * ufl.dot(normal, r.r1 * nu1 + r.r2 * nu2)
 
@@ -390,7 +390,8 @@ def _jump_of(edge: HeldEdge, r0: Jet, m: Expr) -> Callable[[Jet], Expr]:
 def _works(
     model: "ShellModel | MeridianModel", given: _PrescribedStress | _StrainRates
 ) -> list[ufl.Form]:
-    """Return the work of given stresses on the strains of u, and on edges as in C0 interior penalty.
+    """Return the work of given stresses on the strains of u, and on edges as in C0 interior
+    penalty.
 
     Its gradient is the viscous forces. Smooth surfaces have no jumps, so that these need no memory:
     each step closes the edges that it opens.

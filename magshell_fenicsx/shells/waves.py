@@ -161,7 +161,7 @@ class Waves:
         W), and so three are assembled. Only those that are not positive definite are factored for
         their inertia.
         """
-        values = self.sampled_matrices(state)
+        values = self.sampled_tangents(state)
         if not self.nonlocal_terms:
             return self.counts_from(values)
         unstable = list[int]()
@@ -171,7 +171,7 @@ class Waves:
             unstable.append(self._counting.negative_pivots)
         return unstable
 
-    def sampled_matrices(self, state: State) -> NDArray[np.float64]:
+    def sampled_tangents(self, state: State) -> NDArray[np.float64]:
         """Return the entries (5, entries) of the matrices at the five m."""
         of_nodes = self._system.at_state(state).evaluate_forms(
             lambda: self._entries(state, self._nodes[:3])
@@ -179,15 +179,15 @@ class Waves:
         return np.concatenate([of_nodes, _mirrored(of_nodes[1:])]).reshape(len(self._nodes), -1)
 
     def counts_from(self, values: NDArray[np.float64]) -> list[int]:
-        """Return `counts` from the matrices that `sampled_matrices` gives."""
+        """Return `counts` from the matrices that `sampled_tangents` gives."""
         unstable = [0] * self.largest
         for m in self._indefinite(values):
             unstable[m - 1] = self._interpolated_pivots(m, values)
         return unstable
 
     def indefinite(self, values: NDArray[np.float64]) -> set[int]:
-        """m - 1 of the waves whose matrices, as `sampled_matrices` gives them, are not positive
-        definite.
+        """Return m - 1 of the waves whose matrices, as `sampled_tangents` gives them, are not
+        positive definite.
         """
         ranges = self._ranges
         try:
@@ -198,8 +198,8 @@ class Waves:
     def _entries(
         self, state: State, waves: Sequence[float] | NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """(waves, pairs of nodes, 3, 3) entries of Q_m's matrices, with nothing held, at the
-        system's displacement.
+        """Return the entries (waves, pairs of nodes, 3, 3) of Q_m's matrices, without constraints,
+        at the system's displacement.
         """
         factors = {e.amplitude: factor_of(e.amplitude, state.mu) for e in self._nonlinear_energies}
         return self._points.entries(factors, [float(m) for m in waves])
@@ -222,8 +222,8 @@ class Waves:
 
     @cached_property
     def _rows_of_matrix(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
-        """The whole matrix in compressed rows: where they start, columns, and which of these
-        entries stands there.
+        """The whole matrix in compressed rows: row starts, columns, and the number of each entry in
+        `_sparsity`.
         """
         rows, columns = self._sparsity
         mirrored_entries = np.flatnonzero(rows // 3 != columns // 3)  # mirrored: the other triangle
@@ -235,8 +235,8 @@ class Waves:
         return K.indptr.astype(PETSc.IntType), K.indices.astype(PETSc.IntType), K.data
 
     def _indefinite(self, values: NDArray[np.float64]) -> list[int]:
-        """The waves whose matrices are not positive definite, from the entries (nodes, entries) at
-        the nodes.
+        """Return the waves whose matrices are not positive definite, from the entries (nodes,
+        entries) at the nodes.
 
         On a range of m the matrix is a mean of its five Bernstein coefficients with
         weights that are not negative: if these are positive definite, it is so for every m of the
@@ -269,8 +269,8 @@ class Waves:
         return self._counting.negative_pivots
 
     def _filled(self, name: str, entries: NDArray[np.float64], m: int) -> PETSc.Mat:
-        """A matrix with these entries, in the order of `_sparsity`, with what is held; the next
-        call overwrites it.
+        """Return a matrix with these entries, in the order of `_sparsity`, and constraints; the
+        next call overwrites it.
         """
         first, columns, places = self._rows_of_matrix
         data = entries[places]
@@ -350,8 +350,8 @@ def _lagrange_weights(
 
 
 def _mirrored(entries: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The entries (.., 3, 3) of Q_-m from those of Q_m: with -V in place of V, P = U + V becomes P
-    - 2 V.
+    """Return the entries (.., 3, 3) of Q_-m from those of Q_m: with -V in place of V, P = U + V
+    becomes P - 2 V.
     """
     mirrored = entries.copy()
     mirrored[..., 1] = -2 * mirrored[..., 0] - mirrored[..., 1]
@@ -440,8 +440,8 @@ class BandedMatrices:
         self._held_places = place[constrained_rows]
 
     def bands(self, values: Iterable[Array]) -> Array:
-        """The lower bands (matrices, entries) of some matrices, with ones on the diagonal of what
-        is held.
+        """Return the lower bands (matrices, entries) of some matrices, with ones on the diagonal of
+        constrained rows.
         """
         values = list(values)
         stacked = np.zeros((len(values), self._shape[0] * self._shape[1]))

@@ -62,13 +62,13 @@ class Together:
 
     families: Sequence[Diagonal]
 
-    def numbers(self, state: State) -> np.ndarray:
+    def sampled_tangents(self, state: State) -> np.ndarray:
         x = float(state.u[0])
         for family in self.families:
             family.looks.append(x)
         return np.array([family.eigenvalues(x) for family in self.families])
 
-    def counts_of(self, numbers: np.ndarray) -> list[int]:
+    def counts_from(self, numbers: np.ndarray) -> list[int]:
         return [int((of < 0).sum()) for of in numbers]
 
     def indefinite(self, numbers: np.ndarray) -> set[int]:

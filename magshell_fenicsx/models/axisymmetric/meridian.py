@@ -97,7 +97,7 @@ class Meridian:
 
     @property
     def bodies(self) -> list[NDArray[np.bool_]]:
-        """The cells of each shell, or of those that joints connect."""
+        """Cells (as flags) of each shell, or of those that joints connect."""
         bodies = [*self.patches.values()] or [np.ones(len(self._cell_ends), dtype=bool)]
         for tied_parameters in self.tied:
             begin = self._cell_ends[:, :1] - PARAMETER_TOLERANCE

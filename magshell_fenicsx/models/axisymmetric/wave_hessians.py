@@ -61,12 +61,12 @@ class WaveHessians:
         energies_by_support = dict[tuple[int, int, tuple[int, ...]], list[Energy]]()
         for e in energies:
             energies_by_support.setdefault(_support_of(e), []).append(e)
-        self._sites = [
+        self._batches = [
             _WaveBatch(domain, u, batch, energies_here, log)
             for energies_here in energies_by_support.values()
             for batch in _batches(domain, energies_here[0].density)
         ]
-        nodes = [site.nodes(self._nodes) for site in self._sites]
+        nodes = [batch.nodes(self._nodes) for batch in self._batches]
         count = int(self._nodes.max()) + 1
         pairs = [rows * count + columns for rows, columns in nodes]
         upper_numbers = [
@@ -80,18 +80,20 @@ class WaveHessians:
         ]
 
     def entries(self, factors: Mapping[str | None, float], waves: Sequence[float]) -> Array:
-        """(waves, pairs, 3, 3) at the present u; `factors` by amplitude."""
+        """Return the entries (waves, pairs, 3, 3) at the present u; `factors` are those of the
+        energies' amplitudes.
+        """
         total = np.zeros((len(waves), 9 * len(self.rows)))
-        for site, sums in zip(self._sites, self._sums, strict=True):
-            if (blocks := site.blocks(factors, waves)) is not None:
+        for batch, sums in zip(self._batches, self._sums, strict=True):
+            if (blocks := batch.blocks(factors, waves)) is not None:
                 for entries, of_wave in zip(total, blocks, strict=True):
                     entries += sums @ of_wave.ravel()
         return total.reshape(len(waves), -1, 3, 3)
 
 
 class _WaveBatch:
-    """The energies at the points of one batch: of the cells, of the vertices between them, or of an
-    end.
+    """Second variation of energies at the points of one batch: of the cells, of the vertices
+    between them, or of an end.
     """
 
     def __init__(
@@ -127,7 +129,7 @@ class _WaveBatch:
         ]
 
     def nodes(self, nodes: Ints) -> tuple[Ints, Ints]:
-        """Nodes of the rows and nodes of the columns of each entity's matrix, both (entities,
+        """Return the nodes of the rows and of the columns of each entity's matrix, both (entities,
         functions, functions).
         """
         of_entities = np.hstack([nodes[cells] for cells in self._batch.cells])
@@ -135,8 +137,8 @@ class _WaveBatch:
         return rows, columns
 
     def blocks(self, factors: Mapping[str | None, float], waves: Sequence[float]) -> Array | None:
-        """(waves, entities, pairs of components, pairs of functions), see `_UPPER`; None if no
-        energy is there.
+        """Return the matrices (waves, entities, pairs of components, pairs of functions), see
+        `_UPPER`; None if no energy acts.
         """
         present = [number for number, e in enumerate(self._energies) if factors[e.amplitude]]
         if not present:
@@ -198,7 +200,9 @@ class _WaveBatch:
         return e.from_initial and self._domain.initial_placement is not None
 
     def _edge(self, r0: Sequence[Jet]) -> tuple[list[Expr], Expr] | None:
-        """The covector on every side and the width, as of the domain."""
+        """Return the covector on every side and the width, as an `IntegrationDomain` has them; None
+        in cells.
+        """
         density = self._energies[0].density
         if density is None or not density.on_edges:
             return None
@@ -217,7 +221,9 @@ class _WaveBatch:
         ]
 
     def _derivatives(self, field: fem.Function) -> Array:
-        """(points, sides, derivatives, components) of an axisymmetric field."""
+        """Return values and derivatives (points, sides, derivatives, components) of an axisymmetric
+        field.
+        """
         nodal = field.x.array.reshape(-1, PLANE)[self._u.function_space.dofmap.list]
         sides = [
             np.tensordot(nodal[cells], table, axes=(1, 2)).transpose(0, 2, 3, 1)
@@ -232,14 +238,16 @@ class _WaveBatch:
 
     @cached_property
     def _reference(self) -> list[Array]:
-        """(points of an entity, derivatives, functions) in the reference cell, on each side."""
+        """Shape functions (points of an entity, derivatives, functions) in the reference cell, on
+        each side.
+        """
         element = self._u.function_space.element.basix_element
         return [element.tabulate(2, X)[..., 0].transpose(1, 0, 2) for X in self._batch.rule.points]
 
     @cached_property
     def _by_length(self) -> list[Array]:
-        """(entities, derivatives) what makes derivatives by the coordinate of the meridian of
-        these, on each side.
+        """Factors (entities, derivatives) from derivatives in the reference cell to those by the
+        meridian's coordinate, on each side.
         """
         lengths = _lengths(self._u.function_space)
         return [
@@ -248,8 +256,8 @@ class _WaveBatch:
 
     @cached_property
     def _products(self) -> Array:
-        """(points of an entity and pairs of derivatives, pairs of functions), with the functions of
-        all sides.
+        """Products of shape functions (points of an entity and pairs of derivatives, pairs of
+        functions), with the functions of all sides.
         """
         points_per_entity, derivatives, functions = self._reference[0].shape
         count = len(self._sides)
@@ -265,8 +273,8 @@ class _WaveBatch:
 
     @cached_property
     def _order(self) -> Ints:
-        """(pairs of components, points of an entity and pairs of derivatives) places in the rows of
-        its Hessians.
+        """Positions (pairs of components, points of an entity and pairs of derivatives) in the rows
+        of its Hessians.
 
         These pairs are those of `_UPPER`.
         """
@@ -277,8 +285,8 @@ class _WaveBatch:
 
     @cached_property
     def _scales(self) -> Array:
-        """(points, entries of the Hessians) the weights of the integral, one at a vertex, and the
-        lengths of cells.
+        """Weights (points, entries of the Hessians) of the integral, times the factors of
+        derivatives; the quadrature's weight is one at a vertex.
         """
         cells = self._batch.cells[0]
         weights = self._batch.rule.weights
@@ -299,7 +307,9 @@ def _perturbed_density(
     edge: tuple[Sequence[Expr], Expr] | None,
     parameters: Sequence[fem.Constant | fem.Function],
 ) -> Expr:
-    """A density with the Hessian in v, at v = 0, of that at u + v; see `Energy.perturbed_form`."""
+    """Return a density whose Hessian in v, at v = 0, is that of the energy at u + v; see
+    `Energy.perturbed_form`.
+    """
     u_plus_v = [a + b for a, b in zip(u, v, strict=True)]
     if density.work is None:
         return density.value_at([r0, u_plus_v], edge, parameters)
@@ -311,8 +321,8 @@ def _perturbed_density(
 
 
 def _sum_of_blocks(numbers: Ints, in_triangle: NDArray[np.bool_], count: int) -> csr_array:
-    """The sparse matrix (entries of all pairs of nodes, entries of a site's blocks) by which the
-    blocks are added up.
+    """Return the sparse matrix (entries of all pairs of nodes, entries of a batch's blocks) that
+    adds up the blocks.
 
     Parameters
     ----------
@@ -347,7 +357,7 @@ def _support_of(e: Energy) -> tuple[int, int, tuple[int, ...]]:
 
 
 def _batches(domain: IntegrationDomain, density: Density | None) -> Iterable[EntityBatch]:
-    """The points where a density lives; the geometry of each is the covector and the length of the
+    """Return the batches of points of a density; the geometry is the covector and the length of the
     cell, by sides.
     """
     V = domain.r0.function_space
@@ -388,13 +398,15 @@ def _batches(domain: IntegrationDomain, density: Density | None) -> Iterable[Ent
 
 
 def _lengths(V: fem.FunctionSpace) -> Array:
-    """(cells,) of the coordinate's change from the first to the second vertex."""
+    """Return the coordinate's change (cells,) from the first to the second vertex."""
     ends = V.mesh.geometry.x[compat.geometry_dofs(V.mesh), 0]
     return np.asarray(ends[:, 1] - ends[:, 0])
 
 
 def _triangle(size: int) -> Ints:
-    """(size, size) places in the rows of an upper triangle."""
+    """Return the positions (size, size) of a symmetric matrix's entries in the rows of its upper
+    triangle.
+    """
     positions = np.zeros((size, size), dtype=np.int64)
     rows, columns = np.triu_indices(size)
     positions[rows, columns] = positions[columns, rows] = np.arange(len(rows))

@@ -85,9 +85,8 @@ class ControlledPattern:
         )
 
     def transposed(self, r0: Array, forces: Array) -> Array:
-        """The transposed map: what multiplies each of the values in sum(forces .
-
-        B) over places (cells, nodes, 3).
+        """Return the transposed map: factors of each value in sum(forces . B) over places (cells,
+        nodes, 3).
         """
         x, f = np.asarray(r0.reshape(-1, 3)), np.asarray(forces.reshape(-1, 3))
         if self.frame is not None:

@@ -26,9 +26,8 @@ MagneticDensity = Callable[
 
 
 def membrane(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr:
-    """Stretching density, paper Eq.
-
-    (eqn:energy), first term; of the strain from the `natural` forms.
+    """Stretching density, paper Eq. (eqn:energy), first term; of the strain from the `natural`
+    forms.
     """
     E, law = kin.membrane_strain(r0, u), law_at(law, r0)
     if natural is None:
@@ -53,9 +52,8 @@ def prestress(r0: Jet, u: Jet, v: Jet, E: Expr, *, law: Law, natural: Forms | No
 
 
 def bending(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr:
-    """Bending density, paper Eq.
-
-    (eqn:energy), second term; of the change from the `natural` curvature.
+    """Bending density, paper Eq. (eqn:energy), second term; of the change from the `natural`
+    curvature.
     """
     E, K, law = kin.membrane_strain(r0, u), kin.curvature_change(r0, u), law_at(law, r0)
     if natural is None:
@@ -83,14 +81,13 @@ def normal_moment(
 
 
 def law_at(law: Law, r0: Jet) -> Law:
-    """The law at a place, where that of plies has a direction."""
+    """Return the law at a place, on which directions of plies depend."""
     return law.at_point(r0.r, r0.r1, r0.r2, kin.area_vector(r0))
 
 
 def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
-    """-Ba .
-
-    (F - F0) Br, F = a_i (x) a0^i + n (x) n0; paper Eq. (eq:magenergy) without its constant.
+    """-Ba . (F - F0) Br, F = a_i (x) a0^i + n (x) n0; paper Eq. (eq:magenergy) without its
+    constant.
     """
     up1, up2 = kin.dual_basis(r0)
     n, n0 = kin.normal(r0 + u), kin.normal(r0)
@@ -156,7 +153,6 @@ def magnetic_torque(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
 
 def magnetic_tau(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     """Utau: torques from the surface gradient of u, q^c U_ac with a the derivative; paper Eq.
-
     (eq:terms).
     """
     up1, up2 = kin.dual_basis(r0)
@@ -166,7 +162,8 @@ def magnetic_tau(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
 
 
 def magnetic_couple(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
-    """The other term linear in u, zero where Br is parallel to Ba; not in the paper's U1 and U2.
+    """Couple: the other term linear in u, zero where Br is parallel to Ba; not in the paper's U1
+    and U2.
 
     With it, U1 + Uq + Utau is the second-order Taylor polynomial of the full energy.
     """
@@ -183,16 +180,14 @@ def rotation(r0: Jet, u: Jet) -> Expr:
 
 
 def volume(r0: Jet, u: Jet, origin: Expr | None = None) -> Expr:
-    """(x . n dω - x0 . n0 dω0)/3 per flat area (already includes the area ratio), x told from the
-    origin.
-    """
+    """(x . n dω - x0 . n0 dω0)/3 per area of the coordinates, x from the origin."""
     r = r0 + u
     x, x0 = (r.r, r0.r) if origin is None else (r.r - origin, r0.r - origin)
     return (ufl.dot(x, kin.area_vector(r)) - ufl.dot(x0, kin.area_vector(r0))) / 3
 
 
 def swept_volume(r0: Jet, u: Jet, unit: Expr | float = 1.0) -> Expr:
-    """The volume that the surface sweeps when its points move straight to r0 + u; per area of the
+    """Volume that the surface sweeps when its points move straight to r0 + u; per area of the
     coordinates.
 
     It is the work of p = 1 in that unit, and its potential wherever there is one: whatever the

@@ -165,7 +165,7 @@ class HessianIntegral:
         self._replaced = True
 
     def _jets(self, batch: EntityBatch, field: Array) -> Array:
-        """(points, sides, 6, 3) of a field."""
+        """Return the jets (points, sides, 6, 3) of a field."""
         nodes = field.reshape(-1, 3)
         jets_of_sides = [
             t.jets(nodes[self._dofs[cells]])
@@ -224,14 +224,14 @@ class Kernel:
             values.renew()
 
     def evaluate(self, number: int) -> Array:
-        """The Hessian's parts at the points of a batch."""
+        """Return the Hessian's parts at the points of a batch."""
         for target, values in self._varying:
             fill(target, values.latest[number])
         return self._points.evaluate(self._hessian, self._batches[number].size)
 
 
 def _strain(r0: Array, u: Array) -> Array:
-    """(points, 3): E_11, E_12, E_22 from jets (..., 6, 3)."""
+    """Return E_11, E_12, E_22 (points, 3) from jets (..., 6, 3)."""
     first0, first = (np.moveaxis(jets.reshape(-1, JET_SIZE, 3)[:, 1:3], 1, 0) for jets in (r0, u))
     return np.stack(strain_components(first0, first, partial(np.einsum, "pc,pc->p")), axis=1)
 
@@ -262,8 +262,8 @@ def _jet(field: fem.Function, side: int) -> Jet:
 def parameters_at(
     points: PointStorage, parameters: Sequence[Parameter], sides: int
 ) -> tuple[list[Parameter], list[tuple[fem.Function, fem.Function]]]:
-    """A density's parameters at points; those that vary, to be filled, are told with the fields
-    that they stand for.
+    """Return a density's parameters at points, and the pairs of points' fields to be filled and
+    fields that vary.
 
     Where there are two sides, such a vector holds that of the one and then that of the other.
     """
@@ -276,8 +276,8 @@ def parameters_at(
 
 
 def at_points(field: fem.Function, X: Array, cells: NDArray[np.int32]) -> Array:
-    """(cells * points, components) of a field that varies over the cells, at reference points
-    (points, 2).
+    """Return the values (cells * points, components) of a field that varies over the cells, at
+    reference points (points, 2).
 
     A `PointField` is known at its own points, in consecutive cells, and what is returned follows
     it.
@@ -293,7 +293,7 @@ def at_points(field: fem.Function, X: Array, cells: NDArray[np.int32]) -> Array:
 def on_batches(
     field: fem.Function, batches: Sequence[EntityBatch], sides: int = 1
 ) -> Memo[list[Array]]:
-    """The values of a field that varies over the cells, at the points of each batch."""
+    """Return the values of a field that varies over the cells, at the points of each batch."""
     return Memo(
         lambda: [_on_sides(field, batch, range(sides)) for batch in batches],
         lambda: (memo_input(field),),
@@ -301,11 +301,13 @@ def on_batches(
 
 
 def _on_sides(field: fem.Function, batch: EntityBatch, sides: range) -> Array:
-    """(points, sides * components) on the edges, or in the cells, of a batch."""
+    """Return the values (points, sides * components) of a field on the edges, or in the cells, of a
+    batch.
+    """
     values = [at_points(field, batch.rule.points[side], batch.cells[side]) for side in sides]
     return np.hstack(values) if len(values) > 1 else values[0]
 
 
 def fill(field: fem.Function, values: Array) -> None:
-    """The first points' values; the rest of the field is not looked at."""
+    """Fill in the values of the first points; the rest of the field is not used."""
     field.x.array[: values.size] = values.ravel()

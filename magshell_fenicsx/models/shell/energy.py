@@ -70,7 +70,9 @@ class Density:
 
     @property
     def jet_parts(self) -> tuple[str, ...]:
-        """All that must be known of jets."""
+        """Parts of jets that must be known: those of the displacement, then further ones of the
+        placement.
+        """
         return *self.parts, *self.reference_parts
 
     @property
@@ -108,7 +110,7 @@ class Density:
 
 
 def _halves(field: fem.Function) -> tuple[Expr, Expr]:
-    """A vector of the one side of an edge and then of the other, as two."""
+    """Return a vector of both sides of an edge, one after the other, as two vectors."""
     size = field.ufl_shape[0] // 2
     first, second = (
         ufl.as_vector([field[side * size + c] for c in range(size)]) for side in range(2)
@@ -117,7 +119,7 @@ def _halves(field: fem.Function) -> tuple[Expr, Expr]:
 
 
 def per_area(density: Callable[..., Expr]) -> Callable[..., Expr]:
-    """A density per undeformed area, per area of the coordinates."""
+    """Return a density per undeformed area as one per area of the coordinates."""
 
     def density_per_coordinates(r0: Jet, *rest: Any, **options: Any) -> Expr:
         return density(r0, *rest, **options) * kin.area_ratio(r0)
@@ -202,8 +204,8 @@ class HessianTerm:
 def constants_of(
     term: OwnTerm, domain: mesh.Mesh, constants: Constants
 ) -> tuple[fem.Constant | fem.Function, ...]:
-    """The parameters of a term as constants; a free one has the same constant in all terms, kept in
-    `known`.
+    """Return the parameters of a term as constants; a free one has the same constant in all terms,
+    kept in `constants`.
 
     Raises
     ------

@@ -94,7 +94,7 @@ class FastTangent:
         self._element_matrices = np.empty((cells, 9, functions * (functions + 1) // 2))
 
     def tangent(self, factors: Mapping[str, float], stress: Sequence[Weighted] = ()) -> PETSc.Mat:
-        """The assembled matrix, at the present u; it is reused by the next call. Collective.
+        """Return the assembled matrix at the present u; it is reused by the next call. Collective.
 
         Parameters
         ----------
@@ -143,8 +143,8 @@ def hessian_integrals(
     prestress: Density | None = None,
     cell_mask: CellMask = None,
 ) -> list[HessianIntegral]:
-    """The sites of some terms: all cells and all interior edges together, boundary edges term by
-    term. Collective.
+    """Return the integrals of terms' Hessians: one of all cells, one of all interior edges, one of
+    each term's boundary edges. Collective.
 
     `cell_mask` are the local cells that count, with their edges; None for all.
     """

@@ -112,7 +112,7 @@ class PointGradient:
 
     @cached_property
     def gradient(self) -> PointKernel | None:
-        """The kernel of `evaluate`; None if nothing depends on u."""
+        """Kernel of the gradient for `evaluate`; None if nothing depends on u."""
         sums = [
             (sum(self._conservative, ufl.zero()), self._u),
             (sum(self._work, ufl.zero()), self._v),
@@ -123,7 +123,7 @@ class PointGradient:
         return None
 
     def energy(self, name: str) -> PointKernel | None:
-        """The kernel of a term's energy; None if that is zero."""
+        """Return the kernel of a term's energy; None if that is zero."""
         if name not in self._energies:
             W = self._W[self._names.index(name)]
             is_zero = isinstance(W, Zero)
@@ -131,9 +131,7 @@ class PointGradient:
         return self._energies[name]
 
     def chunks(self) -> list[slice]:
-        """The points that are treated together, to be evaluated one after the other with what is
-        given now.
-        """
+        """Renew the inputs and return the chunks of points, to be evaluated one after the other."""
         for kernel_input in self._inputs:
             kernel_input.values.renew()
         return self._chunks
@@ -223,7 +221,9 @@ def _energy(
 
 
 def _jet(field: fem.Function, side: int, parts: Sequence[str]) -> Jet:
-    """The parts that are not there are zero: no density asks for them."""
+    """Return the jet of a field on a side; parts that the points do not have are zero, since no
+    density needs them.
+    """
     first = 3 * len(parts) * side
     vectors = {
         part: ufl.as_vector([field[first + 3 * number + c] for c in range(3)])

@@ -224,7 +224,7 @@ class Edge:
 
 
 def angle_from(sine: Expr, cosine: Expr, reference_turn: Expr) -> Expr:
-    """The angle with that sine and cosine, counted from the turn whose cosine and sine are
+    """Angle with that sine and cosine, counted from the turn whose cosine and sine are
     `reference_turn` (2,).
     """
     return ufl.atan2(

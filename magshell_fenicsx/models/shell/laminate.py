@@ -240,7 +240,7 @@ class _Frame:
         return c_1**2, c_2**2, 2 * c_1 * c_2
 
     def components_up(self, factor: Scalar, S: Triple) -> Components:
-        """A factor times a stress S_11, S_22, S_12 as components with indices up."""
+        """Return a factor times a stress S_11, S_22, S_12 as components with indices up."""
         (a1, a2), (b1, b2), (S1, S2, S6) = self.t1, self.t2, S
         S11 = S1 * a1**2 + S2 * b1**2 + 2 * S6 * a1 * b1
         S12 = S1 * a1 * a2 + S2 * b1 * b2 + S6 * (a1 * b2 + a2 * b1)

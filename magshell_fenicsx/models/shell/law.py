@@ -116,7 +116,7 @@ class Law(ABC):
         """The derivative of `membrane` by E."""
 
     def stress_change(self, E: Tensor, change: Tensor, up: Tensor) -> Components:
-        """The stress of E and a change of it, less that of E."""
+        """Stress of E + change less that of E."""
         if self.linear is self:
             return self.stress(change, up)
         stress, changed_stress = self.stress(E, up), self.stress(E + change, up)
@@ -136,7 +136,7 @@ class Law(ABC):
         covector_up: tuple[Scalar, Scalar],
         covector_square: Scalar,
     ) -> Scalar:
-        """The moment twice along a covector c.
+        """Moment contracted twice with a covector c.
 
         Parameters
         ----------
@@ -149,8 +149,8 @@ class Law(ABC):
     def edge_stiffness(
         self, E: Tensor, up: Tensor, covector_up: tuple[Scalar, Scalar], covector_square: Scalar
     ) -> Scalar:
-        """The derivative of `edge_moment` by K twice along c, to which the penalty of edges is
-        proportional.
+        """Derivative of `edge_moment` by K, contracted twice with c; the penalty of edges is
+        proportional to it.
         """
 
 
@@ -219,7 +219,7 @@ class Koiter(Law):
         return (1 - self.nu) * (T11**2 + 2 * T12 * T21 + T22**2) + self.nu * (T11 + T22) ** 2
 
     def _scaled(self, factor: Scalar, S: Tensor, up: Tensor) -> Components:
-        """A factor times (1 - nu) S + nu tr S with indices up."""
+        """Return a factor times (1 - nu) S + nu tr S with indices up."""
         T11, T12, T21, T22 = _mixed(S, up)
         a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
         raised_components = (T11 * a11 + T12 * a12, T11 * a12 + T12 * a22, T21 * a12 + T22 * a22)
@@ -368,8 +368,8 @@ def trace(S: Tensor, up: Tensor) -> Scalar:
 
 
 def lower_index(covector_up: tuple[Scalar, Scalar], up: Tensor) -> tuple[Scalar, Scalar]:
-    """The components with index down of a covector, from those with index up; `up` is the inverse
-    metric (2, 2).
+    """Return the components with index down of a covector, from those with index up; `up` is the
+    inverse metric (2, 2).
     """
     a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
     det = a11 * a22 - a12**2
@@ -389,7 +389,7 @@ def elastic_density(
     thickness: Parameter | None = None,
     cell_materials: Parameter | None = None,
 ) -> Density:
-    """The density of a material, from one that takes a `law`, on two sides a pair of laws.
+    """Return the density of a material, from one that takes a `law`, on two sides a pair of laws.
 
     The numbers of the law become parameters. `thickness` (1,) multiplies the thickness; None for 1.
     `cell_materials` (4,) is `ShellMaterial.numbers`; None for one material.

@@ -93,7 +93,7 @@ class FormulaParameter:
 
     @property
     def of_place(self) -> Callable[[Array, Array, Array], Array]:
-        """The formula as a function of arrays of coordinates in the model's frame."""
+        """Formula as a function of arrays of coordinates in the model's frame."""
         of_case = formula_function(self.text)
         if not self.turn:
             return of_case
@@ -302,7 +302,7 @@ class OwnTerm:
         )
 
     def at_point(self, density: Callable[..., Expr]) -> Callable[..., Expr]:
-        """A density that takes a function of one number as a vector of one."""
+        """Return a density that takes functions of one number as vectors of one."""
         is_number = [
             isinstance(p, ufl.Coefficient) and p.ufl_shape == (1,) for p in self.parameters
         ]
@@ -367,7 +367,7 @@ class OwnTerm:
         return all(self._is_same(sample, image(*sample)) for sample in _random_samples())
 
     def leaves(self, outline: Outline) -> SymmetryConstraint:
-        """The symmetry that it leaves."""
+        """Return the symmetry that the term preserves."""
         turns = self.turns and all(p.turns(outline) for p in self.formula_parameters)
 
         def mirrors(mirror: Mirror) -> bool:
@@ -400,7 +400,7 @@ class OwnTerm:
 
     @cached_property
     def _symbolic(self) -> Symbolic:
-        """The density, and what it is written with."""
+        """Density as an expression, with the variables that it is written with."""
         import basix.ufl
 
         domain = ufl.Mesh(basix.ufl.element("Lagrange", "triangle", 1, shape=(2,)))
@@ -492,7 +492,7 @@ class OwnTerm:
         return True
 
     def _value(self, sample: Sample, density: Callable[..., Expr]) -> float:
-        """A density at a sample; nan where it has none, as a root of less than zero."""
+        """Return a density's value at a sample; nan where it has none, as a root of less than zero."""
         r0, u, m = sample
         try:
             lowered = ufl.algorithms.apply_algebra_lowering.apply_algebra_lowering

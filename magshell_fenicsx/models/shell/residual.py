@@ -1,5 +1,5 @@
-"""Energies and residuals without compiled forms, from the terms' densities and their gradients at
-points; and both by free parameters.
+"""Energies and residuals from the terms' densities and their gradients at points, without compiled
+forms, and the derivatives of both by free parameters.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -197,7 +197,7 @@ class _CellTerms:
             elements[cells] += factor * self._sheet.at_nodes(self._points.evaluate(chunk, kernel))
 
     def _filled(self, nodal: Array) -> Iterator[tuple[slice, slice]]:
-        """Each chunk, with the derivatives of u filled in, and its cells."""
+        """Yield each chunk, with the derivatives of u filled in, and its cells."""
         points_per_cell = len(self._weights)
         for chunk in self._points.chunks():
             cells = slice(chunk.start // points_per_cell, chunk.stop // points_per_cell)
@@ -285,8 +285,8 @@ class _EdgeTerms:
     def _evaluated(
         self, name: str, kernel: PointKernel | None
     ) -> Iterator[tuple[NDArray[np.intp], Array]]:
-        """A kernel's values in each chunk, at the points of these numbers among those of all cells'
-        edges.
+        """Yield, for each chunk, the numbers of its points among those of all cells' edges, and a
+        kernel's values there.
         """
         if kernel is None:
             return
@@ -304,7 +304,9 @@ class _EdgeTerms:
 
 
 def _placement(r0: fem.Function, table: ShapeTable, frames: Array, parts: Sequence[str]) -> Array:
-    """(local cells, points, parts, 3) in the cells' own coordinates."""
+    """Return the parts (local cells, points, parts, 3) of the placement's jet in the cells' own
+    coordinates.
+    """
     nodes = r0.x.array.reshape(-1, 3)[r0.function_space.dofmap.list]
     jet = in_own_coordinates(
         Jet(*np.moveaxis(table.jets(nodes), 2, 0)), [x[:, None, None] for x in frames.T]
@@ -315,8 +317,8 @@ def _placement(r0: fem.Function, table: ShapeTable, frames: Array, parts: Sequen
 def _points_on_edges(
     V: fem.FunctionSpace, density: Density, frames: Array, points_per_edge: int
 ) -> tuple[NDArray[np.intp], Array]:
-    """(points, sides) among those of all cells' edges, and the geometry that `PointGradient` asks
-    for.
+    """Return the numbers (points, sides) of a density's points among those of all cells' edges, and
+    their geometry for `PointGradient`.
 
     A rule on an edge is symmetric: run backwards, its points come in the opposite order.
     """
@@ -370,7 +372,7 @@ class Slope:
 def point_parameters(
     constants: Mapping[str, fem.Constant], terms: Sequence[ShellTerm], serve: Serve
 ) -> dict[str, FreeParameter]:
-    """The free parameters of a shell, by name; collective.
+    """Return the free parameters of a shell, by name; collective.
 
     Parameters
     ----------
@@ -391,7 +393,7 @@ def point_parameters(
 
 
 def slopes(p: fem.Constant, terms: Sequence[PointTerm], words: str, serve: Serve) -> list[Slope]:
-    """The derivatives of those terms that a parameter enters."""
+    """Return the derivatives, by a parameter, of those terms that it enters."""
     entered = [term for term in terms if any(q is p for q in term.density.parameters)]
     derivatives = [
         Slope(f"{term.name} {words}", term.amplitude, derivative_by(term.density, p))
@@ -405,7 +407,7 @@ def slopes(p: fem.Constant, terms: Sequence[PointTerm], words: str, serve: Serve
 
 
 def derivative_by(density: Density, p: fem.Constant) -> Density:
-    """The density's derivative by a parameter of it."""
+    """Return the density's derivative by a parameter of it."""
 
     def derivative(*arguments: Any) -> Expr:
         first = len(arguments) - len(density.parameters)

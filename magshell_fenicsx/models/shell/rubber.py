@@ -100,7 +100,7 @@ class Incompressible(Law):
 
     @abstractmethod
     def _slopes(self, surface: "Stretched") -> tuple[Scalar, Scalar]:
-        """The derivatives by T and D of the energy of stretching, per volume over E."""
+        """Derivatives by T and D of the energy of stretching, per volume over E."""
 
     @abstractmethod
     def _stiffness(self, surface: "Stretched") -> tuple[Scalar, Scalar, Scalar, Scalar]:

@@ -51,12 +51,12 @@ class PlacementField(fem.Function):  # type: ignore[misc]  # dolfinx has no type
 
 
 def radial(r0: Array, n0: Array) -> Array:
-    """Along the normal."""
+    """Pattern along the normal."""
     return n0
 
 
 def tangential(r0: Array, n0: Array) -> Array:
-    """Along the meridians, away from e3; zero where the normal is along e3."""
+    """Pattern along the meridians, away from e3; zero where the normal is along e3."""
     down = n0[..., 2:3] * n0 - np.array([0.0, 0.0, 1.0])
     length = np.linalg.norm(down, axis=-1, keepdims=True)
     return np.where(length > 1e-9, down / np.maximum(length, 1e-300), 0.0)
@@ -173,8 +173,8 @@ class CellPolynomials:
         return np.asarray(np.matmul(table, self.values[: len(r0)]))  # owned cells come first
 
     def values_between_nodes(self) -> tuple[Array, Array]:
-        """Values (cells, n, size) and places (cells, n, 3) in own cells at its nodes, and between
-        them.
+        """Return values (cells, n, size) and places (cells, n, 3) in own cells, at the nodes and
+        between them.
         """
         X = basix.create_lattice(
             self.element.cell_type,
@@ -191,7 +191,9 @@ class CellPolynomials:
         )
 
     def _reference(self, places: Array) -> Array:
-        """The reference points (n, 2) of places (n, 3) of the first cell, by Newton's method."""
+        """Return the reference points (n, 2) of places (n, 3) of the first cell, by Newton's
+        method.
+        """
         element, nodal = self.cells.element, self.cells.nodal[0]
         X = np.full((len(places), 2), 1 / 3)
         for _ in range(MAX_NEWTON_STEPS):
@@ -233,8 +235,8 @@ def by_patch(
     cells: int,
     key: str = "magnetic.remanent.patches",
 ) -> ByPatch | PatternsByPatch:
-    """A vector for each named patch of a mesh, and one for the "rest"; zero without. All have the
-    same size.
+    """Return a vector for each named patch of a mesh, and one for the "rest", zero by default; all
+    have the same size.
 
     A patch may have a pattern of vectors (3,) in place of one; patches that come later take the
     place of others.
@@ -281,7 +283,8 @@ def pattern_field(
     key: str = "magnetic.remanent",
     size: int = 3,
 ) -> tuple[PlacementField, float | None]:
-    """The pattern in every cell, free to jump from cell to cell, see `project_pattern`; collective.
+    """Return the field of a pattern in every cell, free to jump from cell to cell, see
+    `project_pattern`; collective.
 
     Parameters
     ----------
@@ -317,7 +320,7 @@ def pattern_field(
 
 
 def formula_field(r0: fem.Function, parameter: FormulaParameter) -> fem.Function:
-    """A formula in every cell, of shape (1,), see `pattern_field`; collective."""
+    """Return a formula's field in every cell, of shape (1,), see `pattern_field`; collective."""
     return pattern_field(
         Components([parameter.of_place]), r0, name="factor", key=parameter.key, size=1
     )[0]
@@ -404,7 +407,7 @@ class InterpolatedPattern:
 
 
 def cell_geometry(r0: fem.Function) -> CellGeometry:
-    """The cells of a placement, or of a meridian's."""
+    """Return the cells of a placement, or of a meridian's, with their geometry."""
     V = r0.function_space
     owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
     return CellGeometry(
@@ -418,8 +421,8 @@ def cell_geometry(r0: fem.Function) -> CellGeometry:
 def project_pattern(
     pattern: Pattern, cells: CellGeometry, nodal: Array, element: Element
 ) -> ProjectedFormula:
-    """A pattern in every cell from its values at the nodes: a formula as it has the same moments;
-    collective.
+    """Return a pattern in every cell from its values at the nodes; a formula has the same moments,
+    see `project_formula`. Collective.
     """
     if not getattr(pattern, "by_formula", False):
         return ProjectedFormula(nodal, smooth=True, size=0.0)
@@ -428,15 +431,15 @@ def project_pattern(
 
 
 def inside_cells(nodes: Array) -> Array:
-    """Places (cells, nodes, 3) just inside their cells: a formula that jumps between two cells has
-    both its values.
+    """Return places (cells, nodes, 3) just inside their cells: a formula that jumps between two
+    cells has both its values.
     """
     return np.asarray(nodes + INWARD_SHARE * (nodes.mean(axis=1, keepdims=True) - nodes))
 
 
 def positions_and_normals(r0: fem.Function, points: Array | None = None) -> tuple[Array, Array]:
-    """The nodes of every cell, or other reference points (n, 2), and the cell's normals there:
-    (cells, n, 3) each.
+    """Return the nodes of every cell, or other reference points (n, 2), and the cell's normals
+    there: (cells, n, 3) each.
 
     On a meridian, whose placement has components along e_rho and e_z, they are along (e_rho,
     e_theta, e_z).
@@ -455,7 +458,7 @@ def positions_and_normals(r0: fem.Function, points: Array | None = None) -> tupl
 
 
 def body_cell_geometry(V: fem.FunctionSpace) -> CellGeometry:
-    """The cells of a body."""
+    """Return the cells of a body with their geometry."""
     owned = V.mesh.topology.index_map(3).size_local
     return CellGeometry(
         V.element.basix_element, V.tabulate_dof_coordinates()[V.dofmap.list], owned, V.mesh.comm
@@ -463,8 +466,8 @@ def body_cell_geometry(V: fem.FunctionSpace) -> CellGeometry:
 
 
 def body_positions_and_normals(V: fem.FunctionSpace) -> tuple[Array, Array]:
-    """The nodes of every cell, and the normals of the surface at their height, (cells, nodes, 3)
-    each.
+    """Return the nodes of every cell of a body, and the normals of the surface at their height,
+    (cells, nodes, 3) each.
     """
     element = V.element.basix_element
     table = element.tabulate(1, element.points)[:, :, :, 0]
@@ -482,8 +485,8 @@ def field_in_body(
     key: str = "magnetic.remanent",
     size: int = 3,
 ) -> fem.Function:
-    """A pattern of so many numbers at the nodes of every cell, free to jump from cell to cell;
-    collective.
+    """Return a pattern's field at the nodes of every cell, free to jump from cell to cell; `size`
+    numbers each. Collective.
 
     Parameters
     ----------
@@ -514,7 +517,7 @@ def field_in_body(
 def refuse_unbounded(
     vectors: Array, nodes: Array, comm: MPI.Comm, key: str = "magnetic.remanent"
 ) -> None:
-    """Look at vectors and places (cells, nodes, 3) of a key of the case; collective.
+    """Refuse vectors, at places (cells, nodes, 3), that are not finite or too large; collective.
 
     Raises
     ------

@@ -49,7 +49,7 @@ class TangentFrame:
 
     @classmethod
     def from_jet(cls, jet: Array) -> "TangentFrame":
-        """The frame whose first vector is along r0,_1."""
+        """Return the frame whose first vector is along r0,_1."""
         m, area = _area_vector(jet)
         n0 = m / area[..., None]
         t1 = jet[1] / np.linalg.norm(jet[1], axis=-1, keepdims=True)
@@ -109,7 +109,7 @@ class TangentFrame:
         return np.asarray(np.einsum("...ia,a...j->...ij", self.dual, self.jet[1:3] + u[1:3]))
 
     def _moved_with(self, t: Array, v: Array, u: Array) -> Array:
-        """The vector that has the components of v in t and along the deformed normal."""
+        """Return the vector that has the components of v in t and along the deformed normal."""
         in_surface = np.einsum("...ik,...k,...ij->...j", self.t, v, t)
         return np.asarray(in_surface + _dot(self.n0, v)[..., None] * self.normal(u))
 

@@ -162,7 +162,7 @@ def material_field(
 
 
 def select_cells(cells: CellGeometry, selection: NDArray[np.bool_]) -> CellGeometry:
-    """Some of this rank's cells."""
+    """Return some of this rank's cells."""
     return replace(cells, nodal=cells.nodal[selection], owned=int(selection[: cells.owned].sum()))
 
 
@@ -183,8 +183,8 @@ def patch_of(
 
 
 def thickness_weighted(density: Density, t: fem.Function, component: int = 0) -> Density:
-    """A density per E h times a component of the field t; its first is by default the thickness
-    over h.
+    """Return a density per E h times a component of the field t, by default the first, which is the
+    thickness over h.
     """
 
     def weighted(*arguments: Expr) -> Expr:

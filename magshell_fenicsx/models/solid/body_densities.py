@@ -55,9 +55,8 @@ def magnetic(X: Expr, u: Expr, H: Expr, Br: Expr, Ba: Expr, h: Expr) -> Expr:
 
 
 def magnetic_gradient(X: Expr, u: Expr, H: Expr, Br: Expr, G: Expr, h: Expr) -> Expr:
-    """The part of Ba = G x: -(G x) .
-
-    F Br at the deformed place x = X + u, without its value at u = 0.
+    """The part of Ba = G x: -(G x) . F Br at the deformed place x = X + u, without its value at u =
+    0.
     """
     F = ufl.Identity(3) + H
     return -(ufl.dot(ufl.dot(G, X + u), ufl.dot(F, Br)) - ufl.dot(ufl.dot(G, X), Br)) / h
