@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from extreme.extremes_table import LineFeature, cells, write
+from extreme.extremes_table import Line, cells, write
 from mpi4py import MPI
 from numpy.typing import NDArray
 
@@ -122,7 +122,7 @@ ASPECTS = [(1.0, "along"), (10.0, "along"), (50.0, "along"), (50.0, "across")]
 TIP = 0.66996  # of the elastica at q = 4, over its length
 
 
-def line(variant: Variant) -> LineFeature:
+def line(variant: Variant) -> Line:
     """Run a variant, and the finer solution that it is compared with."""
     start = time.perf_counter()
     result = run(Case.load(CASES / f"{variant.case}.yaml", variant.settings), time_limit=LIMIT)
@@ -139,7 +139,7 @@ def line(variant: Variant) -> LineFeature:
         for row in result.rows
         if row["label"] in ("start", "field", "step") and not row["branch"]
     ]
-    return LineFeature(
+    return Line(
         family=variant.case,
         variant=", ".join(variant.settings),
         outcome=outcome(result),
@@ -157,7 +157,7 @@ def line(variant: Variant) -> LineFeature:
     )
 
 
-def slivers(aspect: float, way: str) -> LineFeature:
+def slivers(aspect: float, way: str) -> Line:
     """The strip with its triangles stretched along or across it: the problem with another chart."""
     start = time.perf_counter()
     case = Case.load(CASES / "slivers.yaml")
@@ -185,7 +185,7 @@ def slivers(aspect: float, way: str) -> LineFeature:
         [model.deflection(point.state.u, "pole") / problem.material.h for point in points]
     )
     seconds = time.perf_counter() - start
-    return LineFeature(
+    return Line(
         family="slivers",
         variant=f"aspect {aspect:g} {way} the strip",
         outcome=said,
@@ -275,7 +275,7 @@ def main(families: Sequence[str]) -> None:
     """Run the families, all if none is named; collective. The table is written of all together."""
     first, lines = MPI.COMM_WORLD.rank == 0, []
 
-    def add(made: LineFeature) -> None:
+    def add(made: Line) -> None:
         lines.append(made)
         if first:
             print(*cells(made), sep="  ", flush=True)

@@ -87,10 +87,11 @@ def read_source(file: Path, settings: Sequence[str] = ()) -> Source:
     try:
         text = read_bounded(file, MAX_CASE_BYTES).decode("utf-8")
     except OSError as e:
-        problem = f"cannot be read: {e.strerror}"
-        if e.errno == EFBIG:
-            problem = f"is larger than {MAX_CASE_BYTES} bytes, too large for a case file"
-        raise CaseError(f"{file}: {problem}") from None
+        if e.errno != EFBIG:
+            raise CaseError(f"{file}: cannot be read: {e.strerror}") from None
+        raise CaseError(
+            f"{file}: is larger than {MAX_CASE_BYTES} bytes, too large for a case file"
+        ) from None
     except UnicodeDecodeError:
         raise CaseError(f"{file}: is not a text file in UTF-8") from None
     source = Source(str(file), {}, folder=file.parent.absolute())

@@ -271,8 +271,7 @@ def read_msh(
     try:
         patch = _patch_of_triangles(file)
     except MeshError as e:
-        key = "shell" if file.in_memory else "shell.file"
-        raise MeshError(f"{key}: {e}") from None
+        raise MeshError(f"shell: {e}" if file.in_memory else f"shell.file: {e}") from None
     if isinstance(mirror, Sector) and patch.t_junctions:
         raise MeshError(
             f"symmetry: {mirror.waves}: not with a T-junction in the mesh file: take symmetry: half"

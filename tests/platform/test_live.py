@@ -260,9 +260,9 @@ def test_a_snap_is_no_search_for_an_instability(monkeypatch: pytest.MonkeyPatch)
 def test_where_a_path_leads() -> None:
     """To a value, through a number of steps, or nobody knows how far."""
     row = {"p_over_pc": 0.25, "w_over_h": 5.0}
-    assert PathEnd("w_over_h", 21.0).part({"w_over_h": 1.0}, row, 7) == 0.2
-    assert PathEnd("w_over_h", words="28 steps", steps=28).part(row, row, 7) == 0.25
-    assert PathEnd("p_over_pc", words="the first instability").part(row, row, 7) is None
+    assert PathEnd("w_over_h", 21.0).completed_part({"w_over_h": 1.0}, row, 7) == 0.2
+    assert PathEnd("w_over_h", words="28 steps", steps=28).completed_part(row, row, 7) == 0.25
+    assert PathEnd("p_over_pc", words="the first instability").completed_part(row, row, 7) is None
     assert (
         PathEnd("p_over_pc", words="the first instability").text(row)
         == "p/pc 0.25 -> the first instability"

@@ -31,7 +31,7 @@ Numbers = dict[str, float]
 class ProblemOnFile(Problem):
     """A problem of a dimpled half hemisphere, R/h = 90, on the triangulation in the file."""
 
-    def _made(self) -> PatchMesh:
+    def _triangulation(self) -> PatchMesh:
         patch = read_msh(
             MeshFile(HERE / "half_disc.msh", 1.0),
             {k: np.append(x, 0.0) for k, x in self.points.items()},

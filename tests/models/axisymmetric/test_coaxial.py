@@ -168,7 +168,7 @@ def test_ball_on_one_of_two() -> None:
     assert two["force"] == pytest.approx(one["force"], rel=1e-6)
     tilted = {"shells": {"lower": cap(), "upper": placed(cap(), 3, 150)}, "loading": PRESSURE}
     axis = np.array([0.5, 0.0, -np.sqrt(0.75)])
-    normal = Case.from_source(tilted).problem().shape.given.normal(np.add([0, 0, 3], axis))
+    normal = Case.from_source(tilted).problem().shape.in_memory.normal(np.add([0, 0, 3], axis))
     assert normal == pytest.approx(axis, abs=1e-12)
 
 

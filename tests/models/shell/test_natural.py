@@ -287,13 +287,13 @@ def test_fields_of_what_is_held() -> None:
     jet[1, ..., 0], jet[2, ..., 1] = 2.0, 0.5
     stretch, curvature, along = np.full(3, 0.2), np.array([0.4, 0.4, 0.0]), lambda r0, n0: 0 * r0
     stresses = Stresses(jet, Material(0.3, 0.01), None, Natural(curvature, stretch, along))
-    held = stresses.of(0 * jet, {"natural_stretch": 1.0, "natural_curvature": 0.0})
+    held = stresses.values_of(0 * jet, {"natural_stretch": 1.0, "natural_curvature": 0.0})
     found = principal_fields(held)
     assert found["E_1"] == pytest.approx((1 / 1.44 - 1) / 2)
     assert held["E_total"] == pytest.approx(0)
     assert found["M_1"] == pytest.approx(0)
     found = principal_fields(
-        stresses.of(0 * jet, {"natural_stretch": 0.0, "natural_curvature": 1.0})
+        stresses.values_of(0 * jet, {"natural_stretch": 0.0, "natural_curvature": 1.0})
     )
     assert found["M_2"] == pytest.approx(-1.3 * 0.4)
     assert found["E_1"] == pytest.approx(0)

@@ -389,7 +389,7 @@ def test_parameters_need_no_new_kernel() -> None:
     ]
     served = [next(t for t in m.system.terms if t.name == "own").points for m in models]  # type: ignore[attr-defined]
     kernels = [
-        next(site for site in each._sites if "own" in site.names)._points.gradient
+        next(part for part in each._parts if "own" in part.names)._points.gradient
         for each in served
     ]
     one, other = (ctypes.cast(kernel._function, ctypes.c_void_p).value for kernel in kernels)

@@ -191,7 +191,7 @@ def test_moments_in_pictures() -> None:
     u[2, ..., 0], u[5, ..., 2] = -e, k
     found = Stresses(
         jet, Material(0.3, 0.1, laminate=laminate(ply(0, 3.0), ply(90, 3.0))), None
-    ).of(u, {})
+    ).values_of(u, {})
     _, B, D = CROSS.matrices(1.0)
     (M,) = found["M"][0] * 0.1**2 / (12 * (1 - 0.3**2))
     assert (

@@ -146,7 +146,7 @@ def test_moments_take_the_thickness_that_is_there() -> None:
     """D grows with its third power."""
     jet, u = RNG.standard_normal((2, 6, 4, 3, 3))
     fields = [
-        principal_fields(Stresses(jet, Material(NU, H), t).of(u, {}))
+        principal_fields(Stresses(jet, Material(NU, H), t).values_of(u, {}))
         for t in (None, np.full((4, 3), 2.0))
     ]
     assert fields[1]["M_1"] == pytest.approx(8 * fields[0]["M_1"])
