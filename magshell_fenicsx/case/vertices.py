@@ -227,7 +227,7 @@ class Vertices:
                 self.size(chart),
                 *(shape.size_at(axis, float(chart[axis])) for axis in range(CHART)),
             )
-        return min(self.size(chart), shape.area / shape.reach)
+        return min(self.size(chart), float(shape.area / shape.reach))
 
     def _refuse(self, name: str, other_place: Array, what: str, hint: str, factor: float) -> None:
         """Refuse a point beside a place (3,) of the case, which is in the words `what`."""

@@ -343,11 +343,11 @@ def intervals(
             numbers["quantile_1_percent"] = weibull.quantile(0.01)
         for name, value in numbers.items():
             resampled.setdefault(name, []).append(value)
-    ends = (0.5 - LEVEL / 2, 0.5 + LEVEL / 2)
+    low, high = 0.5 - LEVEL / 2, 0.5 + LEVEL / 2
     return {
-        name: tuple(map(float, np.quantile(estimates, ends)))
+        name: (float(np.quantile(estimates, low)), float(np.quantile(estimates, high)))
         for name, estimates in resampled.items()
-    }  # type: ignore[misc]
+    }
 
 
 def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") -> str:

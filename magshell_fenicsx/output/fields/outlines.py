@@ -66,7 +66,7 @@ def _placed_objects(
     for part in getattr(loads.magnetic.in_space, "parts", ()):
         yield part, np.eye(3), np.zeros(3), ""
     for moving_source in loads.magnetic.driven:
-        yield moving_source.of, *combined_motion(moving_source.motions, mu), ""
+        yield moving_source.at_rest, *combined_motion(moving_source.motions, mu), ""
 
 
 def vtp_content(lines: tuple[Array, ...], faces: Sequence[Solid] = ()) -> bytes:

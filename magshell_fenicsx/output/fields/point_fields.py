@@ -328,7 +328,7 @@ class PointFields:
         self._magnetisation, self.Br = field or remanence, np.zeros((*r0.shape[1:-1], 0))
         self.susceptibility = np.zeros((*r0.shape[1:-1], 0))
         if field and field.soft:
-            self.susceptibility = field.soft.at(inside_cells(r0[0]), self.n0)[..., None]
+            self.susceptibility = field.soft.susceptibility_at(inside_cells(r0[0]), self.n0)[..., None]
         if field and field.soft and field.soft.alone:
             self._magnetisation, field = None, None
         if self._magnetisation:

@@ -138,9 +138,16 @@ def _draw(
     in_plane = [B @ e for e in directions]
     largest_in_plane = max(float(np.nanmax(np.abs(part), initial=0.0)) for part in in_plane)
     if largest_in_plane > MIN_IN_PLANE_PART * largest:
-        components = (masked(part) for part in in_plane)
+        along_x, along_y = (masked(part) for part in in_plane)
         axes.streamplot(
-            x, y, *components, color="white", linewidth=0.6, density=LINE_DENSITY, arrowsize=0.6
+            x,
+            y,
+            along_x,
+            along_y,
+            color="white",
+            linewidth=0.6,
+            density=LINE_DENSITY,
+            arrowsize=0.6,
         )
     lines = section(surface, grid)
     axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), aspect="equal")
