@@ -140,7 +140,7 @@ def own_mirror(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | 
         shape_constraint(case.shell, perfect),
         *leaves(imperfections, perfect, one_by_one=one_by_one),
     ]
-    if plies := ShellLaminate.from_laminate(case.context):
+    if plies := ShellLaminate.from_context(case.context):
         constraints += plies.leaves(case.context, perfect)
     vectors = [unit(v) for constraint in constraints for v in constraint.vectors]
     if perfect.round and plane.through_e3:

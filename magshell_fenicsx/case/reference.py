@@ -375,12 +375,12 @@ def _allowed(part: Schema, titles: dict[str, str]) -> str:
         return f"[{words}](#{anchor(title)})"
     for alternatives in ("anyOf", "oneOf"):
         if alternatives in part:
-            words = [
+            choices = [
                 _allowed(alternative, titles)
                 for alternative in part[alternatives]
                 if alternative.get("type") != "null"
             ]
-            return (", " if alternatives == "oneOf" else " or ").join(words)
+            return (", " if alternatives == "oneOf" else " or ").join(choices)
     if "const" in part or "enum" in part:
         return ", ".join(
             f"`{_value_text(value)}`" for value in part.get("enum", [part.get("const")])

@@ -236,7 +236,7 @@ def adaptive_cells(formulas: FormulaGroup, outline: Outline) -> RefinedParts:
         return x, area
 
     reference = SubCells(np.zeros(1, np.int64), np.zeros((1, 2)), np.ones((1, 2)))
-    first = reference.of(np.arange(len(triangles)))
+    first = reference.in_each_cell(np.arange(len(triangles)))
     return refine_where_hidden(formulas, first, places_and_areas, lattice, len(triangles))
 
 

@@ -99,16 +99,16 @@ def raised_stiffnesses(scene: Scene, state: State) -> dict[str, float]:
         k = state.mu.get(contact.setting, contact.stiffness)
         deep = scene.model.region(state, contact.amplitude).penetration
         if (
-            deep > contact.bound * h
-            and not contact.given
+            deep > contact.max_penetration * h
+            and not contact.has_given_stiffness
             and k < MAX_STIFFENING * contact.stiffness
         ):
             settings[contact.setting] = STIFFENING * k
     for pair, deep in shell_penetrations(scene, state):
         k = state.mu.get(pair.setting, pair.stiffness)
         if (
-            deep > BOUND_AT_POINTS * pair.bound
-            and not pair.given
+            deep > BOUND_AT_POINTS * pair.max_penetration
+            and not pair.has_given_stiffness
             and k < MAX_STIFFENING_OF_SHELLS * pair.stiffness
         ):
             settings[pair.setting] = STIFFENING * k
@@ -404,19 +404,19 @@ def penetration_message(scene: Scene, state: State, *, moving: bool = False) -> 
     h = scene.problem.material.h
     for contact in scene.problem.loads.contacts:
         deep = scene.model.region(state, contact.amplitude).penetration / h
-        if deep > contact.bound:
+        if deep > contact.max_penetration:
             k = state.mu.get(contact.setting, contact.stiffness)
             return (
                 f"the penetration of the body {contact.body} is {deep:.3g} h, more than "
-                f"bodies.{contact.body}.penetration: {contact.bound:g}; its stiffness is {k:.4g}: "
+                f"bodies.{contact.body}.penetration: {contact.max_penetration:g}; its stiffness is {k:.4g}: "
                 "give four times as much"
             )
     for pair, deep in shell_penetrations(scene, state):
-        largest = pair.bound * (IMPACT_BOUND_RATIO if moving else 1.0)
+        largest = pair.max_penetration * (IMPACT_BOUND_RATIO if moving else 1.0)
         if deep > largest:
             what = f"the penetration between {pair.words} is {deep:.3g} h, more than {largest:g} h"
             k = state.mu.get(pair.setting, pair.stiffness)
-            if moving or pair.given:
+            if moving or pair.has_given_stiffness:
                 return f"{what}; contact: stiffness: is {k:.4g}: give four times as much"
             return f"{what} even with the stiffest penalty: take smaller elements where they touch"
     return ""
@@ -448,7 +448,7 @@ def support_motion_limit(scene: Scene, state: State, name: str, end: float) -> t
         for shell_contact in model.shell_contacts:
             if (
                 shell_contact.gap_at_supports(held_nodes, u)
-                < -shell_contact.pair.bound * scene.problem.material.h
+                < -shell_contact.pair.max_penetration * scene.problem.material.h
             ):
                 return shell_contact.pair.words
         return ""
@@ -541,7 +541,7 @@ def stiffened_equilibrium(scene: Scene, state: State) -> State:
     stays.
     """
     for _ in range(MAX_STIFFENINGS):
-        bodies = [contact for contact in touching_bodies(scene, state) if not contact.given]
+        bodies = [contact for contact in touching_bodies(scene, state) if not contact.has_given_stiffness]
         harder = with_stiffer_bodies(scene, state, bodies) if bodies else None
         if harder is None:
             break

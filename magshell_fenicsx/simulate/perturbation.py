@@ -97,8 +97,8 @@ def scale_at_key(context: Context, key: str) -> float:
     case's unit, else one.
     """
     value, is_length_key = _value_and_kind(context, key)
-    if value:
-        return abs(value)
+    if size := float(abs(value)):
+        return size
     neighbours, _ = _value_and_kind(context, key.rpartition(".")[0])
     if isinstance(neighbours, list):
         sizes = [abs(v) for v in neighbours if isinstance(v, float | int)]

@@ -120,7 +120,7 @@ def build_solid_model(problem: Problem, comm: MPI.Comm) -> "SolidModel":
     from magshell_fenicsx.shells.solid import SolidModel
 
     def factor(x: Array) -> Array:
-        thicknesses = (problem.thickness or Thickness()).at(x)
+        thicknesses = (problem.thickness or Thickness()).values_at(x)
         refuse_unfit(thicknesses, x, comm)
         return thicknesses
 

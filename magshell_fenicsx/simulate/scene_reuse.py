@@ -123,5 +123,5 @@ def _set_fields(model: "ShellModel | MeridianModel", problem: Problem) -> None:
         patches = model.midsurface.patches if model.midsurface else {}
         model.thickness.x.array[:] = thickness_field(problem.thickness, r0, patches).x.array
     if natural:
-        curvature = natural_field(natural, spatial_fields.cells_of(r0), model.V)
+        curvature = natural_field(natural, spatial_fields.cell_geometry(r0), model.V)
         coefficients["natural"].x.array[:] = curvature.x.array

@@ -126,7 +126,7 @@ class _TangentEnergy:
                 : made_of.function_space.dofmap.index_map.size_local
             ]
             material_directions = np.concatenate(scene.comm.allgather(rows))
-        self._law = scene.problem.material.law_in(material_directions).at(
+        self._law = scene.problem.material.law_in(material_directions).at_point(
             places, a1, a2, np.cross(a1, a2)
         )
         self._gamma = np.einsum("...ijc,...kc->...ijk", second, np.linalg.solve(metric, first))
