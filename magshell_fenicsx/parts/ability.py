@@ -174,8 +174,8 @@ class Context:
 
     @property
     def time_unit(self) -> float | None:
-        """R √(ρ/E), the unit of times: in seconds where the case has units; None without a density.
-        """
+        """R √(ρ/E), the unit of times, in seconds where the case has units; None without
+        density."""
         density, modulus = self.shell.density, self.shell.youngs_modulus
         return (
             float(self.shell.reference * np.sqrt(density / modulus))

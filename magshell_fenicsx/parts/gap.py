@@ -97,30 +97,36 @@ def thickness_ratio_at_points(
     return ratio_at
 
 
-def penalty(s: Array, k: float, soft: float) -> tuple[Array, Array, Array]:
+def penalty(s: Array, k: float, soft_penetration: float) -> tuple[Array, Array, Array]:
     """Return psi of penetrations s with its first and second derivative.
 
-    psi'' grows from 0 to k over the penetration `soft`, and is continuous.
+    psi'' grows from 0 to k over the penetration `soft_penetration`, and is continuous.
     """
     t = np.maximum(s, 0.0)
-    is_full = t > soft
-    second = np.where(is_full, k, k * t / soft)
-    first = np.where(is_full, k * (t - soft / 2), k * t**2 / (2 * soft))
-    value = np.where(is_full, k * (t**2 / 2 - t * soft / 2 + soft**2 / 6), k * t**3 / (6 * soft))
+    is_full = t > soft_penetration
+    second = np.where(is_full, k, k * t / soft_penetration)
+    first = np.where(is_full, k * (t - soft_penetration / 2), k * t**2 / (2 * soft_penetration))
+    value = np.where(
+        is_full,
+        k * (t**2 / 2 - t * soft_penetration / 2 + soft_penetration**2 / 6),
+        k * t**3 / (6 * soft_penetration),
+    )
     return value, first, second
 
 
 def expanded_penalty(
-    s: Array, s0: Array, k: float, soft: float, *, with_third_order: bool = False
+    s: Array, s0: Array, k: float, soft_penetration: float, *, with_third_order: bool = False
 ) -> tuple[Array, Array, Array]:
     """Return the Taylor polynomial of `penalty` about penetrations s0, with its derivatives.
 
-    It is of second order, or of third. Differences over a part of `soft` are better by that of
+    It is of second order, or of third. Differences over a part of `soft_penetration` are better by that of
     second order; the derivative of the second derivative needs the third.
     """
-    value, first, second = penalty(s0, k, soft)
+    value, first, second = penalty(s0, k, soft_penetration)
     step = s - s0
-    third = with_third_order * np.where((s0 > 0) & (s0 <= soft), k / soft, 0.0)
+    third = with_third_order * np.where(
+        (s0 > 0) & (s0 <= soft_penetration), k / soft_penetration, 0.0
+    )
     curvature = second + step * third
     return (
         value + step * (first + step * (second / 2 + step / 6 * third)),
@@ -129,17 +135,17 @@ def expanded_penalty(
     )
 
 
-def mean_pressure(s0: Array, s1: Array, k: float, soft: float) -> tuple[Array, Array]:
+def mean_pressure(s0: Array, s1: Array, k: float, soft_penetration: float) -> tuple[Array, Array]:
     """Return (psi(s1) - psi(s0))/(s1 - s0) and its derivative by s1.
 
     Simpson's rule where psi'' has no kink between both, for which it is exact.
     """
-    (v0, p0, _), (v1, p1, k1) = penalty(s0, k, soft), penalty(s1, k, soft)
-    _, p_middle, k_middle = penalty((s0 + s1) / 2, k, soft)
+    (v0, p0, _), (v1, p1, k1) = penalty(s0, k, soft_penetration), penalty(s1, k, soft_penetration)
+    _, p_middle, k_middle = penalty((s0 + s1) / 2, k, soft_penetration)
     simpson, simpson_slope = (p0 + 4 * p_middle + p1) / 6, (2 * k_middle + k1) / 6
-    kinks = (0.0, soft)
+    kinks = (0.0, soft_penetration)
     passes_kink = np.digitize(s0, kinks) != np.digitize(s1, kinks)
-    passes_kink &= np.abs(s1 - s0) > PENETRATION_ROUNDING * soft
+    passes_kink &= np.abs(s1 - s0) > PENETRATION_ROUNDING * soft_penetration
     ds = np.where(passes_kink, s1 - s0, 1.0)
     mean = np.where(passes_kink, (v1 - v0) / ds, simpson)
     return mean, np.where(passes_kink, (p1 - mean) / ds, simpson_slope)

@@ -63,7 +63,8 @@ class GravityStep(BodyForceStep):
     acceleration: Annotated[float, over_size(ACCELERATION)] | None = Field(
         default=None, ge=-1e3, le=1e3
     )
-    """Target of g, as "9.81 m/s^2" where the shell has a density; negative: against the direction [E/(ρ R)]"""
+    """Target of g, as "9.81 m/s^2" where the shell has a density; negative: against the direction
+    [E/(ρ R)]"""
 
     @property
     def place(self) -> Any:

@@ -40,22 +40,23 @@ class JointSection(Section):
     """Two edges that meet, or an edge and the shell on which it is, joined."""
 
     edges: Annotated[list[str], Field(min_length=2, max_length=2)]
-    """Both, each with the name of its shell, as [upper.rim, lower.rim]; of a T-junction, as [stiffener.foot, plate],
-    the edge, then the shell on whose mid-surface it is"""
+    """Both, each with the name of its shell, as [upper.rim, lower.rim]; of a T-junction, as
+    [stiffener.foot, plate], the edge, then the shell on whose mid-surface it is"""
     kind: Literal["rigid", "hinge", "spring"] = "rigid"
     """The angle between the shells stays, is free, or has a spring"""
     stiffness: Annotated[float, or_number("newton"), Field(ge=0, le=1e30)] | None = None
     """Of kind: spring: moment per length and radian [force]"""
     angle: float | None = Field(default=None, ge=-179, le=179)
-    """Of kind: spring: the angle at which it rests, from flat; positive where the shells are folded towards their
-    normals. By default that of the shells where they are; else it grows from there before the load, or as a step of
-    kind: crease [degree]"""
+    """Of kind: spring: the angle at which it rests, from flat; positive where the shells are folded
+    towards their normals. By default that of the shells where they are; else it grows from there
+    before the load, or as a step of kind: crease [degree]"""
 
     @model_validator(mode="after")
     def _of_a_spring(self) -> Self:
         if (self.stiffness is not None) != (self.kind == "spring"):
             raise ValueError(
-                f"stiffness belongs to kind: spring, and must be given there; the kind is {self.kind}"
+                "stiffness belongs to kind: spring, and must be given there; the kind is "
+                f"{self.kind}"
             )
         if self.angle is not None and self.kind != "spring":
             raise ValueError(f"angle: belongs to kind: spring; the kind is {self.kind}")
@@ -107,13 +108,15 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
                 _refuse_too_stiff(i, section, context)
             if section.angle is not None and section.edges[1] in shells:
                 raise ValueError(
-                    f"joints.{i}.angle: of an edge on another shell the spring rests as it is placed: leave it out"
+                    f"joints.{i}.angle: of an edge on another shell the spring rests as it is "
+                    "placed: leave it out"
                 )
             edge, other = section.edges
             if other in shells and edge.startswith(f"{other}_"):
                 others = ", ".join(sorted(set(shells) - {other})) or "none"
                 raise ValueError(
-                    f"joints.{i}: {other}: is the shell of the edge itself, which joins nothing; allowed: {others}"
+                    f"joints.{i}: {other}: is the shell of the edge itself, which joins nothing; "
+                    f"allowed: {others}"
                 )
             for name in section.edges:
                 if name in shells:
@@ -148,8 +151,7 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
 
 
 def _refuse_too_stiff(number: int, section: JointSection, context: Context) -> None:
-    """Check that a spring is not stiffer than rounding allows, beside the softer of its two shells.
-    """
+    """Check that a spring is not stiffer than rounding allows beside the softer shell."""
     shells, least_stiffness = context.sections["shells"], inf
     for edge in section.edges:
         owners = [name for name in shells if edge == name or edge.startswith(f"{name}_")]
@@ -162,9 +164,11 @@ def _refuse_too_stiff(number: int, section: JointSection, context: Context) -> N
     stiffness = section.stiffness or 0.0
     if stiffness > MAX_RELATIVE_STIFFNESS * least_stiffness:
         raise ValueError(
-            f"joints.{number}.stiffness: {stiffness:g}: is {stiffness / least_stiffness:.2g} times that of the shell over its "
-            f"thickness, E h²/(12 (1 - ν²)) = {least_stiffness:.4g}; allowed up to {MAX_RELATIVE_STIFFNESS:g} times, "
-            f"{MAX_RELATIVE_STIFFNESS * least_stiffness:.4g}: a joint so stiff is rigid, use kind: rigid"
+            f"joints.{number}.stiffness: {stiffness:g}: is {stiffness / least_stiffness:.2g} "
+            "times that of the shell over its thickness, E h²/(12 (1 - ν²)) = "
+            f"{least_stiffness:.4g}; allowed up to {MAX_RELATIVE_STIFFNESS:g} times, "
+            f"{MAX_RELATIVE_STIFFNESS * least_stiffness:.4g}: a joint so stiff is rigid, use "
+            "kind: rigid"
         )
 
 

@@ -31,9 +31,15 @@ def section_of(room: str, kind: str) -> type[Section]:
     """Return the section of a kind: the one class in its file with this value of the key `kind`."""
     module = import_module(f"{__package__}.{room}.{kind}")
     module_members = (
-        member for member in vars(module).values() if getattr(member, "__module__", "") == module.__name__
+        member
+        for member in vars(module).values()
+        if getattr(member, "__module__", "") == module.__name__
     )
-    sections = [member for member in module_members if isinstance(member, type) and issubclass(member, Section)]
+    sections = [
+        member
+        for member in module_members
+        if isinstance(member, type) and issubclass(member, Section)
+    ]
     (section,) = (
         member for member in sections if kind in get_args(member.model_fields["kind"].annotation)
     )

@@ -42,11 +42,13 @@ class PlySection(Section):
     angle: float = Field(default=0.0, ge=-360, le=360)
     """From the direction `along` to the fibres, counterclockwise about the normal [degree]"""
     E1: Modulus
-    """Young's modulus along the fibres, in the unit of youngs_modulus; without one over E [force/length²]"""
+    """Young's modulus along the fibres, in the unit of youngs_modulus; without one over E
+    [force/length²]"""
     E2: Modulus
     """Young's modulus across the fibres [force/length²]"""
     nu12: float = Field(gt=-10, lt=10)
-    """Poisson's ratio: how it shrinks across the fibres when it is pulled along them; ν12² < E1/E2"""
+    """Poisson's ratio: how it shrinks across the fibres when it is pulled along them; ν12² <
+    E1/E2"""
     G12: Modulus
     """Shear modulus in the plane [force/length²]"""
     fraction: float = Field(gt=0, le=1)
@@ -66,8 +68,8 @@ class PlySection(Section):
     def _positive(self) -> Self:
         if self.nu12**2 * self.E2 >= self.E1:
             raise ValueError(
-                f"nu12: {self.nu12:g}: allowed is nu12^2 < E1/E2 = {self.E1 / self.E2:.4g}: else a strain costs no "
-                "energy"
+                f"nu12: {self.nu12:g}: allowed is nu12^2 < E1/E2 = {self.E1 / self.E2:.4g}: else "
+                "a strain costs no energy"
             )
         return self
 
@@ -75,9 +77,9 @@ class PlySection(Section):
     def stiffness(self) -> Array:
         """Q (3, 3) with S = Q (E_11, E_22, 2 E_12) in the directions of `along` and across it."""
         nu21 = self.nu12 * self.E2 / self.E1
-        in_ply_axes = np.array([[self.E1, nu21 * self.E1, 0], [nu21 * self.E1, self.E2, 0], [0, 0, 0]]) / (
-            1 - self.nu12 * nu21
-        )
+        in_ply_axes = np.array(
+            [[self.E1, nu21 * self.E1, 0], [nu21 * self.E1, self.E2, 0], [0, 0, 0]]
+        ) / (1 - self.nu12 * nu21)
         in_ply_axes[2, 2] = self.G12
         c, s = np.cos(np.radians(self.angle)), np.sin(np.radians(self.angle))
         c, s = (0.0 if abs(v) < 1e-15 else float(v) for v in (c, s))  # 90 degrees are exact
@@ -98,8 +100,9 @@ class LaminateSection(Section):
     along: (
         Literal["meridian"] | Annotated[list[float], Field(min_length=3, max_length=3)] | None
     ) = None
-    """Direction of the angle 0: away from the pole on the meridians of e3, or the part in the surface of a vector; by
-    default [1, 0, 0] of a strip, a plate and a mesh, meridian of all else"""
+    """Direction of the angle 0: away from the pole on the meridians of e3, or the part in the
+    surface of a vector; by default [1, 0, 0] of a strip, a plate and a mesh, meridian of all
+    else"""
     plies: list[PlySection] = Field(min_length=1, max_length=200)
     """From the inner face outwards"""
 
@@ -127,8 +130,15 @@ class LaminateSection(Section):
     def isotropic(self) -> bool:
         """Whether all directions are alike."""
         matrices = self.matrices(1.0)
-        differences = np.stack([matrices[:, 0] - matrices[:, 2], (matrices[:, 0] - matrices[:, 1]) / 2 - matrices[:, 5]])
-        return not self.twists and bool(np.all(np.abs(differences) <= STIFFNESS_TOLERANCE * np.abs(matrices).max()))
+        differences = np.stack(
+            [
+                matrices[:, 0] - matrices[:, 2],
+                (matrices[:, 0] - matrices[:, 1]) / 2 - matrices[:, 5],
+            ]
+        )
+        return not self.twists and bool(
+            np.all(np.abs(differences) <= STIFFNESS_TOLERANCE * np.abs(matrices).max())
+        )
 
     def matrices(self, E: float) -> Array:
         """Return A, B and D (3, 6) over E h, E h² and E h³, as 11, 12, 22, 16, 26, 66.
@@ -163,8 +173,8 @@ class LaminateSection(Section):
             for key in ("E1", "E2", "G12"):
                 if not MIN_MODULUS_RATIO <= (ratio := getattr(ply, key) / E) <= MAX_MODULUS_RATIO:
                     raise ValueError(
-                        f"shell.laminate.plies.{i}.{key}: is {ratio:.4g} times youngs_modulus: allowed {MIN_MODULUS_RATIO:g} to "
-                        f"{MAX_MODULUS_RATIO:g}"
+                        f"shell.laminate.plies.{i}.{key}: is {ratio:.4g} times youngs_modulus: "
+                        f"allowed {MIN_MODULUS_RATIO:g} to {MAX_MODULUS_RATIO:g}"
                     )
 
 
@@ -177,7 +187,9 @@ def laminate_of(shell: Any, turn: float) -> "Laminate | None":
         return None
     direction = section.direction(shell.geometry)
     direction_in_model = None if direction is None else rotation(turn) @ direction
-    return Laminate(section.matrices(shell.youngs_modulus or 1.0), direction_in_model, section.isotropic)
+    return Laminate(
+        section.matrices(shell.youngs_modulus or 1.0), direction_in_model, section.isotropic
+    )
 
 
 @dataclass(frozen=True)
@@ -210,13 +222,17 @@ class ShellLaminate(Ability):
             context.needs(
                 "shell.laminate",
                 "the whole shell",
-                hint="no plane of boundary: symmetry mirrors a laminate that twists: for each ply lay one at -angle, "
-                "at the same distance from the middle",
+                hint="no plane of boundary: symmetry mirrors a laminate that twists: for each ply "
+                "lay one at -angle, at the same distance from the middle",
             )
 
     def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
         """Return all symmetry of isotropic plies, else that of the directions if nothing twists."""
-        return [] if self.section.isotropic else [_laminate_symmetry(self.section, context.shell.geometry)]
+        return (
+            []
+            if self.section.isotropic
+            else [_laminate_symmetry(self.section, context.shell.geometry)]
+        )
 
 
 def _laminate_symmetry(section: LaminateSection, geometry: str) -> SymmetryConstraint:
@@ -224,7 +240,10 @@ def _laminate_symmetry(section: LaminateSection, geometry: str) -> SymmetryConst
     direction = section.direction(geometry)
     reason = None
     if section.twists:
-        reason = "the laminate is not balanced about the meridian, and twists the shell: lay a ply at -angle for each"
+        reason = (
+            "the laminate is not balanced about the meridian, and twists the shell: lay a ply at "
+            "-angle for each"
+        )
     elif direction is not None and np.hypot(*direction[:2]) > STIFFNESS_TOLERANCE:
         reason = (
             "the angle 0 of the plies is not along the meridians: give laminate.along: meridian"
@@ -233,7 +252,9 @@ def _laminate_symmetry(section: LaminateSection, geometry: str) -> SymmetryConst
     azimuths = (
         ()
         if direction is None
-        else tuple(float(np.arctan2(direction[1], direction[0])) + turn for turn in (0.0, np.pi / 2))
+        else tuple(
+            float(np.arctan2(direction[1], direction[0])) + turn for turn in (0.0, np.pi / 2)
+        )
     )
     if section.twists:
         return SymmetryConstraint(reason, mirrors=no_plane)
@@ -249,9 +270,12 @@ def laminate_account(section: LaminateSection, shell: Any) -> str:
         "/..." if len(section.plies) > 12 else ""
     )
     vector = section.direction(shell.geometry)
-    direction_words = "the meridian" if vector is None else f"[{', '.join(f'{v:g}' for v in vector)}]"
+    direction_words = (
+        "the meridian" if vector is None else f"[{', '.join(f'{v:g}' for v in vector)}]"
+    )
     coupled = f"B up to {np.abs(B).max():.4g} E h^2 couples both" if B.any() else "not coupled"
     return (
-        f"membrane and bending energy of a laminate [{angles}] with 0 along {direction_words}: A11, A22 = {A[0]:.4g}, {A[2]:.4g} "
-        f"E h, D11, D22 = {D[0]:.4g}, {D[2]:.4g} E h^3, {coupled}"
+        f"membrane and bending energy of a laminate [{angles}] with 0 along {direction_words}: "
+        f"A11, A22 = {A[0]:.4g}, {A[2]:.4g} E h, D11, D22 = {D[0]:.4g}, {D[2]:.4g} E h^3, "
+        f"{coupled}"
     )

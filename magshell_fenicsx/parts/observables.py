@@ -166,8 +166,7 @@ class Observables:
         return {}
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
-        """Return columns besides those of every run; `supports` are those with reported reactions.
-        """
+        """Return columns besides those of every run; reactions of `supports` are reported."""
         return (*self.amplitudes(loads), *self.conjugates(loads).values())
 
     def moments(self, loads: "Loads") -> Sequence[str]:

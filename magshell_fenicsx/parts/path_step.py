@@ -46,20 +46,22 @@ class PathStep(Step):
     until: Until
     points: Count = 10
     then: Literal["snap", "follow"] | None = None
-    """What follows the instability that ends the step. `snap`, with `until: limit` or `bifurcation`: the shell is
-    released, and moves under its loads and what else is held, lightly damped, until it rests on the branch that it
-    snaps to. `follow`, with `until: bifurcation`: the branch that begins there is followed, to a target that may stand
-    here, or for `points` steps. A mode that a meridian or a half excludes takes the smallest model that has it: for
-    m waves the sector of 180/m degrees between two mirror planes, else a half, else the whole shell. The next step
-    goes on from there, in that model"""
+    """What follows the instability that ends the step. `snap`, with `until: limit` or
+    `bifurcation`: the shell is released, and moves under its loads and what else is held, lightly
+    damped, until it rests on the branch that it snaps to. `follow`, with `until: bifurcation`: the
+    branch that begins there is followed, to a target that may stand here, or for `points` steps. A
+    mode that a meridian or a half excludes takes the smallest model that has it: for m waves the
+    sector of 180/m degrees between two mirror planes, else a half, else the whole shell. The next
+    step goes on from there, in that model"""
     snap: SnapSection = SnapSection.model_construct()
     """How it is released"""
     branches: bool = False
-    """Follow the branch at the first bifurcation too, to the target or for `points` steps: both directions of one
-    that the model has itself; of a mode that it excludes one, in the smallest model that has it, and the other is the
-    same shape, turned or mirrored"""
+    """Follow the branch at the first bifurcation too, to the target or for `points` steps: both
+    directions of one that the model has itself; of a mode that it excludes one, in the smallest
+    model that has it, and the other is the same shape, turned or mirrored"""
     sensitivities: bool = False
-    """Derive the load at the fold that ends the path by all other amplitudes, the defect and each patch's remanence"""
+    """Derive the load at the fold that ends the path by all other amplitudes, the defect and each
+    patch's remanence"""
 
     @model_validator(mode="before")
     @classmethod
@@ -80,7 +82,9 @@ class PathStep(Step):
     def _target_fits_control(self) -> Self:
         """Allow one target that fits the control with `until: target`, none elsewhere."""
         targets, prescribed = self._given_targets, self.prescribed
-        fitting = [key for key, (quantity, _) in self.targets.items() if prescribed in ("arc", quantity)]
+        fitting = [
+            key for key, (quantity, _) in self.targets.items() if prescribed in ("arc", quantity)
+        ]
         for key, value in targets.items():
             if 0 < abs(value) < LEAST_TARGET:
                 raise ValueError(
@@ -91,8 +95,8 @@ class PathStep(Step):
         ):
             names = " or ".join(fitting) or "another control"
             raise ValueError(
-                f"until: target with control: {self.control} needs {names} (and nothing else) as target; control: arc "
-                f"takes {' or '.join(self.targets)}"
+                f"until: target with control: {self.control} needs {names} (and nothing else) as "
+                f"target; control: arc takes {' or '.join(self.targets)}"
             )
         follows_branch = self.until == "bifurcation" and self.then == "follow"
         if follows_branch and len(targets) > 1:
@@ -124,12 +128,13 @@ class PathStep(Step):
         """Check that a target is the end of a path on which the first instability is looked for."""
         if "until" not in self.model_fields_set:
             raise ValueError(
-                f"{targets[0]} is a target: it goes with until: target; or write until: limit, for the first instability "
-                "on the way there"
+                f"{targets[0]} is a target: it goes with until: target; or write until: limit, "
+                "for the first instability on the way there"
             )
         if len(targets) > 1 or self.prescribed == "load" or targets[0] not in fitting:
             raise ValueError(
-                f"{' and '.join(targets)}: beside until: limit stands one target, the end of the way, with control: arc"
+                f"{' and '.join(targets)}: beside until: limit stands one target, the end of the "
+                "way, with control: arc"
             )
 
     @classmethod
@@ -183,7 +188,9 @@ class PathStep(Step):
         """The latest end of the path with `until: limit`, and its direction; None without."""
         if self.until != "limit":
             return None
-        return next(((self.targets[key], value) for key, value in self._given_targets.items()), None)
+        return next(
+            ((self.targets[key], value) for key, value in self._given_targets.items()), None
+        )
 
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
         """Return the change of the amplitude in the first step, by default one of equal parts.
@@ -267,7 +274,8 @@ class LoadStep(PathStep):
     """
 
     control: Literal["load", "arc"] = "arc"
-    """What is prescribed step by step: the load's amplitude, or arc length, which passes every fold"""
+    """What is prescribed step by step: the load's amplitude, or arc length, which passes every
+    fold"""
     until: Until = "target"
 
 

@@ -113,8 +113,7 @@ class WithOwnTerms(Section):
     _origin: Origin = PrivateAttr(default=Origin())
 
     def written_as(self, origin: Origin) -> Self:
-        """Return the case, with the places of its keys for messages that it does not make itself.
-        """
+        """Return the case with the places of its keys, for messages that it does not make."""
         self._origin = origin
         return self
 
@@ -141,7 +140,8 @@ class WithOwnTerms(Section):
         ):
             return message
         keys = [*about[1].split("."), *([about[2]] if about[2] else [])]
-        return f"{self._origin.place(tuple(int(key) if key.isdecimal() else key for key in keys))}: {message}"
+        path = tuple(int(key) if key.isdecimal() else key for key in keys)
+        return f"{self._origin.place(path)}: {message}"
 
     @property
     def own_terms(self) -> tuple[OwnTerm, ...]:

@@ -19,12 +19,13 @@ class LawKeys(Section):
     """The keys of a shell that choose its law."""
 
     law: Literal["koiter", "neo-hookean", "mooney-rivlin", "ogden"] = "koiter"
-    """Koiter's for small strains; the others for rubber, incompressible at any stretch, with E = 6 (C10 + C01)"""
+    """Koiter's for small strains; the others for rubber, incompressible at any stretch, with E = 6
+    (C10 + C01)"""
     mooney: float | None = Field(default=None, ge=0, le=1000)
     """C01/C10 of law: mooney-rivlin"""
     mu: list[float] | None = Field(default=None, min_length=1, max_length=6)
-    """Of law: ogden, of each term of its energy mu/alpha (λ1^alpha + λ2^alpha + λ3^alpha - 3); only their ratios count,
-    for E = 3/2 (mu1 alpha1 + mu2 alpha2 + ...)"""
+    """Of law: ogden, of each term of its energy mu/alpha (λ1^alpha + λ2^alpha + λ3^alpha - 3); only
+    their ratios count, for E = 3/2 (mu1 alpha1 + mu2 alpha2 + ...)"""
     alpha: list[Exponent] | None = Field(default=None, min_length=1, max_length=6)
     """Of law: ogden, the exponent of each term, with the sign of its mu"""
 
@@ -32,13 +33,14 @@ class LawKeys(Section):
     def _law_fits(self) -> Self:
         if (self.mooney is not None) != (self.law == "mooney-rivlin"):
             raise ValueError(
-                f"mooney: C01/C10 belongs to law: mooney-rivlin, and only to it; here the law is {self.law}"
+                "mooney: C01/C10 belongs to law: mooney-rivlin, and only to it; here the law is "
+                f"{self.law}"
             )
         ogden, mu, alpha = self.law == "ogden", self.mu or [], self.alpha or []
         if bool(mu) != ogden or len(mu) != len(alpha):
             raise ValueError(
-                f"mu, alpha: lists, one as long as the other, of law: ogden alone; here the law is {self.law}, with "
-                f"{len(mu)} and {len(alpha)} numbers"
+                "mu, alpha: lists, one as long as the other, of law: ogden alone; here the law is "
+                f"{self.law}, with {len(mu)} and {len(alpha)} numbers"
             )
         for i, (modulus, exponent) in enumerate(zip(mu, alpha, strict=True)):
             if not (isfinite(modulus) and modulus * exponent > 0):
@@ -47,7 +49,8 @@ class LawKeys(Section):
                 )
         if self.law != "koiter" and (nu := getattr(self, "poisson_ratio", 0.5)) != 0.5:
             raise ValueError(
-                f"poisson_ratio: {nu:g}: law: {self.law} is incompressible: give 0.5, or law: koiter"
+                f"poisson_ratio: {nu:g}: law: {self.law} is incompressible: give 0.5, or law: "
+                "koiter"
             )
         return self
 
@@ -55,7 +58,9 @@ class LawKeys(Section):
     def rubber(self) -> Rubberlike | None:
         """C01/(C10 + C01); of Ogden's law all mu over E, and all alpha; None of Koiter's law."""
         if self.mu and self.alpha:
-            young_ratio = 3 / 2 * sum(mu * alpha for mu, alpha in zip(self.mu, self.alpha, strict=True))
+            young_ratio = (
+                3 / 2 * sum(mu * alpha for mu, alpha in zip(self.mu, self.alpha, strict=True))
+            )
             return tuple(mu / young_ratio for mu in self.mu), tuple(self.alpha)
         ratio = self.mooney or 0.0
         return None if self.law == "koiter" else ratio / (1 + ratio)
@@ -81,7 +86,9 @@ class Rubber(Ability):
     def withdraws(self, context: Context) -> dict[Offer, str]:
         """Return that rubber keeps its volume, so that its thickness changes."""
         return {
-            "a thickness that does not change": f"shell.law: {self.law} makes the shell thinner: take koiter"
+            "a thickness that does not change": (
+                f"shell.law: {self.law} makes the shell thinner: take koiter"
+            )
         }
 
 
@@ -100,4 +107,7 @@ def law_account(rubber: Rubberlike | None) -> str:
         law = f"Ogden, mu/E and alpha: {terms}"
     else:
         law = f"Mooney-Rivlin, C01/C10 = {rubber / (1 - rubber):.5g}" if rubber else "neo-Hookean"
-    return f"membrane and bending energy of incompressible rubber at any stretch ({law}); its thickness follows"
+    return (
+        f"membrane and bending energy of incompressible rubber at any stretch ({law}); its "
+        "thickness follows"
+    )

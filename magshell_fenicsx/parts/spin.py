@@ -55,7 +55,8 @@ class SpinStep(BodyForceStep):
     speed: Annotated[float, over_size(SPEED), BeforeValidator(_of_angles)] | None = Field(
         default=None, ge=0, le=1e3
     )
-    """Target of the angular speed ω, as "3000 rpm" or "300 rad/s" where the shell has a density [√(E/ρ)/R]"""
+    """Target of the angular speed ω, as "3000 rpm" or "300 rad/s" where the shell has a density
+    [√(E/ρ)/R]"""
 
     @property
     def _given_targets(self) -> dict[str, float]:

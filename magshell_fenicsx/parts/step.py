@@ -77,10 +77,11 @@ class Step(Section):
     touches: ClassVar[bool] = False
     points: int
     hold: dict[str, Hold] = Field(default_factory=dict)
-    """Amplitude of another step, or pressure -> what is constant in this step: the load itself (default), its
-    conjugate displacement (of the pressure the volume, of a force the displacement), or a gas under the shell. This
-    step's own amplitude may stand here too if it has `until: limit`: with `conjugate` the instability is that of a
-    shell whose volume or displacement is held, not its load"""
+    """Amplitude of another step, or pressure -> what is constant in this step: the load itself
+    (default), its conjugate displacement (of the pressure the volume, of a force the displacement),
+    or a gas under the shell. This step's own amplitude may stand here too if it has `until: limit`:
+    with `conjugate` the instability is that of a shell whose volume or displacement is held, not
+    its load"""
     search: SearchSection | None = None
     """Search for further solutions at the end of the step"""
 
@@ -303,8 +304,7 @@ class Step(Section):
 
     @classmethod
     def implied(cls) -> dict[str, Any]:
-        """Return `adds` where another step holds the amplitude of this kind or drives it in time.
-        """
+        """Return `adds` where another step holds this amplitude or drives it in time."""
         return {}
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:

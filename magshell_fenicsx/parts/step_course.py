@@ -20,11 +20,12 @@ if TYPE_CHECKING:
 Until = Annotated[
     Literal["limit", "bifurcation", "target", "points", "zero"],
     Field(
-        description="Where the path ends. limit: at the first instability. Where that is a mode which a half or a "
-        "meridian excludes, the path goes on to the model's own first one, but not beyond twice the load; the result "
-        "is still the first. bifurcation: at the first bifurcation; folds are passed. target: at the target. points: "
-        "after `points` steps by arc length. zero, with control: arc: where the load has risen and fallen back to "
-        "zero, the top of an energy barrier, whose height is `barrier` in summary.json"
+        description="Where the path ends. limit: at the first instability. Where that is a mode "
+        "which a half or a meridian excludes, the path goes on to the model's own first one, but "
+        "not beyond twice the load; the result is still the first. bifurcation: at the first "
+        "bifurcation; folds are passed. target: at the target. points: after `points` steps by "
+        "arc length. zero, with control: arc: where the load has risen and fallen back to zero, "
+        "the top of an energy barrier, whose height is `barrier` in summary.json"
     ),
 ]
 Prescribed = Literal["load", "conjugate"]
@@ -44,7 +45,8 @@ class GasSection(Section):
     ambient_over_pc: float | None = Field(default=None, gt=0, le=1e12)
     """The same without one [p_c]"""
     volume: Annotated[float, over_size(VOLUME)] | None = Field(default=None, gt=0, le=1e6)
-    """Volume of the gas under the undeformed shell; by default the volume under the shell itself [R³]"""
+    """Volume of the gas under the undeformed shell; by default the volume under the shell itself
+    [R³]"""
 
     @model_validator(mode="after")
     def _one_ambient(self) -> Self:
@@ -77,10 +79,12 @@ class SearchSection(Section):
     solutions: Annotated[int, Field(ge=1, le=100)] = 3
     """Ends after so many, each a point with the label solution"""
     guesses: Annotated[int, Field(ge=1, le=1000)] = 12
-    """Guesses tried at most: the shell with dents, then both directions of the softest mode of each solution"""
+    """Guesses tried at most: the shell with dents, then both directions of the softest mode of each
+    solution"""
     stable: bool = False
-    """Whether each guess goes down in energy until it rests at a stable solution, which takes minutes on surfaces; only
-    stable ones count. A half or a meridian knows no motions beside its symmetry: take symmetry: none"""
+    """Whether each guess goes down in energy until it rests at a stable solution, which takes
+    minutes on surfaces; only stable ones count. A half or a meridian knows no motions beside its
+    symmetry: take symmetry: none"""
     seconds: Annotated[float, Field(gt=0)] | None = None
     """No guess is tried after so long; by default there is no limit [s]"""
 
@@ -94,12 +98,13 @@ class SnapSection(Section):
     push: float = Field(default=0.05, gt=0, le=10)
     """How far it leaves the fold, along the path's direction there [h]"""
     damping: float = Field(default=0.1, gt=0, le=10)
-    """Part of the critical drag of the third mode of vibration at the fold, where the first one is neutral"""
+    """Part of the critical drag of the third mode of vibration at the fold, where the first one is
+    neutral"""
     tolerance: float = Field(default=1e-3, ge=1e-9, le=1)
     """Largest estimated error of what `errors` names [h]"""
     errors: Errors = "motion"
-    """Of each time step, or of the motion at all rows (column error_over_h): then it is rehearsed with longer steps,
-    which takes several times as long; a snap magnifies the errors of steps"""
+    """Of each time step, or of the motion at all rows (column error_over_h): then it is rehearsed
+    with longer steps, which takes several times as long; a snap magnifies the errors of steps"""
 
 
 class Target(NamedTuple):

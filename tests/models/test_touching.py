@@ -181,7 +181,7 @@ def test_a_half_touches_its_image(law: str, across: int, factor: str | None) -> 
     assert system_of_whole.energies(state_of_whole.u, state_of_whole.mu)[own.name] == pytest.approx(
         2 * energy, rel=1e-9
     )
-    entries_of_whole = system_of_whole.at(state_of_whole).of(of_whole.entries)
+    entries_of_whole = system_of_whole.at_state(state_of_whole).evaluate(of_whole.entries)
     forces, forces_of_whole = (
         each.forces(at.u, at.mu, own.name)
         for each, at in ((system, state), (system_of_whole, state_of_whole))
@@ -315,9 +315,9 @@ def test_a_step_that_passes_through() -> None:
     """Walls that change places on the straight way, and walls that only come near."""
     system, h = ring().model.system, ring().model.material.h
     here, there, near = (flattened(half, 0.0).reshape(-1, 3) for half in (0.7, -0.7, 0.51))
-    assert touching().interpolated_on_surface(here, there)
-    assert not touching().interpolated_on_surface(here, near)
-    assert not touching().interpolated_on_surface(here, here + 100 * h * np.array([0, 0, 1.0]))
+    assert touching().passes_through(here, there)
+    assert not touching().passes_through(here, near)
+    assert not touching().passes_through(here, here + 100 * h * np.array([0, 0, 1.0]))
     assert system.size == here.size
 
 

@@ -217,5 +217,5 @@ def test_thin_walls_that_pass_through() -> None:
         u[upper, 2] = (d - 1) * h
         return u
 
-    assert not term.interpolated_on_surface(apart(1.0), apart(0.26))
-    assert term.interpolated_on_surface(apart(0.3), apart(-0.3))
+    assert not term.passes_through(apart(1.0), apart(0.26))
+    assert term.passes_through(apart(0.3), apart(-0.3))

@@ -78,7 +78,7 @@ class Placed(Section):
     """As a step or a part of its own may be."""
 
     kind: Literal["placed"]
-    interpolated_on_surface: list[Coordinates]
+    through: list[Coordinates]
     name: str
     target: Annotated[float, over_size(PRESSURE)] | None = None
 

@@ -26,11 +26,11 @@ AXIS_TOLERANCE = 1e-6  # an axis whose part across the approach is shorter is al
 
 
 class Distance(ABC):
-    """The signed distance of a body at approach zero, positive outside, with its outline; over R."""
+    """The signed distance (over R) of a body at approach zero, positive outside; its outline."""
 
     @abstractmethod
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return the distance (n,), its gradient (n, 3) and its Hessian (n, 3, 3) at places (n, 3)."""
+        """Return the distance (n,), gradient (n, 3) and Hessian (n, 3, 3) at places (n, 3)."""
 
     @property
     @abstractmethod
@@ -114,21 +114,22 @@ class BodySection(Section):
 
     kind: str
     at: At = At.model_construct()
-    """Where it first touches; it gives `direction`, and without `position` the place: the front of the body touches
-    the undeformed shell there"""
+    """Where it first touches; it gives `direction`, and without `position` the place: the front of
+    the body touches the undeformed shell there"""
     side: Literal["outside", "inside"] = "outside"
     """The side of the shell that it is on"""
     direction: Axis | None = None
     """Of the approach; by default along the shell's normal at `at`, towards the shell"""
     position: Coordinates | None = None
-    """Where it is at approach 0: a point of a plane, the middle of a rod's end, the centre of another body [the shell's
-    length; over R if that has no unit]"""
+    """Where it is at approach 0: a point of a plane, the middle of a rod's end, the centre of
+    another body [the shell's length; over R if that has no unit]"""
     stiffness: float | None = Field(default=None, gt=0, le=1e12)
-    """k of the penalty k s²/2 per area of a penetration s; by default 1e6 D/(R² h²) of a plane, of another body of
-    radius r 15 (1 + R/r) times as much, and four times as much each time that the penetration would exceed its bound
-    [E h/R²]"""
+    """k of the penalty k s²/2 per area of a penetration s; by default 1e6 D/(R² h²) of a plane, of
+    another body of radius r 15 (1 + R/r) times as much, and four times as much each time that the
+    penetration would exceed its bound [E h/R²]"""
     penetration: float = Field(default=1e-3, ge=1e-6, le=0.1)
-    """Largest penetration that is allowed; with a given `stiffness` the run stops where it is more [h]"""
+    """Largest penetration that is allowed; with a given `stiffness` the run stops where it is more
+    [h]"""
 
     @property
     def front_offset(self) -> float:

@@ -62,11 +62,11 @@ class ContactBody:
         through it.
     stiffness
         k of the penalty, over E h/R^2.
-    bound
+    max_penetration
         Largest penetration that is allowed, over h.
     size
         Radius over R of what touches, such as a ball's; infinite for a plane.
-    given
+    has_given_stiffness
         Whether the case gives its stiffness, which then stays.
     start, lift
         Of a body that starts at the shell's face: the place (3,) of the mid-surface there, and from
@@ -79,9 +79,9 @@ class ContactBody:
     direction: Array
     front: Array
     stiffness: float
-    bound: float
+    max_penetration: float
     size: float
-    given: bool = False
+    has_given_stiffness: bool = False
     start: Array | None = None
     lift: Array | None = None
 
@@ -296,8 +296,8 @@ class BodyContact:
             return factor if ratio_memo is None else factor * ratio_memo.renew()
 
         def thicknesses() -> tuple[Array, ...]:
-            given = () if thickness is None else (thickness.x.array,)
-            return (*given, ratio_memo.renew()) if ratio_memo else given
+            has_given_stiffness = () if thickness is None else (thickness.x.array,)
+            return (*has_given_stiffness, ratio_memo.renew()) if ratio_memo else has_given_stiffness
 
         self._factor_memo = Memo(factor, thicknesses)
         self._face_field: PointField | None = None
@@ -328,7 +328,7 @@ class BodyContact:
 
     @property
     def history(self) -> tuple[str, tuple[fem.Constant, float]]:
-        """The name of its stiffness with the constant and its default, see `FiniteElementSystem`."""
+        """The name, constant and default of its stiffness, see `FiniteElementSystem`."""
         return self.contact.setting, (self.stiffness, self.contact.stiffness)
 
     @property
@@ -428,13 +428,20 @@ class BodyContact:
         part
             Of the step at which the system has its forces.
         """
-        k, soft, half = float(self.stiffness.value), SOFT_PENETRATION * self._h, self._h / 2
+        k, soft_penetration, half = (
+            float(self.stiffness.value),
+            SOFT_PENETRATION * self._h,
+            self._h / 2,
+        )
         middle = (begin[0] + end[0]) / 2, (begin[1] + end[1]) / 2
         gaps, n, N = zip(*(self._gap_at(*state) for state in (begin, middle, end)), strict=True)
         s0, _, s1 = (-gap for gap in gaps)
-        mean, slope = mean_pressure(s0, s1, k, soft)
+        mean, slope = mean_pressure(s0, s1, k, soft_penetration)
         normal, bend = (n[0] + 4 * n[1] + n[2]) / 6, (2 * N[1] + N[2]) / 6
-        (_, p0, _), (_, p1, stiff) = penalty(s0, k, soft), penalty(s1, k, soft)
+        (_, p0, _), (_, p1, stiff) = (
+            penalty(s0, k, soft_penetration),
+            penalty(s1, k, soft_penetration),
+        )
 
         def outer(a: Array) -> Array:
             return a[:, :, None] * a[:, None, :]

@@ -62,8 +62,8 @@ def contact_bodies(
                 continue
             if (depth := overlap(body, other)) > 0:
                 raise CaseError(
-                    f"bodies.{other.body}.position: overlaps bodies.{body.body} by {depth:.3g} R at approach 0; bodies "
-                    "that move must be apart"
+                    f"bodies.{other.body}.position: overlaps bodies.{body.body} by {depth:.3g} R "
+                    "at approach 0; bodies that move must be apart"
                 )
     return tuple(made)
 
@@ -107,7 +107,8 @@ def _contact(name: str, section: BodySection, approach: str, ground: ReferenceSh
         if section.position is None:
             position_key, hint = "at", "give a place `at` that it reaches first, or its `position`"
         raise CaseError(
-            f"{key}.{position_key}: the body penetrates the undeformed shell by {depth / h:.4g} h at approach 0; {hint}"
+            f"{key}.{position_key}: the body penetrates the undeformed shell by {depth / h:.4g} h "
+            f"at approach 0; {hint}"
         )
     return contact
 
@@ -258,8 +259,8 @@ def account(context: Context, loads: Loads) -> Account:
     """Return which bodies press, and how stiff the penalty is."""
     bodies, with_units = context.sections["bodies"], context.shell.with_units
     words = [
-        f"body {contact.body}: {bodies[contact.body].words(with_units=with_units)} without friction, "
-        f"stiffness k R²/(E h) = {contact.stiffness:.4g}"
+        f"body {contact.body}: {bodies[contact.body].words(with_units=with_units)} without "
+        f"friction, stiffness k R²/(E h) = {contact.stiffness:.4g}"
         for contact in loads.contacts
     ]
     return Account(words)

@@ -28,12 +28,14 @@ class BoxSection(BodySection):
 
     kind: Literal["box"]
     size: Annotated[list[Size], Field(min_length=3, max_length=3)]
-    """Along `axis`, across it and the approach, and along the approach [the shell's length; over R if that has no
-    unit]"""
+    """Along `axis`, across it and the approach, and along the approach [the shell's length; over R
+    if that has no unit]"""
     edge: Size
-    """Radius of the rounding, at most half of the smallest size [the shell's length; over R if that has no unit]"""
+    """Radius of the rounding, at most half of the smallest size [the shell's length; over R if that
+    has no unit]"""
     axis: Axis
-    """Along the first size, of any length; its part across the approach counts, and there must be one"""
+    """Along the first size, of any length; its part across the approach counts, and there must be
+    one"""
 
     @property
     def front_offset(self) -> float:

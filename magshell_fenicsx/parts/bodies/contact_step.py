@@ -52,7 +52,8 @@ class ContactSection(PathStep):
     body: Name | None = None
     """Its name in `bodies`; not needed if there is one"""
     control: Literal["approach", "force", "arc"] = "arc"
-    """What is prescribed step by step: the approach, the force, or arc length, which passes every fold"""
+    """What is prescribed step by step: the approach, the force, or arc length, which passes every
+    fold"""
     until: Until = "target"
     approach: Annotated[float, over_size(THICKNESS)] | None = Field(default=None, ge=-1e6, le=1e6)
     """Target of the approach, from where the body is at first; with control: approach or arc [h]"""
@@ -129,8 +130,8 @@ class BodiesObservables(Observables):
         Quantity(
             "penetration_over_h",
             "penetration",
-            "Largest penetration of a body into the shell's face, an error of the penalty; negative: minus the least "
-            "gap.",
+            "Largest penetration of a body into the shell's face, an error of the penalty; "
+            "negative: minus the least gap.",
             "error",
             "",
             (THICKNESS,),
@@ -139,7 +140,8 @@ class BodiesObservables(Observables):
         Quantity(
             "contact_radius",
             "contact radius",
-            "Mean distance of the pressure from the body's axis, in the shell's length; over R if that has no unit.",
+            "Mean distance of the pressure from the body's axis, in the shell's length; over R if "
+            "that has no unit.",
             "place",
             units=(PLACE,),
             each=True,
@@ -163,7 +165,8 @@ class BodiesObservables(Observables):
         Quantity(
             "contact_stiffness",
             "stiffness of the contact",
-            "Of the penalty, in E h/R²; raised fourfold where a body without `stiffness` would penetrate too much.",
+            "Of the penalty, in E h/R²; raised fourfold where a body without `stiffness` would "
+            "penetrate too much.",
             "error",
             each=True,
         ),

@@ -27,10 +27,11 @@ class EllipsoidSection(BodySection):
 
     kind: Literal["ellipsoid"]
     semi_axes: Annotated[list[Size], Field(min_length=3, max_length=3)]
-    """Along `axis`, across it and the approach, and along the approach; half of its lengths [the shell's length; over R
-    if that has no unit]"""
+    """Along `axis`, across it and the approach, and along the approach; half of its lengths [the
+    shell's length; over R if that has no unit]"""
     axis: Axis
-    """Along the first semi-axis, of any length; its part across the approach counts, and there must be one"""
+    """Along the first semi-axis, of any length; its part across the approach counts, and there must
+    be one"""
 
     @property
     def front_offset(self) -> float:

@@ -22,7 +22,8 @@ class RodSection(BodySection):
     radius: Size
     """Its radius [the shell's length; over R if that has no unit]"""
     edge: Size
-    """Radius of the edge's rounding, at most `radius` [the shell's length; over R if that has no unit]"""
+    """Radius of the edge's rounding, at most `radius` [the shell's length; over R if that has no
+    unit]"""
 
     @model_validator(mode="after")
     def _edge_fits(self) -> Self:

@@ -117,13 +117,13 @@ class ClosestPointSearch:
 
         Collective.
         """
-        spheres = [self._bounding_spheres(self._r0 + each) for each in (u, v)]
+        spheres = [self._bounding_spheres(self._r0 + displacement) for displacement in (u, v)]
         centres = (spheres[0][0] + spheres[1][0]) / 2
         half_motion = np.linalg.norm(spheres[1][0] - spheres[0][0], axis=1) / 2
         radii = np.maximum(spheres[0][1], spheres[1][1]) + half_motion
         reach = self._largest_thickness
-        near = near_spheres(centres, radii, reach, self._own_cells)
-        pairs = self._select_pairs(*near, reach, self._r0 + u, self._r0 + v)
+        sphere_pairs = near_spheres(centres, radii, reach, self._own_cells)
+        pairs = self._select_pairs(*sphere_pairs, reach, self._r0 + u, self._r0 + v)
         return bool(self._comm.allreduce(len(pairs[0])))
 
     def _bounding_spheres(self, r: Array, cell: Any = slice(None)) -> tuple[Array, Array]:
@@ -170,13 +170,13 @@ class ClosestPointSearch:
                 FOLD_SHRINKAGE * _distances_of_nodes(self._r0, *corners)
             )
             pairs = chunk[has_shrunk.any(axis=(1, 2))]
-            own, other = nodes[i[pairs], :, None], nodes[j[pairs], None, :]
+            own_nodes, other = nodes[i[pairs], :, None], nodes[j[pairs], None, :]
             margin = spacing * (radii[i[pairs]] + radii[j[pairs]])
-            is_close = _distances_of_nodes(r, own, other) < reach + margin[:, None, None]
+            is_close = _distances_of_nodes(r, own_nodes, other) < reach + margin[:, None, None]
             margin = spacing * (undeformed_radii[i[pairs]] + undeformed_radii[j[pairs]])
-            thickness = self.half_thickness[own] + self.half_thickness[other]
-            least = SELF_CONTACT_DISTANCE * thickness - margin[:, None, None]
-            was_apart = _distances_of_nodes(self._r0, own, other) > least
+            thickness = self.half_thickness[own_nodes] + self.half_thickness[other]
+            least_separation = SELF_CONTACT_DISTANCE * thickness - margin[:, None, None]
+            was_apart = _distances_of_nodes(self._r0, own_nodes, other) > least_separation
             is_folded[pairs] = (is_close & was_apart).any(axis=(1, 2))
         return is_folded
 
@@ -192,8 +192,8 @@ class ClosestPointSearch:
                 return pairs
         centres, radii = self._bounding_spheres(self._r0 + u)
         margin = reach + TRACKING_MARGIN * float(radii.mean())
-        near = near_spheres(centres, radii, margin, self._own_cells)
-        pairs = self._select_pairs(*near, margin, self._r0 + u)
+        sphere_pairs = near_spheres(centres, radii, margin, self._own_cells)
+        pairs = self._select_pairs(*sphere_pairs, margin, self._r0 + u)
         self._tracked[reach] = np.array(u), margin, pairs
         return pairs
 
@@ -248,9 +248,9 @@ class ClosestPointSearch:
         for reach in (*(part * max_reach for part in FIRST_REACHES), max_reach):
             places = self.projections(u, reach, points, least_only=True)
             own_least = float(places.distance.min(initial=max_reach))
-            nearest = float(self._comm.allreduce(own_least, MPI.MIN))
-            if nearest < reach:
-                return nearest
+            least = float(self._comm.allreduce(own_least, MPI.MIN))
+            if least < reach:
+                return least
         return max_reach
 
     @cached_property
@@ -263,8 +263,8 @@ class ClosestPointSearch:
         """
         cell, side = np.nonzero(self._cells.neighbours >= 0)
         n, neighbour = len(self._cells.nodes), self._cells.neighbours[cell, side]
-        joined = scipy.sparse.coo_array((np.ones(len(cell)), (cell, neighbour)), (n, n))
-        count, number = scipy.sparse.csgraph.connected_components(joined, directed=False)
+        adjacency = scipy.sparse.coo_array((np.ones(len(cell)), (cell, neighbour)), (n, n))
+        count, number = scipy.sparse.csgraph.connected_components(adjacency, directed=False)
         sizes, (_, first_cells) = np.bincount(number), np.unique(number, return_index=True)
         faced = np.zeros((count, count), dtype=np.int64)  # cells of one surface that another faces
         for surface, cell in enumerate(first_cells):
@@ -379,15 +379,15 @@ class ClosestPointSearch:
             is_listed = keys[row] == neighbour_key
             is_nearer = places.distance[row] < places.distance - DISTANCE_TOLERANCE * self._h
             # the surface that goes on there is not searched
-            is_folded = places.above & self._are_near_in_surface(key_of_point_cell + neighbour)
+            is_folded = places.is_above & self._are_near_in_surface(key_of_point_cell + neighbour)
             is_nearest &= ~is_on_side | (is_listed & ~is_nearer) | is_folded
         places = places.select(is_nearest)
         if not len(places.point):
             return places
         places = _number_directions(places.select(np.lexsort((places.distance, places.point))))
         first = places.firsts
-        least = np.repeat(places.distance[first], np.diff([*first, len(places.point)]))
-        return places.select(places.distance < least + DISTANCE_TOLERANCE * self._h)
+        least_distance = np.repeat(places.distance[first], np.diff([*first, len(places.point)]))
+        return places.select(places.distance < least_distance + DISTANCE_TOLERANCE * self._h)
 
     def are_left_to_edges(
         self, points: ContactPoints, places: Projections, normals: Array
@@ -427,7 +427,9 @@ class ClosestPointSearch:
     ) -> tuple[Flags, Flags]:
         """Return which places are on an edge, and which are steep to their point's cell."""
         on_side = np.column_stack([1 - nearest.X.sum(axis=1), nearest.X]) == 0.0
-        moves_along_side = nearest.free.any(axis=(1, 2)) & (nearest.free[:, :, 1] == 0).all(axis=1)
+        moves_along_side = nearest.free_directions.any(axis=(1, 2)) & (
+            nearest.free_directions[:, :, 1] == 0
+        ).all(axis=1)
         is_boundary = self._cells.neighbours[nearest.cell] < 0
         is_on_edge = moves_along_side & (on_side & is_boundary).any(axis=1)
         # in a corner an edge goes on from one cell to another, or turns
@@ -455,7 +457,7 @@ def _number_directions(places: Projections) -> Projections:
     for direction in range(MAX_DIRECTIONS - 1):
         first = np.flatnonzero(np.diff(places.point[remaining], prepend=-1))
         nearest = np.repeat(remaining[first], np.diff([*first, len(remaining)]))
-        cosine = np.sum(places.way[remaining] * places.way[nearest], axis=1)
+        cosine = np.sum(places.direction[remaining] * places.direction[nearest], axis=1)
         is_same = cosine > SAME_DIRECTION_COSINE
         direction_numbers[remaining[is_same]] = direction
         remaining = remaining[~is_same]
@@ -498,5 +500,7 @@ def gap_between_supports(
 def no_projections() -> Projections:
     """Return no places."""
     no_numbers = np.zeros(0, dtype=np.int64)
-    X, free, distance, way = (np.zeros((0, *shape)) for shape in PLACE_SHAPES)
-    return Projections(no_numbers, no_numbers, X, free, distance, no_numbers, way, no_numbers > 0)
+    X, free_directions, distance, direction = (np.zeros((0, *shape)) for shape in PLACE_SHAPES)
+    return Projections(
+        no_numbers, no_numbers, X, free_directions, distance, no_numbers, direction, no_numbers > 0
+    )

@@ -25,8 +25,8 @@ class ContactObservables(Observables):
         Quantity(
             "contact_force",
             "contact force",
-            "Between shells that touch, or parts of one: the integral of the pressure over the contact; of several "
-            "pairs contact_force_ONE_OTHER.",
+            "Between shells that touch, or parts of one: the integral of the pressure over the "
+            "contact; of several pairs contact_force_ONE_OTHER.",
             "load",
             "F R/(2πD)",
             (POINT_FORCE,),
@@ -35,8 +35,8 @@ class ContactObservables(Observables):
         Quantity(
             "contact_gap_over_h",
             "least gap",
-            "Between the faces of shells that may touch, negative by the penetration of the penalty; no number while "
-            "no places nearer than 4 h face each other.",
+            "Between the faces of shells that may touch, negative by the penetration of the "
+            "penalty; no number while no places nearer than 4 h face each other.",
             "error",
             "",
             (THICKNESS,),
@@ -45,7 +45,8 @@ class ContactObservables(Observables):
         Quantity(
             "contact_penalty",
             "stiffness between shells",
-            "Of the penalty, in E h/R²; raised fourfold where shells would penetrate by over 1e-3 of the thickness.",
+            "Of the penalty, in E h/R²; raised fourfold where shells would penetrate by over 1e-3 "
+            "of the thickness.",
             "error",
             each=True,
         ),
@@ -73,8 +74,8 @@ class ContactObservables(Observables):
             for earlier in loads.pairs[:number]:
                 if _share_cells(pair, earlier, patches):
                     raise MeshError(
-                        f"contact: {pair.words}: shares cells with {earlier.words}: no place is in "
-                        "two pairs"
+                        f"contact: {pair.words}: shares cells with {earlier.words}: no place is "
+                        "in two pairs"
                     )
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
@@ -82,20 +83,20 @@ class ContactObservables(Observables):
 
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
         model, values = view.model, dict[str, float]()
-        for each in model.shell_contacts:
-            at = model.system.at_state(state)
-            force, gap = at.evaluate(each.force), at.evaluate(each.least_gap)
-            numbers = force / model.force_unit, gap / view.h, each.stiffness.value
-            values |= dict(zip(_columns(each.pair), numbers, strict=True))
+        for contact in model.shell_contacts:
+            evaluation = model.system.at_state(state)
+            force, gap = evaluation.evaluate(contact.force), evaluation.evaluate(contact.least_gap)
+            numbers = force / model.force_unit, gap / view.h, contact.stiffness.value
+            values |= dict(zip(_columns(contact.pair), numbers, strict=True))
         return values
 
 
 def _share_cells(pair: "Pair", other: "Pair", patches: Mapping[str, NDArray[np.bool_]]) -> bool:
     """Return whether both members of a pair have cells in those of another, in either order."""
     first, second = (patches[name] for name in other.names)
-    one, two = (patches[name] for name in pair.names)
-    straight = (one & first).any() and (two & second).any()
-    crossed = (two & first).any() and (one & second).any()
+    own_first, own_second = (patches[name] for name in pair.names)
+    straight = (own_first & first).any() and (own_second & second).any()
+    crossed = (own_second & first).any() and (own_first & second).any()
     return bool(straight or crossed)
 
 

@@ -29,9 +29,9 @@ class PairSection(Section):
     between: TwoNames
     """What may touch"""
     stiffness: float | None = Field(default=None, gt=0, le=1e12)
-    """k of the penalty k s²/2 per area of a penetration s; by default 1e6 D/(R² h²), and four times as much each time
-    that the penetration would exceed 1e-3 h, in a motion 0.1 h for a moment; a given one stays, and the run stops where
-    the penetration is more [E h/R²]"""
+    """k of the penalty k s²/2 per area of a penetration s; by default 1e6 D/(R² h²), and four times
+    as much each time that the penetration would exceed 1e-3 h, in a motion 0.1 h for a moment; a
+    given one stays, and the run stops where the penetration is more [E h/R²]"""
 
 
 GivenPair = Annotated[
@@ -60,17 +60,17 @@ class Pair:
         End of the names of its columns.
     stiffness
         k of the penalty, over E h/R^2.
-    bound
+    max_penetration
         Largest penetration that is allowed, over the thickness there.
-    given
+    has_given_stiffness
         Whether the case gives its stiffness, which then stays.
     """
 
     names: tuple[str, str]
     suffix: str
     stiffness: float
-    bound: float = 1e-3
-    given: bool = False
+    max_penetration: float = 1e-3
+    has_given_stiffness: bool = False
 
     def has(self, shell: str) -> bool:
         """Return whether one of several shells, with this name, is in the pair."""
@@ -137,7 +137,7 @@ def model_pairs(
         suffix = f"_{first}_{second}" if len(sections) > 1 else ""
         stiffness = given_stiffness or default * softer
         is_given = given_stiffness is not None
-        pairs.append(Pair((first, second), suffix, stiffness, given=is_given))
+        pairs.append(Pair((first, second), suffix, stiffness, has_given_stiffness=is_given))
     return tuple(pairs)
 
 
@@ -169,15 +169,15 @@ def refuse_unfit_pairs(sections: Sequence[GivenPair], context: Context) -> None:
             if (
                 shells
                 and name not in (WHOLE_SHELL, *shells)
-                and not name.startswith(tuple(f"{each}_" for each in shells))
+                and not name.startswith(tuple(f"{shell}_" for shell in shells))
             ):
                 raise ValueError(
                     f"contact.{i}: {name}: there is no such shell, only {', '.join(shells)}"
                 )
             if name != WHOLE_SHELL and not isinstance(context.shell, MeshSurface):
                 raise ValueError(
-                    f"contact.{i}: {name}: allowed: {WHOLE_SHELL}; parts are the patches of a mesh "
-                    "file"
+                    f"contact.{i}: {name}: allowed: {WHOLE_SHELL}; parts are the patches of a "
+                    "mesh file"
                 )
     if len(earlier_pairs) > 1 and frozenset({WHOLE_SHELL}) in earlier_pairs:
         raise ValueError(f"contact: {WHOLE_SHELL} and itself has all other pairs: give it alone")
@@ -199,7 +199,7 @@ def account(context: Context, loads: "Loads") -> Account:
     return Account(
         [
             f"contact of {pair.words} without friction, stiffness k R²/(E h) = {pair.stiffness:.4g}"
-            + (", as given" if pair.given else "")
+            + (", as given" if pair.has_given_stiffness else "")
             for pair in loads.pairs
         ]
     )

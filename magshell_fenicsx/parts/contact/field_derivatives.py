@@ -86,7 +86,7 @@ class ContactState:
     offsets: FaceOffsets | None
     points: "ContactPoints | MeridianPoints"
     places: "Projections | MeridianProjections"
-    joined: JoinedPlaces
+    joined_places: JoinedPlaces
     penalties: Penalty
     forces: Array
     find_entries_by_place_and_offset: Callable[[], Entries]
@@ -136,9 +136,11 @@ class ContactState:
         rates = self.unknown_rates(w)
         slopes = distance_slopes(n, beta, rates.shape[1])
         closing = -np.einsum("nki,nki->n", slopes, rates[nodes])
-        joined = self.joined
-        closing = np.bincount(joined.group, joined.weight * closing, len(joined.first))
-        return closing.astype(float)
+        joined_places = self.joined_places
+        of_joined = np.bincount(
+            joined_places.group, joined_places.weight * closing, len(joined_places.first)
+        )
+        return np.asarray(of_joined, dtype=float)
 
 
 @dataclass(frozen=True)
@@ -237,14 +239,14 @@ def _by_weights(state: ContactState, weights: EnergyWeights) -> Array:
     if not len(state.places.point):
         return forces
     value, first, _ = state.penalties
-    points, point = state.points, state.places.point[state.joined.first]
+    points, point = state.points, state.places.point[state.joined_places.first]
     rates = state.penetration_rates(weights.w)
     of_places = (weights.energy * value + weights.force * first * rates) / 2
     per_weight = np.bincount(point, of_places, len(points.cell))
-    pressed = np.unique(point)
-    element, nodes = state.cells.element, state.cells.nodes[points.cell[pressed]]
-    tables = element.tabulate(1, points.shape[pressed] @ element.points)[..., 0]
+    pressed_points = np.unique(point)
+    element, nodes = state.cells.element, state.cells.nodes[points.cell[pressed_points]]
+    tables = element.tabulate(1, points.shape[pressed_points] @ element.points)[..., 0]
     slopes = state.weight_slopes(tables, np.einsum("dnk,nki->dni", tables, state.r0[nodes]))
-    of_points = per_weight[pressed] * points.weight[pressed]
+    of_points = per_weight[pressed_points] * points.weight[pressed_points]
     np.add.at(forces, nodes, of_points[:, None, None] * slopes)
     return forces

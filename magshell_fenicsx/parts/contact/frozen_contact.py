@@ -43,7 +43,7 @@ class FrozenContact:
     cells: Cells
     points: ContactPoints
     places: Projections
-    joined: JoinedPlaces
+    joined_places: JoinedPlaces
     penetration: Array
     area_ratio: Array
 
@@ -55,11 +55,11 @@ class FrozenContact:
         h: float,
         points: ContactPoints,
         places: Projections,
-        joined: JoinedPlaces,
+        joined_places: JoinedPlaces,
     ) -> "FrozenContact":
         """Return the active set of a state on an undeformed surface r0 (nodes, 3)."""
         area_ratio = _area_ratio(cells, r0, points)
-        return cls(cells, points, places, joined, h - joined.distance, area_ratio)
+        return cls(cells, points, places, joined_places, h - joined_places.distance, area_ratio)
 
     def on_surface(self, r0: Array) -> "FrozenContact":
         """Return the same active set on another undeformed surface r0 (nodes, 3)."""
@@ -79,26 +79,36 @@ class FrozenContact:
         with_third_order
             See `expanded_penalty`.
         """
-        places, joined, cells = self.places, self.joined, self.cells
-        soft = SOFT_PENETRATION * h
+        places, joined_places, cells = self.places, self.joined_places, self.cells
+        soft_penetration = SOFT_PENETRATION * h
         if not len(places.point):
-            return places, joined, penalty(self.penetration, k, soft)
+            return places, joined_places, penalty(self.penetration, k, soft_penetration)
         r = search.places_of_nodes(u)
         x = search.places_of_points(self.points, r, places.point)
         nodal = r[cells.nodes[places.cell]]
-        X = follow_places(cells, x, nodal, places.X, places.free)
+        X = follow_places(cells, x, nodal, places.X, places.free_directions)
         (_, y), *_ = jets(cells.element, X, nodal, 0)
         off, distance = (x - y)[:, :3], distances(x - y)
         change = distance - places.distance
-        mean = np.bincount(joined.group, joined.weight * change, len(joined.first))
-        weight = joined.weight * (1 - (change - mean[joined.group]) / (BLUR_DISTANCE * h))
-        joined = replace(joined, distance=joined.distance + mean, weight=weight)
-        way = off / np.linalg.norm(off, axis=1)[:, None]
-        places = replace(places, X=X, distance=distance, way=way)
-        penalties = expanded_penalty(
-            h - joined.distance, self.penetration, k, soft, with_third_order=with_third_order
+        mean = np.bincount(
+            joined_places.group, joined_places.weight * change, len(joined_places.first)
         )
-        return places, joined, penalties
+        weight = joined_places.weight * (
+            1 - (change - mean[joined_places.group]) / (BLUR_DISTANCE * h)
+        )
+        joined_places = replace(
+            joined_places, distance=joined_places.distance + mean, weight=weight
+        )
+        direction = off / np.linalg.norm(off, axis=1)[:, None]
+        places = replace(places, X=X, distance=distance, direction=direction)
+        penalties = expanded_penalty(
+            h - joined_places.distance,
+            self.penetration,
+            k,
+            soft_penetration,
+            with_third_order=with_third_order,
+        )
+        return places, joined_places, penalties
 
 
 def _area_ratio(cells: Cells, r0: Array, points: ContactPoints) -> Array:

@@ -84,23 +84,28 @@ def gap_hessians(
     normal = np.column_stack([n, 0 * d])[:, None, :components]
     off = d[:, None, None] * np.column_stack([n, np.ones_like(d)])[:, None, :components]
     A = slopes(off[:, 0], *y[1:])[1]
-    free = places.free
-    M = np.einsum("nik,nkl,njl->nij", free, inverse_in_free_directions(free, A), free)
+    free_directions = places.free_directions
+    M = np.einsum(
+        "nik,nkl,njl->nij",
+        free_directions,
+        inverse_in_free_directions(free_directions, A),
+        free_directions,
+    )
     C = np.zeros((len(d), 2, *beta.shape[1:], components))
     for a in range(2):
-        across = y[1 + a][:, None] * (COMPONENT_SIGNS[:components] > 0)
-        across -= np.sum(normal * across, axis=2, keepdims=True) * normal
-        C[:, a] = -beta[:, :, None] * across
+        tangential = y[1 + a][:, None] * (COMPONENT_SIGNS[:components] > 0)
+        tangential -= np.sum(normal * tangential, axis=2, keepdims=True) * normal
+        C[:, a] = -beta[:, :, None] * tangential
         C[:, a, half:] -= shapes[1 + a][:, :, None] * off
     pull = weight * first / d
     along_normal = beta[:, :, None] * normal
     rows = [distance_slopes(n, beta, components)[:, None], along_normal[:, None], C]
-    left = np.concatenate(rows, axis=1).reshape(len(d), 4, -1)
+    row_vectors = np.concatenate(rows, axis=1).reshape(len(d), 4, -1)
     middle = np.zeros((len(d), 4, 4))
     middle[:, 0, 0] = weight * second
     middle[:, 1, 1] = pull
     middle[:, 2:, 2:] = pull[:, None, None] * M
-    H = left.transpose(0, 2, 1) @ (middle @ left)
+    H = row_vectors.transpose(0, 2, 1) @ (middle @ row_vectors)
     of_places = pull[:, None, None] * beta[:, :, None] * beta[:, None, :]
     for i in range(3):
         H[:, i::components, i::components] -= of_places

@@ -164,7 +164,7 @@ class MeridianContact(ContactTerm):
         self._nodes, self._sides, self._r0 = model.nodes, sides, model.places
         self._points = self._curves.rule(model.degree // 2 + 1, sides)
         self._normals = self._curves.cell_normals()
-        self._half = np.full(len(self._r0), self._h / 2)
+        self._half: Array = np.full(len(self._r0), self._h / 2)
         if self._offsets:
             self._half = self._offsets.undeformed_half_thickness
         self._nodes_of_pair = np.unique(self._nodes[np.any(sides, axis=0)])
@@ -287,12 +287,12 @@ class MeridianContact(ContactTerm):
 
     def _state(self) -> ContactState:
         places = self._active_set()
-        each, ones = np.arange(len(places.point)), np.ones(len(places.point))
-        joined = JoinedPlaces(each, each, places.distance, ones, ones == 0)
+        numbers, ones = np.arange(len(places.point)), np.ones(len(places.point))
+        joined_places = JoinedPlaces(numbers, numbers, places.distance, ones, ones == 0)
         geometry = self._curves, self._r0, self._at, self._offsets, self._points
         derivatives = self._entries_by_place_and_offset, self._entries, self._geometry
         return MeridianContactState(
-            *geometry, places, joined, self._penalty(places), self._forces(), *derivatives
+            *geometry, places, joined_places, self._penalty(places), self._forces(), *derivatives
         )
 
     # what is observed
@@ -308,16 +308,16 @@ class MeridianContact(ContactTerm):
         reach = self._reach
         if not self._material:  # no place is farther than nodes
             reach = min(reach, self._distance_to_nodes(u) * (1 + DISTANCE_TOLERANCE))
-        least = self._projections(u, reach).distance.min(initial=np.inf)
-        return float(least - self._h) if np.isfinite(least) else np.nan
+        least_distance = self._projections(u, reach).distance.min(initial=np.inf)
+        return float(least_distance - self._h) if np.isfinite(least_distance) else np.nan
 
     def _distance_to_nodes(self, u: Array) -> float:
         """Return the least distance of points from the nodes of the other shell."""
         r = self._places_of_nodes(u)
         x, is_first = self._places_of_points(r), self._points.is_first
         first, second = (np.unique(self._nodes[side]) for side in self._sides)
-        ways = x[is_first][:, None] - r[second], x[~is_first][:, None] - r[first]
-        return min(float(distances(way).min()) for way in ways)
+        offsets = x[is_first][:, None] - r[second], x[~is_first][:, None] - r[first]
+        return min(float(distances(offset).min()) for offset in offsets)
 
     def penetration(self) -> float:
         """Return the largest penetration over R, 0 without contact."""
@@ -332,7 +332,7 @@ class MeridianContact(ContactTerm):
         penetration = self._h - places.distance
         return float((penetration / (at_points + at_places)).max(initial=0.0))
 
-    def gap_at_supports(self, held: Longs, u: Array) -> float:
+    def gap_at_supports(self, supported_nodes: Longs, u: Array) -> float:
         """Return the least gap over R at nodes that supports hold.
 
         See `ClosestPointSearch.gap_at_supports`.
@@ -347,7 +347,9 @@ class MeridianContact(ContactTerm):
                 is_pair & ~self._material.are_near(i, j) if self._material else is_pair
             )
 
-        return gap_between_supports(held, self._nodes, self._r0, u, self._half, may_touch)
+        return gap_between_supports(
+            supported_nodes, self._nodes, self._r0, u, self._half, may_touch
+        )
 
     def refuse_overlap(self) -> None:
         """Check that the shells do not overlap undeformed.
@@ -362,9 +364,9 @@ class MeridianContact(ContactTerm):
         if len(penetration) and penetration.max() > PENETRATION_TOLERANCE * self._h:
             deepest = places.point[int(penetration.argmax())]
             rho, z = self._places_of_points(self._r0)[deepest]
-            where, by = f"{rho:.4g}, 0, {z:.4g}", penetration.max() / self._h
+            place, depth = f"{rho:.4g}, 0, {z:.4g}", penetration.max() / self._h
             raise MeshError(
-                f"contact: {self.pair.words} overlap undeformed, by {by:.4g} h at ({where}) R: "
+                f"contact: {self.pair.words} overlap undeformed, by {depth:.4g} h at ({place}) R: "
                 "move them apart"
             )
 
@@ -389,10 +391,10 @@ class MeridianContact(ContactTerm):
         force = np.bincount(cell[places.point], own_share * force_of_places, count)
         force = force + np.bincount(places.cell, (1 - own_share) * force_of_places, count)
         gap = np.full(count, self._reach - self._h)
-        near = self._projections(self._displacement(), self._reach)
-        np.minimum.at(gap, cell[near.point], near.distance - self._h)
-        pressed = np.unique(places.point)
-        pressed_area = np.bincount(cell[pressed], weight[pressed], count)
+        near_places = self._projections(self._displacement(), self._reach)
+        np.minimum.at(gap, cell[near_places.point], near_places.distance - self._h)
+        pressed_points = np.unique(places.point)
+        pressed_area = np.bincount(cell[pressed_points], weight[pressed_points], count)
         is_full = (area > 0) & (pressed_area > FULL_CONTACT_SHARE * area)
         return force / np.where(area > 0, area, 1.0), gap, is_full
 
@@ -402,15 +404,20 @@ class MeridianContact(ContactTerm):
         Between two samples no point moves, relative to another, by more than a part of the least
         thickness.
         """
-        halves = [self._half_at(each)[self._nodes_of_pair] for each in (0 * u, u, v)]
-        least = 2 * min(float(half.min()) for half in halves)
+        halves = [
+            self._half_at(displacement)[self._nodes_of_pair] for displacement in (0 * u, u, v)
+        ]
+        least_thickness = 2 * min(float(half.min()) for half in halves)
         motion = v - u
         motion = motion - [0.0, motion[:, 1].mean()]
         farthest = 2 * np.linalg.norm(motion, axis=1).max()
-        count = int(np.ceil(farthest / (MAX_MOTION_PER_SAMPLE * least)))
-        reach = CROSSING_DISTANCE * least
+        count = int(np.ceil(farthest / (MAX_MOTION_PER_SAMPLE * least_thickness)))
+        reach = CROSSING_DISTANCE * least_thickness
         samples = (u + k / count * (v - u) for k in range(1, count))
-        return any(len(self._projections(each, reach, to_faces=False).point) for each in samples)
+        return any(
+            len(self._projections(displacement, reach, to_faces=False).point)
+            for displacement in samples
+        )
 
     # in a step in time, see `TimeAveragedContact`
 
@@ -466,11 +473,13 @@ class MeridianContact(ContactTerm):
     def _penalty(self, places: MeridianProjections) -> tuple[Array, Array, Array]:
         """Return the penalty of places, with its derivatives by the penetration."""
         penetration, k = self._h - places.distance, self.stiffness.value
-        soft = SOFT_PENETRATION * self._h
+        soft_penetration = SOFT_PENETRATION * self._h
         if self._frozen:
             is_held = self.held is not None
-            return expanded_penalty(penetration, self._frozen[1], k, soft, with_third_order=is_held)
-        penalties = penalty(penetration, k, soft)
+            return expanded_penalty(
+                penetration, self._frozen[1], k, soft_penetration, with_third_order=is_held
+            )
+        penalties = penalty(penetration, k, soft_penetration)
         return self.sample.weigh(places.point, penalties) if self.sample else penalties
 
     def freeze(self) -> tuple[MeridianProjections, Array]:
@@ -488,7 +497,7 @@ class MeridianContact(ContactTerm):
         x, nodal = self._places_of_points(r)[places.point], r[self._nodes[places.cell]]
         for _ in range(FOLLOW_ITERATIONS):
             pull, curvature, _ = slopes(x, self._curves.jets(X, nodal))
-            X = X + np.where(places.free, pull / np.where(places.free, curvature, 1.0), 0.0)
+            X = X + np.where(places.is_free, pull / np.where(places.is_free, curvature, 1.0), 0.0)
         return replace(places, X=X, distance=distances(x - self._curves.jets(X, nodal)[0]))
 
     def _places_of_nodes(self, u: Array, *, to_faces: bool = True) -> Array:
@@ -522,8 +531,8 @@ class MeridianContact(ContactTerm):
         if not len(point):
             return no_projections()
         places = self._curves.project(x, nodal, point, cell)
-        near = places.select(places.distance < face_reach)
-        return self._curves.select_nearest(near, x, nodal, self._material)
+        near_places = places.select(places.distance < face_reach)
+        return self._curves.select_nearest(near_places, x, nodal, self._material)
 
     def _are_left_to_edges(self, places: MeridianProjections) -> Flags:
         """Return which places do not count, since the point of a free end is there too.
@@ -538,7 +547,7 @@ class MeridianContact(ContactTerm):
     def _end_and_steepness(self, places: MeridianProjections) -> tuple[Flags, Flags]:
         """Return which places are at a free end, and in a cell that is steep to the point's."""
         end = (places.X == 1.0).astype(np.int64)
-        at_end = ~places.free & (self._curves.neighbours[places.cell, end] < 0)
+        at_end = ~places.is_free & (self._curves.neighbours[places.cell, end] < 0)
         normals = self._points.normal[places.point] * self._normals[places.cell]
         cosine = np.abs(np.sum(normals, axis=1))
         return np.asarray(at_end), np.asarray(cosine < STEEP_COSINE)
@@ -567,24 +576,24 @@ class MeridianContact(ContactTerm):
         half, weight = functions // 2, self._points.weight[places.point] / 2
         r = self._places_of_nodes(self._at)
         jets = self._curves.jets(places.X, r[self._nodes[places.cell]])
-        shape, along = self._curves.table(1, places.X)
+        shape, shape_slope = self._curves.table(1, places.X)
         A = slopes(self._places_of_points(r)[places.point], jets)[1]
         y, tangent = jets[0], jets[1, :, :2]
-        across = tangent - np.sum(tangent * n, axis=1)[:, None] * n
+        tangential = tangent - np.sum(tangent * n, axis=1)[:, None] * n
         rows = np.zeros((4, *beta.shape, 4))
-        normal, way, slide, turn = rows
-        normal[..., IN_PLANE] = way[..., IN_PLANE] = beta[..., None] * n[:, None]
+        normal, closing, slide, turn = rows
+        normal[..., IN_PLANE] = closing[..., IN_PLANE] = beta[..., None] * n[:, None]
         normal[..., 3] = np.concatenate([-beta[:, :half], beta[:, half:]], axis=1)
-        slide[..., IN_PLANE] = -beta[..., None] * across[:, None]
-        slide[:, half:, IN_PLANE] -= along[..., None] * off[:, None]
-        slide[:, half:, 3] -= along * d[:, None]
+        slide[..., IN_PLANE] = -beta[..., None] * tangential[:, None]
+        slide[:, half:, IN_PLANE] -= shape_slope[..., None] * off[:, None]
+        slide[:, half:, 3] -= shape_slope * d[:, None]
         turn[..., 1] = -beta * y[:, :1]
         turn[:, half:, 0] += m * off[:, :1] * shape
         turn[:, half:, 1] += off[:, :1] * shape
         turn[:, half:, 2] += m * off[:, 1:] * shape
         turn[:, half:, 3] += m * d[:, None] * shape
         B, tension = y[:, 0] * (y[:, 0] + off[:, 0]), -weight * first / d
-        by_A, by_B = _inverse_where(places.free, A), _inverse_where(B > 0, B)
+        by_A, by_B = _inverse_where(places.is_free, A), _inverse_where(B > 0, B)
         flat = rows.reshape(4, count, 4 * functions).swapaxes(0, 1)
         factors = np.column_stack([weight * second, -tension, -tension * by_A, -tension * by_B])
         H = flat.transpose(0, 2, 1) @ (factors[..., None] * flat)
@@ -619,9 +628,9 @@ def meridian_contacts(pairs: Sequence[Pair], model: ModelMeridian) -> list[Merid
         If shells of a pair overlap undeformed.
     """
     patches = {WHOLE_SHELL: np.ones(len(model.nodes), dtype=bool), **model.patches}
-    made = list[MeridianContact]()
+    contacts = list[MeridianContact]()
     for pair in pairs:
         sides = patches[pair.names[0]], patches[pair.names[1]]
-        made.append(MeridianContact(pair, model, sides))
-        made[-1].refuse_overlap()
-    return made
+        contacts.append(MeridianContact(pair, model, sides))
+        contacts[-1].refuse_overlap()
+    return contacts

@@ -116,12 +116,12 @@ class MeridianOffsets(FaceOffsets):
         rho1, z1 = np.moveaxis(tangent, -1, 0)[..., None]
         q, p, c, f, v = np.zeros((5, *a.shape))
         value = self._value_table[cells]
-        q[..., 0], q[..., 2] = (each * self._slopes / speed[..., None] for each in (-z1, rho1))
+        q[..., 0], q[..., 2] = (row * self._slopes / speed[..., None] for row in (-z1, rho1))
         p[..., 0], p[..., 1] = m * value, value
         c[..., 2], v[..., 1] = m * value, self._slopes
         f[..., :] = rho[..., None, None] * v - rho1[..., None] * p
         f[..., 2] -= m * z1 * value
-        a, b, q, p, c, f, v = (self._by_unknowns(each) for each in (a, b, q, p, c, f, v))
+        a, b, q, p, c, f, v = (self._by_unknowns(row) for row in (a, b, q, p, c, f, v))
         w_stretch, w_turn = w * rho / speed, w * speed / rho
         w_shear = -w / (rho * speed)
         squares = (w_stretch, q), (w_stretch, v), (w_turn, p), (w_turn, c), (w_shear, f)

@@ -65,7 +65,7 @@ class MeridianProjections:
     ----------
     point, cell, X
         (n,) number of the point, cell of the place, and where it is in that.
-    free
+    is_free
         (n,) whether it may move along the curve.
     distance
         (n,) over R.
@@ -74,12 +74,14 @@ class MeridianProjections:
     point: Longs
     cell: Longs
     X: Array
-    free: Flags
+    is_free: Flags
     distance: Array
 
     def select(self, selection: Flags | Longs) -> "MeridianProjections":
         """Return the selected places: numbers or flags."""
-        return MeridianProjections(*(getattr(self, each.name)[selection] for each in fields(self)))
+        return MeridianProjections(
+            *(getattr(self, attribute.name)[selection] for attribute in fields(self))
+        )
 
 
 def neighbours_of(nodes: Longs) -> Longs:
@@ -120,10 +122,10 @@ class NeighbouringMaterial:
         count = len(nodes)
         r0 = np.zeros((int(nodes.max()) + 1, 3))
         r0[nodes] = cells
-        near: Flags = np.zeros(count * count, dtype=bool)
+        is_near: Flags = np.zeros(count * count, dtype=bool)
         reach = 2 * SELF_CONTACT_DISTANCE * r0[:, 2]
-        near[near_along_surface(nodes[:, :2], r0[:, :2], reach)] = True
-        self._near = near.reshape(count, count)
+        is_near[near_along_surface(nodes[:, :2], r0[:, :2], reach)] = True
+        self._near = is_near.reshape(count, count)
 
     def are_near(self, cell: Longs, other: Longs) -> Flags:
         """Return whether the way from cells (n,) to others, -1 for none, is short on the curve."""
@@ -138,13 +140,13 @@ class NeighbouringMaterial:
             (cells, functions, 2) deformed places of nodes.
         """
         may_touch = ~self._near[cell, other]
-        near = np.flatnonzero(~may_touch & (cell != other))
-        i, j = cell[near], other[near]
+        near_pairs = np.flatnonzero(~may_touch & (cell != other))
+        i, j = cell[near_pairs], other[near_pairs]
         deformed, undeformed = (
             np.linalg.norm(r[i][:, :, None] - r[j][:, None], axis=3)
             for r in (nodal, self._cells[..., :2])
         )
-        may_touch[near] = (deformed < FOLD_SHRINKAGE * undeformed).any(axis=(1, 2))
+        may_touch[near_pairs] = (deformed < FOLD_SHRINKAGE * undeformed).any(axis=(1, 2))
         return may_touch
 
     def are_distinct(self, places: MeridianProjections, shape: Array, is_above: Flags) -> Flags:
@@ -157,12 +159,12 @@ class NeighbouringMaterial:
         shape
             (n, functions) at the places.
         """
-        near = self.are_near(self.cells_of_points[places.point], places.cell)
+        is_near = self.are_near(self.cells_of_points[places.point], places.cell)
         undeformed = np.einsum("nk,nki->ni", shape, self._cells[places.cell])
         off = self._points[places.point] - undeformed
         distance = np.linalg.norm(off[:, :2], axis=1)
         is_far = distance > SELF_CONTACT_DISTANCE * np.abs(off[:, 2])
-        return np.asarray(~near | (is_above & is_far))
+        return np.asarray(~is_near | (is_above & is_far))
 
 
 class CandidateSearch:
@@ -213,10 +215,10 @@ class CandidateSearch:
         a, chord = nodal[:, 0], nodal[:, 1] - nodal[:, 0]
         off = nodal[:, 2:] - a[:, None] - self._inner_nodes * chord[:, None]
         bulge = self._bulge * np.linalg.norm(off, axis=2).max(axis=1, initial=0.0)
-        way, chords = x[point] - a[cell], chord[cell]
+        offset, chords = x[point] - a[cell], chord[cell]
         squares = np.sum(chord * chord, axis=1)
-        part = np.clip(np.sum(way * chords, axis=1) / squares[cell], 0.0, 1.0)
-        distance = np.linalg.norm(way - part[:, None] * chords, axis=1)
+        part = np.clip(np.sum(offset * chords, axis=1) / squares[cell], 0.0, 1.0)
+        distance = np.linalg.norm(offset - part[:, None] * chords, axis=1)
         is_near = distance - bulge[cell] < reach
         return point[is_near], cell[is_near]
 
@@ -225,17 +227,17 @@ class CandidateSearch:
         first, second, centres = self._first_cells, self._second_cells, nodal.mean(axis=1)
         squares = np.sum((nodal - centres[:, None]) ** 2, axis=2)
         radii = CELL_RADIUS_FACTOR * np.sqrt(squares.max(axis=1))
-        way = centres[first][:, None] - centres[second]
+        offset = centres[first][:, None] - centres[second]
         limit = (radii[first][:, None] + radii[second] + reach) ** 2
-        i, j = np.nonzero(np.sum(way * way, axis=2) < limit)
-        own, cell = first[i], second[j]
+        i, j = np.nonzero(np.sum(offset * offset, axis=2) < limit)
+        own_cell, cell = first[i], second[j]
         if self._material:
-            may_touch = self._material.may_touch(own, cell, nodal)
-            own, cell = own[may_touch], cell[may_touch]
+            may_touch = self._material.may_touch(own_cell, cell, nodal)
+            own_cell, cell = own_cell[may_touch], cell[may_touch]
         else:
-            own, cell = np.concatenate([own, cell]), np.concatenate([cell, own])
-        count = self._counts[own]
-        start = np.repeat(self._starts[own] - np.cumsum(count) + count, count)
+            own_cell, cell = np.concatenate([own_cell, cell]), np.concatenate([cell, own_cell])
+        count = self._counts[own_cell]
+        start = np.repeat(self._starts[own_cell] - np.cumsum(count) + count, count)
         return start + np.arange(len(start)), np.repeat(cell, count)
 
 
@@ -265,8 +267,8 @@ def slopes(x: Array, jets: Array) -> tuple[Array, Array, Array]:
         (n,) A of a straight line.
     """
     y, first, second = jets
-    way = (x - y)[:, :2]
-    off = np.column_stack([way, np.linalg.norm(way, axis=1)])
+    offset = (x - y)[:, :2]
+    off = np.column_stack([offset, np.linalg.norm(offset, axis=1)])
     speed = np.sum(first * first * COMPONENT_SIGNS, axis=1)
     return np.sum(off * first, axis=1), speed - np.sum(off * second, axis=1), speed
 
@@ -346,7 +348,7 @@ class MeridianCurves:
             cell, shape = np.repeat(cells, len(X)), np.tile(table[0], (len(cells), 1))
             flat_normal = normal.reshape(-1, 2)
             parts.append((cell, shape, area.ravel(), sides[0][cell], flat_normal, is_on_edge))
-        return MeridianPoints(*(np.concatenate(each) for each in zip(*parts, strict=True)))
+        return MeridianPoints(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
 
     def project(self, x: Array, nodal: Array, point: Longs, cell: Longs) -> MeridianProjections:
         """Return the closest place of each cell to its point, by Newton's method.
@@ -366,9 +368,9 @@ class MeridianCurves:
             jets = self.jets(X[moving], nodal[cell[moving]])
             pull, curvature, speed = slopes(x[point[moving]], jets)
             step = pull / np.where(curvature > MIN_CURVATURE_RATIO * speed, curvature, speed)
-            before = X[moving]
-            X[moving] = np.clip(before + np.clip(step, -0.25, 0.25), 0.0, 1.0)
-            moving = moving[np.abs(X[moving] - before) >= STEP_TOLERANCE]
+            previous = X[moving]
+            X[moving] = np.clip(previous + np.clip(step, -0.25, 0.25), 0.0, 1.0)
+            moving = moving[np.abs(X[moving] - previous) >= STEP_TOLERANCE]
             if not len(moving):
                 break
         jets = self.jets(X, nodal[cell])
@@ -419,12 +421,12 @@ class MeridianCurves:
         places = places.select(np.lexsort((places.distance, places.point)))
         if not len(places.point):
             return places
-        way = (x[places.point] - self.jets(places.X, nodal[places.cell])[0])[:, :2]
-        way = way / np.maximum(np.linalg.norm(way, axis=1), 1e-300)[:, None]
+        offset = (x[places.point] - self.jets(places.X, nodal[places.cell])[0])[:, :2]
+        offset = offset / np.maximum(np.linalg.norm(offset, axis=1), 1e-300)[:, None]
         begins = np.flatnonzero(np.diff(places.point, prepend=-1))
-        nearest = np.repeat(begins, np.diff([*begins, len(way)]))
-        is_opposite = np.sum(way * way[nearest], axis=1) < SAME_DIRECTION_COSINE
-        is_chosen = np.zeros(len(way), dtype=bool)
+        nearest = np.repeat(begins, np.diff([*begins, len(offset)]))
+        is_opposite = np.sum(offset * offset[nearest], axis=1) < SAME_DIRECTION_COSINE
+        is_chosen = np.zeros(len(offset), dtype=bool)
         is_chosen[begins] = True
         opposite = np.flatnonzero(is_opposite)
         is_chosen[opposite[np.flatnonzero(np.diff(places.point[opposite], prepend=-1))]] = True
@@ -449,9 +451,9 @@ class MeridianCurves:
         Else they are beside them, as in one curve that is straight.
         """
         y, tangent, _ = self.jets(places.X, nodal[places.cell])[..., :2]
-        way = x[places.point, :2] - y
-        height = np.abs(way[:, 0] * tangent[:, 1] - way[:, 1] * tangent[:, 0])
-        size = np.linalg.norm(way, axis=1) * np.linalg.norm(tangent, axis=1)
+        offset = x[places.point, :2] - y
+        height = np.abs(offset[:, 0] * tangent[:, 1] - offset[:, 1] * tangent[:, 0])
+        size = np.linalg.norm(offset, axis=1) * np.linalg.norm(tangent, axis=1)
         return np.asarray(height > ABOVE_SINE * size)
 
     def cell_normals(self) -> Array:

@@ -148,18 +148,24 @@ class _AllCells:
     images: Images | None = field(default=None)
 
     @classmethod
-    def gather(cls, surface: ModelSurface, gathered: GlobalCells) -> "_AllCells":
+    def gather(cls, surface: ModelSurface, global_cells: GlobalCells) -> "_AllCells":
         """Gather the cells of all ranks; collective."""
-        topology, count = surface.topology, len(gathered.own_range)
+        topology, count = surface.topology, len(global_cells.own_range)
         own_corners = topology.connectivity(2, 0).array[: 3 * count].astype(np.int32)
         corners = topology.index_map(0).local_to_global(own_corners).reshape(-1, 3)
         element = surface.space.element.basix_element
-        cells = Cells(element, gathered.nodes, gathered.gather_values(corners))
+        cells = Cells(element, global_cells.nodes, global_cells.gather_values(corners))
         r0 = global_values(surface.r0)
-        factors = [gathered.gather_values(each) for each in surface.volume_factors]
-        patches = {name: gathered.gather_values(inside) for name, inside in surface.patches.items()}
+        factors = [
+            global_cells.gather_values(factors_of_power)
+            for factors_of_power in surface.volume_factors
+        ]
+        patches = {
+            name: global_cells.gather_values(is_inside)
+            for name, is_inside in surface.patches.items()
+        }
         patches[WHOLE_SHELL] = np.ones(len(cells.nodes), dtype=bool)
-        keeps_volume = gathered.gather_values(surface.keeps_volume)
+        keeps_volume = global_cells.gather_values(surface.keeps_volume)
         same_place = np.arange(len(r0))
         return cls(cells, r0, same_place, np.array(factors), keeps_volume, patches)
 
@@ -173,9 +179,11 @@ class _AllCells:
             cells=images.cells(self.cells, self.r0, vertices),
             r0=images.places(self.r0),
             same_place=images.shared_numbers(self.r0, nodes).ravel(),
-            volume_factors=np.array([images.repeat(each) for each in self.volume_factors]),
+            volume_factors=np.array(
+                [images.repeat(factors_of_power) for factors_of_power in self.volume_factors]
+            ),
             keeps_volume=images.repeat(self.keeps_volume),
-            patches={name: images.repeat(inside) for name, inside in self.patches.items()},
+            patches={name: images.repeat(is_inside) for name, is_inside in self.patches.items()},
             images=images,
         )
 
@@ -192,13 +200,13 @@ def surface_contacts(pairs: Sequence[Pair], surface: ModelSurface) -> list[Surfa
         return []
     for dims in ((2, 0), (0, 2), (1, 0)):
         surface.topology.create_connectivity(*dims)
-    gathered, index_map = GlobalCells.gather(surface.space), surface.space.dofmap.index_map
-    all_cells = _AllCells.gather(surface, gathered)
+    global_cells, index_map = GlobalCells.gather(surface.space), surface.space.dofmap.index_map
+    all_cells = _AllCells.gather(surface, global_cells)
     own_dofs = 3 * index_map.local_range[0], 3 * index_map.size_local
     if surface.images:
         all_cells = all_cells.with_images(surface)
-    geometry = _contact_geometry(surface, gathered, all_cells, own_dofs)
-    made = list[SurfaceContact]()
+    geometry = _contact_geometry(surface, global_cells, all_cells, own_dofs)
+    contacts = list[SurfaceContact]()
     for pair in pairs:
         sides = all_cells.patches[pair.names[0]], all_cells.patches[pair.names[1]]
         contact = (
@@ -207,16 +215,19 @@ def surface_contacts(pairs: Sequence[Pair], surface: ModelSurface) -> list[Surfa
             else SurfaceContact(pair, geometry, sides)
         )
         _refuse_overlap(contact, surface.h)
-        made.append(contact)
-    return made
+        contacts.append(contact)
+    return contacts
 
 
 def _contact_geometry(
-    surface: ModelSurface, gathered: GlobalCells, all_cells: _AllCells, own_dofs: tuple[int, int]
+    surface: ModelSurface,
+    global_cells: GlobalCells,
+    all_cells: _AllCells,
+    own_dofs: tuple[int, int],
 ) -> ContactGeometry:
     """Return what the contacts of all pairs share."""
     cells, r0, images = all_cells.cells, all_cells.r0, all_cells.images
-    element, first_cell = surface.space.element.basix_element, gathered.own_range.start
+    element, first_cell = surface.space.element.basix_element, global_cells.own_range.start
     if images:
         own_dofs = 0, r0.size
     growth: SettableNumber | None = surface.natural.stretch if surface.natural else None
@@ -231,16 +242,16 @@ def _contact_geometry(
             all_cells.same_place,
             growth,
         )
-    own_cells, degrees = np.array(gathered.own_range), (surface.degree, element.degree)
+    own_cells, degrees = np.array(global_cells.own_range), (surface.degree, element.degree)
     segments = Segments(cells, own_cells, r0, degrees, surface.h, surface.planes)
-    own = slice(first_cell, gathered.own_range.stop)
+    own_rows = slice(first_cell, global_cells.own_range.stop)
     return ContactGeometry(
         cells,
         r0,
         _displacement_of(surface, images),
         surface.h,
         segments,
-        ContactFields(surface.r0, surface.thickness, gathered.nodes, own),
+        ContactFields(surface.r0, surface.thickness, global_cells.nodes, own_rows),
         offsets,
         own_dofs,
         (first_cell, len(surface.keeps_volume)),
@@ -259,10 +270,10 @@ def _refuse_overlap(contact: SurfaceContact, h: float) -> None:
     """Raise a MeshError if the surfaces of a contact overlap undeformed; collective."""
     penetration, x = contact.deepest_penetration()
     if penetration > PENETRATION_TOLERANCE * h:
-        where = ", ".join(f"{coordinate:.4g}" for coordinate in x + 0.0)
+        place = ", ".join(f"{coordinate:.4g}" for coordinate in x + 0.0)
         raise MeshError(
             f"contact: {contact.pair.words} overlap undeformed, by {penetration / h:.4g} h at "
-            f"({where}) R: move them apart"
+            f"({place}) R: move them apart"
         )
 
 

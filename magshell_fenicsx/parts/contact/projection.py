@@ -41,7 +41,7 @@ FOLLOW_ITERATIONS = 2  # of Newton's method after a small change
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # of the reference triangle
 MAX_DIRECTIONS = 3  # in which a point can face places: on both sides, and before an edge
 COMPONENT_SIGNS = np.array([1.0, 1.0, 1.0, -1.0])  # of the squares of components in the Hessian
-PLACE_SHAPES = (2,), (2, 2), (), (3,)  # of X, free, distance and way of a place
+PLACE_SHAPES = (2,), (2, 2), (), (3,)  # of X, free_directions, distance and direction
 C_DECLARATIONS = """
     typedef struct {
         int64_t degree, coarse_count, count;
@@ -79,9 +79,9 @@ class Cells:
         pairs = np.sort(np.stack(sides, axis=1), axis=2)
         keys = pairs[..., 0] * (self.corners.max() + 1) + pairs[..., 1]
         order = np.argsort(keys.ravel(), kind="stable")
-        shared = np.flatnonzero(np.diff(keys.ravel()[order]) == 0)
+        is_shared_with_next = np.flatnonzero(np.diff(keys.ravel()[order]) == 0)
         neighbours = np.full(keys.size, -1)
-        a, b = order[shared], order[shared + 1]
+        a, b = order[is_shared_with_next], order[is_shared_with_next + 1]
         neighbours[a], neighbours[b] = b // 3, a // 3
         return np.asarray(neighbours.reshape(-1, 3))
 
@@ -196,7 +196,7 @@ def near_along_surface(corners: Longs, x: Array, reach: Array) -> Longs:
         mean_reach = (reach[candidates[rows], None] + reach[candidates]) / 2
         row, column = np.nonzero(lengths <= mean_reach)
         near_pairs.append((candidates[rows[row]], candidates[column]))
-    i, j = (np.concatenate(each) for each in zip(*near_pairs, strict=True))
+    i, j = (np.concatenate(numbers) for numbers in zip(*near_pairs, strict=True))
     vertex_pairs = scipy.sparse.coo_array((np.ones(len(i)), (i, j)), (count, count)).tocsr()
     of_cell = np.repeat(np.arange(n), per_cell)
     flags = np.ones(len(of_cell)), (of_cell, corners.ravel())
@@ -215,7 +215,7 @@ class Projections:
         (n,) numbers of the points, and of the cells of the places.
     X
         (n, 2) in the reference cell.
-    free
+    free_directions
         (n, 2, 2): columns are directions in which a place can move: both inside a cell, along a
         side, none in a corner.
     distance
@@ -223,20 +223,20 @@ class Projections:
     side
         (n,): places in one direction from their point have one number, less than
         `MAX_DIRECTIONS`; 0 that of the nearest.
-    way
+    direction
         (n, 3) unit vectors to the points.
-    above
+    is_above
         (n,) whether the point is above the place, and not beside it as in one surface that is flat.
     """
 
     point: Longs
     cell: Longs
     X: Array
-    free: Array
+    free_directions: Array
     distance: Array
     side: Longs
-    way: Array
-    above: NDArray[np.bool_]
+    direction: Array
+    is_above: NDArray[np.bool_]
 
     @property
     def firsts(self) -> Longs:
@@ -247,7 +247,9 @@ class Projections:
 
     def select(self, selection: Any) -> "Projections":
         """Return the selected places: numbers, flags or a slice."""
-        return Projections(*(getattr(self, each.name)[selection] for each in fields(self)))
+        return Projections(
+            *(getattr(self, attribute.name)[selection] for attribute in fields(self))
+        )
 
 
 @dataclass(frozen=True)
@@ -256,19 +258,19 @@ class UndeformedPairs:
 
     Attributes
     ----------
-    near
+    is_near
         (pairs,) whether the cells are near in the surface; only there r and x matter.
     r, x
         (nodes, 4) and (n, 4) places of nodes and points, with half the thickness, of points with
         the other sign.
-    apart
+    least_distance_ratio
         Least distance of a place that counts, over the mean of both thicknesses.
     """
 
-    near: NDArray[np.bool_]
+    is_near: NDArray[np.bool_]
     r: Array
     x: Array
-    apart: float
+    least_distance_ratio: float
 
 
 @dataclass(frozen=True)
@@ -357,8 +359,8 @@ def nearest_places(
     )
     lattice_places = [np.matmul(positions.swapaxes(1, 2), shape.T) for _, shape in cells.lattices]
     monomials = [
-        cells.monomials @ _as_four_components(each)
-        for each in (nodal, reference.r[cells.nodes[used_cells]])
+        cells.monomials @ _as_four_components(array)
+        for array in (nodal, reference.r[cells.nodes[used_cells]])
     ]
     numbers = cells.element.degree, *(len(X) for X, _ in cells.lattices)
     (ffi, lib), p = library(), _pointers
@@ -369,16 +371,24 @@ def nearest_places(
     point, pair = np.empty((2, capacity), dtype=np.int64)
     floats = [np.empty((capacity, *shape)) for shape in PLACE_SHAPES]
     results = point, pair, *floats, np.empty(capacity, dtype=bool)
-    pair_arguments = row_of_cell.ravel(), first, number, reference.near, search_limits.is_bounded
+    pair_arguments = row_of_cell.ravel(), first, number, reference.is_near, search_limits.is_bounded
     point_arguments = order, _as_four_components(x), _as_four_components(reference.x)
     arguments = p(*pair_arguments, search_limits.reach, *point_arguments)
     count = lib.nearest(
-        c_cells, len(cell), *arguments, reach, max_distance, reference.apart, *p(*results)
+        c_cells,
+        len(cell),
+        *arguments,
+        reach,
+        max_distance,
+        reference.least_distance_ratio,
+        *p(*results),
     )
-    X, free, distance, way = (each[:count] for each in results[2:6])
-    point, pair, above = point[:count], pair[:count], results[6][:count]
+    X, free_directions, distance, direction = (array[:count] for array in results[2:6])
+    point, pair, is_above = point[:count], pair[:count], results[6][:count]
     side = np.zeros(count, dtype=np.int64)
-    return pair, Projections(point, cell[pair], X, free, distance, side, way, above)
+    return pair, Projections(
+        point, cell[pair], X, free_directions, distance, side, direction, is_above
+    )
 
 
 def points_in_cells(cells: Cells, r: Array, cell: Longs, shape: Array) -> Array:
@@ -401,8 +411,8 @@ def points_in_cells(cells: Cells, r: Array, cell: Longs, shape: Array) -> Array:
 def _pointers(*arrays: NDArray[Any]) -> list[Any]:
     kinds = {"int64": "int64_t[]", "float64": "double[]", "bool": "uint8_t[]"}
     return [
-        library()[0].from_buffer(kinds[each.dtype.name], np.ascontiguousarray(each))
-        for each in arrays
+        library()[0].from_buffer(kinds[array.dtype.name], np.ascontiguousarray(array))
+        for array in arrays
     ]
 
 
@@ -419,7 +429,7 @@ def library() -> tuple[Any, Any]:
     return load_native(Path(__file__).with_name("projection.c"), C_DECLARATIONS, MPI.COMM_SELF)
 
 
-def follow_places(cells: Cells, x: Array, nodal: Array, X: Array, free: Array) -> Array:
+def follow_places(cells: Cells, x: Array, nodal: Array, X: Array, free_directions: Array) -> Array:
     """Return the places X (n, 2) after a small change, in the same free directions.
 
     They may be beyond a side.
@@ -427,7 +437,7 @@ def follow_places(cells: Cells, x: Array, nodal: Array, X: Array, free: Array) -
     for _ in range(FOLLOW_ITERATIONS):
         (_, y), *derivatives = jets(cells.element, X, nodal)
         g, A = slopes(with_length(x - y), *(each for _, each in derivatives))
-        X = X - _solve_in_free_directions(free, A, g)
+        X = X - _solve_in_free_directions(free_directions, A, g)
     return X
 
 
@@ -468,33 +478,35 @@ def slopes(
     return -np.stack([dot(off, y1), dot(off, y2)], axis=1), A
 
 
-def _solve_in_free_directions(free: Array, A: Array, g: Array) -> Array:
+def _solve_in_free_directions(free_directions: Array, A: Array, g: Array) -> Array:
     """Return A^-1 g in the free directions."""
     return np.asarray(
         np.einsum(
             "nij,nj->ni",
-            free,
+            free_directions,
             np.einsum(
-                "nij,nj->ni", inverse_in_free_directions(free, A), _in_free_directions(free, g)
+                "nij,nj->ni",
+                inverse_in_free_directions(free_directions, A),
+                _in_free_directions(free_directions, g),
             ),
         )
     )
 
 
-def _in_free_directions(free: Array, g: Array) -> Array:
-    return np.asarray(np.einsum("nji,nj->ni", free, g))
+def _in_free_directions(free_directions: Array, g: Array) -> Array:
+    return np.asarray(np.einsum("nji,nj->ni", free_directions, g))
 
 
-def inverse_in_free_directions(free: Array, A: Array) -> Array:
+def inverse_in_free_directions(free_directions: Array, A: Array) -> Array:
     """Return the inverse (n, 2, 2) of A in the free directions, one where there is none."""
-    none = np.asarray(~free.any(axis=1))
-    reduced = np.einsum("nji,njk,nkl->nil", free, A, free)
-    reduced[:, 0, 0] += none[:, 0]
-    reduced[:, 1, 1] += none[:, 1]
-    turned = np.stack(
+    is_fixed = np.asarray(~free_directions.any(axis=1))
+    reduced = np.einsum("nji,njk,nkl->nil", free_directions, A, free_directions)
+    reduced[:, 0, 0] += is_fixed[:, 0]
+    reduced[:, 1, 1] += is_fixed[:, 1]
+    adjugates = np.stack(
         [reduced[:, 1, 1], -reduced[:, 0, 1], -reduced[:, 1, 0], reduced[:, 0, 0]], axis=1
     )
-    return np.asarray(turned.reshape(-1, 2, 2) / determinant(reduced)[:, None, None])
+    return np.asarray(adjugates.reshape(-1, 2, 2) / determinant(reduced)[:, None, None])
 
 
 def determinant(A: Array) -> Array:
@@ -517,20 +529,22 @@ def near_spheres(
     size_class = np.floor(np.log2(np.maximum(radii, 1e-300) / radii.max())).astype(int)
     classes = [np.flatnonzero(size_class == k) for k in np.unique(size_class)]
     own_classes = [own_spheres[size_class[own_spheres] == k] for k in np.unique(size_class)]
-    classes_with_trees = [(each, scipy.spatial.cKDTree(centres[each])) for each in classes]
+    classes_with_trees = [(spheres, scipy.spatial.cKDTree(centres[spheres])) for spheres in classes]
     pairs = list[tuple[Longs, Longs]]()
     for first in filter(len, own_classes):
         first_tree = scipy.spatial.cKDTree(centres[first])
         for second, second_tree in classes_with_trees:
             distance = radii[first].max() + radii[second].max() + reach
-            close = first_tree.sparse_distance_matrix(second_tree, distance, output_type="ndarray")
-            i, j = first[close["i"]], second[close["j"]]
-            is_near = (close["v"] < radii[i] + radii[j] + reach) & (i != j)
+            near_in_trees = first_tree.sparse_distance_matrix(
+                second_tree, distance, output_type="ndarray"
+            )
+            i, j = first[near_in_trees["i"]], second[near_in_trees["j"]]
+            is_near = (near_in_trees["v"] < radii[i] + radii[j] + reach) & (i != j)
             pairs.append((i[is_near], j[is_near]))
     no_numbers = np.zeros(0, dtype=np.int64)
     i, j = (
-        np.concatenate([no_numbers, *each]).astype(np.int64)
-        for each in zip((no_numbers, no_numbers), *pairs, strict=True)
+        np.concatenate([no_numbers, *spheres]).astype(np.int64)
+        for spheres in zip((no_numbers, no_numbers), *pairs, strict=True)
     )
     return i, j
 

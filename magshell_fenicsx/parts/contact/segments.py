@@ -98,13 +98,18 @@ class ContactPoints:
 
     def select(self, is_selected: Flags) -> "ContactPoints":
         """Return the selected points."""
-        return ContactPoints(*(getattr(self, each.name)[is_selected] for each in fields(self)))
+        return ContactPoints(
+            *(getattr(self, attribute.name)[is_selected] for attribute in fields(self))
+        )
 
     @classmethod
     def concatenate(cls, parts: Sequence["ContactPoints"]) -> "ContactPoints":
         """Return all points of several sets."""
         return cls(
-            *(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(cls))
+            *(
+                np.concatenate([getattr(part, attribute.name) for part in parts])
+                for attribute in fields(cls)
+            )
         )
 
 
@@ -136,7 +141,9 @@ class Triangles:
 
     def select(self, is_selected: Flags) -> "Triangles":
         """Return the selected triangles."""
-        return Triangles(*(getattr(self, each.name)[is_selected] for each in fields(self)))
+        return Triangles(
+            *(getattr(self, attribute.name)[is_selected] for attribute in fields(self))
+        )
 
     def divide(self) -> "Triangles":
         """Return the four quarters of each triangle.
@@ -144,17 +151,17 @@ class Triangles:
         They are at the first corner, at both ends of the third side, and in the middle.
         """
         half1, half2, middle = self.e1 / 2, self.e2 / 2, self.first + (self.e1 + self.e2) / 2
-        inside = np.full_like(self.ends, NOT_ON_EDGE)
+        not_on_edge = np.full_like(self.ends, NOT_ON_EDGE)
         at_begin, at_end = (
             np.where(self.ends == NOT_ON_EDGE, NOT_ON_EDGE, self.ends & corner) for corner in (1, 2)
         )
         quarters = (
-            (self.first, half1, half2, inside),
+            (self.first, half1, half2, not_on_edge),
             (self.first + half1, half1, half2, at_begin),
             (self.first + half2, half1, half2, at_end),
-            (middle, -half1, -half2, inside),
+            (middle, -half1, -half2, not_on_edge),
         )
-        first, e1, e2, ends = (np.concatenate(each) for each in zip(*quarters, strict=True))
+        first, e1, e2, ends = (np.concatenate(arrays) for arrays in zip(*quarters, strict=True))
         return Triangles(np.tile(self.cell, 4), np.tile(self.faces, 4), first, e1, e2, ends)
 
 
@@ -195,10 +202,10 @@ class Polygons:
 
     def concatenate_with(self, other: "Polygons") -> "Polygons":
         """Return these polygons and others."""
-        most = max(self.corners.shape[1], other.corners.shape[1])
+        corner_count = max(self.corners.shape[1], other.corners.shape[1])
         corners = list[Array]()
         for polygons in (self, other):
-            missing = most - polygons.corners.shape[1]
+            missing = corner_count - polygons.corners.shape[1]
             corners.append(np.pad(polygons.corners, ((0, 0), (0, missing), (0, 0)), "edge"))
         return Polygons(
             np.concatenate([self.cell, other.cell]),
@@ -234,8 +241,10 @@ class Polygons:
         sides = c[n, k] - centre[n], after[n, k] - centre[n]
         fans = Triangles(self.cell[n], self.faces[n], centre[n], *sides, ends[n, k])
         single = self.select(is_whole)._single_triangles(has_side[is_whole], ends[is_whole])
-        arrays = [[getattr(part, each.name) for part in (single, fans)] for each in fields(fans)]
-        return Triangles(*(np.concatenate(each) for each in arrays))
+        arrays = [
+            [getattr(part, attribute.name) for part in (single, fans)] for attribute in fields(fans)
+        ]
+        return Triangles(*(np.concatenate(attribute) for attribute in arrays))
 
     def _single_triangles(self, has_side: Flags, ends: Longs) -> Triangles:
         """Return these polygons of three sides as triangles, an edge of the surface the third side.
@@ -245,9 +254,9 @@ class Polygons:
         has_side, ends
             (n, m) whether a side begins at a corner, and the `ends` of that side.
         """
-        own = np.argsort(~has_side, axis=1, kind="stable")[:, :3]
-        corners = np.take_along_axis(self.corners, own[..., None], axis=1)
-        side_ends = np.take_along_axis(ends, own, axis=1)
+        side_numbers = np.argsort(~has_side, axis=1, kind="stable")[:, :3]
+        corners = np.take_along_axis(self.corners, side_numbers[..., None], axis=1)
+        side_ends = np.take_along_axis(ends, side_numbers, axis=1)
         has_edge = (side_ends != NOT_ON_EDGE).any(axis=1)
         apex = np.where(has_edge, (side_ends.argmax(axis=1) + 2) % 3, 0)[:, None]
         first, a, b = (
@@ -268,8 +277,8 @@ class Polygons:
         candidates = np.stack([self.corners, crossing], axis=2).reshape(count, 2 * m, 2)
         has_side = (next_corner != self.corners).any(axis=2)
         is_kept = np.stack([(height >= 0) & has_side, is_crossed], axis=2).reshape(count, 2 * m)
-        most = max(3, int(is_kept.sum(axis=1).max(initial=0)))
-        first = np.argsort(~is_kept, axis=1, kind="stable")[:, :most]
+        corner_count = max(3, int(is_kept.sum(axis=1).max(initial=0)))
+        first = np.argsort(~is_kept, axis=1, kind="stable")[:, :corner_count]
         corners = np.take_along_axis(candidates, first[..., None], axis=1)
         is_corner = np.take_along_axis(is_kept, first, axis=1)
         corners = np.where(is_corner[..., None], corners, corners[:, :1])
@@ -286,9 +295,9 @@ def area(corners: Array) -> Array:
 def centroid(corners: Array) -> Array:
     """Return the centroids (n, 2) of polygons that have an area."""
     off = corners - corners[:, :1]
-    after = np.roll(off, -1, 1)
-    twice = off[..., 0] * after[..., 1] - after[..., 0] * off[..., 1]
-    inner = np.einsum("nk,nki->ni", twice, off + after) / (3 * twice.sum(axis=1))[:, None]
+    next_off = np.roll(off, -1, 1)
+    twice = off[..., 0] * next_off[..., 1] - next_off[..., 0] * off[..., 1]
+    inner = np.einsum("nk,nki->ni", twice, off + next_off) / (3 * twice.sum(axis=1))[:, None]
     return np.asarray(corners[:, 0] + inner)
 
 
@@ -319,7 +328,7 @@ class Segments:
     def __init__(
         self,
         cells: Cells,
-        own: Longs,
+        own_cells: Longs,
         r0: Array,
         degrees: tuple[int, int],
         h: float,
@@ -336,15 +345,21 @@ class Segments:
         for plane in planes:
             self._edge_turns &= np.abs(plane.signed_distance(corners)) > SAME_CORNER_TOLERANCE
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-        inside = cover_distance(triangle_rule(degrees[0])[0])
+        inner_cover = cover_distance(triangle_rule(degrees[0])[0])
         at_edge = cover_distance(edge_rule(degrees[0])[0])
         has_edge = (cells.neighbours < 0).any(axis=1)
-        cover = np.where(has_edge, max(inside, at_edge), inside)
+        cover = np.where(has_edge, max(inner_cover, at_edge), inner_cover)
         self.cover_distance: Array = CELL_RADIUS_FACTOR * sides * cover
-        self.rule = ContactPoints.concatenate(self._points_on(self._triangles(Polygons.cells(own))))
+        self.rule = ContactPoints.concatenate(
+            self._points_on(self._triangles(Polygons.cells(own_cells)))
+        )
 
     def points(
-        self, near: Projections, r: Array, divisions: int, gaps: Callable[[ContactPoints], Array]
+        self,
+        near_places: Projections,
+        r: Array,
+        divisions: int,
+        gaps: Callable[[ContactPoints], Array],
     ) -> ContactPoints:
         """Return all points of this rank.
 
@@ -360,9 +375,9 @@ class Segments:
             Returns the gaps (n,) of points (n) there, over R.
         """
         number, rule = len(self._cells.nodes), self.rule
-        if not len(near.point):
+        if not len(near_places.point):
             return rule
-        keys = np.unique(rule.cell[near.point] * number + near.cell)
+        keys = np.unique(rule.cell[near_places.point] * number + near_places.cell)
         cell, other = keys // number, keys % number
         centres = self._corners(self._r0, other).mean(axis=1)
         order = np.argsort(centres @ ORDERING_DIRECTION, kind="stable")
@@ -400,8 +415,8 @@ class Segments:
         keys = np.stack([is_small, triangles.ends, np.where(has_turn, corner, 0)], axis=1)
         kinds, number = np.unique(keys, axis=0, return_inverse=True)
         points = list[ContactPoints]()
-        for k, (small, ends, offset) in enumerate(kinds):
-            degree = self._degrees[int(small)]
+        for k, (is_small_kind, ends, offset) in enumerate(kinds):
+            degree = self._degrees[int(is_small_kind)]
             rule = (
                 triangle_rule(degree)
                 if ends == NOT_ON_EDGE
@@ -417,7 +432,7 @@ class Segments:
         """Return the points of a rule on each triangle."""
         places = triangles.first[:, None] + X[:, :1] * triangles.e1[:, None]
         places = places + X[:, 1:] * triangles.e2[:, None]
-        cell, faces = (np.repeat(each, len(X)) for each in (triangles.cell, triangles.faces))
+        cell, faces = (np.repeat(numbers, len(X)) for numbers in (triangles.cell, triangles.faces))
         table = self._cells.element.tabulate(1, places.reshape(-1, 2))[..., 0]
         a1, a2 = np.einsum("dnk,nki->dni", table[1:], self._r0[self._cells.nodes[cell]])
         area_ratio = np.linalg.norm(np.cross(a1, a2), axis=1)
@@ -469,11 +484,11 @@ class Cuts:
     def __init__(
         self,
         segments: Segments,
-        near: Callable[[Array], Projections],
+        near_places: Callable[[Array], Projections],
         gaps: Callable[[ContactPoints, Array], Array],
         r0: Array,
     ) -> None:
-        self._segments, self._find_near, self._find_gaps, self._r0 = segments, near, gaps, r0
+        self._segments, self._find_near, self._find_gaps, self._r0 = segments, near_places, gaps, r0
         self._displacements = {0.0: np.zeros_like(r0)}
         self._latest_points = dict[float, tuple[ContactPoints, Array]]()
 
@@ -547,14 +562,14 @@ def cut_by_triangles(triangles: Polygons) -> Polygons:
     if not is_partial.any():
         return common
     partial_triangles = triangles.select(overlaps).select(is_partial[number])
-    inside, rest = _cut_one_by_one(partial_triangles, cells[is_partial])
+    common_once, rest = _cut_one_by_one(partial_triangles, cells[is_partial])
     uncovered = np.bincount(np.searchsorted(cells, rest.cell), area(rest.corners), len(cells))
     is_complete = np.abs(covered + uncovered - REFERENCE_AREA) <= AREA_TOLERANCE
     # where triangles overlap, the later ones count without the earlier ones
     overlapped = cells[is_partial & ~is_complete]
     single = common.select(~np.isin(common.cell, overlapped))
-    cut = inside.select(np.isin(inside.cell, overlapped))
-    return single.concatenate_with(cut).concatenate_with(rest)
+    overlapping = common_once.select(np.isin(common_once.cell, overlapped))
+    return single.concatenate_with(overlapping).concatenate_with(rest)
 
 
 def _cut_one_by_one(triangles: Polygons, cells: Longs) -> tuple[Polygons, Polygons]:
@@ -566,21 +581,21 @@ def _cut_one_by_one(triangles: Polygons, cells: Longs) -> tuple[Polygons, Polygo
     first = np.searchsorted(triangles.cell, cells)
     number = np.searchsorted(triangles.cell, cells, "right") - first
     rest = Polygons.cells(cells)
-    inside = rest.select(np.zeros(0, dtype=np.int64))
+    common_parts = rest.select(np.zeros(0, dtype=np.int64))
     for turn in range(int(number.max(initial=0))):
         row = np.searchsorted(cells, rest.cell)
         has_triangle = number[row] > turn
         cutting = triangles.select(first[row[has_triangle]] + turn)
-        cut, (a, b) = rest.select(has_triangle), oriented_sides(cutting.corners)
-        common = cut.with_faces(cutting.faces)
+        cut_cells, (a, b) = rest.select(has_triangle), oriented_sides(cutting.corners)
+        common = cut_cells.with_faces(cutting.faces)
         for k in range(3):
             common = common.clip(a[:, k], b[:, k])
         overlaps = area(common.corners) > AREA_TOLERANCE
-        inside = inside.concatenate_with(common.select(overlaps))
-        rest = rest.select(~has_triangle).concatenate_with(cut.select(~overlaps))
-        remaining = cut.select(overlaps)
+        common_parts = common_parts.concatenate_with(common.select(overlaps))
+        rest = rest.select(~has_triangle).concatenate_with(cut_cells.select(~overlaps))
+        remaining = cut_cells.select(overlaps)
         for k in range(3):
-            outside = remaining.clip(b[overlaps, k], a[overlaps, k])
-            rest = rest.concatenate_with(outside.with_area())
+            outer_part = remaining.clip(b[overlaps, k], a[overlaps, k])
+            rest = rest.concatenate_with(outer_part.with_area())
             remaining = remaining.clip(a[overlaps, k], b[overlaps, k])
-    return inside, rest
+    return common_parts, rest

@@ -166,8 +166,8 @@ class SurfaceContact(ContactTerm):
 
     def energy(self) -> float:
         """Return the energy of this rank's points over E h R^2."""
-        places, joined, (value, _, _) = self._active_set()
-        return float(self._points.weight[places.point[joined.first]] @ value) / 2
+        places, joined_places, (value, _, _) = self._active_set()
+        return float(self._points.weight[places.point[joined_places.first]] @ value) / 2
 
     def _entries(self) -> Entries:
         """Return the tangent's entries: cached at the present state, computed at a sample."""
@@ -222,10 +222,12 @@ class SurfaceContact(ContactTerm):
         return field, self._fields.shared_by_cells(forces)
 
     def _state(self) -> ContactState:
-        places, joined, penalties = self._active_set()
+        places, joined_places, penalties = self._active_set()
         geometry = self._cells, self._r0, self._at, self._offsets, self._points
         derivatives = self._entries_by_place_and_offset, self._entries, self._geometry
-        return ContactState(*geometry, places, joined, penalties, self._forces(), *derivatives)
+        return ContactState(
+            *geometry, places, joined_places, penalties, self._forces(), *derivatives
+        )
 
     def _add(self, b: Array, forces: Array) -> None:
         """Add forces (nodes, 3) of this rank's points to the owners' vectors; collective."""
@@ -236,17 +238,19 @@ class SurfaceContact(ContactTerm):
 
         Blocks of places in the same pair of cells are summed.
         """
-        places, joined, (_, slope, curvature) = self._active_set()
+        places, joined_places, (_, slope, curvature) = self._active_set()
         if not len(places.point):
             return no_entries()
-        is_blurred = joined.several[joined.group]
-        first = slope[joined.group]
-        second = np.where(is_blurred, first / (BLUR_DISTANCE * self._h), curvature[joined.group])
-        weight = joined.weight * self._points.weight[places.point] / 2
+        is_blurred = joined_places.several[joined_places.group]
+        first = slope[joined_places.group]
+        second = np.where(
+            is_blurred, first / (BLUR_DISTANCE * self._h), curvature[joined_places.group]
+        )
+        weight = joined_places.weight * self._points.weight[places.point] / 2
         order = np.argsort(self._pair_keys(places), kind="stable")
         blocks = self._blocks(places.select(order), weight[order], first[order], second[order])
         rows, columns, values = (list(parts) for parts in zip(*blocks, strict=True))
-        if joined.several.any():
+        if joined_places.several.any():
             for parts, added in zip(
                 (rows, columns, values), self._entries_of_joints(), strict=True
             ):
@@ -285,13 +289,17 @@ class SurfaceContact(ContactTerm):
 
     def _entries_of_joints(self) -> Entries:
         """Return what places that are joined as one have besides the entries of each."""
-        places, joined, (_, slope, curvature) = self._active_set()
-        is_blurred = joined.several[joined.group]
+        places, joined_places, (_, slope, curvature) = self._active_set()
+        is_blurred = joined_places.several[joined_places.group]
         _, n, beta, nodes = self._geometry(places.select(is_blurred))
-        slopes = joined.weight[is_blurred, None, None] * distance_slopes(n, beta, self._components)
-        weight = self._points.weight[places.point[joined.first]] / 2
+        slopes = joined_places.weight[is_blurred, None, None] * distance_slopes(
+            n, beta, self._components
+        )
+        weight = self._points.weight[places.point[joined_places.first]] / 2
         of_joints = weight * (curvature - slope / (BLUR_DISTANCE * self._h))
-        return joint_entries(slopes, nodes, joined.group[is_blurred], of_joints, len(self._r0))
+        return joint_entries(
+            slopes, nodes, joined_places.group[is_blurred], of_joints, len(self._r0)
+        )
 
     def _pair_keys(self, places: Projections) -> Longs:
         """Return a number (n,) of the point's cell and the cell that each place is in."""
@@ -301,42 +309,44 @@ class SurfaceContact(ContactTerm):
 
     def force(self) -> float:
         """Return the integral of the pressure over the contact, over E h R; collective."""
-        places, joined, (_, slope, _) = self._active_set()
-        weight = self._points.weight[places.point[joined.first]]
+        places, joined_places, (_, slope, _) = self._active_set()
+        weight = self._points.weight[places.point[joined_places.first]]
         return float(self._comm.allreduce(float(weight @ slope / 2)))
 
     def least_gap(self) -> float:
         """Return the least gap over R; nan where no faces are within the reach. Collective."""
         self._active_set()
-        least = self._search.least_distance(self._displacement(), self._reach, self._points)
-        return least - self._h if least < self._reach else np.nan
+        least_distance = self._search.least_distance(
+            self._displacement(), self._reach, self._points
+        )
+        return least_distance - self._h if least_distance < self._reach else np.nan
 
     def penetration(self) -> float:
         """Return the largest penetration over R, 0 without contact; collective."""
         places, *_ = self._active_set()
-        own = float((self._h - places.distance).max(initial=0.0))
-        return float(self._comm.allreduce(own, MPI.MAX))
+        own_largest = float((self._h - places.distance).max(initial=0.0))
+        return float(self._comm.allreduce(own_largest, MPI.MAX))
 
     def relative_penetration(self) -> float:
         """Return the largest penetration over the undeformed thickness there; collective."""
         places, *_ = self._active_set()
-        own = 0.0
+        own_largest = 0.0
         if len(places.point):
             thickness = self._search.thickness(self._points, places)
-            own = float(((self._h - places.distance) / thickness).max(initial=0.0))
-        return float(self._comm.allreduce(own, MPI.MAX))
+            own_largest = float(((self._h - places.distance) / thickness).max(initial=0.0))
+        return float(self._comm.allreduce(own_largest, MPI.MAX))
 
     def deepest_penetration(self) -> tuple[float, Array]:
         """Return the largest penetration over R, and its place (3,) over R; collective."""
         places, *_ = self._active_set()
-        own = (0.0, np.zeros(3))
+        own_deepest = (0.0, np.zeros(3))
         if len(places.point):
             deepest = int(places.distance.argmin())
             nodes = self._r0 + self._displacement()
             point = places.point[[deepest]]
             x = self._search.places_of_points(self._points, nodes, point)[0]
-            own = (float(self._h - places.distance[deepest]), x)
-        penetration, x = max(self._comm.allgather(own), key=lambda each: each[0])
+            own_deepest = (float(self._h - places.distance[deepest]), x)
+        penetration, x = max(self._comm.allgather(own_deepest), key=lambda candidate: candidate[0])
         return float(penetration), np.asarray(x)
 
     def cell_pressures_and_gaps(self) -> tuple[Array, Array, Flags]:
@@ -363,15 +373,15 @@ class SurfaceContact(ContactTerm):
         return self._cell_values.get(state, self._compute_pressures_and_gaps)
 
     def _compute_pressures_and_gaps(self) -> tuple[Array, Array, Flags]:
-        places, joined, (_, slope, _) = self._active_set()
+        places, joined_places, (_, slope, _) = self._active_set()
         points, (first_cell, count) = self._points, self._local_cells
-        nearest = places.select(joined.first)
+        nearest = places.select(joined_places.first)
         normals = self._cuts.points(self.cuts.value, self._displacement())[1]
         is_edge_alone = self._search.are_edges_alone(points, nearest, normals)
         force = points.weight[nearest.point] * slope
-        on_faced = np.bincount(nearest.cell, force / 2 * is_edge_alone, len(self._cells.nodes))
-        on_faced = self._in_modelled(on_faced.astype(np.float64)[:, None])[:, 0]
-        on_faced = self._comm.allreduce(on_faced)[self._fields.own]
+        of_edges = np.bincount(nearest.cell, force / 2 * is_edge_alone, len(self._cells.nodes))
+        in_modelled = self._in_modelled(of_edges.astype(np.float64)[:, None])[:, 0]
+        on_faced = self._comm.allreduce(in_modelled)[self._fields.own]
         area, pressure = np.ones(count), np.zeros(count)
         np.add.at(area, points.cell - first_cell, points.weight)
         area[: len(np.unique(points.cell))] -= 1.0
@@ -379,8 +389,12 @@ class SurfaceContact(ContactTerm):
         own_share = force * (1 - is_edge_alone / 2)
         np.add.at(pressure, points.cell[nearest.point] - first_cell, own_share)
         gap = np.full(count, self._reach - self._h)
-        near = self._search.projections(self._displacement(), self._reach, points, least_only=True)
-        np.minimum.at(gap, points.cell[near.point] - first_cell, near.distance - self._h)
+        near_places = self._search.projections(
+            self._displacement(), self._reach, points, least_only=True
+        )
+        np.minimum.at(
+            gap, points.cell[near_places.point] - first_cell, near_places.distance - self._h
+        )
         pressed_area, pressed_points = np.zeros(count), np.unique(nearest.point)
         pressed_cells = points.cell[pressed_points] - first_cell
         np.add.at(pressed_area, pressed_cells, points.weight[pressed_points])
@@ -411,12 +425,12 @@ class SurfaceContact(ContactTerm):
         """
         return self._search.least_distance(self._of_copies(u), self._reach) - self._h
 
-    def gap_at_supports(self, held: Longs, u: Array) -> float:
+    def gap_at_supports(self, supported_nodes: Longs, u: Array) -> float:
         """Return the least gap over R at nodes that supports hold.
 
         See `ClosestPointSearch.gap_at_supports`.
         """
-        return self._search.gap_at_supports(held, self._of_copies(u))
+        return self._search.gap_at_supports(supported_nodes, self._of_copies(u))
 
     def passes_through(self, u: Array, v: Array) -> bool:
         """Return whether points pass through a surface on the straight way from u to v; collective.
@@ -428,17 +442,17 @@ class SurfaceContact(ContactTerm):
 
     def images_pass_through(self, u: Array, v: Array) -> bool:
         """Return `passes_through` of displacements (nodes, 3) of all cells; collective."""
-        least = self.least_thickness(u, v)
+        least_thickness = self.least_thickness(u, v)
         motion = (v - u) - (v - u).mean(axis=0)
         farthest = 2 * np.linalg.norm(motion, axis=1).max()
-        count = int(np.ceil(farthest / (MAX_MOTION_PER_SAMPLE * least)))
+        count = int(np.ceil(farthest / (MAX_MOTION_PER_SAMPLE * least_thickness)))
         if not self._search.come_near(u, v):
             return False
         for k in range(1, count):
-            near = self._search.projections(
-                u + k / count * (v - u), CROSSING_DISTANCE * least, to_faces=False
+            near_places = self._search.projections(
+                u + k / count * (v - u), CROSSING_DISTANCE * least_thickness, to_faces=False
             )
-            if self._comm.allreduce(len(near.point)):
+            if self._comm.allreduce(len(near_places.point)):
                 return True
         return False
 
@@ -451,17 +465,19 @@ class SurfaceContact(ContactTerm):
 
     def sample_rates(self, motion: Array) -> SampleRates:
         """Return the penalty of the points with its rates along a motion (nodes, 3)."""
-        places, joined, _ = self._active_set()
+        places, joined_places, _ = self._active_set()
         if self._offsets:
             motion = np.column_stack([motion, self._offsets.change(self._at, motion)])
         _, n, beta, nodes = self._geometry(places)
         slopes = distance_slopes(n, beta, self._components)
         closing = -np.einsum("nki,nki->n", slopes, motion[nodes])
-        closing = np.bincount(joined.group, joined.weight * closing, len(joined.first))
+        closing = np.bincount(
+            joined_places.group, joined_places.weight * closing, len(joined_places.first)
+        )
         return SampleRates.sum_over_points(
             len(self._points.weight),
-            places.point[joined.first],
-            self._h - joined.distance,
+            places.point[joined_places.first],
+            self._h - joined_places.distance,
             closing,
             self.stiffness.value,
             SOFT_PENETRATION * self._h,
@@ -478,11 +494,11 @@ class SurfaceContact(ContactTerm):
         """
         u = self._displacement()
         places, *_ = self._active_set()
-        normals, left = self._segments.normals(self._r0 + u), self._places_left_to_edges
+        normals, left_places = self._segments.normals(self._r0 + u), self._places_left_to_edges
         is_left = self._search.are_left_to_edges(self._points, places, normals)
-        stays_left = self._search.are_left_to_edges(self._points, left, normals)
+        stays_left = self._search.are_left_to_edges(self._points, left_places, normals)
         changed = self._force(self._points, places.select(is_left))
-        changed += self._force(self._points, left.select(~stays_left))
+        changed += self._force(self._points, left_places.select(~stays_left))
         astray = self._astray_share(self._points, places, changed)
         if astray <= MAX_ASTRAY_FORCE:
             return None
@@ -544,18 +560,18 @@ class SurfaceContact(ContactTerm):
     def _force(self, points: ContactPoints, places: Projections) -> float:
         """Return twice the force of this rank's points on their nearest of some places."""
         nearest = places.select(places.firsts)
-        soft = SOFT_PENETRATION * self._h
-        pressures = penalty(self._h - nearest.distance, self.stiffness.value, soft)[1]
+        soft_penetration = SOFT_PENETRATION * self._h
+        pressures = penalty(self._h - nearest.distance, self.stiffness.value, soft_penetration)[1]
         return float(points.weight[nearest.point] @ pressures)
 
     def _near(self, u: Array) -> Projections:
         """Return the places in all cells that may press on this rank's cells at a displacement."""
         reach = self._h + self._segments.cover_distance
-        near = self._search.projections_in_cells(
+        near_places = self._search.projections_in_cells(
             self._rule, u, self._search.places_of_nodes(u), float(reach.max())
         )
-        is_near = near.distance < reach[self._rule.cell[near.point]]
-        return self._search.select_distant_cells(self._rule, near.select(is_near))
+        is_near = near_places.distance < reach[self._rule.cell[near_places.point]]
+        return self._search.select_distant_cells(self._rule, near_places.select(is_near))
 
     def _gaps(self, points: ContactPoints, u: Array) -> Array:
         """Return the gaps (n,) over R of points at a displacement, up to the reach."""
@@ -586,12 +602,12 @@ class SurfaceContact(ContactTerm):
 
         (nodes, 4) with the derivative by the offset H where that varies.
         """
-        places, joined, (_, slope, _) = self._active_set()
+        places, joined_places, (_, slope, _) = self._active_set()
         forces = np.zeros((len(self._r0), self._components))
         if len(places.point):
             _, n, beta, nodes = self._geometry(places)
-            weight = joined.weight * self._points.weight[places.point] / 2
-            pressure = weight * slope[joined.group]
+            weight = joined_places.weight * self._points.weight[places.point] / 2
+            pressure = weight * slope[joined_places.group]
             slopes = distance_slopes(n, beta, self._components)
             np.add.at(forces, nodes, -pressure[:, None, None] * slopes)
         return forces
@@ -601,7 +617,7 @@ class SurfaceContact(ContactTerm):
 
         The penalty has its two derivatives by the penetration. At the present state, or sample.
         """
-        soft = SOFT_PENETRATION * self._h
+        soft_penetration = SOFT_PENETRATION * self._h
         if self._frozen:
             self._at, self._points = np.array(self._displacement()), self._frozen.points
             is_held = self.held is not None
@@ -616,11 +632,13 @@ class SurfaceContact(ContactTerm):
             self._places, self._places_left_to_edges, self._joined = self._active_sets.get(
                 (u, self.cuts.value, growth), lambda: self._find_places(points, normals, u)
             )
-        joined = self._joined
-        penalties = penalty(self._h - joined.distance, self.stiffness.value, soft)
+        joined_places = self._joined
+        penalties = penalty(
+            self._h - joined_places.distance, self.stiffness.value, soft_penetration
+        )
         if self.sample:
-            penalties = self.sample.weigh(self._places.point[joined.first], penalties)
-        return self._places, joined, penalties
+            penalties = self.sample.weigh(self._places.point[joined_places.first], penalties)
+        return self._places, joined_places, penalties
 
     def _find_places(
         self, points: ContactPoints, normals: Array, u: Array
@@ -629,8 +647,8 @@ class SurfaceContact(ContactTerm):
         places = self._search.projections(u, (1 + DISTANCE_TOLERANCE) * self._h, points)
         is_left = self._search.are_left_to_edges(points, places, normals)
         counted = places.select(~is_left)
-        joined = JoinedPlaces.join(counted, BLUR_DISTANCE * self._h)
-        return counted, places.select(is_left), joined
+        joined_places = JoinedPlaces.join(counted, BLUR_DISTANCE * self._h)
+        return counted, places.select(is_left), joined_places
 
     def freeze(self) -> FrozenContact:
         """Return the contact of the present state, with its active set fixed; collective."""

@@ -90,7 +90,7 @@ class SampleRates:
         penetration: Array,
         closing: Array,
         k: float,
-        soft: float,
+        soft_penetration: float,
     ) -> "SampleRates":
         """Sum the penalties of places over their points.
 
@@ -104,11 +104,11 @@ class SampleRates:
         k, soft
             See `penalty`.
         """
-        value, first, second = penalty(penetration, k, soft)
-        closing = np.where(np.abs(closing) > PENETRATION_ROUNDING * soft, closing, 0.0)
-        segment = np.digitize(penetration, (0.0, soft)).astype(float)
+        value, first, second = penalty(penetration, k, soft_penetration)
+        closing = np.where(np.abs(closing) > PENETRATION_ROUNDING * soft_penetration, closing, 0.0)
+        segment = np.digitize(penetration, (0.0, soft_penetration)).astype(float)
         of_places = value, first * closing, second * closing**2, segment
-        return cls(*(np.bincount(point, each, count).astype(float) for each in of_places))
+        return cls(*(np.bincount(point, values, count).astype(float) for values in of_places))
 
 
 class SampleCache(Generic[Value]):
@@ -125,7 +125,7 @@ class SampleCache(Generic[Value]):
                 self._samples.append(self._samples.pop(i))
                 return value
         value = compute()
-        copied_state = [np.array(each) for each in state]
+        copied_state = [np.array(item) for item in state]
         self._samples = [*self._samples[1 - len(SIMPSON_RULE) :], (copied_state, value)]
         return value
 
@@ -181,9 +181,11 @@ def samples_of_step(
         rates.append(contact.sample_rates(end - begin))
     contact.sample = None
     positions, weights = np.transpose(SIMPSON_RULE)
-    work = weights @ [each.rate for each in rates]
-    curvature = (positions * weights) @ [each.curvature for each in rates]
-    is_kink = np.any([one.segment != other.segment for one, other in pairwise(rates)], axis=0)
+    work = weights @ [sample_rates.rate for sample_rates in rates]
+    curvature = (positions * weights) @ [sample_rates.curvature for sample_rates in rates]
+    is_kink = np.any(
+        [earlier.segment != other.segment for earlier, other in pairwise(rates)], axis=0
+    )
     energy_change = rates[-1].value - rates[0].value
     end_slope, off_middle = rates[-1].rate - energy_change, part - 0.5
     of_force = _factor(energy_change, work, is_kink)

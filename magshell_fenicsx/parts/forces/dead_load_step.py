@@ -63,7 +63,8 @@ def _or_formula(unit: str) -> Any:
             or not abs(number) <= MAX_COMPONENT
         ):
             raise ValueError(
-                f"{value!r}: allowed are numbers up to {MAX_COMPONENT:g} in size, with a unit, and formulas"
+                f"{value!r}: allowed are numbers up to {MAX_COMPONENT:g} in size, with a unit, "
+                "and formulas"
             )
         return number
 
@@ -97,14 +98,16 @@ class DeadLoadSection(Section):
     per_length: PerLength | None = None
     """On an edge [force/length]"""
     moment: Moment | None = None
-    """On an edge, about its tangent with the surface on its left; positive turns the normal outward [force]"""
+    """On an edge, about its tangent with the surface on its left; positive turns the normal outward
+    [force]"""
     per_area: PerArea | None = None
     """Over the surface [force/length²]"""
     pressure: VaryingPressure | None = None
     """Over the surface, against the undeformed normal [force/length²]"""
     potential: Formula | None = None
-    """Over all: energy per undeformed area as a formula of the deformed place x, y, z in the shell's length, whose
-    negative gradient is the force: gravity, springs, a field of force [force/length]"""
+    """Over all: energy per undeformed area as a formula of the deformed place x, y, z in the
+    shell's length, whose negative gradient is the force: gravity, springs, a field of force
+    [force/length]"""
 
     @model_validator(mode="after")
     def _one_load_in_one_place(self) -> Self:
@@ -116,7 +119,8 @@ class DeadLoadSection(Section):
         places = [place for place in fitting if getattr(self, place) is not None]
         if len(places) != 1:
             raise ValueError(
-                "a load is at a point, on an edge, or on a part of the surface: give one of at, edge, over"
+                "a load is at a point, on an edge, or on a part of the surface: give one of at, "
+                "edge, over"
             )
         quantities = {key for keys in fitting.values() for key in keys}
         given_keys = sorted(key for key in quantities if getattr(self, key) is not None)
@@ -160,12 +164,14 @@ class DeadSection(PathStep):
     loads: list[DeadLoadSection] = Field(min_length=1, max_length=1000)
     """At a factor of one"""
     control: Literal["load", "displacement", "arc"] = "arc"
-    """What is prescribed step by step: the factor, the displacement, or arc length, which passes every fold"""
+    """What is prescribed step by step: the factor, the displacement, or arc length, which passes
+    every fold"""
     until: Until = "target"
     factor: float | None = Field(default=None, ge=-1e9, le=1e9)
     """Target of the common factor; with control: load or arc"""
     displacement: Annotated[float, or_number("metre"), Field(ge=-1e9, le=1e9)] | None = None
-    """Target of the displacement along the loads; with control: displacement or arc [the shell's length]"""
+    """Target of the displacement along the loads; with control: displacement or arc [the shell's
+    length]"""
     points: Count = 20
 
     @model_validator(mode="after")
@@ -206,17 +212,17 @@ class DeadSection(PathStep):
             context.has_point(f"{step.key}.loads.{i}.at", load.at)
 
     def warning(self, step: ProgrammeStep) -> str | None:
-        """Return that a pressure by formula keeps its direction, where that of a fluid would turn.
-        """
+        """Return that a pressure by formula keeps its direction, unlike that of a fluid."""
         varying = next(
             (i for i, load in enumerate(self.loads) if isinstance(load.pressure, str)), None
         )
         if varying is None:
             return None
         return (
-            f"{step.key}.loads.{varying}.pressure: dead: per undeformed area, fixed to the material and along the "
-            "undeformed normal; a live one, as of a fluid, turns with the surface (a ring buckles at 3/4 of the dead "
-            "one) and is the same everywhere: kind: pressure"
+            f"{step.key}.loads.{varying}.pressure: dead: per undeformed area, fixed to the "
+            "material and along the undeformed normal; a live one, as of a fluid, turns with the "
+            "surface (a ring buckles at 3/4 of the dead one) and is the same everywhere: kind: "
+            "pressure"
         )
 
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
@@ -231,13 +237,27 @@ class DeadSection(PathStep):
         R, meridian = context.shell.reference, outline.meridian
         constant_loads = [load for load in self.loads if not load.varies]
         forces = [
-            np.array(v) for load in constant_loads for v in (load.force, load.per_length, load.per_area) if v
+            np.array(v)
+            for load in constant_loads
+            for v in (load.force, load.per_length, load.per_area)
+            if v
         ]
         places = [np.array(context.points[load.at]) / R for load in self.loads if load.at]
         vectors = [unit(v) for v in (*forces, *places)]
         potentials = [load.potential for load in self.loads if load.potential]
-        x = outline.sample() if potentials or len(constant_loads) < len(self.loads) else np.zeros((0, 3))
-        all_patches = {None, "all", *(shell_meridian.name for shell_meridian in (meridian.shell_meridians if meridian else ()))}
+        x = (
+            outline.sample()
+            if potentials or len(constant_loads) < len(self.loads)
+            else np.zeros((0, 3))
+        )
+        all_patches = {
+            None,
+            "all",
+            *(
+                shell_meridian.name
+                for shell_meridian in (meridian.shell_meridians if meridian else ())
+            ),
+        }
         has_patches = any(load.over not in all_patches for load in self.loads)
 
         def mirrors(mirror: Mirror) -> bool:
@@ -253,10 +273,13 @@ class DeadSection(PathStep):
         if any(tilted(v) for v in vectors):
             reason = "a load is not along e3, or off the axis"
         is_axisymmetric = (
-            all(load_turns(load, meridian, R) for load in self.loads if load.varies) if meridian else True
+            all(load_turns(load, meridian, R) for load in self.loads if load.varies)
+            if meridian
+            else True
         )
         if meridian and not (
-            is_axisymmetric and all(scalar_is_axisymmetric(text, meridian, R) for text in potentials)
+            is_axisymmetric
+            and all(scalar_is_axisymmetric(text, meridian, R) for text in potentials)
         ):
             reason = reason or "a load differs around e3"
         energies = [
@@ -295,7 +318,9 @@ class DeadSection(PathStep):
                 largest = MAX_COMPONENT * (
                     scales.E * scales.h / (scales.R if name != "per_length" else 1.0)
                 )
-                yield Formulas(f"{key}.loads.{i}.{name}", values, -largest, largest, scales.R, load=True)
+                yield Formulas(
+                    f"{key}.loads.{i}.{name}", values, -largest, largest, scales.R, load=True
+                )
             if load.potential:  # of the deformed place: the undeformed one is looked at
                 largest = MAX_COMPONENT * scales.E * scales.h
                 yield Formulas(
@@ -349,7 +374,9 @@ def is_image(
     ):
         if (vector is None) != (other_vector is None):
             return False
-        if vector and np.abs(mirror.reflection @ vector - other_vector).max() > 1e-10 * np.linalg.norm(vector):
+        if vector and np.abs(
+            mirror.reflection @ vector - other_vector
+        ).max() > 1e-10 * np.linalg.norm(vector):
             return False
     return True
 
@@ -371,8 +398,7 @@ def _mirrored_formula(
 
 
 def potential(name: str, text: str, Q: Array, scales: Scales) -> OwnTerm:
-    """Return the energy of a load that depends on the deformed place, zero where nothing has moved.
-    """
+    """Return the energy of a load by the deformed place, zero where nothing has moved."""
 
     def energy_at(r: "Expr", scale: "Expr", energy_scale: "Expr") -> "Expr":
         x = [scale * sum(float(Q[j, i]) * r[j] for j in range(3) if Q[j, i]) for i in range(3)]
@@ -409,7 +435,8 @@ class ForcesObservables(Observables):
         factors = {amplitude(name).column: state.mu[name] for name in self.amplitudes(loads)}
         displaced = also_displaced(loads)
         return factors | {
-            f"w_{name}_over_h": model.loaded_deflection(state.u, name) / view.h for name in displaced
+            f"w_{name}_over_h": model.loaded_deflection(state.u, name) / view.h
+            for name in displaced
         }
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:

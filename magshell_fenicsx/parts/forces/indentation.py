@@ -59,8 +59,8 @@ class IndentationSection(PathStep):
     at: Place = Place.model_construct()
     """Where the force is, by default the pole or the centre; on a hemisphere polar is below 89"""
     control: Literal["displacement", "load", "arc"] = "displacement"
-    """What is prescribed step by step: w, F, or arc length, which passes every fold; the default is load with a target
-    `force`"""
+    """What is prescribed step by step: w, F, or arc length, which passes every fold; the default is
+    load with a target `force`"""
     until: Until = "target"
     depth: Annotated[float, over_size(THICKNESS)] | None = Field(default=None, ge=-1e4, le=1e4)
     """Target w under the load; with control: displacement or arc [h]"""
@@ -79,8 +79,9 @@ class IndentationSection(PathStep):
         context.has_point(f"{step.key}.at.point", self.at.point)
         if context.solid and not self.patch:
             raise ValueError(
-                "loading.patch: 0: a point force sinks into a solid without limit; give the patch its radius over h "
-                "(of the paper's indenter, 0.2 mm at R = 25.2 mm, with R/h = 90: 0.714)"
+                "loading.patch: 0: a point force sinks into a solid without limit; give the patch "
+                "its radius over h (of the paper's indenter, 0.2 mm at R = 25.2 mm, with R/h = "
+                "90: 0.714)"
             )
 
     def leaves(
@@ -101,7 +102,9 @@ class IndentationSection(PathStep):
         polar = radians(at.polar)
         if not outline.sphere and polar:
             allowed_places = "at its centre or tip, polar: 0, or at a point of points"
-            raise CaseError(f"{key}.at.polar: {at.polar:g}: a {geometry} is loaded {allowed_places}")
+            raise CaseError(
+                f"{key}.at.polar: {at.polar:g}: a {geometry} is loaded {allowed_places}"
+            )
         if outline.highest is None or not (outline.disc or geometry == "strip"):
             raise CaseError(f"{key}.at: a {geometry} has no pole: give {{point: NAME}}, of points")
         if not outline.sphere:
@@ -127,12 +130,16 @@ class IndentationSection(PathStep):
         self, step: ProgrammeStep, context: Context, outline: "Outline", chart_place: Array
     ) -> None:
         width = getattr(context.shell, "width", None) if context.shell.geometry == "strip" else None
-        room = outline.edge - float(np.hypot(*chart_place[:2])) if outline.sphere else min(1.0, width or 1.0)
+        room = (
+            outline.edge - float(np.hypot(*chart_place[:2]))
+            if outline.sphere
+            else min(1.0, width or 1.0)
+        )
         largest = room * context.shell.R_over_h
         if self.patch and not 0.3 <= self.patch <= largest:
             raise CaseError(
-                f"{step.key}.patch: {self.patch:g}: allowed are 0 for a point, or 0.3 to {largest:.4g}, where it "
-                "reaches the edge"
+                f"{step.key}.patch: {self.patch:g}: allowed are 0 for a point, or 0.3 to "
+                f"{largest:.4g}, where it reaches the edge"
             )
 
     @classmethod

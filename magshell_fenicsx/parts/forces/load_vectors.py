@@ -66,7 +66,11 @@ class Weighted:
 
 
 def load_entries(
-    V: fem.FunctionSpace, direction: Expr, measure: Weighted, log: KernelLog, name: str = "load vector"
+    V: fem.FunctionSpace,
+    direction: Expr,
+    measure: Weighted,
+    log: KernelLog,
+    name: str = "load vector",
 ) -> Entries:
     """Return the owned entries of l with l . u = integral of direction . u."""
     load = fem.assemble_vector(log.compile(name, ufl.dot(direction, ufl.TestFunction(V)) * measure))
@@ -101,10 +105,13 @@ def averaged(
         On every rank, if the mesh is too coarse to know the patch.
     """
     total = measure.total(V, log, "patch weight")
-    if radius is not None and not MIN_PATCH_SHARE <= total / (np.pi * radius**2 / 3) <= 1 / MIN_PATCH_SHARE:
+    if (
+        radius is not None
+        and not MIN_PATCH_SHARE <= total / (np.pi * radius**2 / 3) <= 1 / MIN_PATCH_SHARE
+    ):
         raise MeshError(
-            f"loading.patch: its radius is {radius:.3g} R, which the mesh is too coarse for: choose a smaller "
-            "mesh.size, or 0 for a force at a point"
+            f"loading.patch: its radius is {radius:.3g} R, which the mesh is too coarse for: "
+            "choose a smaller mesh.size, or 0 for a force at a point"
         )
     dofs, values = load_entries(V, fem.Constant(V.mesh, direction), measure, log, "patch load")
     return dofs, np.asarray(values / total)
@@ -179,7 +186,9 @@ def vertex_normal(
         Flags of the cells that count; None for all.
     """
     _, is_at_vertex, (a1, a2) = _corners(r0, x, cells)
-    total = r0.function_space.mesh.comm.allreduce(np.cross(a1[is_at_vertex], a2[is_at_vertex]).sum(axis=0))
+    total = r0.function_space.mesh.comm.allreduce(
+        np.cross(a1[is_at_vertex], a2[is_at_vertex]).sum(axis=0)
+    )
     return np.asarray(total / np.linalg.norm(total))
 
 
@@ -188,7 +197,9 @@ def by_vertex_normal(r0: fem.Function, x: Array, v: Array, cells: Inside | None 
     collective.
     """
     table, is_at_vertex, (a1, a2) = _corners(r0, x, cells)
-    total = r0.function_space.mesh.comm.allreduce(np.cross(a1[is_at_vertex], a2[is_at_vertex]).sum(axis=0))
+    total = r0.function_space.mesh.comm.allreduce(
+        np.cross(a1[is_at_vertex], a2[is_at_vertex]).sum(axis=0)
+    )
     size = np.linalg.norm(total)
     p = (v - total * (total @ v) / size**2) / size
     by_tangents = np.stack([np.cross(a2, p), np.cross(p, a1)]) * is_at_vertex[..., None]
@@ -310,7 +321,7 @@ class Measures(Protocol):
 
 @dataclass(frozen=True)
 class DeadLoads:
-    """Dead loads together.
+    """The sum of dead loads.
 
     Attributes
     ----------
@@ -320,10 +331,9 @@ class DeadLoads:
         The sum of their sizes over E h R: of a force its length, of a distributed one that of its
         integral's density.
     spread
-        Of those that are spread: the density, where it is, and whether it has been divided by how
-        large that is.
+        Of distributed loads: the density, its measure, and whether it has been divided by that.
     sizes
-        What `size` is as forms, where it depends on the placement.
+        `size` as forms, where it depends on the placement.
     """
 
     entries: Entries
@@ -332,70 +342,100 @@ class DeadLoads:
     sizes: "Sequence[ufl.Form]" = ()
 
 
+class _DeadLoadSum:
+    """The sum of dead loads while it is made; collective.
+
+    Attributes
+    ----------
+    parts
+        The entries of each load.
+    size, densities, sizes
+        See `DeadLoads`.
+    """
+
+    def __init__(self, V: fem.FunctionSpace, measures: Measures, log: KernelLog) -> None:
+        self._V, self._measures, self._log = V, measures, log
+        self.parts, self.size = list[Entries](), 0.0
+        self.densities = list[tuple[Expr, Weighted, bool]]()
+        self.sizes = list[ufl.Form]()
+
+    def add(self, load: DeadLoad) -> None:
+        """Add a load; moments and potentials have no load vectors."""
+        if isinstance(load, PointForce):
+            self.parts.append(self._measures.at_point(load.point, load.force))
+            self.size += float(np.linalg.norm(load.force))
+        elif isinstance(load, EdgeForce):
+            self._add_edge_force(load)
+        elif isinstance(load, AreaForce):
+            self._add_area_force(load)
+        else:
+            assert isinstance(load, EdgeMoment | Potential)
+
+    def _add_edge_force(self, load: EdgeForce) -> None:
+        ds = self._measures.edge(load.edge)
+        if callable(load.force):
+            self._add_pattern(load.force, ds, load.edge)
+            return
+        length = ds.total(self._V, self._log)
+        force = np.asarray(load.force / length) if load.total else load.force
+        strength = float(np.linalg.norm(force))
+        self._add_density(self._constant(force), ds, strength, is_total=load.total)
+        self.size += strength * length
+
+    def _add_area_force(self, load: AreaForce) -> None:
+        dx = self._measures.area(load.patch)
+        if callable(load.force):
+            self._add_pattern(load.force, dx, is_part=load.patch is not None)
+            return
+        if isinstance(load.force, float):
+            direction = -self._constant(load.force) * self._measures.normal
+            strength = abs(load.force)
+        else:
+            direction = self._constant(load.force)
+            strength = float(np.linalg.norm(load.force))
+        self._add_density(direction, dx, strength)
+        self.size += strength * dx.total(self._V, self._log)
+
+    def _add_pattern(
+        self, pattern: Pattern, measure: Weighted, edge: str | None = None, *, is_part: bool = False
+    ) -> None:
+        """Add a pattern and the integral of its size, which is known for all of a surface."""
+        density, known_size = self._measures.field(pattern, edge)
+        strength = ufl.sqrt(ufl.dot(density, density))
+        self._add_density(density, measure, strength)
+        if known_size is not None and not is_part:
+            self.size += known_size
+            return
+        form = self._log.compile("load size", strength * measure)
+        self.size += float(self._V.mesh.comm.allreduce(fem.assemble_scalar(form)))
+
+    def _add_density(
+        self, density: Expr, measure: Weighted, strength: Expr | float, *, is_total: bool = False
+    ) -> None:
+        """Add a density on a measure; of a total force it has been divided by the length."""
+        self.parts.append(load_entries(self._V, density, measure, self._log))
+        self.densities.append((density, measure, is_total))
+        if not is_total:
+            size = self._constant(strength) if isinstance(strength, float) else strength
+            self.sizes.append(size * measure)
+
+    def _constant(self, value: float | Array) -> fem.Constant:
+        return fem.Constant(self._V.mesh, value)
+
+
 def assemble_dead_loads(
     loads: Sequence[DeadLoad], V: fem.FunctionSpace, measures: Measures, log: KernelLog
 ) -> DeadLoads:
     """Return the load vector of all dead loads but the moments; collective."""
-    parts, size = list[Entries](), 0.0
-    densities, sizes = list[tuple[Expr, Weighted, bool]](), list[ufl.Form]()
-
-    def constant(value: float | NDArray[np.float64]) -> fem.Constant:
-        return fem.Constant(V.mesh, value)
-
-    def spread(
-        direction: Expr, measure: Weighted, strength: Expr | float, *, total: bool = False
-    ) -> None:
-        parts.append(load_entries(V, direction, measure, log))
-        densities.append((direction, measure, total))
-        if not total:
-            sizes.append(
-                (constant(strength) if isinstance(strength, float) else strength) * measure
-            )
-
-    def spread_pattern(
-        pattern: Pattern, measure: Weighted, edge: str | None = None, *, part: bool = False
-    ) -> float:
-        """The integral of its size."""
-        direction, total = measures.field(pattern, edge)
-        strength = ufl.sqrt(ufl.dot(direction, direction))
-        spread(direction, measure, strength)
-        if total is not None and not part:
-            return total
-        form = log.compile("load size", strength * measure)
-        return float(V.mesh.comm.allreduce(fem.assemble_scalar(form)))
-
+    load_sum = _DeadLoadSum(V, measures, log)
     for load in loads:
-        if isinstance(load, PointForce):
-            parts.append(measures.at_point(load.point, load.force))
-            size += float(np.linalg.norm(load.force))
-        elif isinstance(load, EdgeForce):
-            ds = measures.edge(load.edge)
-            if callable(load.force):
-                size += spread_pattern(load.force, ds, load.edge)
-                continue
-            length = ds.total(V, log)
-            force = np.asarray(load.force / length) if load.total else load.force
-            strength = float(np.linalg.norm(force))
-            spread(constant(force), ds, strength, total=load.total)
-            size += strength * length
-        elif isinstance(load, AreaForce):
-            dx = measures.area(load.patch)
-            if callable(load.force):
-                size += spread_pattern(load.force, dx, part=load.patch is not None)
-                continue
-            if isinstance(load.force, float):
-                direction, strength = -constant(load.force) * measures.normal, abs(load.force)
-            else:
-                direction, strength = constant(load.force), float(np.linalg.norm(load.force))
-            spread(direction, dx, strength)
-            size += strength * dx.total(V, log)
-        else:
-            assert isinstance(load, EdgeMoment | Potential)  # no load vectors
+        load_sum.add(load)
     vector = np.zeros(3 * V.dofmap.index_map.size_local)
-    for dofs, values in parts:
+    for dofs, values in load_sum.parts:
         np.add.at(vector, dofs, values)
     dofs = np.flatnonzero(vector).astype(np.int32)
-    return DeadLoads((dofs, vector[dofs]), size, densities, sizes)
+    entries = dofs, vector[dofs]
+    return DeadLoads(entries, load_sum.size, load_sum.densities, load_sum.sizes)
 
 
 def patch_indicator(domain: mesh.Mesh, patch: NDArray[np.bool_]) -> fem.Function:

@@ -38,8 +38,7 @@ class RevolutionIntegrals:
     measures: Sequence[ufl.Measure] = ()
 
     def with_parts(self, loads: Sequence[DeadLoad]) -> "RevolutionIntegrals":
-        """Return these integrals with one measure for the ends and points of all loads of a form.
-        """
+        """Return these integrals, with one measure for all ends and points of a form."""
         parts = list[Facets]()
         for load in forces(loads):
             if isinstance(load, AreaForce):
@@ -82,7 +81,10 @@ class RevolutionIntegrals:
         axis.
         """
         parameter = np.array([self.meridian.points[point][0]])
-        a, pole = self.domain.constant(radius), self.domain.constant(self.meridian.section(parameter)[0])
+        a, pole = (
+            self.domain.constant(radius),
+            self.domain.constant(self.meridian.section(parameter)[0]),
+        )
         depth = 1 - ufl.dot(self.domain.r0 - pole, self.domain.r0 - pole) / a**2
         weight, integral = ufl.conditional(ufl.gt(depth, 0), depth**2, 0), self.domain.over_area()
         return lambda f: integral(weight * f)
@@ -143,17 +145,25 @@ def dead_loads(
     return Energy(name, energy, name, linear=True), size, sizes
 
 
-def pole_force(name: str, force: Force, unit: float, integrals: RevolutionIntegrals, log: KernelLog) -> Energy:
+def pole_force(
+    name: str, force: Force, unit: float, integrals: RevolutionIntegrals, log: KernelLog
+) -> Energy:
     """Return a force against the outward normal at a point on the axis, or over a patch there."""
-    integral = integrals.patch(force.patch, force.point) if force.patch else integrals.pole(force.point)
+    integral = (
+        integrals.patch(force.patch, force.point) if force.patch else integrals.pole(force.point)
+    )
     is_begin = np.isclose(
         integrals.meridian.cells[:, 0], integrals.meridian.points[force.point][0]
     ).any()  # the normal is e3 there
-    share = integrals.domain.constant((1.0 if is_begin else -1.0) * unit / _circumferential_integral(integral, integrals, log))
+    share = integrals.domain.constant(
+        (1.0 if is_begin else -1.0) * unit / _circumferential_integral(integral, integrals, log)
+    )
     return Energy(name, lambda u: integral(share * u.r[2]), name, linear=True)
 
 
-def _circumferential_integral(integral: Integral, integrals: RevolutionIntegrals, log: KernelLog) -> float:
+def _circumferential_integral(
+    integral: Integral, integrals: RevolutionIntegrals, log: KernelLog
+) -> float:
     """Return the integral of 1, all around."""
     return _integral(integrals.domain.constant(1.0), integral, log)
 

@@ -19,7 +19,13 @@ from magshell_fenicsx.models.shell.spatial_fields import (
     refuse_unbounded,
 )
 from magshell_fenicsx.models.shell.thickness import patch_of
-from magshell_fenicsx.parts.forces.load_vectors import Entries, Weighted, averaged, smooth, patch_indicator
+from magshell_fenicsx.parts.forces.load_vectors import (
+    Entries,
+    Weighted,
+    averaged,
+    patch_indicator,
+    smooth,
+)
 from magshell_fenicsx.platform import compat
 
 Array = NDArray[np.float64]
@@ -84,7 +90,10 @@ class BodyMeasures:
         )  # and not through a closed shell
         dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": WEIGHT_DEGREE})
         return averaged(
-            self._V, force, Weighted(is_in_shell * smooth(d - height * normal, radius), dx), self._log
+            self._V,
+            force,
+            Weighted(is_in_shell * smooth(d - height * normal, radius), dx),
+            self._log,
         )
 
     def _reach(self, x: Array, n: Array) -> float:
@@ -95,7 +104,9 @@ class BodyMeasures:
         cells_at_x = X[(np.linalg.norm(X, axis=2) < 1e-9).any(axis=1)]
         from_normal = cells_at_x - (cells_at_x @ n)[..., None] * n
         return float(
-            self._V.mesh.comm.allreduce(np.linalg.norm(from_normal, axis=2).max(initial=0.0), MPI.MAX)
+            self._V.mesh.comm.allreduce(
+                np.linalg.norm(from_normal, axis=2).max(initial=0.0), MPI.MAX
+            )
         )
 
 
@@ -108,8 +119,7 @@ def thickness_at(body: BodyMesh, x: Array) -> float:
 def outer_patch(
     body: BodyMesh, V: fem.FunctionSpace, point: str, radius: float, log: KernelLog
 ) -> Entries:
-    """Return an inward force averaged over the outer face around a point, with the weight `smooth`.
-    """
+    """Return an inward force averaged over the outer face around a point, weighted by `smooth`."""
     x, normal = body.points[point], body.normals[point]
     values = x + thickness_at(body, x) / 2 * normal, radius
     centre, a = (fem.Constant(body.mesh, value) for value in values)

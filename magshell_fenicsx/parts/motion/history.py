@@ -49,9 +49,9 @@ class RampHistory(Section):
 
     kind: Literal["ramp"]
     to: Level
-    """Value at its end, as a target of the load would be, with a unit or without one: 400 Pa or 0.5 of p_c, a force, an
-    approach, the speed of a spin, the factor of a support. Of the field: a flux density, or a part of that in
-    `magnetic`"""
+    """Value at its end, as a target of the load would be, with a unit or without one: 400 Pa or 0.5
+    of p_c, a force, an approach, the speed of a spin, the factor of a support. Of the field: a flux
+    density, or a part of that in `magnetic`"""
     over: Time
     """Time that it takes"""
 
@@ -218,5 +218,6 @@ class Viscosity(Ability):
                 raise ValueError(f"shell.{key}: {value}: must be positive")
             if isinstance(value, str) and not units:
                 raise ValueError(
-                    f"shell.{key}: {value}: its unit needs shell.density, youngs_modulus and lengths"
+                    f"shell.{key}: {value}: its unit needs shell.density, youngs_modulus and "
+                    "lengths"
                 )

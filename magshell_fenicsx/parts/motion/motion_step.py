@@ -68,10 +68,10 @@ class TimeSection(Step):
     points: Annotated[int, Field(ge=1, le=100000)] = 100
     """Equal parts of the duration, each a row"""
     history: dict[str, History] = Field(default_factory=dict)
-    """Load -> its values over the time of the step: `field` (over that of `magnetic`, or as a flux density), `pressure`
-    (over p_c, or as 400 Pa), `interaction` (its factor), or the amplitude of another step, as its target: a ramp, step,
-    triangle or sine, a table [[time, value], ...] with straight lines and jumps, or a formula of the time t without
-    units"""
+    """Load -> its values over the time of the step: `field` (over that of `magnetic`, or as a flux
+    density), `pressure` (over p_c, or as 400 Pa), `interaction` (its factor), or the amplitude of
+    another step, as its target: a ramp, step, triangle or sine, a table [[time, value], ...] with
+    straight lines and jumps, or a formula of the time t without units"""
     rho_inf: float = Field(default=0.8, ge=0, le=1)
     """Factor by which the highest frequencies fade at each step; 1 conserves energy"""
     step: Time | None = None
@@ -79,22 +79,23 @@ class TimeSection(Step):
     tolerance: float = Field(default=1e-3, ge=1e-9, le=1)
     """Largest estimated error of what `errors` names [h]"""
     errors: Errors = "step"
-    """Of each time step, or of the motion at all rows (column error_over_h): then it is rehearsed with longer steps,
-    which takes several times as long; a snap magnifies the errors of steps"""
+    """Of each time step, or of the motion at all rows (column error_over_h): then it is rehearsed
+    with longer steps, which takes several times as long; a snap magnifies the errors of steps"""
     balance: float = Field(default=BALANCE, ge=1e-9, le=1)
-    """Largest error of the balance of energy (column imbalance), over kinetic + stored + dissipated + work; beside a
-    body a time step with more than its share is repeated with a smaller one, unless `step` is given; a run warns where
-    it is larger"""
+    """Largest error of the balance of energy (column imbalance), over kinetic + stored + dissipated
+    + work; beside a body a time step with more than its share is repeated with a smaller one,
+    unless `step` is given; a run warns where it is larger"""
     drag: Rate = 0.0
-    """Force over mass and velocity; free vibrations fade at half of it [per unit of time; 20 Hz is 20 per second]"""
+    """Force over mass and velocity; free vibrations fade at half of it [per unit of time; 20 Hz is
+    20 per second]"""
     push: PushSection | None = None
     """How it begins to move"""
     velocity: Annotated[list[Formula], Field(min_length=3, max_length=3)] | None = None
-    """Initial velocity along e1, e2, e3, added: formulas of the undeformed place x, y, z in the length of the shell,
-    over R if that has no unit [the same length per unit of time]"""
+    """Initial velocity along e1, e2, e3, added: formulas of the undeformed place x, y, z in the
+    length of the shell, over R if that has no unit [the same length per unit of time]"""
     until: Literal["duration", "rest", "event", "instability"] = "duration"
-    """At the end of the duration; as soon as the shell rests: then its equilibrium is the last row; at the `event`; or
-    at the first row at which the shell has an unstable direction"""
+    """At the end of the duration; as soon as the shell rests: then its equilibrium is the last row;
+    at the `event`; or at the first row at which the shell has an unstable direction"""
     event: EventSection | None = None
     """What ends the step with `until: event`"""
 
@@ -165,7 +166,8 @@ class TimeSection(Step):
         for where, text in self.with_units():
             if context.time_unit is None or not context.shell.with_units:
                 raise ValueError(
-                    f"{key}.{where}: {text}: a time with a unit needs shell.density, youngs_modulus and lengths"
+                    f"{key}.{where}: {text}: a time with a unit needs shell.density, "
+                    "youngs_modulus and lengths"
                 )
         loads = {each.name: each.load for each in context.steps}
         factors = _factors_of_sections(context)

@@ -21,7 +21,9 @@ from magshell_fenicsx.models.shell.parameters import Condition, HeldComponents
 Array = NDArray[np.float64]
 
 
-def moving_edges(edges: Mapping[str, Set[Hashable]], conditions: Mapping[str, Condition]) -> list[str]:
+def moving_edges(
+    edges: Mapping[str, Set[Hashable]], conditions: Mapping[str, Condition]
+) -> list[str]:
     """Return the names of edges with sides that neither are held nor lie in a plane of symmetry.
 
     Parameters
@@ -167,8 +169,7 @@ def ring_openings(
 def meridian_openings(
     meridian: Meridian, conditions: Mapping[str, Condition], sides: Mapping[str, float]
 ) -> tuple[list[str], tuple[str, ...]]:
-    """Return the ends that are not held, and those of them where a live pressure has no potential.
-    """
+    """Return the ends that are not held, and those where a live pressure has no potential."""
     places = {
         name: meridian.section(np.array([meridian.parameter(name)]))[0] for name in meridian.ends
     }
@@ -179,6 +180,7 @@ def no_potential(names: Sequence[str]) -> str:
     """Return the message about edges without a potential."""
     edges = f"edge{'s' * (len(names) > 1)} {', '.join(names)}"
     return (
-        f"a potential of the pressure, which follows the free {edges}: volume_change and the pressure's part of "
-        "energy are those of a straight motion from the undeformed shape; of instabilities, flutter is not looked for"
+        f"a potential of the pressure, which follows the free {edges}: volume_change and the "
+        "pressure's part of energy are those of a straight motion from the undeformed shape; of "
+        "instabilities, flutter is not looked for"
     )

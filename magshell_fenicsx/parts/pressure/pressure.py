@@ -1,5 +1,4 @@
-"""The step `kind: pressure`, a gas under the shell as its conjugate, and the observables of both.
-"""
+"""The step `kind: pressure`, a gas under the shell as its conjugate, and their observables."""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -50,30 +49,32 @@ class PressureSection(PathStep):
     }
     kind: Literal["pressure"]
     control: Literal["volume", "load", "arc"] = "volume"
-    """What is prescribed step by step: ΔV, p, or arc length, which passes every fold. The default is load with a target
-    `pressure`; and arc beside a free edge, where no ΔV is conjugate to p"""
+    """What is prescribed step by step: ΔV, p, or arc length, which passes every fold. The default
+    is load with a target `pressure`; and arc beside a free edge, where no ΔV is conjugate to p"""
     until: Until = "limit"
     pressure: Annotated[float, over_size(PRESSURE)] | None = Field(default=None, ge=-1e6, le=1e6)
     """Target p; with control: load or arc [p_c]"""
     volume_change: Annotated[float, over_size(VOLUME)] | None = Field(default=None, ge=-1e4, le=1e4)
     """Target ΔV; with control: volume or arc [R³]"""
     on: dict[str, Literal["outside", "inside"]] | None = Field(default=None, min_length=1)
-    """Name of one of several shells, or of a patch of a mesh file -> the face that is pressed; by default all from
-    outside. ΔV is then the volume that these sweep"""
+    """Name of one of several shells, or of a patch of a mesh file -> the face that is pressed; by
+    default all from outside. ΔV is then the volume that these sweep"""
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
         if self.on is None:
             return
         if context.solid or not isinstance(context.shell, MeshSurface):
             raise ValueError(
-                f"{step.key}.on: names one of several shells, or a patch of a mesh file: leave it out"
+                f"{step.key}.on: names one of several shells, or a patch of a mesh file: leave it "
+                "out"
             )
         loads = [other.load for other in context.steps]
         if any(
             isinstance(load, PressureSection) and load.on not in (None, self.on) for load in loads
         ):
             raise ValueError(
-                f"{step.key}.on: another step has a pressure elsewhere: there is one, on the same shells"
+                f"{step.key}.on: another step has a pressure elsewhere: there is one, on the same "
+                "shells"
             )
 
     def leaves(
@@ -214,11 +215,13 @@ class EnclosedGas:
         change = self.conjugate / unit
         if first + change <= 0:
             raise CaseError(
-                f"hold.pressure.gas.volume: {first:.4g}: the shell has shrunk by {-change:.4g} R^3 already"
+                f"hold.pressure.gas.volume: {first:.4g}: the shell has shrunk by {-change:.4g} "
+                "R^3 already"
             )
         if pressure >= ambient:
             raise CaseError(
-                f"hold.pressure.gas: the pressure, {pressure:.4g} p_c, is not below the ambient {ambient:.4g} p_c"
+                f"hold.pressure.gas: the pressure, {pressure:.4g} p_c, is not below the ambient "
+                f"{ambient:.4g} p_c"
             )
         content = (ambient - pressure) * (first + change)
 

@@ -34,7 +34,7 @@ def test_nearest_in_cells(parts: int) -> None:
         cells, r, x, (each, each, np.ones(COUNT, dtype=np.int64), each), np.inf
     )
     assert list(pair) == list(each)
-    kinds = at.free.any(axis=1).sum(axis=1)
+    kinds = at.free_directions.any(axis=1).sum(axis=1)
     assert min(np.bincount(kinds)) >= 3  # in corners, on sides, inside
 
     for n in each:
@@ -48,7 +48,7 @@ def test_nearest_in_cells(parts: int) -> None:
             distance, at.X[n], method="SLSQP", constraints=INSIDE, tol=1e-12
         )
         assert at.distance[n] < best.fun + 1e-9
-        for way in at.free[n].T:
+        for way in at.free_directions[n].T:
             assert distance(at.X[n] + 1e-6 * way) == pytest.approx(
                 distance(at.X[n] - 1e-6 * way), abs=1e-12
             )
