@@ -74,7 +74,7 @@ class EnergyFactory:
     thickness
         Factor (1,) of h; None for 1.
     natural
-        The natural shape; None if it is the drawn one.
+        The natural shape; None if it is the undeformed one.
     free_constants
         Constants of the free parameters, by name.
     has_folds

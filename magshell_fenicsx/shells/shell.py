@@ -302,7 +302,7 @@ class ShellModel(ThinModel):
     def _natural_shape(
         self, cells: CellGeometry, free_constants: dict[str, fem.Constant]
     ) -> Shape | None:
-        """Return the natural shape, None if it is the drawn one; its amplitudes are added to the
+        """Return the natural shape, None if it is the undeformed one; its amplitudes are added to the
         constants of free parameters.
         """
         if not self.loads.natural:
@@ -430,7 +430,7 @@ class ShellModel(ThinModel):
         residual = self._point_residual(density_terms)
         residual.begin(energies=True)
         for term in density_terms:
-            # the form of a pressure on a growing shape measures from the drawn placement
+            # the form of a pressure on a growing shape measures from the initial placement
             if not (self.growing and term.amplitude == "pressure"):
                 term.points = residual
         parameters = self._free_parameters(terms, density_terms, residual)
@@ -499,8 +499,8 @@ class ShellModel(ThinModel):
             support_along(self.V, 1, self._mirrored_facets, direction)
             for direction in self.mirror.in_plane_vectors
         ]
-        sites = self._hessians + hessian_integrals(self.r0, self.degree, [edges], self.kernels)
-        fast = FastTangent(self.u, sites, constraints)
+        integrals = self._hessians + hessian_integrals(self.r0, self.degree, [edges], self.kernels)
+        fast = FastTangent(self.u, integrals, constraints)
         terms = [edges if t is self._mirror_term else t for t in self.system.terms]
         terms = [t.antisymmetric() if hasattr(t, "antisymmetric") else t for t in terms]
         system = self.system

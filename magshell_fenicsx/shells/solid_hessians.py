@@ -171,7 +171,7 @@ def body_hessian_integrals(
     """
     V = X.function_space
     nonlinear = [t for t in terms if isinstance(t, SolidTerm) and not t.linear]
-    sites = []
+    integrals = []
     for degree in sorted({t.density.degree for t in nonlinear if t.density.support == "body"}):
         points, w = basix.make_quadrature(basix.CellType.hexahedron, degree)
         cells = np.arange(V.mesh.topology.index_map(3).size_local, dtype=np.int32)
@@ -179,7 +179,7 @@ def body_hessian_integrals(
         of_degree = [
             t for t in nonlinear if t.density.support == "body" and t.density.degree == degree
         ]
-        sites.append(BodyHessianIntegral(X, counted_cells, _rule(V, points, w), of_degree, log))
+        integrals.append(BodyHessianIntegral(X, counted_cells, _rule(V, points, w), of_degree, log))
     for term in nonlinear:
         if term.density.support == "body":
             continue
@@ -189,8 +189,8 @@ def body_hessian_integrals(
             rule = _rule(V, _on_facet(points, facet), w)
             at_facet = cells_at_facets[numbers == facet]
             counted_cells = at_facet if cell_mask is None else at_facet[cell_mask[at_facet]]
-            sites.append(BodyHessianIntegral(X, counted_cells, rule, [term], log, facet))
-    return sites
+            integrals.append(BodyHessianIntegral(X, counted_cells, rule, [term], log, facet))
+    return integrals
 
 
 def _rule(V: fem.FunctionSpace, points: Array, weights: Array) -> EntityRule:

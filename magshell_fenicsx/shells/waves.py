@@ -62,7 +62,7 @@ class Waves:
     V
         Space of the waves' coefficients (U + V, V, W); see `domains.wave_jets`.
     largest
-        Waves that are looked at by default: m = 1 to this. The perfect sphere buckles in waves of
+        Largest m that is examined by default, from 1 on. The perfect sphere buckles in waves of
         length 2 pi sqrt(Rh)/(12(1 - nu^2))^(1/4), of which 1.73 (nu = 0.5) to 1.86 (nu = 0) times
         sqrt(R/h) fit around the equator; a wider circle has more, and so has a surface of smaller
         radii of curvature.
@@ -240,7 +240,7 @@ class Waves:
 
         On a range of m the matrix is a mean of its five Bernstein coefficients with
         weights that are not negative: if these are positive definite, it is so for every m of the
-        piece. Else the piece is halved, for the next states too, until its waves are as few as
+        range. Else the range is halved, for the next states too, until its waves are as few as
         coefficients.
         """
         once, twice = self._bands
@@ -308,7 +308,7 @@ class Waves:
 
 
 def largest_wave_number(meridian: Meridian, length: float) -> int:
-    """Return the largest m that is looked at, see `Waves.largest`."""
+    """Return the largest m that is examined, see `Waves.largest`."""
     return ceil(2.2 * meridian.reach * sqrt(meridian.curvature / length)) + 5
 
 
@@ -377,7 +377,7 @@ class WaveFamily:
 
 @dataclass(frozen=True)
 class SymmetryBreakingWaves:
-    """All waves around the axis that are looked at."""
+    """All waves around the axis that are examined."""
 
     waves: Waves
 

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 MIN_RELATIVE_WEIGHT = 1e-10  # weights below it, relative to the largest, are left out
-FIRST_NEIGHBOURS = 32  # points that are looked at first
+FIRST_NEIGHBOURS = 32  # points that are searched first
 
 
 @dataclass(frozen=True)

@@ -175,7 +175,7 @@ class HessianIntegral:
 
 
 class Kernel:
-    """The point Hessian of one term on a site."""
+    """Kernel of the point Hessian of one term of an integral."""
 
     def __init__(
         self,

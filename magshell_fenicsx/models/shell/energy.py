@@ -179,7 +179,7 @@ class HessianTerm:
 
     @cached_property
     def tangent_form(self) -> fem.Form:
-        """Takes long to compile, and is compiled when it is first asked for."""
+        """Form of the tangent; it takes long to compile, which is done at the first use."""
         V = self._v.function_space
         gradient = ufl.derivative(self._energy, self._v, ufl.TestFunction(V))
         hessian = ufl.derivative(gradient, self._v, ufl.TrialFunction(V))

@@ -68,27 +68,27 @@ class FastTangent:
     ----------
     u
         The displacement that the terms were written with.
-    sites
+    integrals
         Integrals of the terms; they may have other terms too.
     constraints
         Constraints of components of u; those along other directions are the system's.
     moving
-        Local cells with nodes that move, and the terms' sites on these cells and their edges alone.
+        Local cells with nodes that move, and the integrals of the terms on these cells and their edges alone.
     """
 
     def __init__(
         self,
         u: fem.Function,
-        sites: Sequence[ElementIntegral],
+        integrals: Sequence[ElementIntegral],
         constraints: Sequence[Constraint],
         moving: tuple[NDArray[np.bool_], Sequence[ElementIntegral]] | None = None,
     ) -> None:
         V, clamped = u.function_space, [c for c in constraints if isinstance(c, fem.DirichletBC)]
-        self._u, self._sites, self._nodes = u, sites, V.dofmap.list
+        self._u, self._integrals, self._nodes = u, integrals, V.dofmap.list
         self._moving = moving[0] if moving else None
-        self._moving_sites = moving[1] if moving else ()
+        self._moving_integrals = moving[1] if moving else ()
         self._matrix = BlockMatrix(
-            V, [batch.cells for site in sites for batch in site.coupling], clamped
+            V, [batch.cells for integral in integrals for batch in integral.coupling], clamped
         )
         cells, functions = V.dofmap.list.shape
         self._element_matrices = np.empty((cells, 9, functions * (functions + 1) // 2))
@@ -105,11 +105,13 @@ class FastTangent:
         self._element_matrices[:] = 0
         self._matrix.clear()
         first = 0
-        for site in self._sites:
-            if stress and isinstance(site, HessianIntegral):
-                site.replace_strain(self._u.x.array, stress, self._moving)
-            site.add(self._u.x.array, factors, self._element_matrices, partial(self._couple, first))
-            first += len(site.coupling)
+        for integral in self._integrals:
+            if stress and isinstance(integral, HessianIntegral):
+                integral.replace_strain(self._u.x.array, stress, self._moving)
+            integral.add(
+                self._u.x.array, factors, self._element_matrices, partial(self._couple, first)
+            )
+            first += len(integral.coupling)
         self._matrix.add_cells(self._element_matrices)
         return self._matrix.assemble()
 
@@ -119,13 +121,13 @@ class FastTangent:
         """
         product, x = np.zeros((len(v) // 3, 3)), v.reshape(-1, 3)
         element_matrices = np.zeros(self._element_matrices.shape)
-        for site in self._moving_sites:
+        for integral in self._moving_integrals:
 
-            def couple(batch: int, K: Array, site: ElementIntegral = site) -> None:
-                first, second = (self._nodes[cells] for cells in site.coupling[batch].cells)
+            def couple(batch: int, K: Array, integral: ElementIntegral = integral) -> None:
+                first, second = (self._nodes[cells] for cells in integral.coupling[batch].cells)
                 add_coupling_products(product, K, first, second, x)
 
-            site.add(self._u.x.array, factors, element_matrices, couple)
+            integral.add(self._u.x.array, factors, element_matrices, couple)
         add_cell_products(
             product, element_matrices[self._moving], self._nodes[self._moving], x
         )  # others have no node that moves
@@ -152,13 +154,13 @@ def hessian_integrals(
     nonlinear = [t for t in terms if isinstance(t, ShellTerm | HessianTerm) and not t.linear]
     cells = [t for t in nonlinear if t.density.facets is None and t.density.sides == 1]
     interior = [t for t in nonlinear if t.density.sides == 2]
-    sites = []
+    integrals = []
     for rule in dict.fromkeys(t.density.quadrature for t in cells):
         of_rule = [t for t in cells if t.density.quadrature == rule]
         batches = cell_batches(V, rule or cell_quadrature(degree), cell_mask)
-        sites.append(HessianIntegral(r0, batches, 1, of_rule, log, None if rule else prestress))
+        integrals.append(HessianIntegral(r0, batches, 1, of_rule, log, None if rule else prestress))
     if interior:
-        sites.append(
+        integrals.append(
             HessianIntegral(
                 r0, interior_batches(V, edge_quadrature(degree), cell_mask), 2, interior, log
             )
@@ -166,5 +168,5 @@ def hessian_integrals(
     for term in nonlinear:
         if term.density.facets is not None:
             batches = boundary_batches(V, edge_quadrature(degree), term.density.facets, cell_mask)
-            sites.append(HessianIntegral(r0, batches, 1, [term], log))
-    return sites
+            integrals.append(HessianIntegral(r0, batches, 1, [term], log))
+    return integrals

@@ -52,7 +52,7 @@ class PointGradient:
     """Some terms' densities at points, and dW/du of their sum, or the virtual work's derivative in
     v.
 
-    Kernels are compiled when they are first asked for, on all ranks.
+    Kernels are compiled at their first use, on all ranks.
 
     Parameters
     ----------

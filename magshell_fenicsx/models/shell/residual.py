@@ -95,15 +95,15 @@ class FastResidual:
         def kind(term: PointTerm) -> tuple[int | None, str | None, str]:
             return term.density.quadrature, term.amplitude, term.name if one_by_one else ""
 
-        sites: list[_ResidualPart] = []
+        parts: list[_ResidualPart] = []
         for kind_of_terms in dict.fromkeys(map(kind, on_cells)):
             terms_of_kind = [term for term in on_cells if kind(term) == kind_of_terms]
-            sites.append(
+            parts.append(
                 _CellTerms(r0, kind_of_terms[0] or cell_quadrature(degree), terms_of_kind, log)
             )
         if on_edges:
-            sites.append(_EdgeTerms(r0, edge_quadrature(degree), on_edges, log))
-        self._sites = sites
+            parts.append(_EdgeTerms(r0, edge_quadrature(degree), on_edges, log))
+        self._parts = parts
         self.names = frozenset(term.name for term in terms)
         self._u, self._nodes = u, u.function_space.dofmap.list
         self._dofs = (3 * self._nodes[:, :, None] + np.arange(3)).ravel()
@@ -112,14 +112,14 @@ class FastResidual:
         """Begin the kernels of the residual, and those of the energies if they will be asked
         for.
         """
-        for site in self._sites:
-            site.begin(energies=energies)
+        for part in self._parts:
+            part.begin(energies=energies)
 
     def energy(self, name: str) -> float:
         """Return the energy of a term on this rank's part, at the present u; collective at
         first.
         """
-        return next(site for site in self._sites if name in site.names).energy(self._nodal(), name)
+        return next(part for part in self._parts if name in part.names).energy(self._nodal(), name)
 
     def add(self, b: Array, factors: Mapping[str, float]) -> None:
         """Add the residual to the local vector (ghosts included), at the present u; collective at
@@ -127,8 +127,8 @@ class FastResidual:
         """
         nodal = self._nodal()
         elements = np.zeros_like(nodal)
-        for site in self._sites:
-            site.add(nodal, factors, elements)
+        for part in self._parts:
+            part.add(nodal, factors, elements)
         b += np.bincount(self._dofs, elements.ravel(), len(b))
 
     def _nodal(self) -> Array:

@@ -1,4 +1,4 @@
-"""Membrane strains, changes of curvature and bending moments at points, in NumPy, to be looked at.
+"""Membrane strains, changes of curvature and bending moments at points, in NumPy, for output.
 
 The tensors are those of the energy (`kinematics`, `law`), on the undeformed surface: E_ij = (a_ij -
 a0_ij)/2, K_ij = b_ij - b0_ij and M_ij, what the energy gives for a change of K. The normal is

@@ -12,7 +12,7 @@ import scipy.sparse
 from along import difference
 
 import magshell_fenicsx as ms
-from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
+from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem, SystemVariables
 from magshell_fenicsx.assembly.terms import FormTerm
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.continuation.system import State, dot
@@ -233,8 +233,9 @@ def test_fast_tangent_and_residual() -> None:
     fast = ms.Scene(case).model.system
     pattern = next(t for t in fast.terms if t.name == "interior edges")
     assert isinstance(pattern, FormTerm)
+    variables = SystemVariables(fast.parameters)
     forms = FiniteElementSystem(
-        fast.u, fast.terms, fast.clamped, pattern, 1.0, fast._assembler, parameters=fast.parameters
+        fast.u, fast.terms, fast.clamped, pattern, 1.0, fast._assembler, variables=variables
     )
     u = fast.zero_at_supports(1e-3 * np.random.default_rng(0).standard_normal(fast.size))
     assert difference(fast, u, BOTH) <= 1e-11

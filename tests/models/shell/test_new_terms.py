@@ -172,7 +172,7 @@ def test_a_fold_takes_no_energy_from_rigid_motion_and_resists_opening(angle: flo
 def test_small_folds_are_smooth_edges() -> None:
     """Where cells meet smoothly the two forms of the jump agree to the square of its angle."""
     model = ShellModel(panel(0.25), MATERIAL, 3, {}, Loads())
-    made = (replace(model.factory, folded=folded) for folded in (False, True))
+    made = (replace(model.factory, has_folds=folded) for folded in (False, True))
     model.u.x.array[:] = random_displacement(model, 1e-5)
     smooth, folded = (factory.term(factory.interior_edges()).energy() for factory in made)
     assert folded == pytest.approx(smooth, rel=1e-3)
