@@ -64,7 +64,9 @@ def mass_factor(model: Model) -> Expr | None:
 
 
 def displacement_product(model: Model, factor: Expr | float) -> ufl.Form:
-    """Return the weighted integral of u . v over the undeformed mid-surface of the modelled part."""
+    """Return the weighted integral of u . v over the undeformed mid-surface of the modelled
+    part.
+    """
     product = factor * ufl.dot(ufl.TrialFunction(model.V), ufl.TestFunction(model.V))
     return _integral(model, model.domain.revolution_factor * product if model.thin else product)
 

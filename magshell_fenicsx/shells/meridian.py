@@ -230,8 +230,8 @@ class MeridianModel(ThinModel):
         )
 
     def _natural_shape(self, free_constants: dict[str, fem.Constant]) -> Shape | None:
-        """Return the natural shape, None if it is the undeformed one; its amplitudes are added to the
-        constants of free parameters.
+        """Return the natural shape, None if it is the undeformed one; its amplitudes are added
+        to the constants of free parameters.
         """
         if not self.loads.natural:
             return None

@@ -145,8 +145,8 @@ class ShellModes:
         """Return the `count` lowest natural modes, ascending, and all that are unstable;
         eigenvalues are omega^2 rho R^2/E.
 
-        The mass is consistent, without rotary inertia, and that of the undeformed shell. On the meridian
-        vibrations around the axis are among them. Otherwise as `lowest`.
+        The mass is consistent, without rotary inertia, and that of the undeformed shell. On the
+        meridian vibrations around the axis are among them. Otherwise as `lowest`.
 
         Raises
         ------

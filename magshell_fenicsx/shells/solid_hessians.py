@@ -72,11 +72,11 @@ class BodyHessianIntegral:
         parts = [cells[i : i + size] for i in range(0, len(cells), size)]
         self._batches = [EntityBatch((part,), rule, np.empty((len(part), 0))) for part in parts]
         self._points = PointStorage(max([1, *(batch.size for batch in self._batches)]))
-        place = terms[0].density.support
+        region = terms[0].density.region
         self._geometry = [
-            _geometry(self._jets(batch, X.x.array), place, facet) for batch in self._batches
+            _geometry(self._jets(batch, X.x.array), region, facet) for batch in self._batches
         ]
-        self._g, self._u = self._points.field(SIZES[place]), self._points.field(3 * JET_PARTS)
+        self._g, self._u = self._points.field(SIZES[region]), self._points.field(3 * JET_PARTS)
         self._hessians = {}
         self._pairs: dict[str, BlockPairs] = {}
         self._varying: dict[str, list[tuple[fem.Function, Memo[list[Array]]]]] = {}
@@ -144,7 +144,7 @@ class BodyHessianIntegral:
             return ufl.dot(ufl.diff(W, z), v) / 2 if density.work else W
 
         parameters = [vector(v, 0), *at_points] if density.work else at_points
-        if density.support == "outer":
+        if density.region == "outer":
             return hessian_density(
                 function(*(vector(f, 3 * part) for f in (g, z) for part in range(3)), *parameters)
             )
@@ -152,7 +152,7 @@ class BodyHessianIntegral:
             [[z[3 * part + c] for part in range(1, JET_PARTS)] for c in range(3)]
         )
         inverse = ufl.as_matrix([[g[INVERSE + 3 * i + j] for j in range(3)] for i in range(3)])
-        frame = [vector(g, NORMAL), vector(g, TANGENT)] if density.support == "end" else []
+        frame = [vector(g, NORMAL), vector(g, TANGENT)] if density.region == "end" else []
         W = function(
             vector(g, 0), vector(z, 0), ufl.dot(by_reference, inverse), *frame, *parameters
         )
@@ -172,16 +172,16 @@ def body_hessian_integrals(
     V = X.function_space
     nonlinear = [t for t in terms if isinstance(t, SolidTerm) and not t.linear]
     integrals = []
-    for degree in sorted({t.density.degree for t in nonlinear if t.density.support == "body"}):
+    for degree in sorted({t.density.degree for t in nonlinear if t.density.region == "body"}):
         points, w = basix.make_quadrature(basix.CellType.hexahedron, degree)
         cells = np.arange(V.mesh.topology.index_map(3).size_local, dtype=np.int32)
         counted_cells = cells if cell_mask is None else cells[cell_mask[cells]]
         of_degree = [
-            t for t in nonlinear if t.density.support == "body" and t.density.degree == degree
+            t for t in nonlinear if t.density.region == "body" and t.density.degree == degree
         ]
         integrals.append(BodyHessianIntegral(X, counted_cells, _rule(V, points, w), of_degree, log))
     for term in nonlinear:
-        if term.density.support == "body":
+        if term.density.region == "body":
             continue
         cells_at_facets, numbers = _cells_at(body, term.density.facets)
         points, w = term.density.rule
@@ -221,13 +221,13 @@ def _cells_at(
     return np.asarray(cells[owned], dtype=np.int32), numbers[owned]
 
 
-def _geometry(jets: Array, place: str, facet: int | None) -> Array:
-    """Return the geometry (points, SIZES[place]) from the placement's jets; dX/dxi and n and t by
+def _geometry(jets: Array, region: str, facet: int | None) -> Array:
+    """Return the geometry (points, SIZES[region]) from the placement's jets; dX/dxi and n and t by
     rows.
     """
     flat = jets.reshape(-1, JET_PARTS, 3)
-    if place == "outer":
-        return flat.reshape(-1, SIZES[place])
+    if region == "outer":
+        return flat.reshape(-1, SIZES[region])
     G = flat[:, 1:].transpose(0, 2, 1)  # columns are the derivatives
     inverse, size = np.linalg.inv(G), np.linalg.det(G)
     if facet is None:

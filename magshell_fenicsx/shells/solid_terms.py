@@ -72,7 +72,7 @@ class SolidDensity:
     parameters: tuple[fem.Constant | fem.Function, ...]
     parts: tuple[int, ...] = GRADIENT
     degree: int = QUADRATURE_DEGREE
-    support: Literal["body", "outer", "end"] = "body"
+    region: Literal["body", "outer", "end"] = "body"
     facets: Facets = field(default_factory=lambda: np.empty(0, dtype=np.int32))
     upper: bool = False
     work: Callable[..., Expr] | None = None
@@ -392,7 +392,7 @@ class TermFactory:
 
         parameters = constants_of(term, self.u.function_space.mesh, self.free_constants)
         return SolidDensity(
-            on_face, parameters, ON_FACE, support="outer", facets=self.body.faces[OUTER_FACE]
+            on_face, parameters, ON_FACE, region="outer", facets=self.body.faces[OUTER_FACE]
         )
 
     def volume_change(self, origin: Array | None) -> ufl.Form:
@@ -409,7 +409,7 @@ class TermFactory:
         weight.x.array[:] = body.at_nodes(Q, 6 * body.heights * (1 - body.heights) / body.thickness)
         parameters = (weight, *self._constants(intensity), reference_turn)
         density = SolidDensity(
-            body_densities.turning, parameters, support="end", facets=self.body.faces[edge]
+            body_densities.turning, parameters, region="end", facets=self.body.faces[edge]
         )
         term = EndMoment(name, density, self._on_faces([density]), self.u, self.log, amplitude)
         length = self.log.compile(
@@ -499,7 +499,7 @@ class TermFactory:
             function = density.function if v is None else density.work
             assert function
             parameters = density.parameters if v is None else (v, *density.parameters)
-            if density.support == "outer":
+            if density.region == "outer":
                 area = ufl.cross(J[:, 0], J[:, 1])
                 arguments = X, J[:, 0], J[:, 1], u, ufl.dot(H, J[:, 0]), ufl.dot(H, J[:, 1])
                 forms.append(

@@ -243,21 +243,27 @@ class Waves:
         range. Else the range is halved, for the next states too, until its waves are as few as
         coefficients.
         """
-        once, twice = self._bands
-        first, rest = once.bands([self._weights[1] @ values]), twice.bands(values)
-        definite = cache(lambda m: twice.is_positive_definite(rest, self._weights[m]))
-        indefinite = set[int]() if once.is_positive_definite(first, np.ones(1)) else {1}
+        bands_of_one, bands_of_others = self._bands
+        matrix_of_one = bands_of_one.bands([self._weights[1] @ values])
+        matrices_of_others = bands_of_others.bands(values)
+
+        def is_definite(weights: NDArray[np.float64]) -> bool:
+            return bands_of_others.is_positive_definite(matrices_of_others, weights)
+
+        is_definite_wave = cache(lambda m: is_definite(self._weights[m]))
+        indefinite = set[int]()
+        if not bands_of_one.is_positive_definite(matrix_of_one, np.ones(1)):
+            indefinite.add(1)
         open_ranges, self._ranges = [*self._ranges], []  # of others of the same terms too
         while open_ranges:
             wave_range = open_ranges.pop()
-            ends = definite(wave_range.first) and definite(wave_range.last)
+            first, last = wave_range.first, wave_range.last
             if wave_range.short:
-                indefinite |= {
-                    m for m in range(wave_range.first, wave_range.last + 1) if not definite(m)
-                }
+                indefinite |= {m for m in range(first, last + 1) if not is_definite_wave(m)}
             elif not (
-                ends
-                and all(twice.is_positive_definite(rest, weights) for weights in wave_range.inner)
+                is_definite_wave(first)
+                and is_definite_wave(last)
+                and all(is_definite(weights) for weights in wave_range.inner)
             ):
                 open_ranges += wave_range.halves(self._nodes)
                 continue

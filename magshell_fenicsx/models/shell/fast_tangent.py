@@ -73,7 +73,8 @@ class FastTangent:
     constraints
         Constraints of components of u; those along other directions are the system's.
     moving
-        Local cells with nodes that move, and the integrals of the terms on these cells and their edges alone.
+        Local cells with nodes that move, and the integrals of the terms on these cells and their
+        edges alone.
     """
 
     def __init__(

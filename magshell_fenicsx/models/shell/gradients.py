@@ -49,26 +49,26 @@ class PointTerm(Protocol):
 
 
 class PointGradient:
-    """Some terms' densities at points, and dW/du of their sum, or the virtual work's derivative in
-    v.
+    """Densities of some terms at points, and the gradient dW/du of their sum.
 
-    Kernels are compiled at their first use, on all ranks.
+    Of a virtual work the derivative by v takes the place of dW/du. Kernels are compiled at their
+    first use, on all ranks.
 
     Parameters
     ----------
     terms
-        All on cells, or all on edges with as many sides.
+        Terms that are all on cells, or all on edges with as many sides.
     parts
         Parts of the jets that the points have.
     points_per_entity, count
-        Points of an entity, and of all; a chunk has whole entities.
+        Number of points of an entity, and of all points; a chunk has whole entities.
     r0
-        (points, sides * parts * 3) in the cells' own coordinates.
+        Jets (points, sides * parts * 3) of the placement, in the cells' own coordinates.
     geometry
         (points, 4): `cell_frames`; on edges (points, 6 sides + 1): the frame of each side, the
         covectors of the edge in the sides' own coordinates (see `kinematics.conormal`), the width.
     values
-        Gives (points, 3) of a field that a density depends on.
+        Function that gives the values (points, components) of a field that a density depends on.
     """
 
     def __init__(
@@ -86,12 +86,12 @@ class PointGradient:
         chunk = max(CHUNK_POINTS // points_per_entity, 1) * points_per_entity
         self._chunks = [slice(first, min(first + chunk, count)) for first in range(0, count, chunk)]
         points = self._points = PointStorage(max(min(count, chunk), 1))
-        self._u, placement, place = (
+        self._u, placement, point_geometry = (
             points.field(size) for size in (self._size, self._size, geometry.shape[1])
         )
         self._inputs = [
             _KernelInput(placement, r0),
-            _KernelInput(place, Memo(lambda: geometry, tuple)),
+            _KernelInput(point_geometry, Memo(lambda: geometry, tuple)),
         ]
         self._names, self._log = [term.name for term in terms], log
         self._W, self._work, self._v = list[Expr](), list[Expr](), points.field(self._size)
@@ -100,10 +100,18 @@ class PointGradient:
             self._inputs += [
                 _KernelInput(target, _field_values(field, values)) for target, field in varying
             ]
-            self._W.append(_energy(term.density, [placement, self._u], place, parts, parameters))
+            self._W.append(
+                _energy(term.density, [placement, self._u], point_geometry, parts, parameters)
+            )
             if term.density.work:
                 self._work.append(
-                    _energy(term.density, [placement, self._u, self._v], place, parts, parameters)
+                    _energy(
+                        term.density,
+                        [placement, self._u, self._v],
+                        point_geometry,
+                        parts,
+                        parameters,
+                    )
                 )
         self._conservative = [
             W for W, term in zip(self._W, terms, strict=True) if not term.density.work
@@ -144,8 +152,9 @@ class PointGradient:
         return np.asarray(self._u.x.array[: count * self._size].reshape(count, self._size))
 
     def evaluate(self, chunk: slice, kernel: PointKernel) -> Array:
-        """`gradient` by what was filled in, in the same order, or `energy`; the array is reused by
-        the next call.
+        """Return a kernel's values at the points of a chunk, from what was filled in.
+
+        They are in the order of `input_array`; the next call reuses the array.
         """
         for kernel_input in self._inputs:
             kernel_input.fill(chunk)
@@ -161,9 +170,9 @@ class _KernelInput:
     field
         Field of the values at the points of a chunk.
     values
-        At all points.
+        Values at all points.
     filled
-        The chunk whose values the room has, and their version.
+        Chunk whose values the field has, and their version; None before the first.
     """
 
     field: fem.Function
@@ -171,7 +180,7 @@ class _KernelInput:
     filled: tuple[slice, int] | None = None
 
     def fill(self, chunk: slice) -> None:
-        """Have the latest values of a chunk in the room."""
+        """Fill the latest values of a chunk into the field."""
         if self.filled != (chunk, self.values.version):
             fill(self.field, self.values.latest[chunk])
             self.filled = chunk, self.values.version
@@ -199,15 +208,16 @@ def in_own_coordinates(jet: Jet, frame: Sequence[Expr | Array]) -> Jet:
 def _energy(
     density: Density,
     fields: Sequence[fem.Function],
-    place: fem.Function,
+    point_geometry: fem.Function,
     parts: Sequence[str],
     parameters: Sequence[fem.Constant | fem.Function],
 ) -> Expr:
-    """Per area of the reference cell, or per parameter (from 0 to 1) of the edge; of r0, u and
-    perhaps v.
+    """Return a density per area of the reference cell, or per parameter (from 0 to 1) of the edge.
+
+    `fields` are those of r0, u and perhaps v.
     """
     sides = range(density.sides)
-    frames = [[place[FRAME_SIZE * side + i] for i in range(FRAME_SIZE)] for side in sides]
+    frames = [[point_geometry[FRAME_SIZE * side + i] for i in range(FRAME_SIZE)] for side in sides]
     r0_jets = [_jet(fields[0], side, parts) for side in sides]
     others = [
         [in_own_coordinates(_jet(f, side, parts), frames[side]) for side in sides]
@@ -216,8 +226,13 @@ def _energy(
     if not density.on_edges:
         return frames[0][-1] * density.value_at([r0_jets, *others], None, parameters)
     first = FRAME_SIZE * density.sides
-    m = [ufl.as_vector([place[first + 2 * side], place[first + 2 * side + 1]]) for side in sides]
-    return density.value_at([r0_jets, *others], (m, place[first + 2 * density.sides]), parameters)
+    m = [
+        ufl.as_vector([point_geometry[first + 2 * side], point_geometry[first + 2 * side + 1]])
+        for side in sides
+    ]
+    return density.value_at(
+        [r0_jets, *others], (m, point_geometry[first + 2 * density.sides]), parameters
+    )
 
 
 def _jet(field: fem.Function, side: int, parts: Sequence[str]) -> Jet:

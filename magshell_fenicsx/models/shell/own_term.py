@@ -492,7 +492,9 @@ class OwnTerm:
         return True
 
     def _value(self, sample: Sample, density: Callable[..., Expr]) -> float:
-        """Return a density's value at a sample; nan where it has none, as a root of less than zero."""
+        """Return a density's value at a sample; nan where it has none, as a root of less than
+        zero.
+        """
         r0, u, m = sample
         try:
             lowered = ufl.algorithms.apply_algebra_lowering.apply_algebra_lowering

@@ -18,4 +18,4 @@ def test_a_rank_without_parts() -> None:
         formulas, none, lambda parts: (np.zeros((0, len(lattice.places), 3)), np.zeros(0)), lattice
     )
     assert seen.values.shape == (0, len(lattice.places), 2)
-    assert seen.between.shape == (0,)
+    assert seen.hidden.shape == (0,)
