@@ -21,7 +21,7 @@ from magshell_fenicsx.continuation.fold import (
     times_tangent,
 )
 from magshell_fenicsx.continuation.newton import BorderedNewton
-from magshell_fenicsx.continuation.system import Amplitudes, State, System, Vector, dot, max_abs
+from magshell_fenicsx.continuation.system import State, System, Vector, dot, max_abs
 
 Kind = Literal["fold", "bifurcation"]
 # a smaller part of v . R_mu that changes along v is zero by symmetry where bifurcations meet
@@ -152,7 +152,7 @@ class DifferenceSystem:
 
     weight: float
     system: System
-    mu: Amplitudes
+    mu: dict[str, float]
     is_same_p: bool
 
 

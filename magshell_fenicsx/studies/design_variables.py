@@ -231,7 +231,7 @@ def _fields(case: Case, design: DesignSection) -> tuple[ControlPointField, ...]:
             )
         start: Array
         if name == "thickness":  # that of several shells is 1 but for their patches
-            start = (problem.thickness or Thickness()).at(places)[:, None]
+            start = (problem.thickness or Thickness()).values_at(places)[:, None]
         elif name == "curvature":
             start = _curvatures(problem, places)
         else:

@@ -309,7 +309,7 @@ def _axisymmetry_of_formulas(
     remanence = magnetic.remanent.components if magnetic.remanent else None
     applied = magnetic.applied.components if magnetic.applied.beside else None
     is_axisymmetric = dict[str, bool]()
-    if remanence:
+    if remanence and not isinstance(remanence, UserField):
         is_axisymmetric["the formula of the remanence"] = bool(
             meridian and vector_is_axisymmetric(remanence, meridian)
         )
@@ -344,7 +344,7 @@ def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
     """The field that a step drives; else the remanence alone, where a reduced model shows it as it
     is.
     """
-    magnetic, turn, patch_rims = context.section_of(MagneticSection), modelled.turn, modelled.within
+    magnetic, turn, patch_rims = context.section_of(MagneticSection), modelled.turn, modelled.patch_rims
     assert magnetic
     driven_amplitudes = {name for step in context.steps for name in (step.name, *step.load.drives)}
     observed: dict[str, Any] = {
