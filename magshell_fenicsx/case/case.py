@@ -267,7 +267,7 @@ class Case(WithParts):
         sections["imperfections"] = self.imperfections
         is_programme, is_solid = isinstance(self.loading, list), self.model == "solid"
         without_steps = Context(
-            self.shell, self.points, sections, whole=is_programme, solid=is_solid
+            self.shell, self.points, sections, is_programme=is_programme, solid=is_solid
         )
         return replace(without_steps, steps=programme(self.loading, without_steps))
 

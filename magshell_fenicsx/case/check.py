@@ -80,7 +80,7 @@ def _refuse_unsupported(problem: Problem) -> None:
     unsupported = all(
         condition in ("free", "symmetry") for condition in problem.conditions.values()
     )
-    springs_may_hold = bool(problem.loads.own)  # a run asks its tangent
+    springs_may_hold = bool(problem.loads.user_terms)  # a run asks its tangent
     if unsupported and not (problem.at_rest or problem.moves_freely or springs_may_hold):
         raise CaseError(
             "boundary: nothing is held: clamp an edge or a patch, or hold points, for instance"
@@ -151,9 +151,9 @@ def _edges_without_potential(problem: Problem, patch: PatchMesh | None) -> tuple
     span = problem.meridian
     if span is None:
         return open_edges(
-            patch or problem.triangulated(), problem.conditions, problem.loads.pressed
+            patch or problem.triangulated(), problem.conditions, problem.loads.pressed_sides
         )
-    return ring_openings(span.ends(), problem.conditions, problem.loads.pressed)[1]
+    return ring_openings(span.ends(), problem.conditions, problem.loads.pressed_sides)[1]
 
 
 def _surface_lines(patch: PatchMesh) -> list[str]:

@@ -128,7 +128,7 @@ def make_problem(
     modelled = _modelled(case, shell, part, mesh, points)
     loads = replace(
         _loads(case, modelled),
-        own=tuple(term.turned(part.turn) for term in energies),
+        user_terms=tuple(term.turned(part.turn) for term in energies),
         contacts=mesh.bodies,
     )
     problem = _problem(case, shell, part, mesh, modelled, loads, constraints)
@@ -152,7 +152,7 @@ def _modelled(
         plane=part.plane,
         axisymmetric=part.axisymmetric,
         vertices=points.of_steps,
-        within={
+        patch_rims={
             name: in_frame(imperfections[key].inside, turn) for name, key in case.dimples.items()
         },
         deviations={
@@ -211,7 +211,7 @@ def _problem(
         left_out=left_out,
         thickness=_thickness(case, part.turn),
         length=case.shell.reference,
-        within=modelled.within,
+        within=modelled.patch_rims,
         supports=supports,
         reactions=bool(loads.moves) if case.reactions is None else case.reactions,
         body_contacts=tuple((region.size, region.reach) for region in mesh.contact_regions),

@@ -57,7 +57,7 @@ class Context:
         Key of the case -> its section.
     steps
         The programme.
-    whole
+    is_programme
         Whether the programme is a list of the case file, so that no step comes before it.
     solid
         Whether the body is modelled in three dimensions.
@@ -67,7 +67,7 @@ class Context:
     points: Mapping[str, list[float]]
     sections: Mapping[str, Any]
     steps: "Sequence[ProgrammeStep]" = field(default=())
-    whole: bool = True
+    is_programme: bool = True
     solid: bool = False
 
     def section_of(self, kind: type[Kind]) -> Kind | None:
@@ -85,7 +85,7 @@ class Context:
 
     @property
     def missing_offers(self) -> "dict[Offer, str]":
-        """What abilities may need and the case has not -> what to do about that."""
+        """The offers that abilities may need and the case has not -> what to do about that."""
         missing = dict[Offer, str]()
         for ability in self.abilities:
             missing |= ability.withdraws(self)
@@ -145,8 +145,8 @@ class Context:
             With the key and the points that there are.
         """
         if name is not None and name not in self.points:
-            named = ", ".join(self.points) or "none"
-            raise ValueError(f"{key}: {name}: name it in points, with its place; there are {named}")
+            names = ", ".join(self.points) or "none"
+            raise ValueError(f"{key}: {name}: name it in points, with its place; there are {names}")
 
     def on_shell(self, key: str, polar: float) -> None:
         """Check that a direction from the centre of a sphere is a degree from its edge at least.
@@ -158,9 +158,9 @@ class Context:
         """
         edge = self.shell.edge_polar
         if edge is not None and not 0 <= polar < edge - 1:
-            least = getattr(self.shell, "hole", None) or 0
+            smallest_polar = getattr(self.shell, "hole", None) or 0
             raise ValueError(
-                f"{key}.at.polar: {polar:g} is not on the shell: allowed {least:g} to {edge - 1:g}"
+                f"{key}.at.polar: {polar:g} is not on the shell: allowed {smallest_polar:g} to {edge - 1:g}"
             )
 
     @property
@@ -206,7 +206,7 @@ class Modelled:
         Key of each imperfection below `shell` -> its deviation, in the model's frame.
     vertices
         Amplitude of a load at one place -> name of the vertex there.
-    within
+    patch_rims
         Name of the patch of each dimple -> whether places (n, 3) are within its rim.
     """
 
@@ -216,7 +216,7 @@ class Modelled:
     plane: Mirror | None
     axisymmetric: bool
     vertices: Mapping[str, str]
-    within: "Mapping[str, InsideRim]"
+    patch_rims: "Mapping[str, InsideRim]"
     deviations: "Mapping[str, Deviation]"
 
 
@@ -226,7 +226,7 @@ class Formulas:
 
     Attributes
     ----------
-    least, most
+    minimum, maximum
         Allowed values.
     length
         R in the unit of the places.
@@ -239,8 +239,8 @@ class Formulas:
 
     key: str
     values: Sequence[float | str]
-    least: float
-    most: float
+    minimum: float
+    maximum: float
     length: float
     load: bool = False
     deformed: bool = False
@@ -304,12 +304,12 @@ class Ability:
         """Return what other abilities may need and a case with this one has not -> what to do."""
         return {}
 
-    def in_time(self, context: Context, driven: Collection[str]) -> InTime | None:
+    def in_time(self, context: Context, driven_amplitudes: Collection[str]) -> InTime | None:
         """Return its load that may be a function of time; None without.
 
         Parameters
         ----------
-        driven
+        driven_amplitudes
             The amplitudes that steps before have driven.
         """
         return None
@@ -358,17 +358,17 @@ class KeyAbility(Ability, Generic[Kind]):
 
     Attributes
     ----------
-    given
+    sections
         The value of the key.
     """
 
     key: ClassVar[str]
-    given: Kind
+    sections: Kind
 
     @classmethod
     def from_context(cls, context: Context) -> Self | None:
-        given = context.sections.get(cls.key)
-        return cls(given) if given else None
+        sections = context.sections.get(cls.key)
+        return cls(sections) if sections else None
 
 
 class Part(Section, Ability):

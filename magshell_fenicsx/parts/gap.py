@@ -1,4 +1,4 @@
-"""What touches the faces of a shell: the penalty of a penetration, and the thickness of the shell.
+"""The penalty of a penetration into the face of a shell, and the thickness of the shell.
 
 A shell that keeps its volume gets thinner as its surface stretches. A natural shape is what has
 grown without stress, and its volume stays. Penetrations and thicknesses are over R, stiffnesses

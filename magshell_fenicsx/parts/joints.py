@@ -102,7 +102,7 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
             raise ValueError("joints: join edges of several shells: give shells")
         context.needs("joints", "a mid-surface", "a material without viscosity")
         joined_edges = set[str]()
-        for i, section in enumerate(self.given):
+        for i, section in enumerate(self.sections):
             if section.stiffness:
                 context.has_modulus(f"joints.{i}.stiffness")
                 _refuse_too_stiff(i, section, context)
@@ -129,7 +129,7 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
 
     def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
         """Return the planes that cross each joint: its edges are their own mirror images."""
-        names = [name for section in self.given for name in section.edges]
+        names = [name for section in self.sections for name in section.edges]
         return [
             SymmetryConstraint(
                 mirrors=lambda mirror: all(mirror.image_of_edge(n) == n for n in names)
@@ -137,7 +137,7 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
         ]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
-        scales = context.scales if any(section.stiffness for section in self.given) else None
+        scales = context.scales if any(section.stiffness for section in self.sections) else None
         joints = tuple(
             Joint(
                 (section.edges[0], section.edges[1]),
@@ -145,7 +145,7 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
                 (section.stiffness or 0.0) / (scales.E * scales.h * scales.R) if scales else 0.0,
                 None if section.angle is None else radians(section.angle),
             )
-            for section in self.given
+            for section in self.sections
         )
         return {"joints": joints}
 

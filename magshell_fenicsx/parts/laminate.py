@@ -107,7 +107,7 @@ class LaminateSection(Section):
     """From the inner face outwards"""
 
     @model_validator(mode="after")
-    def _whole(self) -> Self:
+    def _fractions_add_up(self) -> Self:
         if abs(sum(ply.fraction for ply in self.plies) - 1) > 1e-6:
             raise ValueError("plies: their fractions must add up to 1")
         if len(frozenset[bool]().union(*(ply._with_units for ply in self.plies))) > 1:

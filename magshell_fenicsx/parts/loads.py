@@ -34,14 +34,14 @@ class Loads:
 
     Attributes
     ----------
-    pressed
+    pressed_sides
         Patches that a live pressure acts on: 1 from outside, -1 from inside; empty: on all from
         outside.
     forces, dead
         Amplitude -> the force, or the dead loads that grow together.
-    own
+    user_terms
         User-defined energies.
-    growing
+    growing_imperfections
         Amplitude -> imperfections that grow.
     remanence
         The magnetisation where no field is applied: it loads nothing, and is drawn.
@@ -58,15 +58,15 @@ class Loads:
     """
 
     pressure: bool = False
-    pressed: Mapping[str, float] = field(default_factory=dict)
+    pressed_sides: Mapping[str, float] = field(default_factory=dict)
     forces: Mapping[str, Force] = field(default_factory=dict)
     magnetic: "Magnetisation | None" = None
     dead: Mapping[str, tuple[DeadLoad, ...]] = field(default_factory=dict)
-    own: tuple[OwnTerm, ...] = ()
+    user_terms: tuple[OwnTerm, ...] = ()
     natural: "Natural | None" = None
     moves: tuple[Move, ...] = ()
     contacts: "tuple[ContactBody, ...]" = ()
-    growing: Mapping[str, tuple[Deviation, ...]] = field(default_factory=dict)
+    growing_imperfections: Mapping[str, tuple[Deviation, ...]] = field(default_factory=dict)
     remanence: "Magnetisation | None" = None
     sensors: "tuple[Sensor, ...]" = ()
     field_maps: "tuple[FieldMap, ...]" = ()

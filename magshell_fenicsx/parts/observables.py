@@ -119,8 +119,10 @@ class MapGrid:
     @property
     def places(self) -> Array:
         """The places (n, 3) of its points, over R."""
-        along = np.meshgrid(*(np.linspace(0.0, 1.0, n) for n in self.points[::-1]), indexing="ij")
-        shares = np.stack([each.ravel() for each in along[::-1]], axis=-1)
+        coordinates = np.meshgrid(
+            *(np.linspace(0.0, 1.0, n) for n in self.points[::-1]), indexing="ij"
+        )
+        shares = np.stack([coordinate.ravel() for coordinate in coordinates[::-1]], axis=-1)
         return np.asarray(self.corner + shares @ self.sides)
 
 
@@ -138,11 +140,11 @@ class Observables:
     """
 
     quantities: ClassVar[tuple[Quantity, ...]] = ()
-    varied: ClassVar[tuple[Amplitude, ...]] = ()
+    curve_amplitudes: ClassVar[tuple[Amplitude, ...]] = ()
     before_points: ClassVar[bool] = False
 
     def __init_subclass__(cls) -> None:
-        register_for_all_cases(cls.quantities, cls.varied)
+        register_for_all_cases(cls.quantities, cls.curve_amplitudes)
 
     def amplitudes(self, loads: "Loads") -> Sequence[str]:
         """Return the amplitudes that are its columns."""

@@ -73,7 +73,7 @@ class PathStep(Step):
         if not isinstance(data, dict) or "control" in data or default != cls.conjugate_control:
             return data
         quantities = {
-            each.quantity for key, each in cls.targets.items() if data.get(key) is not None
+            target.quantity for key, target in cls.targets.items() if data.get(key) is not None
         }
         control = "arc" if data.get("until") == "limit" else "load"  # load control passes no fold
         return {**data, "control": control} if quantities == {"load"} else data

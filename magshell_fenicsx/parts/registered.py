@@ -91,7 +91,9 @@ ACCOUNTS = (  # modules here with a function `account`, in the order of `magshel
 
 @dataclass(frozen=True)
 class Origin:
-    """Where the keys of a case were written, and what; equal cases may come from different files.
+    """The places where the keys of a case were written, and its data.
+
+    Equal cases may come from different files.
 
     Attributes
     ----------
@@ -119,7 +121,7 @@ class WithOwnTerms(Section):
 
     @property
     def origin(self) -> Origin:
-        """Where and how the case was written."""
+        """The places where the case was written, and its data."""
         return self._origin
 
     @property
@@ -133,13 +135,13 @@ class WithOwnTerms(Section):
 
         A name after the key, as that of a patch, is looked for below it.
         """
-        about = re.match(r"([a-z]\w*(?:\.\w+)*): (?:([\w.]+): )?", message)
+        match = re.match(r"([a-z]\w*(?:\.\w+)*): (?:([\w.]+): )?", message)
         if (
-            not (about and self._origin.place)
-            or about[1].split(".")[0] not in type(self).model_fields
+            not (match and self._origin.place)
+            or match[1].split(".")[0] not in type(self).model_fields
         ):
             return message
-        keys = [*about[1].split("."), *([about[2]] if about[2] else [])]
+        keys = [*match[1].split("."), *([match[2]] if match[2] else [])]
         path = tuple(int(key) if key.isdecimal() else key for key in keys)
         return f"{self._origin.place(path)}: {message}"
 
@@ -167,7 +169,9 @@ def step_class(name: str) -> type[Step]:
     """Return the class of the steps with a kind, or an amplitude, of this name."""
     if name in STEPS:
         return STEPS[name]
-    return next(each for each in STEPS.values() if getattr(each, "amplitude", None) == name)
+    return next(
+        step_kind for step_kind in STEPS.values() if getattr(step_kind, "amplitude", None) == name
+    )
 
 
 def parts_of(context: Context) -> dict[str, Part]:

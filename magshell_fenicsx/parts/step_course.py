@@ -108,9 +108,7 @@ class SnapSection(Section):
 
 
 class Target(NamedTuple):
-    """What the value of a key prescribes, the amplitude or its conjugate, and its column of
-    path.csv.
-    """
+    """A quantity that the value of a key prescribes, with its column of path.csv."""
 
     quantity: Prescribed
     column: str
@@ -303,7 +301,7 @@ class ExpectedEnd:
 
 @dataclass(frozen=True)
 class SizingContext:
-    """What element sizes depend on.
+    """The numbers on which element sizes depend.
 
     Attributes
     ----------

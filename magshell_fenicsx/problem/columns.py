@@ -41,7 +41,7 @@ def own_amplitudes(loads: Loads) -> dict[str, float]:
     They are those of parts, of the user's energies, and of their parameters.
     """
     of_parts = {name: 0.0 for registered in OBSERVABLES for name in registered.free_amplitudes(loads)}
-    terms = [term for term in loads.own if term.density]
+    terms = [term for term in loads.user_terms if term.density]
     return (
         of_parts
         | {term.name: term.value for term in terms}
@@ -53,7 +53,7 @@ def extra_columns(problem: Problem) -> tuple[str, ...]:
     """Return the columns of a row besides those of every run; the case's units come last."""
     loads = problem.loads
     of_points = [f"{point}_u{axis}" for point in problem.context.points for axis in "xyz"]
-    observed = [column for term in loads.own for column in term.observed]
+    observed = [column for term in loads.user_terms for column in term.observed]
     reported = problem.supports if problem.reactions else ()
     before_points, after_points = list[str](), list[str]()
     for registered in OBSERVABLES:

@@ -127,11 +127,11 @@ def refuse_unfit_formulas(formulas: Sequence[PlacedFormulas], x: Array) -> None:
     """
     for key_formulas in formulas:
         spec, values = key_formulas.spec, key_formulas.values_at(x)
-        out_of_bounds = ~((values >= spec.least) & (values <= spec.most))
+        out_of_bounds = ~((values >= spec.minimum) & (values <= spec.maximum))
         if out_of_bounds.any():
             row, i = np.argwhere(out_of_bounds)[0]
             place = ", ".join(f"{c:.3g}" for c in x[row])
-            bounds = f"{spec.least:.4g} to {spec.most:.4g}"
+            bounds = f"{spec.minimum:.4g} to {spec.maximum:.4g}"
             raise CaseError(
                 f"{spec.key}: {shown_value(key_formulas.texts[i])}: is {values[row, i]:.4g} "
                 f"at (x, y, z)/R = ({place}): allowed {bounds}"

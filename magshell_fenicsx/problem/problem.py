@@ -247,7 +247,7 @@ class Problem:
     @property
     def listed(self) -> bool:
         """Whether the programme is a list of steps, and no single load."""
-        return self.context.whole
+        return self.context.is_programme
 
     @property
     def time_unit(self) -> float | None:

@@ -191,8 +191,8 @@ class MeridianModel(ThinModel):
     def _in_cells(self, loads: Loads) -> Loads:
         """Return the loads with functions and numbers of cells in place of formulas and patches."""
         formula_to_field = partial(formula_field, self.r0)
-        own = tuple(term.with_functions(formula_to_field) for term in loads.own)
-        loads = replace(loads, own=own)
+        own = tuple(term.with_functions(formula_to_field) for term in loads.user_terms)
+        loads = replace(loads, user_terms=own)
         patches, cell_count = self.meridian.patches, len(self.meridian.order)
         for name in ("magnetic", "remanence"):
             if magnetisation := getattr(loads, name):
@@ -203,14 +203,14 @@ class MeridianModel(ThinModel):
         """Return the placement with amplitudes of imperfections; None if none of them grows."""
         shapes = {
             name: self.meridian.growth(self.V, deviations)
-            for name, deviations in self.loads.growing.items()
+            for name, deviations in self.loads.growing_imperfections.items()
         }
         return PlacementAmplitudes(self.r0, shapes, self.material.h) if shapes else None
 
     def _make_factory(self) -> EnergyFactory:
         """Return what makes the energies of this shell."""
         meridian, loads = self.meridian, self.loads
-        pressed_cells = side_field(loads.pressed, meridian) if loads.pressed else None
+        pressed_cells = side_field(loads.pressed_sides, meridian) if loads.pressed_sides else None
         free_constants: dict[str, fem.Constant] = {}
         natural_shape = self._natural_shape(free_constants)
         initial_placement = self.growing and self.growing.initial_placement
@@ -266,7 +266,7 @@ class MeridianModel(ThinModel):
         if loads.magnetic:
             self.energies += factory.magnetic(loads.magnetic)
         free_ends, self.without_potential = meridian_openings(
-            meridian, self.conditions, loads.pressed
+            meridian, self.conditions, loads.pressed_sides
         )
         if loads.pressure:
             self.energies.append(factory.pressure(potential=not self.without_potential))
@@ -471,7 +471,7 @@ class MeridianModel(ThinModel):
                 last=(side > 0) != self.meridian.begins(name),
             )
             for name, s in ends.items()
-            if (side := side_of(name, self.loads.pressed))
+            if (side := side_of(name, self.loads.pressed_sides))
             and (motions := motions_of(self.loads, name))
         ]
         return EdgePressure(PRESSURE, self.material.classical_pressure / self.material.h, lids)

@@ -244,9 +244,9 @@ class ShellModel(ThinModel):
                 loads = replace(loads, **{name: replace(magnetisation, remanent=vectors)})
         formula_to_field = partial(formula_field, self.r0)
         own = (
-            term.with_functions(formula_to_field, self.midsurface.function) for term in loads.own
+            term.with_functions(formula_to_field, self.midsurface.function) for term in loads.user_terms
         )
-        return replace(loads, own=tuple(own))
+        return replace(loads, user_terms=tuple(own))
 
     def _put_edges_in_planes(self) -> None:
         """Move the nodes of edges with the condition "plane" into their planes."""
@@ -260,7 +260,7 @@ class ShellModel(ThinModel):
         """Return the placement with amplitudes of imperfections; None if none of them grows."""
         shapes = {
             name: self.midsurface.growth(self.V, deviations)
-            for name, deviations in self.loads.growing.items()
+            for name, deviations in self.loads.growing_imperfections.items()
         }
         return PlacementAmplitudes(self.r0, shapes, self.material.h) if shapes else None
 
@@ -294,7 +294,7 @@ class ShellModel(ThinModel):
             natural_shape,
             free_constants,
             is_folded,
-            pressed=side_field(loads.pressed, midsurface) if loads.pressed else None,
+            pressed=side_field(loads.pressed_sides, midsurface) if loads.pressed_sides else None,
             creases=creases,
             cell_materials=self.cell_materials,
         )

@@ -116,8 +116,8 @@ class SolidModel(ModelBase):
         self.V = quadratic_space(body.mesh)
         self.u, self.r0 = fem.Function(self.V, name="u"), fem.Function(self.V, name="r0")
         self.r0.interpolate(lambda x: x)
-        own = tuple(term.with_functions(self._formula_field) for term in loads.own)
-        self.loads = replace(loads, own=own)
+        own = tuple(term.with_functions(self._formula_field) for term in loads.user_terms)
+        self.loads = replace(loads, user_terms=own)
         self.factory = factory = self._make_factory()
         self._pattern, *areal_distortion = factory.distortions()
         self._held, planes, self.supports = supports(body, self.r0, conditions)
@@ -129,7 +129,7 @@ class SolidModel(ModelBase):
         is_enclosed = enclosed(self.loads, free_ends, self.without_potential)
         self._terms: list[Term] = [self._pattern, *areal_distortion, factory.compression()]
         self._terms += self._field_and_pressure_terms()
-        self._terms += [factory.user_term(term) for term in self.loads.own if term.density]
+        self._terms += [factory.user_term(term) for term in self.loads.user_terms if term.density]
         self.observed = self._observed_forms()
         self._terms += self._force_terms()
         self._faces = [
@@ -191,7 +191,7 @@ class SolidModel(ModelBase):
     def _observed_forms(self) -> dict[str, fem.Form]:
         """Return the forms that the user's terms observe, and those of an induced magnetisation."""
         factory, kernels = self.factory, self.kernels
-        observed = kernels.compile_all(factory.observed(term) for term in self.loads.own)
+        observed = kernels.compile_all(factory.observed(term) for term in self.loads.user_terms)
         if self.loads.magnetic:
             observed |= kernels.compile_all([factory.induced(self.loads.magnetic)])
         return observed

@@ -292,7 +292,7 @@ def energies_moving_the_shell(scene: Scene, state: State) -> dict[str, float]:
     One is a surface tension.
     """
     system, energies = scene.model.system, dict[str, float]()
-    for term in scene.problem.loads.own:
+    for term in scene.problem.loads.user_terms:
         load = system.load(state.u, state.mu, term.name) if term.value else 0.0 * state.u
         if max_abs(scene.comm, load) == 0:
             continue

@@ -408,7 +408,7 @@ class Scene:
     def _observe_own_terms(self, state: State) -> dict[str, float]:
         """Return the integrals that user-defined energies observe."""
         model, columns = self.model, dict[str, float]()
-        for term in self.problem.loads.own:
+        for term in self.problem.loads.user_terms:
             factor = state.mu[term.name] if term.density else 1.0
             for column in term.observed:
                 integral = model.system.at_state(state).integral(model.observed[column])

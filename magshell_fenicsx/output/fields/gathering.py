@@ -89,7 +89,7 @@ class RevolvedGatherer:
         self._at_ends = Stresses(r, model.material, thickness_at_ends).frame
         if isinstance(model.meridian.embedding, DeviatedEmbedding):
             s, embedding = model.meridian.cells.ravel(), model.meridian.embedding
-            deviations = (*embedding.deviations, *deviations_at(loads.growing, mu))
+            deviations = (*embedding.deviations, *deviations_at(loads.growing_imperfections, mu))
             imperfect = replace(embedding, deviations=deviations)
             w0 = imperfect.w0(np.column_stack([s, 0 * s])) / model.material.h
             self._fields.constant[W0] = np.asarray(w0.reshape(-1, 2))

@@ -171,7 +171,7 @@ class SurfaceGatherer:
             self._split_nodes(numbers, r[0], r_at_samples[0])
         self._averaging_matrix = self._weighted_mean()
         deviation = model.midsurface.deviation(
-            self._reference_nodes, deviations_at(loads.growing, mu)
+            self._reference_nodes, deviations_at(loads.growing_imperfections, mu)
         )
         if deviation is not None:
             self._fields.constant[W0] = np.asarray(

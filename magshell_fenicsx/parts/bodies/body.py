@@ -35,11 +35,11 @@ class Distance(ABC):
     @property
     @abstractmethod
     def lines(self) -> list[Array]:
-        """Its outline: places (n, 3) along lines."""
+        """The outline of the body: places (n, 3) along lines."""
 
     @property
     def solid(self) -> Solid | None:
-        """Its faces; None of a body without."""
+        """The faces of the body; None without."""
         return None
 
     @property
@@ -187,7 +187,7 @@ class RigidBodies(KeyAbility[Mapping[str, BodySection]]):
 
     def refuse_unfit(self, context: Context) -> None:
         """Refuse names and places, and bodies beside a solid."""
-        for name, body in self.given.items():
+        for name, body in self.sections.items():
             context.on_shell(f"bodies.{name}", 0.0 if body.at.point else body.at.polar)
             if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,39}", name):
                 raise ValueError(
@@ -215,13 +215,13 @@ def rounded(q: Array, edge: float) -> tuple[Array, Array, Array]:
     """
     outside_part = np.maximum(q, 0.0)
     distance = np.linalg.norm(outside_part, axis=1)
-    outside = distance > 0
+    is_outside = distance > 0
     nearest = np.eye(q.shape[1])[q.argmax(axis=1)]
-    n = np.where(outside[:, None], outside_part / np.maximum(distance, 1e-300)[:, None], nearest)
+    n = np.where(is_outside[:, None], outside_part / np.maximum(distance, 1e-300)[:, None], nearest)
     active = (outside_part > 0)[:, :, None] * np.eye(q.shape[1])
     H = (active - n[:, :, None] * n[:, None, :]) / np.maximum(distance, 1e-300)[:, None, None]
     return (
-        np.where(outside, distance, q.max(axis=1)) - edge,
+        np.where(is_outside, distance, q.max(axis=1)) - edge,
         n,
-        np.where(outside[:, None, None], H, 0.0),
+        np.where(is_outside[:, None, None], H, 0.0),
     )

@@ -38,7 +38,7 @@ SYMMETRY_TOLERANCE = 1e-10  # of distances and directions of images
 def contact_bodies(
     bodies: Mapping[str, BodySection],
     approaches: Mapping[str, str],
-    driven: Collection[str],
+    driven_amplitudes: Collection[str],
     ground: ReferenceShell,
 ) -> tuple[ContactBody, ...]:
     """Return the bodies of a case as a model has them.
@@ -47,7 +47,7 @@ def contact_bodies(
     ----------
     approaches
         Body -> name of its approach, the amplitude.
-    driven
+    driven_amplitudes
         The amplitudes that steps drive.
 
     Raises
@@ -55,17 +55,17 @@ def contact_bodies(
     CaseError
         If a body penetrates the undeformed shell, or one that moves overlaps another.
     """
-    made = [_contact(name, body, approaches[name], ground) for name, body in bodies.items()]
-    for i, body in enumerate(made):
-        for other in made[i + 1 :]:
-            if not {body.amplitude, other.amplitude} & {*driven}:
+    contacts = [_contact(name, body, approaches[name], ground) for name, body in bodies.items()]
+    for i, body in enumerate(contacts):
+        for other in contacts[i + 1 :]:
+            if not {body.amplitude, other.amplitude} & {*driven_amplitudes}:
                 continue
             if (depth := overlap(body, other)) > 0:
                 raise CaseError(
                     f"bodies.{other.body}.position: overlaps bodies.{body.body} by {depth:.3g} R "
                     "at approach 0; bodies that move must be apart"
                 )
-    return tuple(made)
+    return tuple(contacts)
 
 
 def _contact(name: str, section: BodySection, approach: str, ground: ReferenceShell) -> ContactBody:
@@ -148,14 +148,14 @@ class ContactZone:
         """Return small elements that show the ring of a contact, and a small body."""
         x, y = map(float, self.place)
         ring_width, size = sqrt(sizing.h), self.size
-        small = (
+        small_body = (
             [DiscFeature((x, y), 1.5 * size, max(size / 3, 0.1 * sizing.h), 0.4)]
             if size < ring_width
             else []
         )
         return [
             DiscFeature((x, y), self.reach, RING_SIZE * ring_width / sizing.refinement, growth),
-            *small,
+            *small_body,
         ]
 
 

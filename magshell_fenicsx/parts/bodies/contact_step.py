@@ -171,7 +171,9 @@ class BodiesObservables(Observables):
             each=True,
         ),
     )
-    varied = (Amplitude("approach", "approach_over_h", "force", "", sideways=True, each=True),)
+    curve_amplitudes = (
+        Amplitude("approach", "approach_over_h", "force", "", sideways=True, each=True),
+    )
 
     def amplitudes(self, loads: "Loads") -> tuple[str, ...]:
         return tuple(

@@ -44,9 +44,9 @@ class Cylinder(Distance):
     radius: float
 
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
-        across = np.eye(3) - np.outer(self.axis, self.axis)
-        g, n, N = Sphere(np.zeros(3), self.radius)((x - self.centre) @ across)
-        return g, n, across @ N @ across
+        projection = np.eye(3) - np.outer(self.axis, self.axis)
+        g, n, N = Sphere(np.zeros(3), self.radius)((x - self.centre) @ projection)
+        return g, n, projection @ N @ projection
 
     @property
     def lines(self) -> list[Array]:

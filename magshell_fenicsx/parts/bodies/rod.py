@@ -62,15 +62,15 @@ class Rod(Distance):
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
         r, d = x - self.end, self.along
         off = r - (r @ d)[:, None] * d
-        far = np.linalg.norm(off, axis=1)
-        e = off / np.maximum(far, 1e-300)[:, None]
-        q = np.column_stack([far - self.radius + self.edge, r @ d + self.edge])
+        from_axis = np.linalg.norm(off, axis=1)
+        e = off / np.maximum(from_axis, 1e-300)[:, None]
+        q = np.column_stack([from_axis - self.radius + self.edge, r @ d + self.edge])
         g, n, N = rounded(q, self.edge)
         basis = np.stack([e, np.broadcast_to(d, e.shape)], axis=1)  # d(rho, z)/dx
-        around = np.eye(3) - np.outer(d, d) - e[:, :, None] * e[:, None, :]
-        turned = (n[:, 0] / np.maximum(far, 1e-300))[:, None, None] * around
+        circumferential = np.eye(3) - np.outer(d, d) - e[:, :, None] * e[:, None, :]
+        by_rotation = (n[:, 0] / np.maximum(from_axis, 1e-300))[:, None, None] * circumferential
         H = np.einsum("nai,nab,nbj->nij", basis, N, basis) + np.where(
-            far[:, None, None] > 0, turned, 0.0
+            from_axis[:, None, None] > 0, by_rotation, 0.0
         )
         return g, np.einsum("na,nai->ni", n, basis), H
 

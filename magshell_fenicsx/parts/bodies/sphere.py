@@ -38,12 +38,12 @@ class Sphere(Distance):
 
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
         r = x - self.centre
-        far = np.maximum(np.linalg.norm(r, axis=1), 1e-300)
-        n = r / far[:, None]
+        from_centre = np.maximum(np.linalg.norm(r, axis=1), 1e-300)
+        n = r / from_centre[:, None]
         return (
-            far - self.radius,
+            from_centre - self.radius,
             n,
-            (np.eye(3) - n[:, :, None] * n[:, None, :]) / far[:, None, None],
+            (np.eye(3) - n[:, :, None] * n[:, None, :]) / from_centre[:, None, None],
         )
 
     @property

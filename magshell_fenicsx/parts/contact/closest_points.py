@@ -248,9 +248,9 @@ class ClosestPointSearch:
         for reach in (*(part * max_reach for part in FIRST_REACHES), max_reach):
             places = self.projections(u, reach, points, least_only=True)
             own_least = float(places.distance.min(initial=max_reach))
-            least = float(self._comm.allreduce(own_least, MPI.MIN))
-            if least < reach:
-                return least
+            least_distance = float(self._comm.allreduce(own_least, MPI.MIN))
+            if least_distance < reach:
+                return least_distance
         return max_reach
 
     @cached_property

@@ -100,18 +100,18 @@ class ShellContact(KeyAbility[Sequence[GivenPair]]):
     key = "contact"
 
     def refuse_unfit(self, context: Context) -> None:
-        refuse_unfit_pairs(self.given, context)
+        refuse_unfit_pairs(self.sections, context)
 
     def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
         """Return all symmetry, but no meridian if a patch of a shell may touch."""
-        names = {name for pair in self.given for name in names_of(pair)} - {WHOLE_SHELL}
+        names = {name for pair in self.sections for name in names_of(pair)} - {WHOLE_SHELL}
         return [patch_constraint("contact", names, context.shell)]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         assembly = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
         return {
             "pairs": model_pairs(
-                self.given, context.shell.poisson_ratio, assembly.moduli if assembly else {}
+                self.sections, context.shell.poisson_ratio, assembly.moduli if assembly else {}
             )
         }
 

@@ -613,8 +613,8 @@ class MeridianContactState(ContactState):
 
     def weight_slopes(self, tables: Array, places: Array) -> Array:
         tangent = places[1]
-        along = tangent / np.sum(tangent**2, axis=1)[:, None]
-        by_place = tables[1][..., None] * along[:, None]
+        direction = tangent / np.sum(tangent**2, axis=1)[:, None]
+        by_place = tables[1][..., None] * direction[:, None]
         by_place[..., 0] += tables[0] / places[0, :, :1]
         return np.asarray(by_place)
 

@@ -240,8 +240,9 @@ class Projections:
 
     @property
     def firsts(self) -> Longs:
-        """Where each point and direction begins, of places ordered by points, directions,
-        distances.
+        """Numbers of the first place of each point and direction, of places in their order.
+
+        The order is by points, directions and distances.
         """
         return np.flatnonzero(np.diff(MAX_DIRECTIONS * self.point + self.side, prepend=-1))
 
@@ -254,7 +255,7 @@ class Projections:
 
 @dataclass(frozen=True)
 class UndeformedPairs:
-    """Which pairs of points and places are near each other within the undeformed surface.
+    """The pairs of points and places that are near each other within the undeformed surface.
 
     Attributes
     ----------

@@ -225,8 +225,8 @@ class Polygons:
             (cells, 3) whether the side opposite to each corner is on an edge, and whether the edge
             turns in the corner.
         """
-        c, after = self.corners, np.roll(self.corners, -1, axis=1)
-        has_side = np.linalg.norm(c - after, axis=2) > SAME_CORNER_TOLERANCE
+        c, next_corners = self.corners, np.roll(self.corners, -1, axis=1)
+        has_side = np.linalg.norm(c - next_corners, axis=2) > SAME_CORNER_TOLERANCE
         coordinates = np.stack([1 - c.sum(axis=2), c[..., 0], c[..., 1]], axis=2)
         on_side = np.abs(coordinates) < SAME_CORNER_TOLERANCE
         on_open_side = on_side & np.roll(on_side, -1, axis=1) & open_sides[self.cell][:, None]
@@ -238,7 +238,7 @@ class Polygons:
         centre = np.zeros((len(c), 2))
         centre[~is_whole] = centroid(c[~is_whole])
         n, k = np.nonzero(has_side & ~is_whole[:, None])
-        sides = c[n, k] - centre[n], after[n, k] - centre[n]
+        sides = c[n, k] - centre[n], next_corners[n, k] - centre[n]
         fans = Triangles(self.cell[n], self.faces[n], centre[n], *sides, ends[n, k])
         single = self.select(is_whole)._single_triangles(has_side[is_whole], ends[is_whole])
         arrays = [

@@ -279,7 +279,7 @@ class ContactTerm:
 
     @property
     def history(self) -> dict[str, tuple[StateNumber, float]]:
-        """Its numbers in the history of a state, with defaults; see `FiniteElementSystem`."""
+        """The numbers that a state sets, with defaults; see `FiniteElementSystem`."""
         return {self.pair.setting: (self.stiffness, self.pair.stiffness)}
 
     def add_residual(self, b: Array, factor: float) -> None:

@@ -389,10 +389,10 @@ def _mirrored_formula(
         return False
     values, images = (
         np.stack(
-            [formula_function(v)(*places.T) for v in (each.vector or [each.pressure or 0.0])],
+            [formula_function(v)(*places.T) for v in (one_load.vector or [one_load.pressure or 0.0])],
             axis=-1,
         )
-        for each, places in ((load, x), (other, image))
+        for one_load, places in ((load, x), (other, image))
     )
     return equal_to_rounding(values if load.vector is None else values @ mirror.reflection, images)
 

@@ -48,7 +48,7 @@ class ImperfectionStep(LoadStep):
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
         return {
-            "growing": {
+            "growing_imperfections": {
                 step.name: tuple(modelled.deviations[key] for key in self.multiplies(step, context))
             }
         }
@@ -85,7 +85,7 @@ class GrowingObservables(Observables):
     )
 
     def free_amplitudes(self, loads: "Loads") -> tuple[str, ...]:
-        return tuple(loads.growing)
+        return tuple(loads.growing_imperfections)
 
 
 def grown_by(steps: Iterable[ProgrammeStep], keys: Collection[str]) -> dict[str, list[str]]:

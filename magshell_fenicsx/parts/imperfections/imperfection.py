@@ -312,7 +312,7 @@ class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
                 "defect"
             )
         edge = None if shell.edge_polar is None else radians(shell.edge_polar)
-        for key, section in self.given.items():
+        for key, section in self.sections.items():
             try:
                 section.refuse_unfit(shell.R_over_h, shell.poisson_ratio, edge)
             except ValueError as e:

@@ -139,7 +139,7 @@ class FieldMapping(KeyAbility[Mapping[str, FieldMapSection]]):
     def refuse_unfit(self, context: Context) -> None:
         """Refuse maps where nothing is magnetised, and names that no file can have."""
         refuse_unfit_reading(self.key, context)
-        for name in self.given:
+        for name in self.sections:
             if not (name.isascii() and name.isidentifier() and len(name) <= MAX_NAME_LENGTH):
                 raise ValueError(
                     f"field_maps: {name}: a name is made of at most {MAX_NAME_LENGTH} letters, "
@@ -148,7 +148,7 @@ class FieldMapping(KeyAbility[Mapping[str, FieldMapSection]]):
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:
         """Refuse the total field where the strength of the applied one is unknown."""
-        for name, section in self.given.items():
+        for name, section in self.sections.items():
             refuse_unknown_field(f"field_maps.{name}", section.field, context)
 
     def numbers(self, context: Context) -> list[str]:
@@ -156,7 +156,7 @@ class FieldMapping(KeyAbility[Mapping[str, FieldMapSection]]):
         return [
             f"field map {name}: {' x '.join(map(str, section.points))} places, {section.field} "
             "field"
-            for name, section in self.given.items()
+            for name, section in self.sections.items()
         ]
 
 

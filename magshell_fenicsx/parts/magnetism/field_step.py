@@ -130,7 +130,7 @@ class RotationSection(Step):
                 f"{step.key}.kind: rotation needs a field: magnetic.lambda_m, not zero"
             )
         driven_amplitudes = context.driven_before(step.number)
-        if context.whole and FieldSection.amplitude not in driven_amplitudes:
+        if context.is_programme and FieldSection.amplitude not in driven_amplitudes:
             raise ValueError(
                 f"{step.key}.kind: rotation needs a field: a step of kind: field before it"
             )

@@ -123,7 +123,7 @@ def refuse_unfit_interaction(context: Context) -> None:
             f"magnetic.interaction: {magnetic.interaction}: acts between parts of a mesh file "
             "that are not connected: take geometry: mesh, or interaction: all or none"
         )
-    if context.whole and AMPLITUDE not in {step.name for step in context.steps}:
+    if context.is_programme and AMPLITUDE not in {step.name for step in context.steps}:
         raise CaseError(
             f"magnetic.interaction: {magnetic.interaction}: no step of the programme drives it: "
             "begin loading with a step of kind: interaction, or take interaction: none"

@@ -113,7 +113,7 @@ class Sensing(KeyAbility[Mapping[str, SensorSection]]):
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:
         """Refuse sensors in the undeformed shell."""
-        for name, section in self.given.items():
+        for name, section in self.sections.items():
             if not name.isidentifier():
                 raise CaseError(
                     f"sensors: {name}: a name is made of letters, digits and _, as it begins "

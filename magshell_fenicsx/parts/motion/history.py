@@ -109,38 +109,55 @@ def _tag(data: Any) -> str | None:
     return {"ramp": "ramp", "step": "step", "triangle": "wave", "sine": "wave"}.get(str(kind))
 
 
-def curve(history: History, time: Value, level: Value, here: float) -> Curve:
-    """The value over the time since the begin; `here` is the value before."""
+def curve(history: History, time: Value, level: Value, start: float) -> Curve:
+    """Return the value of a load over the time since the begin of its history.
+
+    Parameters
+    ----------
+    time, level
+        Return a time, and a value of the history, as a number.
+    start
+        The value before.
+    """
     if isinstance(history, str):
-        of = formula(re.sub(r"\bt\b", "x", history))
-        return lambda t, before: float(of(*np.array([t, 0.0, 0.0]).reshape(3, 1))[0])
+        function = formula(re.sub(r"\bt\b", "x", history))
+        return lambda t, before: float(function(*np.array([t, 0.0, 0.0]).reshape(3, 1))[0])
     if isinstance(history, RampHistory):
-        over, to = time(history.over), level(history.to)
-        return lambda t, before: float(here + (to - here) * min(t / over, 1.0))
+        duration, end = time(history.over), level(history.to)
+        return lambda t, before: float(start + (end - start) * min(t / duration, 1.0))
     if isinstance(history, StepHistory):
-        at, to = time(history.at), level(history.to)
-        return lambda t, before: to if t > at or (t == at and not before) else here
+        jump, end = time(history.at), level(history.to)
+        return lambda t, before: end if t > jump or (t == jump and not before) else start
     if isinstance(history, WaveHistory):
-        size, period, mean = level(history.size), time(history.period), level(history.mean)
-        if history.kind == "sine":
-            return lambda t, before: float(mean + size * np.sin(2 * np.pi * t / period))
-        return lambda t, before: float(
-            mean + size * (2 / np.pi) * np.arcsin(np.sin(2 * np.pi * t / period))
-        )
-    times, values = [time(t) for t, _ in history], [level(v) for _, v in history]
+        return _wave(history, time, level)
+    return _interpolation([time(t) for t, _ in history], [level(v) for _, v in history])
+
+
+def _wave(history: WaveHistory, time: Value, level: Value) -> Curve:
+    """Return a sine, or a triangle that has the turning points of the sine."""
+    size, period, mean = level(history.size), time(history.period), level(history.mean)
+    if history.kind == "sine":
+        return lambda t, before: float(mean + size * np.sin(2 * np.pi * t / period))
+    return lambda t, before: float(
+        mean + size * (2 / np.pi) * np.arcsin(np.sin(2 * np.pi * t / period))
+    )
+
+
+def _interpolation(times: Sequence[float], values: Sequence[float]) -> Curve:
+    """Return straight lines between the values of a table, with its jumps."""
 
     def interpolated(t: float, before: bool) -> float:
-        after = int(np.searchsorted(times, t, side="left" if before else "right"))
-        if after in (0, len(times)):
-            return values[min(after, len(values) - 1)]
-        t0, t1 = times[after - 1 : after + 1]
-        return values[after - 1] + (values[after] - values[after - 1]) * (t - t0) / (t1 - t0)
+        row = int(np.searchsorted(times, t, side="left" if before else "right"))
+        if row in (0, len(times)):
+            return values[min(row, len(values) - 1)]
+        t0, t1 = times[row - 1 : row + 1]
+        return values[row - 1] + (values[row] - values[row - 1]) * (t - t0) / (t1 - t0)
 
     return interpolated
 
 
 def marks(history: History, time: Value, end: float) -> list[float]:
-    """Times within (0, end) at which it jumps or has a kink."""
+    """Return the times within (0, end) at which a history jumps or has a kink."""
     times: list[float] = []
     if isinstance(history, RampHistory):
         times = [time(history.over)]
@@ -155,14 +172,14 @@ def marks(history: History, time: Value, end: float) -> list[float]:
 
 
 def times_of(history: History) -> list[float | str]:
-    """All its times."""
+    """Return all times of a history."""
     if isinstance(history, list):
         return [t for t, _ in history]
     return [getattr(history, key) for key in ("over", "at", "period") if hasattr(history, key)]
 
 
 def levels_of(history: History) -> list[float | str]:
-    """All its values."""
+    """Return all values of a history."""
     if isinstance(history, list):
         return [level for _, level in history]
     return [getattr(history, key) for key in ("to", "size", "mean") if hasattr(history, key)]

@@ -122,8 +122,10 @@ class TimeSection(Step):
                 raise ValueError(
                     f"history.{name}: the times of a table must not fall, nor be negative"
                 )
-            jumps, least = getattr(history, "kind", "") == "step", min(times, default=1.0)
-            if not isinstance(history, list) and (least < 0 or (least == 0 and not jumps)):
+            jumps, least_time = getattr(history, "kind", "") == "step", min(times, default=1.0)
+            if not isinstance(history, list) and (
+                least_time < 0 or (least_time == 0 and not jumps)
+            ):
                 raise ValueError(f"history.{name}: times must be positive")
         return self
 
@@ -153,23 +155,23 @@ class TimeSection(Step):
         return self.until in ("duration", "event") and self.push is None and not self.hold
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
-        key, driven = step.key, context.driven_before(step.number)
+        key, driven_amplitudes = step.key, context.driven_before(step.number)
         timed = {
-            each.name: each
+            in_time.name: in_time
             for ability in context.abilities
-            if (each := ability.in_time(context, driven))
+            if (in_time := ability.in_time(context, driven_amplitudes))
         }
         if "field" in self.history and (
             why := timed["field"].refused if "field" in timed else NO_FIELD
         ):
             raise ValueError(f"{key}.history.field: {why}")
-        for where, text in self.with_units():
+        for time_key, text in self.with_units():
             if context.time_unit is None or not context.shell.with_units:
                 raise ValueError(
-                    f"{key}.{where}: {text}: a time with a unit needs shell.density, "
+                    f"{key}.{time_key}: {text}: a time with a unit needs shell.density, "
                     "youngs_modulus and lengths"
                 )
-        loads = {each.name: each.load for each in context.steps}
+        loads = {in_time.name: in_time.load for in_time in context.steps}
         factors = _factors_of_sections(context)
         allowed = {"field", "pressure", *factors, *loads} - {"lambda_m", "angle", "time"}
         for name, history in self.history.items():
@@ -192,11 +194,13 @@ class TimeSection(Step):
     ) -> list[SymmetryConstraint]:
         if not self.velocity:
             return []
-        given, R = vector_function(self.velocity), context.shell.reference
+        initial_velocity, R = vector_function(self.velocity), context.shell.reference
 
         def keeps(mirror: Mirror) -> bool:
             S, x = mirror.reflection, outline.sample()
-            return equal_to_rounding(given(R * x) @ S, given(R * mirror.image(x)))
+            return equal_to_rounding(
+                initial_velocity(R * x) @ S, initial_velocity(R * mirror.image(x))
+            )
 
         turns = outline.meridian and vector_is_axisymmetric(self.velocity, outline.meridian, R)
         return [
@@ -207,11 +211,11 @@ class TimeSection(Step):
 
     def with_units(self) -> Iterator[tuple[str, str]]:
         """Yield key and text of each time with a unit."""
-        given: dict[str, Any] = {"duration": self.duration, "step": self.step, "drag": self.drag}
+        times: dict[str, Any] = {"duration": self.duration, "step": self.step, "drag": self.drag}
         for name, history in self.history.items():
-            given |= {f"history.{name} {i}": t for i, t in enumerate(times_of(history))}
+            times |= {f"history.{name} {i}": t for i, t in enumerate(times_of(history))}
         yield from (
-            (key.split(" ")[0], value) for key, value in given.items() if isinstance(value, str)
+            (key.split(" ")[0], value) for key, value in times.items() if isinstance(value, str)
         )
 
 
@@ -225,7 +229,9 @@ def _factors_of_sections(context: Context) -> set[str]:
 
     steps = [STEPS[kind] for kind in KINDS_BEFORE_LOAD]
     return {
-        each.amplitude for each in steps if issubclass(each, FactorStep) and each.asked_for(context)
+        step_kind.amplitude
+        for step_kind in steps
+        if issubclass(step_kind, FactorStep) and step_kind.asked_for(context)
     }
 
 

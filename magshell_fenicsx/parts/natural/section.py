@@ -185,7 +185,7 @@ class NaturalSection(Section, Ability):
             natural,
         )  # the solver takes long to import
 
-        return {"natural": natural(context, modelled.turn, modelled.within)}
+        return {"natural": natural(context, modelled.turn, modelled.patch_rims)}
 
 
 def components(value: Any) -> list[float | str]:

@@ -87,7 +87,7 @@ class PressureSection(PathStep):
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
         sides = {"outside": 1.0, "inside": -1.0}
-        return {"pressed": {name: sides[face] for name, face in (self.on or {}).items()}}
+        return {"pressed_sides": {name: sides[face] for name, face in (self.on or {}).items()}}
 
     def course(self, step_start: StepStart) -> StepCourse:
         course = super().course(step_start)
@@ -138,7 +138,7 @@ class PressureObservables(Observables):
             patch_of,
         )  # the solver takes long to import
 
-        for name in loads.pressed:
+        for name in loads.pressed_sides:
             patch_of(surface.patches, name, "loading.on")
 
     def conjugate_unit(self, view: ModelView, name: str) -> float | None:
@@ -161,7 +161,7 @@ def account(context: Context, loads: "Loads") -> Account:
     if not loads.pressure:
         return Account(left_out=["pressure: not loaded by it (the volume is only reported)"])
     faces = ", ".join(
-        f"{name} from {'outside' if side > 0 else 'inside'}" for name, side in loads.pressed.items()
+        f"{name} from {'outside' if side > 0 else 'inside'}" for name, side in loads.pressed_sides.items()
     )
     return Account(
         [

@@ -1,1 +1,1 @@
-"""What is held, what moves there, and its reactions."""
+"""Supports: conditions on edges and points, their motions, and their reactions."""

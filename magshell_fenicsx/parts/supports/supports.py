@@ -122,7 +122,7 @@ def refuse_unknown(
             refuse_joined(f"loading.loads: edge: {edge}", edge)
             allowed_names = ", ".join(sorted(edges)) or "none"
             raise MeshError(f"loading.loads: edge: {edge}: the surface has only {allowed_names}")
-    for term in loads.own:
+    for term in loads.user_terms:
         if term.on is not None and term.on not in edges:
             allowed_names, key = (
                 ", ".join(sorted(edges)) or "none",
