@@ -11,6 +11,7 @@ edge, s = t . (n x m) and c = n . m:
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import permutations
 from typing import TYPE_CHECKING, Self
 
 import basix
@@ -618,6 +619,45 @@ def refuse_misplaced_feet(
         surfaces.foot_of(surface.edges[joint.edges[0]], on).refuse_misplaced(
             r0.function_space.mesh.comm, h, key, joint
         )
+    refuse_coinciding_shells(tied, surface, r0, h)
+
+
+def refuse_coinciding_shells(
+    tied: Sequence[tuple[Joint, str, NDArray[np.bool_]]],
+    surface: Midsurface,
+    r0: fem.Function,
+    h: float,
+) -> None:
+    """Refuse two shells that stand on a third one in the same place; collective.
+
+    Parameters
+    ----------
+    tied
+        T-junctions, their keys, and the cells of this rank of the shell that is stood on.
+
+    Raises
+    ------
+    MeshError
+        On every rank, with both edges.
+    """
+    for (joint, key, _), (other_joint, _, _) in permutations(tied, 2):
+        edge, other_edge = joint.edges[0], other_joint.edges[0]
+        shell, other = (_shell_of(name, surface) for name in (edge, other_edge))
+        if shell == other or other is None:
+            continue
+        foot = Surfaces.of(r0).foot_of(surface.edges[edge], surface.patches[other])
+        if min(r0.function_space.mesh.comm.allgather(foot.clearance)) < APART * h:
+            raise MeshError(
+                f"{key}: the shells of the edges {edge} and {other_edge} lie in each other: leave "
+                "one of them out, or move it"
+            )
+
+
+def _shell_of(edge: str, surface: Midsurface) -> str | None:
+    """Return the name of the shell of an edge, which begins with it; None of a mesh file's edge."""
+    return next(
+        (name for name in surface.patches if edge.startswith((f"{name}.", f"{name}_"))), None
+    )
 
 
 def tees(model: "ShellModel") -> list[Tee]:
@@ -626,6 +666,7 @@ def tees(model: "ShellModel") -> list[Tee]:
     tied = _tee_joints(model.loads.joints, surface)
     if not tied:
         return []
+    refuse_coinciding_shells(tied, surface, model.r0, model.material.h)
     edges, factors, log = surface.edges, _factors(model), model.kernels
     return [
         Tee(joint, key, model.r0, model.u, edges[joint.edges[0]], on, factors, model.material, log)
