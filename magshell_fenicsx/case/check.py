@@ -47,6 +47,7 @@ def _described(case: Case, problem: Problem) -> str:
     if unsupported and not (problem.at_rest or problem.moves_freely or springs_may_hold):
         raise CaseError(
             "boundary: nothing is held: clamp an edge or a patch, or hold points, for instance"
+            + problem.support_hint
         )
     numbers = {
         "R/h": 1 / problem.material.h,

@@ -184,7 +184,8 @@ class Scene:
         self.loose = unsure and self.problem.at_rest
         motion = self.model.free_motion(self.unloaded().mu) if unsure and not self.loose else ""
         if motion and not self.problem.moves_freely:
-            raise MeshError(f"mesh: {flat}" if (flat := self.flat_triangle) else motion)
+            flat = self.flat_triangle
+            raise MeshError(f"mesh: {flat}" if flat else motion + self.problem.support_hint)
         self.free_in_time = bool(motion)
         if motion:
             self.warnings.append(NOT_COUNTED)
