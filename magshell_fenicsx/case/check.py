@@ -84,6 +84,7 @@ def _refuse_unsupported(problem: Problem) -> None:
     if unsupported and not (problem.at_rest or problem.moves_freely or springs_may_hold):
         raise CaseError(
             "boundary: nothing is held: clamp an edge or a patch, or hold points, for instance"
+            + problem.support_hint
         )
 
 

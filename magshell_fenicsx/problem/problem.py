@@ -143,6 +143,10 @@ class PendingModes:
     with_modes: "Callable[[tuple[Mode, ...]], Problem]"
 
 
+def _needs_inertia_alone(step: ProgrammeStep) -> bool:
+    return step.load.motion is not None and step.load.motion.needs_inertia_alone
+
+
 @dataclass(frozen=True)
 class Problem:
     """Everything that will be computed, dimensionless (lengths in R).
@@ -300,11 +304,20 @@ class Problem:
 
         Inertia then resists its rigid motions.
         """
-        motions = [step.load.motion for step in self.programme]
-        needs_inertia_alone = all(
-            motion is not None and motion.needs_inertia_alone for motion in motions
+        statics = [step for step in self.programme if not _needs_inertia_alone(step)]
+        return bool(self.programme) and not (statics or self.frequencies or self.stability)
+
+    @property
+    def support_hint(self) -> str:
+        """The step of a load that acts before a motion which needs no support, for a message; empty
+        where there is none.
+        """
+        if self.moves_freely or not any(map(_needs_inertia_alone, self.programme)):
+            return ""
+        return (
+            "; a shell that moves in time alone need not be held: let a field, for instance, act in "
+            "the history of the step of kind: time, and no load before it"
         )
-        return bool(motions) and needs_inertia_alone and not (self.frequencies or self.stability)
 
     @property
     def imperfections(self) -> Mapping[str, ImperfectionSection]:

@@ -11,6 +11,7 @@ the other shell, t along the edge, s = t . (n x m) and c = n . m:
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import permutations
 from typing import TYPE_CHECKING, NamedTuple, Self
 
 import basix
@@ -671,6 +672,39 @@ def refuse_misplaced_edges(
     for joint, key, is_other_shell in tied_edges:
         edge = surfaces.edge_on_shell(surface.edges[joint.edges[0]], is_other_shell)
         edge.refuse_misplaced(comm, h, key, joint)
+    _refuse_coinciding_shells(tied_edges, surface, r0, h)
+
+
+def _refuse_coinciding_shells(
+    tied_edges: Sequence[TiedEdge], surface: Midsurface, r0: fem.Function, h: float
+) -> None:
+    """Refuse two shells that stand on a third one in the same place; collective.
+
+    Raises
+    ------
+    MeshError
+        On every rank, with both edges.
+    """
+    if len(tied_edges) < 2:
+        return
+    surfaces, comm = MidSurfaces.gather(r0), r0.function_space.mesh.comm
+    for (joint, key, _), (other_joint, _, _) in permutations(tied_edges, 2):
+        edge, other_edge = joint.edges[0], other_joint.edges[0]
+        shell, other_shell = (_shell_of_edge(name, surface) for name in (edge, other_edge))
+        if shell == other_shell or other_shell is None:
+            continue
+        place = surfaces.edge_on_shell(surface.edges[edge], surface.patches[other_shell])
+        if min(comm.allgather(place.clearance)) < MAX_DISTANCE_IN_THICKNESSES * h:
+            raise MeshError(
+                f"{key}: the shells of the edges {edge} and {other_edge} lie in each other: leave "
+                "one of them out, or move it"
+            )
+
+
+def _shell_of_edge(edge: str, surface: Midsurface) -> str | None:
+    """Return the name of the shell of an edge, which begins with it; None of a mesh file's edge."""
+    beginnings = {name: (f"{name}.", f"{name}_") for name in surface.patches}
+    return next((name for name, words in beginnings.items() if edge.startswith(words)), None)
 
 
 def t_junction_terms(model: "ShellModel") -> list[SurfaceTJunction]:
@@ -679,6 +713,7 @@ def t_junction_terms(model: "ShellModel") -> list[SurfaceTJunction]:
     tied_edges = _tied_edges(model.loads.joints, surface)
     if not tied_edges:
         return []
+    _refuse_coinciding_shells(tied_edges, surface, model.r0, model.material.h)
     stiffness, material, log = _stiffness_factors(model), model.material, model.kernels
     terms = []
     for tied_edge in tied_edges:

@@ -203,7 +203,8 @@ class Scene:
         if may_be_free and not self.allows_rigid_motion:
             motion = self.model.free_motion(self.unloaded().mu)
         if motion and not self.problem.moves_freely:
-            raise MeshError(f"mesh: {flat}" if (flat := self.flat_triangle) else motion)
+            flat = self.flat_triangle
+            raise MeshError(f"mesh: {flat}" if flat else motion + self.problem.support_hint)
         self.free_in_time = bool(motion)
         if motion:
             self.warnings.append(NOT_COUNTED)

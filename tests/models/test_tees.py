@@ -218,6 +218,25 @@ def test_check_refuses_what_a_run_refuses(data: dict[str, Any], message: str) ->
     assert re.sub("(web|rib)_", r"\1.", str(of_run.value)) in str(of_check.value)
 
 
+def two_webs(distance: float) -> Case:
+    """Two webs that stand on one base, side by side."""
+    data = pushed({})
+    twin = {**data["shells"]["web"], "points": {}}
+    twin["place"] = {"position": [0.5 + distance, 0, 0.3], "axis": {"polar": 90}}
+    joints = [*data["joints"], {"edges": ["twin.right", "base"]}]
+    return Case.from_source(data | {"shells": {**data["shells"], "twin": twin}, "joints": joints})
+
+
+def test_two_webs_in_one_place_are_refused() -> None:
+    """Both would be joined to the base and not to each other: 1.7 times as stiff as one web."""
+    words = "shells of the edges web.right and twin.right lie in each other: leave one"
+    with pytest.raises(CaseError, match=words):
+        describe(two_webs(0.0))
+    with pytest.raises(MeshError, match=words.replace(".right", "_right")):
+        Scene(two_webs(0.0))
+    assert "mesh: " in describe(two_webs(0.1))
+
+
 def test_a_web_that_stands_aslant_is_accepted() -> None:
     """At six degrees, where it takes the same place for ten thicknesses."""
     assert "mesh: " in describe(Case.from_source(placed(ASLANT)))

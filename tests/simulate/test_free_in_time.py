@@ -11,6 +11,7 @@ from scipy.special import ellipe, ellipk
 
 from magshell_fenicsx import Case, Scene
 from magshell_fenicsx.case.check import describe
+from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.runs.rows import columns
 from magshell_fenicsx.simulate.follow import follow
@@ -78,6 +79,16 @@ def test_a_magnetised_plate_is_a_compass_needle() -> None:
 def test_what_needs_a_shell_that_is_held(change: dict[str, Any]) -> None:
     with pytest.raises(MeshError, match="not held"):
         Scene(case_of(loading={**SWING, **change}))
+
+
+def test_a_field_before_the_motion_needs_a_support() -> None:
+    """The message says how the plate may stay free."""
+    still = {"kind": "time", "duration": "0.1 s", "points": 2}
+    hint = "need not be held: let a field, for instance, act in the history"
+    with pytest.raises(CaseError, match=f"nothing is held: .*{hint}"):
+        describe(case_of(loading=still))
+    with pytest.raises(MeshError, match=f"not held: .*{hint}"):
+        Scene(case_of(loading=still))
 
 
 @pytest.mark.slow
