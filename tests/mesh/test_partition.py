@@ -58,7 +58,7 @@ def test_ranks_of_about_the_same_size_with_one_layer_of_ghosts(ranks: int) -> No
     """
     cells, _ = strips(20)
     wanted, offsets = destinations(cells, 2, ranks)
-    of_cell = [list(each) for each in np.split(wanted, offsets[1:-1])]
+    of_cell = [each.tolist() for each in np.split(wanted, offsets[1:-1])]
     owner, on = [each[0] for each in of_cell], [facets(cell) for cell in cells]
     for each, mine in zip(of_cell, on, strict=True):
         beside = {rank for rank, other in zip(owner, on, strict=True) if mine & other}
