@@ -69,7 +69,9 @@ class Device:
             for q in held_conjugates_of_step.values()
         ]
         self._units = np.array([scale[name] / system.length for name in held_conjugates_of_step])
-        self.size = system.size + len(held_conjugates_of_step) * (self.comm.rank == self.comm.size - 1)
+        self.size = system.size + len(held_conjugates_of_step) * (
+            self.comm.rank == self.comm.size - 1
+        )
 
     def for_system(self, system: System) -> "Device":
         """Return the same device on another system."""
@@ -123,7 +125,8 @@ class Device:
             for name, q in zip(self.names, self._conjugates, strict=True)
         ]
         rows = (
-            np.array([self._system.potential(u, mu, name) for name in self.names]) + held_conjugates_of_step
+            np.array([self._system.potential(u, mu, name) for name in self.names])
+            + held_conjugates_of_step
         )
         return np.asarray(rows * self._units)
 

@@ -33,7 +33,7 @@ from magshell_fenicsx.continuation.point import (
     SolverJournal,
     StepOptions,
 )
-from magshell_fenicsx.continuation.snes import GUESS_TOO_FAR
+from magshell_fenicsx.continuation.snes import DIVERGED, GUESS_TOO_FAR
 from magshell_fenicsx.continuation.step_control import (
     MIN_FRACTION_BEFORE_FOLD,
     PREDICTOR_POINTS,
@@ -74,6 +74,9 @@ MAX_ESTIMATE_CORRECTION = 0.01  # in lengths: the single correction of an estima
 # one path
 MAX_DISTANCE_RATIO = 3.0
 ZERO_DISPLACEMENT = 1e-6  # in lengths: smaller displacements count as zero
+# in arc length, to which steps shrink before a first touch: from deeper inside a hard body the
+# correction is led astray
+MIN_STEP_BEFORE_TOUCH = 1e-6
 
 
 class NotANumber(RuntimeError):
@@ -427,7 +430,7 @@ class Path:
                     controller.rejected = None if passes_kinks else result
                     result = self.as_base(result.point) if passes_kinks else result.reason
                 if isinstance(result, str):
-                    controller.reject_step(plan, result, self.options.smallest)
+                    controller.reject_step(plan, result, self._smallest_step(result))
                     continue
                 straight = self._cosine(current, result) > self.options.growth_cosine
                 kink = passes_kinks or self._has_kink(current, result)
@@ -647,6 +650,16 @@ class Path:
         if rejected.point.has_instability_since(current):
             return False
         return not self.are_apart(current, self.relative_to(current, rejected.point))
+
+    def _smallest_step(self, reason: str) -> float:
+        """Return the smallest step after a failure: a shorter one by arc length where a body may
+        be just ahead.
+        """
+        is_astray = reason in (GUESS_TOO_FAR, DIVERGED) and self.newton.options.allows_kinks
+        smallest = self.options.smallest
+        if is_astray and self.control == "arc":
+            return min(smallest, MIN_STEP_BEFORE_TOUCH)
+        return smallest
 
     def are_apart(self, low: Point, high: Point, rounding: float = ZERO_DISPLACEMENT) -> bool:
         """Return whether two points are too far apart for one path with their tangents.

@@ -20,6 +20,7 @@ from dolfinx.cpp.io import perm_gmsh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.partition import partitioner
 from magshell_fenicsx.mesh.patch import (
     DeviatedEmbedding,
     Deviation,
@@ -273,14 +274,18 @@ def distribute(patch: PatchMesh, comm: MPI.Comm) -> Midsurface:
 def create_mesh(
     comm: MPI.Comm, element: Any, cells: NDArray[np.int64], x: NDArray[np.float64]
 ) -> mesh.Mesh:
-    """Return a distributed mesh of cells and nodes (n, 3) that every rank has; collective."""
+    """Return a distributed mesh of cells and nodes (n, 3) that every rank has; collective.
+
+    Of the same cells it has the same numbers on the same ranks.
+    """
+    facet = element.basix_element.entity_closure_dofs[-2][0]
     is_first_rank = comm.rank == 0
     return mesh.create_mesh(
         comm,
         cells=cells if is_first_rank else cells[:0],
         x=x if is_first_rank else x[:0],
         e=element,
-        partitioner=compat.shared_facet_partitioner(),
+        partitioner=partitioner(cells, len(facet), comm.rank, comm.size),
     )
 
 

@@ -11,8 +11,8 @@ import numpy as np
 
 from magshell_fenicsx.input.section import case_sizes
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.ability import Context
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.registered import OBSERVABLES
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.quantity import DISTANCE, TURN, Unit
@@ -40,7 +40,9 @@ def own_amplitudes(loads: Loads) -> dict[str, float]:
 
     They are those of parts, of the user's energies, and of their parameters.
     """
-    of_parts = {name: 0.0 for registered in OBSERVABLES for name in registered.free_amplitudes(loads)}
+    of_parts = {
+        name: 0.0 for registered in OBSERVABLES for name in registered.free_amplitudes(loads)
+    }
     terms = [term for term in loads.user_terms if term.density]
     return (
         of_parts

@@ -14,9 +14,9 @@ from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import Section, or_number
 from magshell_fenicsx.mesh.grading import Feature, Grading, LineFeature, RingFeature
-from magshell_fenicsx.parts.step_course import SizingContext
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.step import Step
+from magshell_fenicsx.parts.step_course import SizingContext
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.shape.shell_sections import MeshSurface
 
@@ -143,9 +143,13 @@ def grading(
         features += part.features(outline, sizing, growth)
     for place, loads in loaded:
         for kind in {type(load): None for load in loads}:
-            features += kind.mesh_features([load for load in loads if type(load) is kind], place, sizing)
+            features += kind.mesh_features(
+                [load for load in loads if type(load) is kind], place, sizing
+            )
     features += varying
-    return Grading(features, min(_largest_size(context, outline, sizing), largest) / mesh.refinement)
+    return Grading(
+        features, min(_largest_size(context, outline, sizing), largest) / mesh.refinement
+    )
 
 
 def _largest_size(context: Context, outline: "Outline", sizing: SizingContext) -> float:

@@ -29,11 +29,11 @@ from magshell_fenicsx.models.shell.parameters import Condition, Material, defaul
 from magshell_fenicsx.models.shell.spatial_fields import InsideRim
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 from magshell_fenicsx.parts.imperfections.modes import Mode
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
-from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.problem.mesh_sizes import MeshSection, SolidSection
 from magshell_fenicsx.problem.requests import (
@@ -73,7 +73,9 @@ def solid_body_of(context: Context) -> SolidBody | None:
     shell, ratio = context.shell, _solid_section(context).bulk_to_shear
     share = shell.rubber or 0.0
     assert isinstance(share, float)  # Ogden's law needs a mid-surface
-    return SolidBody(MooneyRivlin.from_poisson_ratio(shell.poisson_ratio, ratio, share), layer_bounds(context))
+    return SolidBody(
+        MooneyRivlin.from_poisson_ratio(shell.poisson_ratio, ratio, share), layer_bounds(context)
+    )
 
 
 def layer_bounds(context: Context) -> list[float]:

@@ -335,7 +335,9 @@ class RunFiles:
         if scene is not self._scene:
             self._scene, self._gatherer = scene, gatherer(scene.model, self._comm)
         surface, mirror = self._gatherer.gather(state.u, state.mu), scene.problem.mirror
-        grids = [grid for observables in OBSERVABLES for grid in observables.on_grids(scene.view, state)]
+        grids = [
+            grid for observables in OBSERVABLES for grid in observables.on_grids(scene.view, state)
+        ]
 
         def write() -> None:
             assert surface is not None

@@ -70,7 +70,9 @@ class _ModeWriter:
     folder: Path
     say: Say
     _model_modes: dict[int, tuple[ShellModes, Gatherer]] = field(default_factory=dict)
-    _whole_shell_modes: dict[int, tuple[ModeSpace, ShellModes, Gatherer]] = field(default_factory=dict)
+    _whole_shell_modes: dict[int, tuple[ModeSpace, ShellModes, Gatherer]] = field(
+        default_factory=dict
+    )
 
     def _modes_of_whole_shell(self, number: int) -> tuple[ModeSpace, ShellModes, Gatherer]:
         """Return what sees all modes of the shell at a point, its modes, and their gatherer.
@@ -288,7 +290,9 @@ def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
         state = stiffened_equilibrium(scene, state)
         try:
             modes = shell_modes.vibrations(
-                whole_shell.state(state), section.count, allows_rigid_motion=scene.allows_rigid_motion
+                whole_shell.state(state),
+                section.count,
+                allows_rigid_motion=scene.allows_rigid_motion,
             )
             result.frequencies[number] = modes
             if scene.model.contacts:

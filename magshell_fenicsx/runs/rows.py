@@ -67,7 +67,9 @@ class RowMaker:
             self._sums_before, self._step = dict(self._sums), record.step
         since_begin = {name: record.clock.get(name, 0.0) for name in SUMMED_COLUMNS}
         self._sums = {name: self._sums_before[name] + since_begin[name] for name in SUMMED_COLUMNS}
-        stored_energy = (record.scene or self._scene).energy_of_shell(record.point.state, values["energy"])
+        stored_energy = (record.scene or self._scene).energy_of_shell(
+            record.point.state, values["energy"]
+        )
         of_record = {name: record.clock.get(name, 0.0) for name in ("kinetic", "imbalance")}
         return {**self._sums, **of_record, "stored": stored_energy}
 

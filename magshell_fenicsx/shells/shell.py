@@ -244,7 +244,8 @@ class ShellModel(ThinModel):
                 loads = replace(loads, **{name: replace(magnetisation, remanent=vectors)})
         formula_to_field = partial(formula_field, self.r0)
         own = (
-            term.with_functions(formula_to_field, self.midsurface.function) for term in loads.user_terms
+            term.with_functions(formula_to_field, self.midsurface.function)
+            for term in loads.user_terms
         )
         return replace(loads, user_terms=tuple(own))
 

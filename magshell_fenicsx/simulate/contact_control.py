@@ -541,7 +541,9 @@ def stiffened_equilibrium(scene: Scene, state: State) -> State:
     stays.
     """
     for _ in range(MAX_STIFFENINGS):
-        bodies = [contact for contact in touching_bodies(scene, state) if not contact.has_given_stiffness]
+        bodies = [
+            contact for contact in touching_bodies(scene, state) if not contact.has_given_stiffness
+        ]
         harder = with_stiffer_bodies(scene, state, bodies) if bodies else None
         if harder is None:
             break

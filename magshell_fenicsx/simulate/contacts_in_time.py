@@ -72,7 +72,11 @@ class ContactsInTime:
             pair = contact.pair
             k = begin.mu.get(pair.setting, pair.stiffness)
             needed = stiff_for(pair, speed, self._system.length)
-            if needed > k and not pair.has_given_stiffness and evaluation.evaluate(contact.penetration) <= 0:
+            if (
+                needed > k
+                and not pair.has_given_stiffness
+                and evaluation.evaluate(contact.penetration) <= 0
+            ):
                 settings[pair.setting] = needed
         return settings
 

@@ -326,6 +326,9 @@ def expand_shell_contact(scene: Scene, other: Scene, state: State) -> None:
 
     Both scenes have the same mesh.
     """
+    assert np.array_equal(scene.model.V.dofmap.list, other.model.V.dofmap.list), (
+        "contact is given by numbers of cells"
+    )
     evaluation = scene.model.system.at_state(state)
     of_one: Sequence[Any] = scene.model.shell_contacts
     of_other: Sequence[Any] = other.model.shell_contacts

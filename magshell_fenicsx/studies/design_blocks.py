@@ -243,10 +243,14 @@ class ControlPointField(Bounded):
         """The points in the frame of one of several shells, over its own length."""
         control_points = self.controls.places
         x = place.to_shell_frame(
-            np.insert(control_points, 1, 0.0, axis=1) if self.controls.is_axisymmetric else control_points
+            np.insert(control_points, 1, 0.0, axis=1)
+            if self.controls.is_axisymmetric
+            else control_points
         )
         points_of_shell = (
-            np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]]) if self.controls.is_axisymmetric else x
+            np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]])
+            if self.controls.is_axisymmetric
+            else x
         )
         return ControlPoints(points_of_shell, self.controls.width / place.scale), ratio
 

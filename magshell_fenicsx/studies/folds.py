@@ -36,7 +36,10 @@ def has_knockdown(case: Case) -> bool:
         return False
     # where the way ends before a fold, none is to be followed there
     return (
-        by_one_mesh and loading.until == "limit" and not loading.branches and loading.limit_target is None
+        by_one_mesh
+        and loading.until == "limit"
+        and not loading.branches
+        and loading.limit_target is None
     )
 
 

@@ -50,7 +50,9 @@ def sheets(factors: tuple[str | None, str | None], apart: float = h, thick: floa
 
 def gap_of(scene: Scene) -> float:
     return float(
-        scene.model.system.at_state(scene.unloaded()).evaluate(scene.model.shell_contacts[0].least_gap)
+        scene.model.system.at_state(scene.unloaded()).evaluate(
+            scene.model.shell_contacts[0].least_gap
+        )
     )
 
 

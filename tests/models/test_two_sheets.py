@@ -61,7 +61,12 @@ def pressed(
     *_, last = follow(scene)
     (touching,) = scene.model.shell_contacts
     at = scene.model.system.at_state(last.point.state)
-    return scene, scene.observe(last.point.state), at.evaluate(touching.cell_pressures_and_gaps)[0], last
+    return (
+        scene,
+        scene.observe(last.point.state),
+        at.evaluate(touching.cell_pressures_and_gaps)[0],
+        last,
+    )
 
 
 def test_patch_test_of_equal_meshes(tmp_path: Path) -> None:

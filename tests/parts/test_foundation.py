@@ -326,7 +326,9 @@ def test_a_free_disc_on_springs_swings_as_a_rigid_body() -> None:
     R_over_h = DISC["radius_to_thickness"]
     springs = {"stiffness": 1e-4 / R_over_h, "tangential": 3e-4 / R_over_h}  # over E/R
     scene = ms.Scene(load(**FREE_DISC, foundation=springs, frequencies={}, symmetry="axisymmetric"))
-    modes = ShellModes(scene.model).vibrations(scene.unloaded(), 4, allows_rigid_motion=scene.allows_rigid_motion)
+    modes = ShellModes(scene.model).vibrations(
+        scene.unloaded(), 4, allows_rigid_motion=scene.allows_rigid_motion
+    )
     assert sorted(mode.label for mode in modes) == ["", "m = 1", "m = 1", "torsion"]
     expected = {("", 1e-4), ("m = 1", 1e-4), ("m = 1", 3e-4), ("torsion", 3e-4)}
     assert {(mode.label, round(mode.eigenvalue, 7)) for mode in modes} == expected

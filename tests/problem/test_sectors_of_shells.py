@@ -11,8 +11,8 @@ from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError, read_source
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.shells.shell import ShellModel
 from magshell_fenicsx.shells.sector_modes import SectorModes
+from magshell_fenicsx.shells.shell import ShellModel
 
 h = 0.02
 MATERIAL = {"thickness": h, "youngs_modulus": 1, "poisson_ratio": 0.3}
@@ -123,7 +123,10 @@ def test_copies_make_the_half(name: str) -> None:
     ours, theirs = (
         system.at_state(State(v, mu)) for system, v in ((model.system, u), (half.system, copies))
     )
-    forces = ours.evaluate(model.shell_contacts[0].force), theirs.evaluate(half.shell_contacts[0].force)
+    forces = (
+        ours.evaluate(model.shell_contacts[0].force),
+        theirs.evaluate(half.shell_contacts[0].force),
+    )
     assert forces[1] == pytest.approx(waves * forces[0], rel=1e-9)
     assert (forces[0] > 0) == (name == "rings")
 

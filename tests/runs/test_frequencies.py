@@ -127,7 +127,9 @@ def free_square(nu: float, order: int = 12) -> list[float]:
 @pytest.mark.parametrize("symmetry", ["half", "none"])
 def test_a_free_plate_has_six_rigid_motions_before_it_vibrates(symmetry: str) -> None:
     scene = Scene(Case.load(CASES / "free_plate.yaml", [f"symmetry={symmetry}"]))
-    modes = ShellModes(scene.model).vibrations(scene.unloaded(), 11, allows_rigid_motion=scene.allows_rigid_motion)
+    modes = ShellModes(scene.model).vibrations(
+        scene.unloaded(), 11, allows_rigid_motion=scene.allows_rigid_motion
+    )
     D = scene.problem.material.bending_stiffness
     values = [mode.eigenvalue for mode in modes]
     assert values[:6] == [0.0] * 6
@@ -161,7 +163,9 @@ def test_a_free_disc_as_a_meridian() -> None:
     """
     shell = {"geometry": "disc", "radius_to_thickness": 1000, "poisson_ratio": 0.33}
     scene = scene_of(shell, {"rim": "free"}, frequencies={})
-    modes = ShellModes(scene.model).vibrations(scene.unloaded(), 7, allows_rigid_motion=scene.allows_rigid_motion)
+    modes = ShellModes(scene.model).vibrations(
+        scene.unloaded(), 7, allows_rigid_motion=scene.allows_rigid_motion
+    )
     assert [mode.label for mode in modes] == ["", "torsion", "m = 1", "m = 1", "m = 2", "", "m = 3"]
     assert [mode.eigenvalue for mode in modes[:4]] == [0.0] * 4
     exact = [

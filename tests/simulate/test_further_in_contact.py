@@ -54,7 +54,9 @@ def test_search() -> None:
     _, start, *found = (record.point.state for record in follow(scene))
     stage = load_stage(scene)
     path, here = stage.begin("load", "arc", start, 1e-5, 1e-4)
-    way = checked_run(stage, path, here, ContinuationGoal("points", [start.mu["load"]], "load", steps=50))
+    way = checked_run(
+        stage, path, here, ContinuationGoal("points", [start.mu["load"]], "load", steps=50)
+    )
     reached = [
         point.state
         for _, (_, point) in zip(found, (it for it in way if it[0] == "target"), strict=False)

@@ -437,7 +437,10 @@ def test_the_number_of_waves_changes_along_a_boundary(tmp_path: Path) -> None:
         stretched.
         """
         start = ms.Scene(ms.Case.load(case))
-        scene = Scene(problem_on_moved_mesh(start, ms.Case.load(case, [f"{key}={depth!r}"]).problem()), start.comm)
+        scene = Scene(
+            problem_on_moved_mesh(start, ms.Case.load(case, [f"{key}={depth!r}"]).problem()),
+            start.comm,
+        )
         return {
             r.mode: r.point.state.mu["pressure"]
             for r in ms.follow(scene)

@@ -51,7 +51,8 @@ class Eigenvalues:
             values, vectors = np.linalg.eigh(self.of(x))
             slopes = [[float(v @ A @ v) for A in self.A[1:]] for v in vectors.T[:OBSERVABLES]]
             beside = [
-                (float(value), slope) for value, slope in zip(values[:OBSERVABLES], slopes, strict=True)
+                (float(value), slope)
+                for value, slope in zip(values[:OBSERVABLES], slopes, strict=True)
             ]
             return DesignEvaluation({"left": self.most - float(x.sum())}, beside={"all": beside})
 

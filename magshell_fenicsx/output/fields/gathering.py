@@ -151,7 +151,8 @@ class RevolvedGatherer:
     def _swept_fields(self, fields: Mapping[str, Array]) -> dict[str, Array]:
         """Return fields (cells, 2, ...) of the meridian at the nodes of the swept surface."""
         return {
-            name: self._swept.on_parallels(values, self._fields.weight) for name, values in fields.items()
+            name: self._swept.on_parallels(values, self._fields.weight)
+            for name, values in fields.items()
         }
 
 

@@ -328,7 +328,9 @@ class PointFields:
         self._magnetisation, self.Br = field or remanence, np.zeros((*r0.shape[1:-1], 0))
         self.susceptibility = np.zeros((*r0.shape[1:-1], 0))
         if field and field.soft:
-            self.susceptibility = field.soft.susceptibility_at(inside_cells(r0[0]), self.n0)[..., None]
+            self.susceptibility = field.soft.susceptibility_at(inside_cells(r0[0]), self.n0)[
+                ..., None
+            ]
         if field and field.soft and field.soft.alone:
             self._magnetisation, field = None, None
         if self._magnetisation:
@@ -340,7 +342,9 @@ class PointFields:
             )
         if field and field.uniform:
             h = material.h if thickness is None else material.h * thickness
-            self.constant, self._torque = magnetic_loads(self._geometry(), field, inside_cells(r0[0]), h)
+            self.constant, self._torque = magnetic_loads(
+                self._geometry(), field, inside_cells(r0[0]), h
+            )
 
     @property
     def jet(self) -> Array:

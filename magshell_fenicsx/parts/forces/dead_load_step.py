@@ -231,6 +231,9 @@ class DeadSection(PathStep):
     def step(self, change: float | None, load_start: LoadStart) -> float | None:
         return abs(change) / self.points if self.control == "displacement" and change else None
 
+    def scale(self, load_start: LoadStart) -> float:
+        return abs(self.factor or 1.0)
+
     def leaves(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
@@ -389,7 +392,10 @@ def _mirrored_formula(
         return False
     values, images = (
         np.stack(
-            [formula_function(v)(*places.T) for v in (one_load.vector or [one_load.pressure or 0.0])],
+            [
+                formula_function(v)(*places.T)
+                for v in (one_load.vector or [one_load.pressure or 0.0])
+            ],
             axis=-1,
         )
         for one_load, places in ((load, x), (other, image))

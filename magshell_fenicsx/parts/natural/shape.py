@@ -254,7 +254,9 @@ class Shape:
         """
         assert self.stretch is not None
         return np.asarray(
-            np.polynomial.polynomial.polyval(float(self.stretch.value), self.volume_coefficients(first, points))
+            np.polynomial.polynomial.polyval(
+                float(self.stretch.value), self.volume_coefficients(first, points)
+            )
         )
 
     def volume_coefficients(self, first: Array, points: Array) -> Array:

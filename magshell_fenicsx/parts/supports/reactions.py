@@ -51,7 +51,9 @@ class Reaction:
         )
 
 
-def reactions(model: "ModelBase", state: State, mirror: Mirror | None = None) -> dict[str, Reaction]:
+def reactions(
+    model: "ModelBase", state: State, mirror: Mirror | None = None
+) -> dict[str, Reaction]:
     """Return the reactions of all supports in the model's frame; collective.
 
     A point has the force of its node; edges and patches that hold a node together share it equally.

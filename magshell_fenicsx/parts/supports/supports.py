@@ -111,7 +111,11 @@ def refuse_unknown(
     for name, condition in conditions.items():
         allowed = set(edges)
         allowed |= set(points) - {"pole"} if isinstance(condition, HeldComponents) else set()
-        allowed |= set(patches) if isinstance(condition, HeldComponents) or condition == "clamped" else set()
+        allowed |= (
+            set(patches)
+            if isinstance(condition, HeldComponents) or condition == "clamped"
+            else set()
+        )
         if name not in allowed:
             refuse_joined(f"boundary.{name}", name)
             allowed_names = ", ".join(sorted(allowed)) or "none"
@@ -371,7 +375,9 @@ def supports(
     named_supports: dict[str, Support] = {}
     supports_on_planes: dict[str, Support] = {}
     for name, condition in conditions.items():
-        components = condition.components if isinstance(condition, HeldComponents) else ALL_COMPONENTS
+        components = (
+            condition.components if isinstance(condition, HeldComponents) else ALL_COMPONENTS
+        )
         if condition in ("free", "symmetry"):
             continue
         nodes = None if condition == "clamped" else is_in_middle

@@ -152,7 +152,9 @@ def test_frequencies_of_a_free_shell_cut_in_two() -> None:
     for data in (cut, cap(polar=80) | {"boundary": {"rim": "free"}}):
         scene = Scene(Case.from_source({**data, "mesh": {"size": np.pi / 18}, "frequencies": {}}))
         assert scene.model.axisymmetric
-        found.append(ShellModes(scene.model).vibrations(scene.unloaded(), 6, allows_rigid_motion=True))
+        found.append(
+            ShellModes(scene.model).vibrations(scene.unloaded(), 6, allows_rigid_motion=True)
+        )
     assert [mode.label for mode in found[0]] == [mode.label for mode in found[1]]
     squares = [np.array([mode.eigenvalue for mode in of]) for of in found]
     assert not squares[0][:4].any()

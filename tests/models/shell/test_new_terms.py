@@ -80,7 +80,12 @@ SHELLS: dict[str, Callable[[], ShellModel]] = {
         panel(),
         MATERIAL,
         2,
-        {"bottom": "plane", "left": "plane", "top": HeldComponents((0, 1)), "right": HeldComponents((0, 1))},
+        {
+            "bottom": "plane",
+            "left": "plane",
+            "top": HeldComponents((0, 1)),
+            "right": HeldComponents((0, 1)),
+        },
         Loads(pressure=True),
     ),
     "two terms on an edge": lambda: ShellModel(

@@ -109,7 +109,8 @@ def test_isotropic_plies_are_koiters(kind: dict[str, bool]) -> None:
     u = random_displacement(models[0], 2e-3)
     mu = {
         name: MU[name]
-        for name in {t.amplitude for t in models[0].system.terms} | set(models[0].factory.free_constants)
+        for name in {t.amplitude for t in models[0].system.terms}
+        | set(models[0].factory.free_constants)
         if name
     }
     forces = [model.system.residual(u, mu) for model in models]

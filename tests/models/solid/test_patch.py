@@ -21,7 +21,9 @@ def test_uniform_deformation() -> None:
     """x = F X, J = 1.02, given on the whole boundary of a block of two layers; kappa/mu = 100."""
     patch = triangulate(StripShape(0.8, False), lambda x: 0.25, {}, plane_embedding)
     body = sweep(patch, 0.3, 2, MPI.COMM_SELF)
-    model = SolidModel(body, Material(0.5, 0.3), MooneyRivlin.from_poisson_ratio(0.5, 100.0), {}, Loads())
+    model = SolidModel(
+        body, Material(0.5, 0.3), MooneyRivlin.from_poisson_ratio(0.5, 100.0), {}, Loads()
+    )
     V = model.V
     outside = fem.locate_dofs_topological(V, 2, mesh.exterior_facet_indices(body.mesh.topology))
     held = [fem.dirichletbc(np.zeros(3), outside, V)]

@@ -51,7 +51,9 @@ def model(request: pytest.FixtureRequest) -> SolidModel:
     loads = Loads(
         pressure=True, magnetic=field, dead={} if uniform else {"load": (EdgeMoment("rim", 0.7),)}
     )
-    return SolidModel(body, Material(0.5, h), MooneyRivlin.from_poisson_ratio(0.5, 100.0, 0.4), conditions, loads)  # type: ignore[arg-type]
+    return SolidModel(
+        body, Material(0.5, h), MooneyRivlin.from_poisson_ratio(0.5, 100.0, 0.4), conditions, loads
+    )  # type: ignore[arg-type]
 
 
 def displacement(model: SolidModel) -> np.ndarray:

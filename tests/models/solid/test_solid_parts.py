@@ -109,7 +109,11 @@ def test_loads_add_up_to_their_resultants(load: Any) -> None:
         factor=lambda x: 1 + 0.3 * x[:, 2],
     )
     model = SolidModel(
-        body, Material(0.3, H), MooneyRivlin.from_poisson_ratio(0.3, 100.0), {}, Loads(dead={"load": (load,)})
+        body,
+        Material(0.3, H),
+        MooneyRivlin.from_poisson_ratio(0.3, 100.0),
+        {},
+        Loads(dead={"load": (load,)}),
     )
     X = model.r0.x.array.reshape(-1, 3)
     for axis, force in zip(np.eye(3), (1.0, 2.0, 3.0), strict=True):
@@ -122,7 +126,9 @@ def test_a_moment_turns_the_end_about_its_edge() -> None:
     """
     body = body_of(STRIP, 0.2, layers=2)
     moment = Loads(dead={"load": (EdgeMoment("right", 3.0),)})
-    model = SolidModel(body, Material(0.3, H), MooneyRivlin.from_poisson_ratio(0.3, 100.0), {}, moment)
+    model = SolidModel(
+        body, Material(0.3, H), MooneyRivlin.from_poisson_ratio(0.3, 100.0), {}, moment
+    )
     X = model.r0.x.array.reshape(-1, 3)
     assert resultant(model, np.cross([0.0, 1.0, 0.0], X)) == pytest.approx(3.0 * WIDTH, rel=1e-9)
     for translation in np.eye(3):

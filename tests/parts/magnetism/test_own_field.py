@@ -494,7 +494,9 @@ def moment_and_tip(case: Case) -> tuple[np.ndarray, dict[str, float]]:
     """A m² at the end of the path, and its row."""
     scene = Scene(case.problem())
     *_, last = follow(scene)
-    (found,) = (said for room in OBSERVABLES if (said := room.summary(scene.view, last.point.state)))
+    (found,) = (
+        said for room in OBSERVABLES if (said := room.summary(scene.view, last.point.state))
+    )
     assert found["magnetic_moment"]["unit"] == "A m²"
     return np.array(found["magnetic_moment"]["value"]), scene.observe(last.point.state)
 
