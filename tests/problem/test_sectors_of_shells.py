@@ -11,8 +11,8 @@ from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError, read_source
 from magshell_fenicsx.mesh.patch import MeshError
-from magshell_fenicsx.shells.shell import ShellModel
 from magshell_fenicsx.shells.sector_modes import SectorModes
+from magshell_fenicsx.shells.shell import ShellModel
 
 h = 0.02
 MATERIAL = {"thickness": h, "youngs_modulus": 1, "poisson_ratio": 0.3}
