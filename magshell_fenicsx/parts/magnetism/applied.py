@@ -127,7 +127,9 @@ class AppliedField:
         B, G, H = self._total_field(self._values_at_rest.renew(), x)
         is_lost = ~np.isfinite(B).all(axis=1)
         self.lost = self._lost_description(x[is_lost][0]) if is_lost.any() else self.lost
-        second = H[:, :, *COMPONENT_PAIRS] * np.where(COMPONENT_PAIRS[0] == COMPONENT_PAIRS[1], 0.5, 1.0)
+        second = H[:, :, *COMPONENT_PAIRS] * np.where(
+            COMPONENT_PAIRS[0] == COMPONENT_PAIRS[1], 0.5, 1.0
+        )
         columns = [array.reshape(*u.shape[:2], -1) for array in (u, self._B0, B, G, second)]
         return np.concatenate(columns, axis=-1)
 

@@ -74,7 +74,10 @@ class FieldSection(FactorStep):
 
         field = step_start.loads.magnetic
         direction = components(
-            directions(step_start.context.steps, field, step_start.turn)[step_start.step.number - 1], field
+            directions(step_start.context.steps, field, step_start.turn)[
+                step_start.step.number - 1
+            ],
+            field,
         )
         return direction, float(direction @ field_at(step_start.mu))
 
@@ -154,9 +157,14 @@ class RotationSection(Step):
         from magshell_fenicsx.parts.magnetism import direction  # the solver takes long to import
 
         field, number = step_start.loads.magnetic, step_start.step.number
-        ends = direction.directions(step_start.context.steps, field, step_start.turn)[number - 1 : number + 1]
+        ends = direction.directions(step_start.context.steps, field, step_start.turn)[
+            number - 1 : number + 1
+        ]
         start, end = (direction.components(end, field) for end in ends)
-        size, total = float(start @ direction.field_at(step_start.mu)), acos(float(ends[0] @ ends[1]))
+        size, total = (
+            float(start @ direction.field_at(step_start.mu)),
+            acos(float(ends[0] @ ends[1])),
+        )
         targets = [float(t) for t in np.linspace(0.0, total, self.points + 1)[1:]]
         drive = Drive("arc", "load", total, targets, total / self.points, total / self.points)
         if size == 0:
@@ -174,7 +182,9 @@ class RotationSection(Step):
         )
         return StepCourse(drive, "limit", curves=(curves, 0.0), forbidden=forbidden, at_once=True)
 
-    def expected_end(self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float) -> ExpectedEnd:
+    def expected_end(
+        self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float
+    ) -> ExpectedEnd:
         from magshell_fenicsx.parts.magnetism.direction import (
             directions,
         )  # the solver takes long to import
@@ -197,7 +207,9 @@ def turn_name(step: ProgrammeStep) -> str:
 def direction_before(number: int, context: Context) -> NDArray[np.float64] | None:
     """The unit vector (3,) of the field where a step begins; None without a field."""
     rotated_to = [
-        step.load.to for step in context.steps_before(number) if isinstance(step.load, RotationSection)
+        step.load.to
+        for step in context.steps_before(number)
+        if isinstance(step.load, RotationSection)
     ]
     if rotated_to:
         return rotated_to[-1].vector()

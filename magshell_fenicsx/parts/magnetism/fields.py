@@ -379,7 +379,11 @@ class MagneticSection(Section, Ability):
 
         if self.remanent and isinstance(self.remanent.components, list):
             yield Formulas(
-                "magnetic.remanent.components", self.remanent.components, -MAX_COMPONENT, MAX_COMPONENT, 1.0
+                "magnetic.remanent.components",
+                self.remanent.components,
+                -MAX_COMPONENT,
+                MAX_COMPONENT,
+                1.0,
             )
         if isinstance(self.susceptibility, str):
             yield Formulas(

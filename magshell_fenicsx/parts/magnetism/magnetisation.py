@@ -68,7 +68,9 @@ def by_points(section: RemanentSection, turn: float = 0.0) -> ControlledPattern:
     """
     places, vectors = read_vectors(section.path, "magnetic.remanent.file", section.files)
     assert section.filter
-    return ControlledPattern(ControlPoints(places, section.filter), vectors, rotation(turn) if turn else None)
+    return ControlledPattern(
+        ControlPoints(places, section.filter), vectors, rotation(turn) if turn else None
+    )
 
 
 def magnetisation(
@@ -230,7 +232,11 @@ def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
     if remanent.file:
         by_place = by_points(remanent)
         fields.append(lambda x: by_place(x, x))
-        reasons += [] if by_place.controls.is_axisymmetric else ["the remanence is given at points in space"]
+        reasons += (
+            []
+            if by_place.controls.is_axisymmetric
+            else ["the remanence is given at points in space"]
+        )
     patterns = {
         name: remanence
         for name, remanence in zip(remanent.patches or {}, remanences, strict=False)
@@ -344,7 +350,11 @@ def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
     """The field that a step drives; else the remanence alone, where a reduced model shows it as it
     is.
     """
-    magnetic, turn, patch_rims = context.section_of(MagneticSection), modelled.turn, modelled.patch_rims
+    magnetic, turn, patch_rims = (
+        context.section_of(MagneticSection),
+        modelled.turn,
+        modelled.patch_rims,
+    )
     assert magnetic
     driven_amplitudes = {name for step in context.steps for name in (step.name, *step.load.drives)}
     observed: dict[str, Any] = {

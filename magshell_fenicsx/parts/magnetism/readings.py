@@ -61,9 +61,7 @@ class FieldObservables(Observables):
         if magnetisation is None or magnetisation.absent:
             return {}
         at_state = view.model.system.at_state(state)
-        moment = at_state.evaluate(lambda: magnetic_moment(view, state.mu)) @ rotation(
-            view.azimuth
-        )
+        moment = at_state.evaluate(lambda: magnetic_moment(view, state.mu)) @ rotation(view.azimuth)
         size = magnetisation.tesla * magnetisation.metres**3 / MU_0 if magnetisation.metres else 1.0
         unit = "√(E/μ0) R³" if magnetisation.soft and magnetisation.soft.alone else "|Br| R³/μ0"
         return {

@@ -234,7 +234,10 @@ class SelfField:
 
         Charges of this field stay with the material. `r0` and `u` are jets at its nodes.
         """
-        frame, magnetisation = TangentFrame.from_jet(np.concatenate([r0, 0 * r0])), self.magnetisation
+        frame, magnetisation = (
+            TangentFrame.from_jet(np.concatenate([r0, 0 * r0])),
+            self.magnetisation,
+        )
         n = frame.normal(u)
         J, soft = np.zeros_like(n), magnetisation.soft
         if not (soft and soft.alone):

@@ -102,7 +102,9 @@ class SourceStep(LoadStep):
                 f"{key}.source: {self.source}: magnetic.applied.sources has no such source; "
                 f"allowed: {', '.join(names) or 'none'}"
             )
-        if context.is_programme and FieldSection.amplitude not in context.driven_before(step.number):
+        if context.is_programme and FieldSection.amplitude not in context.driven_before(
+            step.number
+        ):
             raise ValueError(
                 f"{key}.kind: source needs the field of its source: a step of kind: field before it"
             )
