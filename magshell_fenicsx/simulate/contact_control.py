@@ -408,8 +408,8 @@ def penetration_message(scene: Scene, state: State, *, moving: bool = False) -> 
             k = state.mu.get(contact.setting, contact.stiffness)
             return (
                 f"the penetration of the body {contact.body} is {deep:.3g} h, more than "
-                f"bodies.{contact.body}.penetration: {contact.max_penetration:g}; its stiffness is {k:.4g}: "
-                "give four times as much"
+                f"bodies.{contact.body}.penetration: {contact.max_penetration:g}; its stiffness is "
+                f"{k:.4g}: give four times as much"
             )
     for pair, deep in shell_penetrations(scene, state):
         largest = pair.max_penetration * (IMPACT_BOUND_RATIO if moving else 1.0)

@@ -20,7 +20,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _ContactPlaces:
-    """Where bodies press, and the displacements of shells that may touch, at one end of a step."""
+    """Places where bodies press, and displacements of shells that may touch, at a step's end."""
 
     bodies: list[tuple[Array, float | Array]]
     shells: list[Array]
@@ -82,12 +82,14 @@ class ContactsInTime:
 
     def average_along(self, begin: State, end: State, part: float) -> None:
         """Take the forces of a step at a part of it."""
-        before, after = self._at_begin(begin), self._places(end)
+        places_before, places_after = self._at_begin(begin), self._places(end)
         for pressing, low, high in zip(
-            self._body_contacts, before.bodies, after.bodies, strict=True
+            self._body_contacts, places_before.bodies, places_after.bodies, strict=True
         ):
             pressing.average(low, high, part)
-        for contact, u, v in zip(self._shell_contacts, before.shells, after.shells, strict=True):
+        for contact, u, v in zip(
+            self._shell_contacts, places_before.shells, places_after.shells, strict=True
+        ):
             contact.samples = ()
             contact.samples = samples_of_step(contact, u, v, part)
 
@@ -101,8 +103,10 @@ class ContactsInTime:
     def penetration_message(self, begin: State, end: State) -> str:
         """Return which shells pass through each other in a step, in words; empty if none do."""
         displacements = zip(self._at_begin(begin).shells, self._places(end).shells, strict=True)
-        for contact, (before, after) in zip(self._shell_contacts, displacements, strict=True):
-            if contact.images_pass_through(before, after):
+        for contact, (places_before, places_after) in zip(
+            self._shell_contacts, displacements, strict=True
+        ):
+            if contact.images_pass_through(places_before, places_after):
                 return f"{contact.pair.words} pass through each other"
         return ""
 

@@ -75,7 +75,7 @@ def follow(
                 )
             if text := run.remark_on_release():
                 remark(run.place + text)
-            yield from run.beyond()
+            yield from run.records_beyond()
         except (Stopped, NotANumber) as e:
             if not run.has_answer or step is not steps[-1]:
                 raise Stopped(run.reason(e)) from None
@@ -127,8 +127,8 @@ def _start(scene: Scene, state: State, *, has_rise: bool) -> Iterator[Record]:
     """
 
     def record(pivots: int, factorisations: int, clock: dict[str, float]) -> Record:
-        still = 0.0 * state.u
-        point = Point(state, 0.0, still, 0.0, pivots, pivots, 0, factorisations)
+        zero = 0.0 * state.u
+        point = Point(state, 0.0, zero, 0.0, pivots, pivots, 0, factorisations)
         return Record("start", "", point, clock=clock, scene=scene, shown=scene.displacement)
 
     try:
@@ -166,7 +166,7 @@ class _StepRun:
     scene
         The scene at its present end; another one behind a symmetry switch.
     end
-        State at the end, after `beyond`.
+        State at the end, after `records_beyond`.
     label
         Label of the last record.
     is_unstable
@@ -237,7 +237,7 @@ class _StepRun:
             return ""
         return _buckled_text(self.scene, fold, self._first_instability)
 
-    def beyond(self) -> Iterator[Record]:
+    def records_beyond(self) -> Iterator[Record]:
         """Yield the records of the branch or the snap that follows an instability at the end."""
         step, record = self._step, self._last
         if record is None:
@@ -250,8 +250,8 @@ class _StepRun:
                 yield self._completed(record)
             from magshell_fenicsx.simulate.transient import snap_records
 
-            held = held_conjugates_of_step(self.scene, step, record.point.state)
-            records = snap_records(self.scene, step.load.released_by, record, held)
+            held_conjugates = held_conjugates_of_step(self.scene, step, record.point.state)
+            records = snap_records(self.scene, step.load.released_by, record, held_conjugates)
         elif step.load.follows_branch and self.label == "bifurcation":
             records = follow_branch_of_step(self.scene, step, record)
         if records is None:

@@ -86,7 +86,7 @@ class StepRefinement:
 
     Attributes
     ----------
-    scene, held, marks
+    scene, held_conjugates, marks
         See `MotionRows`.
     begin
         A new integrator and the motion's begin.
@@ -98,7 +98,7 @@ class StepRefinement:
     """
 
     scene: Scene
-    held: Mapping[str, HeldConjugate]
+    held_conjugates: Mapping[str, HeldConjugate]
     marks: Collection[float]
     begin: Callable[[], tuple[Integrator, Motion]]
     ends: Sequence[float]
@@ -108,43 +108,45 @@ class StepRefinement:
         """Return steps with which the error at all rows is below the tolerance."""
         scene, tolerance = self.scene, steps.tolerance
         coarse_tolerance = min(COARSE_TOLERANCE_RATIO * tolerance, MAX_COARSE_TOLERANCE)
-        coarse = replace(steps, tolerance=max(tolerance, coarse_tolerance))
+        coarse_steps = replace(steps, tolerance=max(tolerance, coarse_tolerance))
         speeds = [
             (max_abs(scene.model.system.comm, motion.v), motion.t, mean_step)
-            for motion, mean_step in self._rows(coarse)
+            for motion, mean_step in self._rows(coarse_steps)
         ]
         largest_speed, fastest, _ = max(speeds)
         longest = max(step for speed, _, step in speeds if speed >= FAST_SPEED * largest_speed)
-        coarse = replace(coarse, longest=longest, fastest=fastest)
-        rows = [motion.u for motion, _ in self._rows(coarse)]
+        coarse_steps = replace(coarse_steps, longest=longest, fastest=fastest)
+        rows = [motion.u for motion, _ in self._rows(coarse_steps)]
         refinement, ratio = 1.0, 0.5
         while True:
             refinement *= ratio
             errors = list[float]()
-            for i, (motion, _) in enumerate(self._rows(coarse.refined(refinement))):
+            for i, (motion, _) in enumerate(self._rows(coarse_steps.refined(refinement))):
                 coarser_u = rows[min(i, len(rows) - 1)]
                 errors.append(ratio**2 / (1 - ratio**2) * _distance(scene, motion.u, coarser_u))
                 rows[i : i + 1] = [motion.u]
             largest_error = max(*errors, TINY_ERROR)
             needed = refinement * float(np.sqrt(AIMED_ERROR * tolerance / largest_error))
-            needed = min(max(needed, MIN_STEP_RATIO), (tolerance / coarse.tolerance) ** (1 / 3))
+            needed = min(
+                max(needed, MIN_STEP_RATIO), (tolerance / coarse_steps.tolerance) ** (1 / 3)
+            )
             if needed * MAX_STEP_RATIO >= refinement:
-                refined = coarse.refined(needed)
+                refined = coarse_steps.refined(needed)
                 return RefinedSteps(refined, rows[: len(errors)], errors, needed / refinement)
             ratio = 0.25
 
     def _rows(self, steps: TimeSteps) -> Iterator[tuple[Motion, float]]:
         """Yield the motion at each row, and the mean step before it."""
         integrator, motion = self.begin()
-        rows = MotionRows(self.scene, integrator, self.held, steps, self.marks)
+        rows = MotionRows(self.scene, integrator, self.held_conjugates, steps, self.marks)
         time_step, largest_kinetic = steps.first, integrator.kinetic(motion)
         for end in self.ends:
-            before, count = motion, integrator.steps
+            previous, count = motion, integrator.steps
             self.scene.progress.trying(_progress_point(motion), end - motion.t)
-            motion, time_step = rows.advanced(before, time_step, end)
+            motion, time_step = rows.advanced(previous, time_step, end)
             largest_kinetic = max(largest_kinetic, integrator.kinetic(motion))
-            yield motion, (motion.t - before.t) / (integrator.steps - count)
-            if self.is_over(before, motion, largest_kinetic):
+            yield motion, (motion.t - previous.t) / (integrator.steps - count)
+            if self.is_over(previous, motion, largest_kinetic):
                 return
 
 
@@ -159,7 +161,7 @@ class MotionRows:
 
     Parameters
     ----------
-    held
+    held_conjugates
         See `make_stage`.
     marks
         Times at which loads have kinks or jumps.
@@ -169,7 +171,7 @@ class MotionRows:
 
     scene: Scene
     integrator: Integrator
-    held: Mapping[str, HeldConjugate]
+    held_conjugates: Mapping[str, HeldConjugate]
     steps: TimeSteps
     marks: Collection[float]
     refinement: StepRefinement | None = None
@@ -306,7 +308,7 @@ class MotionRows:
 
         Rigid motions that are free have no stiffness: the sign of their pivots is rounding.
         """
-        stage = make_stage(self.scene, state, self.held)
+        stage = make_stage(self.scene, state, self.held_conjugates)
         if self.scene.free_in_time:
             return 0
         return stage.newton.factor_at(stage.enter(state)).negative_pivots

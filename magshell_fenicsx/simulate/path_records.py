@@ -258,10 +258,11 @@ def _records_in_stage(stage: Stage, walk: ContinuationRun, branches: int) -> Rec
             monitor.begin(onward.path, onward.points[0], stage.leave)
     yield from records_ahead
     if records_ahead:
-        at = amount(stage.scene, path.name, records_ahead[-1].point.state.mu[path.name])
+        value_here = amount(stage.scene, path.name, records_ahead[-1].point.state.mu[path.name])
         target = amount(stage.scene, path.name, goal.targets[-1])
         stop_reason = (
-            f"load control cannot pass the fold at {at}, before its target, {target}; {stop_reason}"
+            f"load control cannot pass the fold at {value_here}, before its target, {target}; "
+            f"{stop_reason}"
         )
     if monitor.unlocated:
         why = (

@@ -289,7 +289,11 @@ class Scene:
         It is empty if fields were found everywhere since the begin of the path.
         """
         lost_here = [field.lost for field in self.model.fields if field.lost]
-        places = [place for lost in self.model.system.comm.allgather(lost_here) for place in lost]
+        places = [
+            place
+            for lost_places in self.model.system.comm.allgather(lost_here)
+            for place in lost_places
+        ]
         return f"; on this way a step has found no field: {places[0]}" if places else ""
 
     @property

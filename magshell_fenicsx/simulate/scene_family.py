@@ -404,8 +404,8 @@ class SceneFamily:
         stage = self._stages.pop(p, None)
         if stage is None:
             scene = self._scene(p)
-            if self._base.device or self._base.along:
-                stage = self._base.on(scene)
+            if self._base.device or self._base.parametrised:
+                stage = self._base.on_scene(scene)
             else:
                 stage = Stage(scene, scene.newton)
         self._stages[p] = stage
@@ -443,14 +443,14 @@ class SceneFamily:
             return self._linear_amplitudes.at(p)
         old, new, mu = self._origin.problem, self.problem(p), dict(self._record.point.state.mu)
         earlier_steps = old.programme[: self._record.step - 1]
-        for before, after in zip(earlier_steps, new.programme, strict=False):
+        for old_step, new_step in zip(earlier_steps, new.programme, strict=False):
             old_target, new_target = (
-                step.load.target or step.load.limit_target for step in (before, after)
+                step.load.target or step.load.limit_target for step in (old_step, new_step)
             )
             if not (old_target and new_target) or old_target[0].quantity != "load":
                 continue
-            if isclose(mu.get(before.name, np.nan), old_target[1], rel_tol=1e-9):
-                mu[before.name] = new_target[1]
+            if isclose(mu.get(old_step.name, np.nan), old_target[1], rel_tol=1e-9):
+                mu[old_step.name] = new_target[1]
         old_values, new_values = own_amplitudes(old.loads), own_amplitudes(new.loads)
         mu |= {
             name: new_values[name]

@@ -165,9 +165,11 @@ def search_at_end_of_step(
         The states at both ends of the step.
     """
     if step.load.search:
-        held = held_conjugates_of_step(scene, step, begin)
+        held_conjugates = held_conjugates_of_step(scene, step, begin)
         name = step.name if step.name in end.mu else "lambda_m"  # of a turning field
-        for record in _solutions(make_stage(scene, end, held), name, end, step.load.search):
+        for record in _solutions(
+            make_stage(scene, end, held_conjugates), name, end, step.load.search
+        ):
             yield replace(record, amplitude=step.name)
 
 

@@ -285,8 +285,10 @@ def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
         difference = DeviationDifference(forward, backward, change / (2 * tiny))
         return _load_change(stage, fold, with_deviation(scene, difference))
 
-    growing = grown_by(scene.problem.programme, problem.imperfections)
-    factors = [fold.state.mu[amplitude] for amplitude, keys in growing.items() if key in keys]
+    keys_of_amplitudes = grown_by(scene.problem.programme, problem.imperfections)
+    factors = [
+        fold.state.mu[amplitude] for amplitude, keys in keys_of_amplitudes.items() if key in keys
+    ]
     return (factors or [1.0])[0] * (load_change(step) - load_change(-step)) / (2 * step)
 
 
@@ -303,7 +305,7 @@ def _load_change(stage: Stage, fold: Fold, other: Scene) -> float:
         for v in (fold.state.u, fold.left_null_vector)
     )
     expand_contact(scene, other, stage.leave(fold.state))
-    system = stage.on(other).newton.system
+    system = stage.on_scene(other).newton.system
     other_fold = replace(fold, state=State(u, fold.state.mu), left_null_vector=left_null_vector)
     return sensitivity(system, other_fold, system.residual(u, fold.state.mu))
 

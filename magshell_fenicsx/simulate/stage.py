@@ -36,23 +36,23 @@ class Stage:
     ----------
     device
         Prescribes the conjugates of some amplitudes; None if all are loads.
-    along
+    parametrised
         Varies several amplitudes together; None if the step varies one amplitude of the model.
     """
 
     scene: Scene
     newton: BorderedNewton
     device: Device | None = None
-    along: ParametrisedSystem | None = None
+    parametrised: ParametrisedSystem | None = None
 
     def enter(self, state: State) -> State:
         """Return a state of the model as a state of the step's system."""
         state = self.device.enter(state) if self.device else state
-        return self.along.contract(state) if self.along else state
+        return self.parametrised.contract(state) if self.parametrised else state
 
     def leave(self, state: State) -> State:
         """Return a state of the step's system as a state of the model."""
-        state = self.along.expand(state) if self.along else state
+        state = self.parametrised.expand(state) if self.parametrised else state
         state = self.device.leave(state) if self.device else state
         return self.scene.model.system.with_moved_supports(state)
 
@@ -61,11 +61,11 @@ class Stage:
         du = self.device.displacement(point.du) if self.device else point.du
         return replace(point, state=self.leave(point.state), du=du)
 
-    def on(self, scene: Scene) -> "Stage":
+    def on_scene(self, scene: Scene) -> "Stage":
         """Return the stage of the same step on another scene, with the same held values."""
         system: System = scene.model.system
         device = self.device.for_system(system) if self.device else None
-        parametrised = self.along.for_system(device or system) if self.along else None
+        parametrised = self.parametrised.for_system(device or system) if self.parametrised else None
         newton = scene.newton.for_system(parametrised or device or system)
         return Stage(scene, newton, device, parametrised)
 
@@ -141,7 +141,7 @@ def load_stage(scene: Scene) -> Stage:
 def make_stage(
     scene: Scene,
     state: State,
-    held: Mapping[str, HeldConjugate] | None = None,
+    held_conjugates: Mapping[str, HeldConjugate] | None = None,
     curves: tuple[str, Mapping[str, Curve], float] | None = None,
 ) -> Stage:
     """Return the stage of a step.
@@ -150,7 +150,7 @@ def make_stage(
     ----------
     state
         A state in equilibrium.
-    held
+    held_conjugates
         Amplitude -> its conjugate, see `Device`.
     curves
         Name of an amplitude, the amplitudes that are functions of it, and its value at the state.
@@ -160,16 +160,19 @@ def make_stage(
     Stopped
         If the volume is held where none is conjugate to the pressure.
     """
-    for name in held or ():
+    for name in held_conjugates or ():
         _refuse_open(scene, name)
     system: System = scene.model.system
-    device, along = None, None
-    if held:
+    device, parametrised = None, None
+    if held_conjugates:
         factors = scene.newton.factor_at(state)
-        scale = {name: natural_scale(system, factors, state, name) for name in held}
-        system = device = Device(system, held, scale)
+        scale = {name: natural_scale(system, factors, state, name) for name in held_conjugates}
+        system = device = Device(system, held_conjugates, scale)
     if curves:
-        system = along = ParametrisedSystem(system, *curves)
+        system = parametrised = ParametrisedSystem(system, *curves)
     return Stage(
-        scene, scene.newton.for_system(system) if held or curves else scene.newton, device, along
+        scene,
+        scene.newton.for_system(system) if held_conjugates or curves else scene.newton,
+        device,
+        parametrised,
     )

@@ -38,8 +38,8 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
     if load.motion:
         from magshell_fenicsx.simulate.transient import motion_records  # steps at rest do without
 
-        held = held_conjugates_of_step(scene, step, state)
-        return (yield from motion_records(scene, load.motion, state, held))
+        held_conjugates = held_conjugates_of_step(scene, step, state)
+        return (yield from motion_records(scene, load.motion, state, held_conjugates))
     if load.touches:
         state = state_at_first_contact(scene, step, state)
     course = load.course(_step_start(scene, step, state))
@@ -48,8 +48,8 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
     if step.name in load.hold:
         return (yield from _at_held_conjugate(scene, step, state, course.drive))
     drive, limit_reason = _within_support_limits(scene, step, state, course.drive)
-    held = held_conjugates_of_step(scene, step, state)
-    stage = make_stage(scene, state, held, course.curves and (step.name, *course.curves))
+    held_conjugates = held_conjugates_of_step(scene, step, state)
+    stage = make_stage(scene, state, held_conjugates, course.curves and (step.name, *course.curves))
     path, start = stage.begin(step.name, drive.control, state, drive.first, drive.scale)
     path = _with_step_options(scene, path, course, drive)
     is_to_target = course.until == "target" or load.limit_target
@@ -162,9 +162,9 @@ def _at_held_conjugate(scene: Scene, step: ProgrammeStep, state: State, drive: D
 
     The load itself is not driven.
     """
-    held, name = held_conjugates_of_step(scene, step, state), step.name
+    held_conjugates, name = held_conjugates_of_step(scene, step, state), step.name
     q = -scene.model.system.potential(state.u, state.mu, name)
-    others = {key: conjugate for key, conjugate in held.items() if key != name}
+    others = {key: conjugate for key, conjugate in held_conjugates.items() if key != name}
     path_of_load, _ = make_stage(scene, state, others).begin(
         name, "arc", state, drive.first, drive.scale
     )
@@ -183,21 +183,21 @@ def _at_held_conjugate(scene: Scene, step: ProgrammeStep, state: State, drive: D
 def stage_of_step(scene: Scene, step: ProgrammeStep, state: State) -> Stage:
     """Return the stage of a step, from any state of it."""
     curves = step.load.curves(_step_start(scene, step, state))
-    held = held_conjugates_of_step(scene, step, state)
-    return make_stage(scene, state, held, curves and (step.name, *curves))
+    held_conjugates = held_conjugates_of_step(scene, step, state)
+    return make_stage(scene, state, held_conjugates, curves and (step.name, *curves))
 
 
 def held_conjugates_of_step(
     scene: Scene, step: ProgrammeStep, state: State
 ) -> dict[str, float | Conjugate]:
     """Return amplitude -> its conjugate that a step holds, with the values of a state."""
-    held = dict[str, float | Conjugate]()
+    held_conjugates = dict[str, float | Conjugate]()
     for name, how in step.load.hold.items():
         if isinstance(how, Gas):
-            held[name] = enclosed_gas(scene, how.gas, state).law()
+            held_conjugates[name] = enclosed_gas(scene, how.gas, state).law()
         elif how == "conjugate":
-            held[name] = -scene.model.system.potential(state.u, state.mu, name)
-    return held
+            held_conjugates[name] = -scene.model.system.potential(state.u, state.mu, name)
+    return held_conjugates
 
 
 def enclosed_gas(scene: Scene, section: GasSection, state: State) -> EnclosedGas:

@@ -113,7 +113,7 @@ def switch_symmetry(stage: Stage, bifurcation: Record, scale: float) -> Symmetry
     if bifurcation.mode in OWN_MODES:
         return _switch_in_same_model(stage, bifurcation, scale)
     new = model_with_mode(stage.scene, bifurcation.mode)
-    new_stage = stage.on(new)
+    new_stage = stage.on_scene(new)
     try:
         mode = ShellModes(stage.scene.model).null_vector(bifurcation.point.state, bifurcation.mode)
     except ModesNotFound as e:
@@ -254,12 +254,12 @@ def _settled_contact(stage: Stage, path: Path, guess: State, phi: Vector) -> Sta
 def _at_rest(stage: Stage, path: Path, guess: State, mode: Vector) -> Point | str:
     """Return the point near a guess that a force along a mode holds at rest, or why not."""
     try:
-        held = held_along(stage.newton, stage.enter(guess), mode)
+        held_point = held_along(stage.newton, stage.enter(guess), mode)
     except np.linalg.LinAlgError:
-        held = None
-    if held is None:
+        held_point = None
+    if held_point is None:
         return "shells that touch do not come to rest there; take a finer mesh"
-    return _point_along(path, held[0], mode, 0)
+    return _point_along(path, held_point[0], mode, 0)
 
 
 def _located(stage: Stage, path: Path, guess: State, phi: Vector) -> Point | str:

@@ -54,7 +54,7 @@ class MovingState(State):
 
 
 def motion_records(
-    scene: Scene, load: TimeSection, state: State, held: Mapping[str, HeldConjugate]
+    scene: Scene, load: TimeSection, state: State, held_conjugates: Mapping[str, HeldConjugate]
 ) -> Records:
     """Yield the records of a step in time; the return value is the state at its end.
 
@@ -62,7 +62,7 @@ def motion_records(
     ----------
     state
         Where it begins: a `MovingState`, or at rest.
-    held
+    held_conjugates
         Amplitude -> its conjugate, as of `make_stage`.
 
     Raises
@@ -70,7 +70,7 @@ def motion_records(
     Stopped
         If steps in time become too small, or the shell does not come to rest.
     """
-    start = _MotionStart(scene, load, state, held)
+    start = _MotionStart(scene, load, state, held_conjugates)
     integrator, motion = start.begin()
     duration = dimensionless_time(scene.problem, load.duration)
     steps = _time_steps(scene, load)
@@ -80,21 +80,23 @@ def motion_records(
     marks = start.loads.marks
     refinement = None
     if load.errors == "motion" and steps.fixed is None:
-        refinement = StepRefinement(scene, held, marks, start.begin, row_times, end_of_motion)
-    rows = MotionRows(scene, integrator, held, steps, marks, refinement)
+        refinement = StepRefinement(
+            scene, held_conjugates, marks, start.begin, row_times, end_of_motion
+        )
+    rows = MotionRows(scene, integrator, held_conjugates, steps, marks, refinement)
     time_step, ending = steps.first, ""
     for end in row_times:
-        before, first_step = motion, time_step
-        motion, time_step, point = rows.journalled(before, first_step, end)
-        if end_of_motion.event and end_of_motion.has_event(before, motion):
-            event_time = rows.crossing(before, first_step, motion, end_of_motion.event)
-            motion, time_step, point = rows.journalled(before, first_step, event_time)
+        previous, first_step = motion, time_step
+        motion, time_step, point = rows.journalled(previous, first_step, end)
+        if end_of_motion.event and end_of_motion.has_event(previous, motion):
+            event_time = rows.crossing(previous, first_step, motion, end_of_motion.event)
+            motion, time_step, point = rows.journalled(previous, first_step, event_time)
             ending = "event"
         clock = energies.clock(motion)
         excluded_pivots = _excluded_pivots(scene, point.state)
         rest = None
         if load.until == "rest" and energies.is_quiet:
-            rest = _equilibrium_near(scene, held, point.state)
+            rest = _equilibrium_near(scene, held_conjugates, point.state)
         if load.until == "instability" and point.negative_pivots + excluded_pivots:
             ending = "instability"
         if load.until == "duration" and end == row_times[-1]:
@@ -118,14 +120,14 @@ def motion_records(
 
 
 def snap_records(
-    scene: Scene, snap: SnapSection, fold: Record, held: Mapping[str, HeldConjugate]
+    scene: Scene, snap: SnapSection, fold: Record, held_conjugates: Mapping[str, HeldConjugate]
 ) -> Records:
     """Yield the records of a snap from a fold or a bifurcation to rest.
 
     The return value is the state at its end. Loads are constant, except those whose conjugates are
-    `held`. The shell leaves a fold along the path's direction there, a bifurcation along its mode.
-    Its drag is in proportion to the frequency of its third mode of vibration: the first one has
-    none there.
+    `held_conjugates`. The shell leaves a fold along the path's direction there, a bifurcation along
+    its mode. Its drag is in proportion to the frequency of its third mode of vibration: the first
+    one has none there.
 
     Raises
     ------
@@ -148,7 +150,7 @@ def snap_records(
     direction = system.zero_at_supports(fold.point.du)
     size = snap.push * system.length / max_abs(system.comm, direction)
     pushed_state = State(state.u + size * direction, state.mu)
-    return (yield from motion_records(scene, load, pushed_state, held))
+    return (yield from motion_records(scene, load, pushed_state, held_conjugates))
 
 
 def _time_steps(scene: Scene, load: TimeSection) -> TimeSteps:
@@ -168,9 +170,13 @@ class _MotionStart:
     """
 
     def __init__(
-        self, scene: Scene, load: TimeSection, state: State, held: Mapping[str, HeldConjugate]
+        self,
+        scene: Scene,
+        load: TimeSection,
+        state: State,
+        held_conjugates: Mapping[str, HeldConjugate],
     ) -> None:
-        self._scene, self._load, self._state, self._held = scene, load, state, held
+        self._scene, self._load, self._state, self._held = scene, load, state, held_conjugates
         self.loads = LoadsInTime(scene.problem, load, state, scene.motions)
         unit = scene.problem.time_unit or 1.0
         self._drag = float(in_units("1/second")(load.drag)) * unit
@@ -216,14 +222,14 @@ class _MotionStart:
         return SupportInertia(
             scene.model.system,
             mass_with_supports(scene.model),
-            lambda t, before: (loads(t, before), loads.rates(t, before, moving)),
+            lambda t, previous: (loads(t, previous), loads.rates(t, previous, moving)),
             state.ground if isinstance(state, MovingState) else None,
         )
 
 
 @dataclass(frozen=True)
 class _MotionEnd:
-    """What ends a motion before its duration: an event, or rest.
+    """End of a motion before its duration: an event, or rest.
 
     Attributes
     ----------
@@ -235,15 +241,15 @@ class _MotionEnd:
     integrator: Integrator
     event: Callable[[Motion], float] | None
 
-    def has_event(self, before: Motion, after: Motion) -> bool:
+    def has_event(self, previous: Motion, next_motion: Motion) -> bool:
         """Whether the event is between two motions."""
         if self.event is None:
             return False
-        return self.event(before) * self.event(after) <= 0 and self.event(after) != self.event(
-            before
-        )
+        return self.event(previous) * self.event(next_motion) <= 0 and self.event(
+            next_motion
+        ) != self.event(previous)
 
-    def __call__(self, before: Motion, after: Motion, largest_kinetic: float) -> bool:
+    def __call__(self, previous: Motion, next_motion: Motion, largest_kinetic: float) -> bool:
         """Return whether a motion need not be followed beyond the second of two rows.
 
         Parameters
@@ -252,10 +258,10 @@ class _MotionEnd:
             The largest kinetic energy so far.
         """
         if self.load.until == "rest":
-            kinetic = max(self.integrator.kinetic(before), self.integrator.kinetic(after))
+            kinetic = max(self.integrator.kinetic(previous), self.integrator.kinetic(next_motion))
             if kinetic <= QUIET_ENERGY * largest_kinetic:
                 return True
-        return self.has_event(before, after)
+        return self.has_event(previous, next_motion)
 
 
 class _Energies:
@@ -282,8 +288,8 @@ class _Energies:
         size = self._scene.model.multiplicity
         self.kinetic = self._integrator.kinetic(motion)
         self.largest_kinetic = max(self.largest_kinetic, self.kinetic)
-        stored = self._scene.model.system.stored_energy(motion.u, motion.mu)
-        imbalance = self.kinetic + stored + motion.dissipated - motion.work - self._at_begin
+        stored_energy = self._scene.model.system.stored_energy(motion.u, motion.mu)
+        imbalance = self.kinetic + stored_energy + motion.dissipated - motion.work - self._at_begin
         return {
             "time": motion.t * (self._scene.problem.time_unit or 1.0),
             "kinetic": size * self.kinetic,
@@ -304,8 +310,8 @@ class _Energies:
             if name not in system.coordinates
         }
         work = motion.work - sum(motion.mu[name] * change for name, change in changes.items())
-        stored = system.stored_energy(rest.u, rest.mu)
-        imbalance = stored + motion.dissipated - work - self._at_begin
+        stored_energy = system.stored_energy(rest.u, rest.mu)
+        imbalance = stored_energy + motion.dissipated - work - self._at_begin
         return {**clock, "kinetic": 0.0, "work": size * work, "imbalance": size * imbalance}
 
 
@@ -334,12 +340,12 @@ def _event_function(
 
 
 def _equilibrium_near(
-    scene: Scene, held: Mapping[str, HeldConjugate], state: State
+    scene: Scene, held_conjugates: Mapping[str, HeldConjugate], state: State
 ) -> State | None:
     """Return the equilibrium near a state; None if there is none near, or an unstable one."""
-    stage, comm = make_stage(scene, state, held), scene.model.system.comm
+    stage, comm = make_stage(scene, state, held_conjugates), scene.model.system.comm
     start = stage.enter(state)
-    start, raised = start.with_(start.u, NO_LOAD, 0.0), dict[str, float]()
+    start, new_settings = start.with_(start.u, NO_LOAD, 0.0), dict[str, float]()
     while True:
         outcome = stage.newton.solve(start, NO_LOAD, PrescribedLoad(NO_LOAD, 0.0))
         distance = max_abs(comm, outcome.state.u - start.u) / scene.model.system.length
@@ -349,11 +355,13 @@ def _equilibrium_near(
         stiffer = raised_stiffnesses(scene, rest)
         if not stiffer:
             break
-        raised |= stiffer
-        start = State(outcome.state.u, {**outcome.state.mu, **raised})
+        new_settings |= stiffer
+        start = State(outcome.state.u, {**outcome.state.mu, **new_settings})
     if stage.newton.factor_at(outcome.state).negative_pivots:
         return None
-    return State(rest.u, state.mu | {name: rest.mu[name] for name in (*held, *raised)})
+    return State(
+        rest.u, state.mu | {name: rest.mu[name] for name in (*held_conjugates, *new_settings)}
+    )
 
 
 def viscosity(scene: Scene, state: State) -> Viscosity | None:

@@ -27,15 +27,15 @@ from magshell_fenicsx.assembly.global_mesh import (
 )
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.magnetism.charge_derivatives import Weights
+from magshell_fenicsx.parts.magnetism.corotated_stiffness import BlockRotation
 from magshell_fenicsx.parts.magnetism.coulomb import InteractingCharges, PartsTooNear
-from magshell_fenicsx.parts.magnetism.foreseen import Foreseen
+from magshell_fenicsx.parts.magnetism.force_extrapolation import ForceExtrapolation
 from magshell_fenicsx.parts.magnetism.interaction import AMPLITUDE, Interaction
 from magshell_fenicsx.parts.magnetism.magnetised_cells import MagnetisedShell, unit
 from magshell_fenicsx.parts.magnetism.multipole_expansion import CellNodes, InteractionHessian
 from magshell_fenicsx.parts.magnetism.pairs import NO_IMAGES, Copies, Stiffness
 from magshell_fenicsx.parts.magnetism.self_field import self_field
 from magshell_fenicsx.parts.magnetism.singular_pairs import SingularPairs
-from magshell_fenicsx.parts.magnetism.turned import Turning
 from magshell_fenicsx.parts.observables import ModelView
 
 if TYPE_CHECKING:
@@ -93,8 +93,10 @@ class InteractionTerm:
             )
         self._inputs_of_charges: tuple[Array, ...] = ()
         self._evaluations = deque[tuple[Array, float, Array]](maxlen=MAX_REMEMBERED_STATES)
-        self._blocks, self._turning = BlockProducts(self._comm), Turning(self._comm)
-        self._extrapolation = Foreseen(self._blocks, self._rotations, alone=self._comm.size == 1)
+        self._blocks, self._turning = BlockProducts(self._comm), BlockRotation(self._comm)
+        self._extrapolation = ForceExtrapolation(
+            self._blocks, self._rotations, is_single_rank=self._comm.size == 1
+        )
         self._latest_hessians: (
             tuple[Array, tuple[InteractionHessian, InteractionHessian], Array] | None
         ) = None  # beside its nodes and u
@@ -153,7 +155,7 @@ class InteractionTerm:
         """Add the residual of extrapolated forces, see `assembly.dense_tangent.DenseTerm`."""
         self._nodes()  # what is known is forgotten if shape or remanence changed
         extrapolated = (
-            self._extrapolation.at(
+            self._extrapolation.forces(
                 global_values(self._u).ravel(),
                 self._latest_hessians[1][0],
                 self._latest_hessians[2],
@@ -338,7 +340,7 @@ class InteractionTerm:
         )
         self._evaluations.appendleft((nodes, self._scale * energy, forces))
         if self._comm.allreduce(bool(np.isfinite(energy)), MPI.LAND):
-            self._extrapolation.learn(global_values(self._u).ravel(), forces)
+            self._extrapolation.add_state(global_values(self._u).ravel(), forces)
         return self._scale * energy, forces
 
     def _nodes(self) -> Array:
@@ -362,8 +364,8 @@ class InteractionTerm:
         ):
             self._inputs_of_charges, self._latest_hessians = inputs, None
             self._evaluations.clear()
-            self._extrapolation = Foreseen(
-                self._blocks, self._rotations, alone=self._comm.size == 1
+            self._extrapolation = ForceExtrapolation(
+                self._blocks, self._rotations, is_single_rank=self._comm.size == 1
             )
             for name in ("_charges", "_singular_pairs"):
                 self.__dict__.pop(name, None)

@@ -18,11 +18,11 @@ from scipy.sparse import bsr_array
 
 from magshell_fenicsx.assembly.dense_tangent import SinglePrecisionBlocks
 from magshell_fenicsx.parts.magnetism.charge_derivatives import Complex, Weights, places
+from magshell_fenicsx.parts.magnetism.corotated_stiffness import BlockRotation, StoredBlocks
 from magshell_fenicsx.parts.magnetism.magnetised_cells import COMPLEX_STEP
 from magshell_fenicsx.parts.magnetism.multipoles import COUNT, derivatives, ends, harmonics, shift
 from magshell_fenicsx.parts.magnetism.pairs import Pairs, Points, Stiffness
 from magshell_fenicsx.parts.magnetism.tree import Tree
-from magshell_fenicsx.parts.magnetism.turned import Kept, Turning
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -362,23 +362,25 @@ class InteractionHessian:
     cells: CellNodes
     sign: float
     is_adjacent: NDArray[np.bool_]
-    turning: Turning
+    block_rotation: BlockRotation
 
     @cached_property
     def near_blocks(self) -> bsr_array:
         """Blocks of near nodes, see `assembly.dense_tangent.DenseHessian`."""
         return self.near.matrix(self.sign)
 
-    def turned(self, q: Array) -> SinglePrecisionBlocks | None:
+    def rotated_blocks(self, q: Array) -> SinglePrecisionBlocks | None:
         """Return the blocks `is_adjacent` where nodes are rotated by q (nodes, 4).
 
         None with several images.
         """
-        return self.turning.turned(self.near, self.sign, self.cells.numbers, q, self._kept_blocks)
+        return self.block_rotation.rotated_blocks(
+            self.near, self.sign, self.cells.numbers, q, self._stored_blocks
+        )
 
     @cached_property
-    def _kept_blocks(self) -> Kept:
-        return self.turning.kept(self.near, self.is_adjacent)
+    def _stored_blocks(self) -> StoredBlocks:
+        return self.block_rotation.stored_blocks(self.near, self.is_adjacent)
 
     def times_far(self, v: Array) -> Array:
         """Return products with the multipoles' part, see `assembly.dense_tangent.DenseHessian`."""

@@ -84,7 +84,7 @@ def carry(source: Scene, target: Scene, u: Vector) -> Vector:
 
 
 def _chart(scene: Scene) -> Array:
-    """Coordinates (n, 1 or 2) of this rank's nodes in the chart; of several shells each in its own."""
+    """Coordinates (n, 1 or 2) of this rank's nodes in the chart, of several shells in their own."""
     return np.asarray(getattr(scene.model, "chart_by_shell", scene.model.chart)())
 
 

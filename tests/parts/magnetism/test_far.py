@@ -12,7 +12,7 @@ from magshell_fenicsx.parts.magnetism.magnetised_cells import MagnetisedShell
 from magshell_fenicsx.parts.magnetism.multipole_expansion import CellNodes, InteractionHessian
 from magshell_fenicsx.parts.magnetism.multipoles import harmonics, translations
 from magshell_fenicsx.parts.magnetism.pairs import Stiffness
-from magshell_fenicsx.parts.magnetism.turned import Turning
+from magshell_fenicsx.parts.magnetism.corotated_stiffness import BlockRotation
 
 Array = NDArray[np.float64]
 H, SIDES = 0.02, 5
@@ -106,7 +106,7 @@ def test_derivatives(monkeypatch: pytest.MonkeyPatch) -> None:
     stiffness = Stiffness(beside, 1.0, numbers, numbers, np.eye(3)[None])
     _, gradient = charges.evaluate(nodes, own, stiffness)
     cells = CellNodes(numbers, own, numbers, np.arange(numbers.size), stiffness.turn)
-    kept, turning = np.ones(len(stiffness.columns), dtype=bool), Turning(MPI.COMM_SELF)
+    kept, turning = np.ones(len(stiffness.columns), dtype=bool), BlockRotation(MPI.COMM_SELF)
     acting = InteractionHessian(
         stiffness, far, far.jacobian(far.place_charges(nodes)), 1.0, cells, 1.0, kept, turning
     )

@@ -1,0 +1,119 @@
+"""Second derivatives of charges by nodes, rotated with the nodes: near nodes, in single precision.
+
+In go the blocks of a `Stiffness` and the rotations of nodes, out come rotated blocks. In C; see
+docs/theory.md.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from mpi4py import MPI
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.dense_tangent import SinglePrecisionBlocks
+from magshell_fenicsx.parts.magnetism.pairs import C_TYPES, Stiffness
+from magshell_fenicsx.platform.native import load_native
+
+Array = NDArray[np.float64]
+Ints = NDArray[np.int64]
+Indices = NDArray[np.int32]
+C_DECLARATIONS = """
+    void turn_blocks(int64_t, const int32_t *, const int32_t *, const int32_t *, const double *, const double *, double,
+        const double *, const int64_t *, const double *, const int32_t *, const int32_t *, float *);
+"""
+
+
+@dataclass(frozen=True)
+class StoredBlocks:
+    """The blocks of a `Stiffness` that are rotated and stored.
+
+    Attributes
+    ----------
+    starts, numbers
+        Of each row of blocks, where it starts, and the numbers of its blocks.
+    first
+        Which of these is the first one of its row that is stored.
+    row_starts, columns
+        Starts of rows, and columns, of what is stored.
+    """
+
+    starts: Indices
+    numbers: Indices
+    first: Indices
+    row_starts: Indices
+    columns: Indices
+
+    @classmethod
+    def select(
+        cls, stiffness: Stiffness, is_selected: NDArray[np.bool_], *, upper: bool
+    ) -> "StoredBlocks":
+        """Return the selected of all blocks (blocks,).
+
+        Parameters
+        ----------
+        upper
+            Whether blocks below the diagonal are not stored.
+        """
+        numbers = np.flatnonzero(is_selected).astype(np.int32)
+        counts = np.append(0, np.cumsum(is_selected, dtype=np.int32))
+        starts = counts[stiffness.starts].astype(np.int32)
+        rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+        columns = stiffness.columns[numbers]
+        is_stored = columns >= (rows if upper else 0)
+        stored_counts = np.append(0, np.cumsum(is_stored, dtype=np.int32))
+        row_starts = stored_counts[starts].astype(np.int32)
+        first = (starts[1:] - np.diff(row_starts)).astype(np.int32)
+        return cls(starts, numbers, first, row_starts, columns[is_stored])
+
+
+class BlockRotation:
+    """The rotation of second derivatives with their nodes; the constructor is collective."""
+
+    def __init__(self, comm: MPI.Comm) -> None:
+        source = Path(__file__).with_name("corotated_stiffness.c")
+        self._ffi, self._lib = load_native(source, C_DECLARATIONS, comm)
+        self._upper = comm.size == 1
+
+    def stored_blocks(self, stiffness: Stiffness, is_selected: NDArray[np.bool_]) -> StoredBlocks:
+        """Return the selected blocks (blocks,); on one rank those of one half of the matrix."""
+        return StoredBlocks.select(stiffness, is_selected, upper=self._upper)
+
+    def rotated_blocks(
+        self, stiffness: Stiffness, sign: float, number: Ints, q: Array, stored: StoredBlocks
+    ) -> SinglePrecisionBlocks | None:
+        """Return blocks of `Stiffness.matrix` where nodes are rotated.
+
+        None where there are several images, whose blocks are not stored apart.
+
+        Parameters
+        ----------
+        number
+            (rows,) global numbers of the nodes of rows.
+        q
+            (all nodes, 4) quaternions, scalar last.
+        """
+        count = len(stiffness.columns)
+        if len(stiffness.turn) > 2:
+            return None
+        pointer = self._pointer
+        values = np.empty((len(stored.columns), 3, 3), dtype=np.float32)
+        images = self._ffi.NULL
+        if len(stiffness.turn) > 1:
+            images = pointer(stiffness.blocks[count:])
+        blocks = (
+            pointer(stored.starts),
+            pointer(stored.numbers),
+            pointer(stiffness.columns),
+            pointer(stiffness.blocks[:count]),
+            images,
+        )
+        rotations = pointer(stiffness.turn[-1]), pointer(number), pointer(q)
+        results = pointer(stored.first), pointer(stored.row_starts), pointer(values)
+        self._lib.turn_blocks(len(stored.first), *blocks, sign, *rotations, *results)
+        return SinglePrecisionBlocks(stored.row_starts, stored.columns, values, self._upper)
+
+    def _pointer(self, array: NDArray[Any]) -> Any:
+        assert array.flags.c_contiguous
+        return self._ffi.from_buffer(C_TYPES[array.dtype], array)

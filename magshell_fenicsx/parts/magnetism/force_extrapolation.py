@@ -1,0 +1,273 @@
+"""Extrapolated forces of all charges on each other, from states on a path and beside it.
+
+In go forces that were computed at states (`ForceExtrapolation.add_state`) and an earlier second
+derivative, out come forces at states near by. docs/theory.md.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.assembly.dense_tangent import BlockProducts, SinglePrecisionBlocks
+from magshell_fenicsx.parts.magnetism.multipole_expansion import InteractionHessian
+
+Array = NDArray[np.float64]
+PATH_POINTS = 3  # of the path whose forces are stored
+MAX_COEFFICIENTS = 3  # of the polynomial along the path
+MAX_CHANGES = 4  # beside the path whose forces are stored
+STATES_PER_EARLIER_POINT = 3  # that are stored: the point, and two that tell a slope
+# distance of states of one point over that from the point before, at most
+SAME_POINT_RATIO = 0.5
+MIN_NEW_SHARE = 0.3  # of a change, that newer changes do not have
+MIN_ALONG_SHARE = 0.5  # of a way, along the path
+ROTATION_TOLERANCE = 0.02  # rad that a node rotates before D is rotated again
+MIN_SEPARATION = 0.1  # of two positions along the path, over the larger one
+STORED_PRODUCTS = 6  # with D
+DIRECTION_COSINE = 0.999  # of a change and a direction along which forces are then known
+SLOPE_DISTANCE_RATIO = 0.05  # distance of two states that tell a slope, over that of points
+
+
+@dataclass(frozen=True)
+class ForceState:
+    """A state u of all nodes with this rank's part of the forces there, and of D u."""
+
+    u: Array
+    forces: Array
+    product: Array
+
+    @property
+    def remainder(self) -> Array:
+        """The forces without D u."""
+        return self.forces - self.product
+
+
+class ForceExtrapolation:
+    """Forces near states at which they were computed, by an earlier second derivative D and its
+    errors.
+
+    D is here what is stored between nodes of cells in boxes that touch: what it lacks is smooth
+    along the path, and small beside it. Along the path, the forces without D u are a polynomial
+    through its last points. It has slopes at points where two states near each other are known.
+    Changes of u beside the path correct D and the polynomial by secants, the newest change first
+    (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443: secants of several steps).
+
+    Parameters
+    ----------
+    rotations
+        Returns quaternions (nodes, 4) of the nodes at a state since another one.
+    is_single_rank
+        Whether all nodes are on this rank.
+    """
+
+    def __init__(
+        self,
+        blocks: BlockProducts,
+        rotations: Callable[[Array, Array], Array],
+        *,
+        is_single_rank: bool,
+    ) -> None:
+        self._blocks, self._rotations, self._is_single_rank = blocks, rotations, is_single_rank
+        self._points = list[list[ForceState]]()  # the newest last; of each point several states
+        self._distances = list[float]()  # to each point from the one before
+        self._D: InteractionHessian | None = None
+        self._stored: SinglePrecisionBlocks | None = None  # of D, turned to `_rotated_u`
+        self._rotated_u: Array | None = None
+        self._products = deque[tuple[Array, Array]](maxlen=STORED_PRODUCTS)  # the last u and D u
+        self._model: tuple[PathPolynomial, list[tuple[Array, Array]]] | None = None
+
+    def add_state(self, u: Array, forces: Array) -> None:
+        """Add computed forces at a state."""
+        state = ForceState(u, forces, self._product(u) if self._D else np.zeros_like(forces))
+        if self._points and not self._is_new_point(u):
+            self._points[-1] = [*self._points[-1][-MAX_CHANGES:], state]
+        else:
+            distance = float(np.linalg.norm(u - self._points[-1][-1].u)) if self._points else 0.0
+            earlier_points = [
+                point[-STATES_PER_EARLIER_POINT:] for point in self._points[1 - PATH_POINTS :]
+            ]
+            self._points, self._distances = (
+                [*earlier_points, [state]],
+                [*self._distances[1 - PATH_POINTS :], distance],
+            )
+        self._model = None
+
+    def forces(self, u: Array, D: InteractionHessian, u_of_D: Array) -> Array | None:
+        """Return this rank's part of the forces at u; None if nothing is known.
+
+        Parameters
+        ----------
+        D
+            The second derivative.
+        u_of_D
+            The state at which it was computed.
+        """
+        if not (self._points and np.isfinite(u).all()):
+            return None
+        if D is not self._D or self._is_new_point(u):
+            self._rotate_stiffness(u, D, u_of_D)
+        polynomial, changes = self._model = self._model or self._make_model()
+        forces, s = self._product(u) + polynomial.remainder(u), u - polynomial.base.u
+        for q, y in changes:
+            forces = forces + (q @ s) * y
+        return forces
+
+    def extrapolation_holds_along(self, u: Array, step: Array) -> bool:
+        """Return whether forces are known at two states near each other and u, along a direction."""
+        if not self._points or self._is_new_point(u):
+            return False
+        largest_distance, step_size = (
+            SLOPE_DISTANCE_RATIO * self._distances[-1],
+            float(np.linalg.norm(step)),
+        )
+        for state, other in pairwise(self._points[-1]):
+            change, distance_to_u = state.u - other.u, float(np.linalg.norm(u - state.u))
+            distance = float(np.linalg.norm(change))
+            if (
+                max(distance, distance_to_u) < largest_distance
+                and abs(change @ step) > DIRECTION_COSINE * step_size * distance
+            ):
+                return True
+        return False
+
+    def _is_new_point(self, u: Array) -> bool:
+        """Return whether a state is not of the last point."""
+        return (
+            float(np.linalg.norm(u - self._points[-1][-1].u))
+            > SAME_POINT_RATIO * self._distances[-1]
+        )
+
+    def _rotate_stiffness(self, u: Array, D: InteractionHessian, u_of_D: Array) -> None:
+        """Take D as it is at another state, if nodes have rotated enough."""
+        earlier_u = self._rotated_u if D is self._D else None
+        if (
+            earlier_u is not None
+            and 2 * np.abs(self._rotations(u, earlier_u)[:, :3]).max() < ROTATION_TOLERANCE
+        ):
+            return
+        rotated = D.turned(self._rotations(u, u_of_D))
+        if rotated is None and earlier_u is not None:
+            return
+        self._D, self._rotated_u = D, u
+        self._stored = (
+            SinglePrecisionBlocks.from_blocks(D.near_blocks, upper=self._is_single_rank)
+            if rotated is None
+            else rotated
+        )
+        self._model = None
+        self._products.clear()
+        self._points = [
+            [ForceState(state.u, state.forces, self._product(state.u)) for state in point]
+            for point in self._points
+        ]
+
+    def _make_model(self) -> tuple["PathPolynomial", list[tuple[Array, Array]]]:
+        """Return the polynomial along the path, and orthonormal changes with what is lacking along
+        them.
+        """
+        polynomial, changes = PathPolynomial.from_points(self._points), list[tuple[Array, Array]]()
+        pairs = [pair for point in reversed(self._points) for pair in pairwise(reversed(point))]
+        for state, other in pairs[:MAX_CHANGES]:
+            s = state.u - other.u
+            y, size = (
+                state.remainder
+                - other.remainder
+                - polynomial.remainder(state.u)
+                + polynomial.remainder(other.u),
+                float(np.linalg.norm(s)),
+            )
+            for _ in range(2):
+                for q, y_of_q in changes:
+                    part = float(q @ s)
+                    s, y = s - part * q, y - part * y_of_q
+            new_size = float(np.linalg.norm(s))
+            if new_size > MIN_NEW_SHARE * size:
+                changes.append((np.asarray(s / new_size), np.asarray(y / new_size)))
+        return polynomial, changes
+
+    def _product(self, u: Array) -> Array:
+        """Return D u, which is stored for the last states."""
+        for stored_u, product in self._products:
+            if np.array_equal(u, stored_u):
+                return product
+        assert self._D
+        assert self._stored
+        product = self._blocks.times(self._stored, u)
+        self._products.appendleft((u, product))
+        return product
+
+
+@dataclass(frozen=True)
+class PathPolynomial:
+    """The forces without D u as a polynomial of the position along a direction.
+
+    Attributes
+    ----------
+    base
+        The newest state, at position 0.
+    direction
+        Of size one.
+    distance
+        The unit of positions.
+    coefficients
+        Of the powers from the first on.
+    """
+
+    base: ForceState
+    direction: Array
+    distance: float
+    coefficients: Array
+
+    @classmethod
+    def from_points(cls, points: list[list[ForceState]]) -> "PathPolynomial":
+        """Return the polynomial through the last state of each point; the newest point is the last."""
+        base, previous = points[-1][-1], points[-2][-1] if len(points) > 1 else None
+        if previous is None or np.array_equal(previous.u, base.u):
+            return cls(base, np.zeros_like(base.u), 1.0, np.zeros((0, len(base.forces))))
+        direction, distance = base.u - previous.u, float(np.linalg.norm(base.u - previous.u))
+        direction = np.asarray(direction / distance)
+        rows, values, places = list[Array](), list[Array](), [0.0]
+        powers = np.arange(1.0, MAX_COEFFICIENTS + 1)
+        for point in reversed(points):
+            last = point[-1]
+            s = last.u - base.u
+            position, size = float(direction @ s) / distance, float(np.linalg.norm(s)) / distance
+            if last is not base:
+                separation = min(abs(position - x) for x in places)
+                is_across = abs(position) < MIN_ALONG_SHARE * size
+                if is_across or separation < MIN_SEPARATION * max(1.0, abs(position)):
+                    continue
+                places.append(position)
+                rows.append(np.asarray(position**powers))
+                values.append(last.remainder - base.remainder)
+            for state, other in pairwise(reversed(point)):
+                change = state.u - other.u
+                step, length = (
+                    float(direction @ change) / distance,
+                    float(np.linalg.norm(change)) / distance,
+                )
+                if (
+                    len(rows) < MAX_COEFFICIENTS
+                    and MIN_ALONG_SHARE * length < abs(step)
+                    and length < SLOPE_DISTANCE_RATIO
+                ):
+                    position = float(direction @ (state.u - base.u)) / distance
+                    rows.append(np.asarray((position**powers - (position - step) ** powers) / step))
+                    values.append(np.asarray((state.remainder - other.remainder) / step))
+                    break
+            if len(rows) == MAX_COEFFICIENTS:
+                break
+        n = len(rows)
+        coefficients = np.linalg.solve(np.array(rows)[:, :n], np.array(values))
+        return cls(base, direction, distance, np.asarray(coefficients, dtype=np.float64))
+
+    def remainder(self, u: Array) -> Array:
+        """Return the forces without D u at a state."""
+        position = float(self.direction @ (u - self.base.u)) / self.distance
+        return np.asarray(
+            self.base.remainder
+            + position ** np.arange(1, len(self.coefficients) + 1) @ self.coefficients
+        )
