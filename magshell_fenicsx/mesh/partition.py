@@ -41,8 +41,8 @@ def partitioner(
 def destinations(
     cells: NDArray[np.int64], nodes_of_facet: int, size: int
 ) -> tuple[Ranks, NDArray[np.int32]]:
-    """Return the ranks that get each cell, its owner first, one cell after the other, and where those
-    of each cell begin.
+    """Return the ranks that get each cell, its owner first, one cell after the other, and where
+    those of each cell begin.
     """
     count = len(cells)
     if size == 1:

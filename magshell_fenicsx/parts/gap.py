@@ -119,8 +119,8 @@ def expanded_penalty(
 ) -> tuple[Array, Array, Array]:
     """Return the Taylor polynomial of `penalty` about penetrations s0, with its derivatives.
 
-    It is of second order, or of third. Differences over a part of `soft_penetration` are better by that of
-    second order; the derivative of the second derivative needs the third.
+    It is of second order, or of third. Differences over a part of `soft_penetration` are better by
+    that of second order; the derivative of the second derivative needs the third.
     """
     value, first, second = penalty(s0, k, soft_penetration)
     step = s - s0

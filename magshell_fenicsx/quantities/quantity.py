@@ -263,8 +263,8 @@ class Quantity:
 
         Examples
         --------
-        >>> [Quantity("", "", "", "load", symbol).ascii_symbol for symbol in ("p/p_c", "λ_m", "ΔV/R³")]
-        ['p/pc', 'lambda_m', 'dV/R^3']
+        >>> [Quantity("", "", "", "load", symbol).ascii_symbol for symbol in ("p/p_c", "λ_m",
+        "ΔV/R³")] ['p/pc', 'lambda_m', 'dV/R^3']
         """
         return plain_text(re.sub(r"(?<=[A-Za-z])_", "", self.symbol)) or self.words
 

@@ -56,9 +56,12 @@ class CandidateSection(Section):
     """
 
     of: str
-    """A result: a column of path.csv, knockdown, critical_field_mT, omega2_1, hertz_1, barrier, ..."""
+    """A result: a column of path.csv, knockdown, critical_field_mT, omega2_1, hertz_1, barrier, ...
+    """
     at: Amount | None = None
-    """Where the last step is then: its load or displacement, as in the data; by default the end of the path"""
+    """Where the last step is then: its load or displacement, as in the data; by default the end of
+    the path
+    """
     noise: Amount
     """Standard deviation of such a measurement"""
 
@@ -77,11 +80,14 @@ class ProgrammeSection(Section):
     settings: list[str] = Field(default_factory=list)
     """Other values in that case, as for `--set`: `["loading.3.duration=2 s"]`"""
     data: str | None = None
-    """A CSV file to compare with: columns of path.csv with units. The first one is the place, such as `time [s]` or
-    `applied [mT]`; a column `step` has the number of the step, by default the last one. Between the points of a run it
-    is read on straight lines"""
+    """A CSV file to compare with: columns of path.csv with units. The first one is the place, such
+    as `time [s]` or `applied [mT]`; a column `step` has the number of the step, by default the last
+    one. Between the points of a run it is read on straight lines
+    """
     of: list[str] = Field(default_factory=list)
-    """Further results: a column, along the last step; or a number, as of a sweep: `time_s@tip_uz_mm=-2`, `knockdown`"""
+    """Further results: a column, along the last step; or a number, as of a sweep:
+    `time_s@tip_uz_mm=-2`, `knockdown`
+    """
     changes: list[str] = Field(default_factory=list)
     """Columns that are counted from the begin of their step on"""
     samples: int = Field(default=40, ge=20, le=10_000)
@@ -105,12 +111,16 @@ class IdentifySection(Section):
     """
 
     parameters: dict[str, ParameterSection] = Field(default_factory=dict)
-    """Key of the case with a number (`shell.youngs_modulus`, `magnetic.remanent.flux_density`) -> what is known of it:
-    `{}`, or `{prior: 4.2 MPa, deviation: 0.2 MPa}`. It starts where the case has it"""
+    """Key of the case with a number (`shell.youngs_modulus`, `magnetic.remanent.flux_density`) ->
+    what is known of it: `{}`, or `{prior: 4.2 MPa, deviation: 0.2 MPa}`. It starts where the case
+    has it
+    """
     remanence: RemanenceSection | None = None
     """The remanence as a field that is looked for, beside the parameters or alone"""
     noise: dict[str, Amount] = Field(default_factory=dict)
-    """Column of the data -> standard deviation of its noise; by default estimated from the residuals"""
+    """Column of the data -> standard deviation of its noise; by default estimated from the
+    residuals
+    """
     changes: list[str] = Field(default_factory=list)
     """Columns of the data that are measured from the begin of the last step on"""
     candidates: list[CandidateSection] = Field(default_factory=list)
@@ -118,8 +128,9 @@ class IdentifySection(Section):
     predict: dict[str, ProgrammeSection] = Field(default_factory=dict)
     """Name -> another history, or another case, that is predicted with the parameters found"""
     narrow: str | None = None
-    """What the next measurement should narrow: a parameter, by default the one with the largest relative deviation; or
-    `remanence`, the root mean square over all numbers of the field"""
+    """What the next measurement should narrow: a parameter, by default the one with the largest
+    relative deviation; or `remanence`, the root mean square over all numbers of the field
+    """
     steps: int = Field(default=20, ge=1, le=1000)
     """At most so many steps of Gauss-Newton"""
 

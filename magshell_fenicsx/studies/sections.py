@@ -26,11 +26,13 @@ class ShapeSection(Section):
     components: Annotated[list[Formula], Field(min_length=3, max_length=3)] | None = None
     """The wanted place as formulas of the undeformed x, y, z over R [R]"""
     curve: Annotated[list[Point], Field(min_length=3)] | None = None
-    """Of a strip: points of the curve of its middle line from the root on, which a spline joins; it is scaled to the
-    strip's length [any length]"""
+    """Of a strip: points of the curve of its middle line from the root on, which a spline joins; it
+    is scaled to the strip's length [any length]
+    """
     stages: Annotated[int, Field(ge=1, le=50)] = 1
-    """Of a curve: it is first wanted with 1/stages of its curvature, then with 2/stages, and so on. All but the last
-    have a quarter of the iterations"""
+    """Of a curve: it is first wanted with 1/stages of its curvature, then with 2/stages, and so on.
+    All but the last have a quarter of the iterations
+    """
 
     @model_validator(mode="after")
     def _one_of_them(self) -> Self:
@@ -49,10 +51,11 @@ Results = Annotated[
 
 
 class ObjectiveSection(Section):
-    """One of its keys; the results are knockdown, critical_field (in units buckling_pressure_Pa, critical_field_mT),
-    mass (over that of the thickness h everywhere), barrier, natural frequencies (omega2_1, omega2_2, ... as in
-    frequencies.csv, or hertz_1, ...), or a column of path.csv where the path ends, such as force_N or a force of a
-    support."""
+    """One of its keys; the results are knockdown, critical_field (in units buckling_pressure_Pa,
+    critical_field_mT), mass (over that of the thickness h everywhere), barrier, natural frequencies
+    (omega2_1, omega2_2, ... as in frequencies.csv, or hertz_1, ...), or a column of path.csv where
+    the path ends, such as force_N or a force of a support.
+    """
 
     maximise: Results | None = None
     """A result; of several the least, so that they end equal where nothing else stops them"""
@@ -130,7 +133,8 @@ class RemanenceVariables(Section):
     magnitude: Bounds | None = None
     """Least and largest length of a vector; by default lengths stay as they are [|B^r|]"""
     steps: Annotated[int, Field(ge=2, le=360)] | None = None
-    """At the end polar angles (and azimuths) are rounded to the nearest of so many steps of a turn"""
+    """At the end polar angles (and azimuths) are rounded to the nearest of so many steps of a turn
+    """
 
     @model_validator(mode="after")
     def _magnitudes(self) -> Self:
@@ -166,8 +170,10 @@ class DesignSection(Section):
     objective: ObjectiveSection
     """What is wanted"""
     numbers: dict[str, Amounts] = Field(default_factory=dict)
-    """Key of the case with a number (`magnetic.remanent.polar`, `shell.poisson_ratio`) -> least and largest value, with
-    units where the key has one: `magnetic.applied.flux_density: [-20 mT, 20 mT]`"""
+    """Key of the case with a number (`magnetic.remanent.polar`, `shell.poisson_ratio`) -> least and
+    largest value, with units where the key has one: `magnetic.applied.flux_density: [-20 mT, 20
+    mT]`
+    """
     remanence: RemanenceVariables | None = None
     """Vectors of the remanence that vary"""
     thickness: FieldVariables | None = None
@@ -175,7 +181,9 @@ class DesignSection(Section):
     curvature: FieldVariables | None = None
     """Natural curvatures 11 and 22, which vary: `natural.curvature` [1/R]"""
     deviation: FieldVariables | None = None
-    """Deviation w0 of the shape outwards, which varies from zero on: one more of `shell.imperfections` [h]"""
+    """Deviation w0 of the shape outwards, which varies from zero on: one more of
+    `shell.imperfections` [h]
+    """
     constraints: list[LimitSection] = Field(default_factory=list)
     """Results that must stay within bounds"""
     iterations: int = Field(default=60, ge=1, le=10_000)
@@ -269,7 +277,9 @@ class PlacedDefectsSection(DefectsSection):
     """
 
     on: str | None = None
-    """Name of one of several shells, over whose thickness they are; by default each has as many of its own"""
+    """Name of one of several shells, over whose thickness they are; by default each has as many of
+    its own
+    """
 
 
 IMPERFECTIONS = "shell.imperfections"
@@ -281,7 +291,9 @@ class EnsembleSection(Section):
     """
 
     keys: dict[str, Distribution] = Field(default_factory=dict)
-    """Key of the case, with dots (`magnetic.lambda_m`, `shell.imperfections.0.amplitude`) -> its distribution"""
+    """Key of the case, with dots (`magnetic.lambda_m`, `shell.imperfections.0.amplitude`) -> its
+    distribution
+    """
     defects: (
         Annotated[
             Annotated[PlacedDefectsSection, Tag("one")]
@@ -290,7 +302,8 @@ class EnsembleSection(Section):
         ]
         | None
     ) = None
-    """Random defects of a sphere, or a list of these: for different shells, or of different kinds"""
+    """Random defects of a sphere, or a list of these: for different shells, or of different kinds
+    """
 
     @model_validator(mode="after")
     def _something_is_random(self) -> Self:

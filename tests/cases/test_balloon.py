@@ -5,7 +5,8 @@ With the arc length S of the undeformed meridian, its radius rho(S), the deforme
 slope phi of the deformed meridian and the stretches l1 along it and l2 = r/rho around it, the
 energy W(l1, l2) per undeformed area gives
 
-    (rho W_1)' = W_2 cos phi,   r' = l1 cos phi,   z' = -l1 sin phi,   rho W_1 phi' = p l1 r - W_2 sin phi.
+    (rho W_1)' = W_2 cos phi,   r' = l1 cos phi,   z' = -l1 sin phi,   rho W_1 phi' = p l1 r - W_2
+    sin phi.
 """
 
 from collections.abc import Callable
@@ -295,8 +296,9 @@ def test_magnetic_balloon(remanence: str, raised: float) -> None:
 
 @pytest.mark.slow
 def test_models_of_a_balloon() -> None:
-    """Meridian, half and full dome of Mooney and Rivlin's rubber under a live pressure have the same fold, 5e-4; its
-    volume, at the flat top of the curve, to 1e-2."""
+    """Meridian, half and full dome of Mooney and Rivlin's rubber under a live pressure have the
+    same fold, 5e-4; its volume, at the flat top of the curve, to 1e-2.
+    """
     settings = [
         "shell.law=mooney-rivlin",
         "shell.mooney=0.05",

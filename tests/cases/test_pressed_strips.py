@@ -106,8 +106,9 @@ def test_two_cantilevers() -> None:
 
 
 def test_strips_that_meet_flat() -> None:
-    """All of two opposite cantilevers meets at once; behind that they touch along the middle line, F = 12 EI d/L^3 for
-    a way d of one clamp: each half has F (L/2)^3/(3 EI) = d/2."""
+    """All of two opposite cantilevers meets at once; behind that they touch along the middle line,
+    F = 12 EI d/L^3 for a way d of one clamp: each half has F (L/2)^3/(3 EI) = d/2.
+    """
     gap, way, width = 0.1, 0.4, 0.2
     strip = {
         "geometry": "plate",

@@ -27,8 +27,11 @@ def alone(shell: dict[str, Any], w: float) -> float:
 
 @pytest.mark.slow
 def test_coaxial_domes() -> None:
-    """One after the other: the upper one snaps as it does alone, 1e-3, and at its own force falls on the lower one;
-    both snap where the force is the sum of those of each alone at its displacement, 2e-2. On meridians."""
+    """One after the other: the upper one snaps as it does alone, 1e-3, and at its own force falls
+    on the lower one; both snap where the force is the sum of those of each alone at its
+    displacement, 2e-2. On
+    meridians.
+    """
     source = read_source(CASES / "coaxial_domes.yaml")
     upper, lower = (source.data["shells"][name] for name in ("upper", "lower"))
     points = {"points": {"top": [np.sin(np.radians(2)), 0, np.cos(np.radians(2))]}}
@@ -57,8 +60,9 @@ def test_stacked_domes() -> None:
 
 @pytest.mark.slow
 def test_a_dome_lands() -> None:
-    """It snaps, hits the other dome and comes to rest where the path by arc length has the load of the fold, 1e-5; the
-    balance of energy lacks less than 1e-3 of it."""
+    """It snaps, hits the other dome and comes to rest where the path by arc length has the load of
+    the fold, 1e-5; the balance of energy lacks less than 1e-3 of it.
+    """
     mesh, domes = (
         {"mesh": {"size": 0.03}},
         [read_source(CASES / name).data for name in ("dome_lands.yaml", "coaxial_domes.yaml")],

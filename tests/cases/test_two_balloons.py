@@ -5,7 +5,8 @@ Two equal balloons meet in the plane between them. Where a membrane lies on it t
 and nothing else changes: with the arc length S of the undeformed disc, its radius S, and forces F =
 S W_1 (see test_balloon.py)
 
-    F' = W_2 cos phi,   r' = l1 cos phi,   z' = -l1 sin phi,   F phi' = p l1 r - W_2 sin phi,   phi = 0 up to S = c.
+    F' = W_2 cos phi,   r' = l1 cos phi,   z' = -l1 sin phi,   F phi' = p l1 r - W_2 sin phi,   phi
+    = 0 up to S = c.
 """
 
 import numpy as np

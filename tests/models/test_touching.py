@@ -138,8 +138,11 @@ def test_states_with_the_same_cuts_share_a_pattern() -> None:
     [("neo-hookean", 0, None), ("koiter", 1, "1 + 0.1*x + y**2/9")],
 )
 def test_a_half_touches_its_image(law: str, across: int, factor: str | None) -> None:
-    """Walls that meet in the plane, or are pressed together across it: the energy and its variations, also by
-    antisymmetric additions, are half of those of the whole ring; the force is that of the whole; 1e-9."""
+    """Walls that meet in the plane, or are pressed together across it: the energy and its
+    variations, also by antisymmetric additions, are half of those of the whole ring; the force is
+    that of the whole;
+    1e-9.
+    """
     pressed = {"tilt": 0.02 * across, "across": across, "wide": 0.4 if law == "koiter" else 2.5}
     shell = RING["shell"] | ({"law": law, "poisson_ratio": 0.5} if law != "koiter" else {})
     shell |= {"thickness_factor": factor} if factor else {}

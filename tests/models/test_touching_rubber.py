@@ -94,7 +94,8 @@ def test_pressed_sheets() -> None:
     With the pressure q per undeformed area, the tension T and the penetration s, of each sheet that
     has grown to g
 
-        (E g h/3)(l - l^-5) = T/g + q h/(2 g l^3),   d = g h/l^2 - s,   q = k (s - SOFT_PENETRATION h/2).
+        (E g h/3)(l - l^-5) = T/g + q h/(2 g l^3),   d = g h/l^2 - s,   q = k (s - SOFT_PENETRATION
+        h/2).
     """
     g = 1.1
     scene = sheets(grown=g)

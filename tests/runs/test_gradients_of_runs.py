@@ -118,8 +118,9 @@ def test_mistakes(tmp_path: Path, section: str, message: str) -> None:
 
 @pytest.mark.slow
 def test_one_key_without_a_gradient(tmp_path: Path) -> None:
-    """A remanence across the mirror plane breaks the symmetry of the half that is modelled: that key
-    is named, and the others have what they have without it."""
+    """A remanence across the mirror plane breaks the symmetry of the half that is modelled: that
+    key is named, and the others have what they have without it.
+    """
     (tmp_path / "strip.yaml").write_text(STRIP)
     coarse, found = "--set=mesh.refinement=0.5", dict[str, dict[str, Any]]()
     for out, by in (

@@ -23,7 +23,8 @@ CAP: dict[str, Any] = {
 
 @pytest.mark.parametrize("hole", [0, 4])
 def test_a_load_goes_on_at_a_ball(hole: float) -> None:
-    """The pole's face is 3.5 h above the ball; what the load grows by from there on, the ball bears.
+    """The pole's face is 3.5 h above the ball; what the load grows by from there on, the ball
+    bears.
 
     A hole's edge meets the ball farther down, by the sphere's sag, less the shell's turn.
     """

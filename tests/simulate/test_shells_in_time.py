@@ -76,8 +76,11 @@ def found_of(base: dict[str, Any]) -> list[dict[str, Any]]:
 def test_the_force_of_a_step_does_the_work_that_the_energy_changes_by(
     symmetry: str, ends: tuple[float, float], shell: dict[str, Any]
 ) -> None:
-    """Where contact sets in, ceases and goes on: 1e-9 of the larger energy. Differences of the force are its tangent
-    within 1e-3, as the tangent leaves out how factors at kinks change with the direction of the way."""
+    """Where contact sets in, ceases and goes on: 1e-9 of the larger energy. Differences of the
+    force are its tangent within 1e-3, as the tangent leaves out how factors at kinks change with
+    the direction of the
+    way.
+    """
     steps = {"loading": [{"kind": "time", "duration": 1.0, "points": 1}], "symmetry": symmetry}
     scene = Scene(Case.from_source(discs(**shell) | steps | {"mesh": MESHES[symmetry]}))
     (contact,), h = scene.model.shell_contacts, scene.model.material.h

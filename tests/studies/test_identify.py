@@ -435,8 +435,9 @@ def test_a_table_of_a_spreadsheet(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_rows_without_a_number_are_counted(tmp_path: Path) -> None:
-    """What is nan or empty is said in the output and in identify.json, by column; the band is that of
-    the table without these rows."""
+    """What is nan or empty is said in the output and in identify.json, by column; the band is that
+    of the table without these rows.
+    """
     text = (
         CAP.replace("{kind: pressure, until: limit}", "{kind: field, points: 1}")
         + "symmetry: axisymmetric\n"

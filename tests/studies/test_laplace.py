@@ -242,8 +242,9 @@ def test_a_smooth_field_of_given_strength() -> None:
 
 @pytest.mark.slow
 def test_the_strength_that_makes_data_most_likely() -> None:
-    """No strength or noise nearby has a higher density of the data, which is normal (SciPy); of 40 fields bands cover
-    what they say, and misfit and noise are those that were put in."""
+    """No strength or noise nearby has a higher density of the data, which is normal (SciPy); of 40
+    fields bands cover what they say, and misfit and noise are those that were put in.
+    """
     own, rng = Blurred(), np.random.default_rng(5)
     inside, misfits, noises = list[float](), list[float](), list[float]()
     for seed in range(40):

@@ -5,7 +5,8 @@ Reissner-Mindlin shell on an octant of a cylinder: displacement u and director d
 degree k on a grid of quadrilaterals; the corner A is moved radially in steps. Lengths as in the
 case, energies over E h:
 
-    membrane and bending   W(E) + h^2/12 W(K),    W(A) = ((1 - nu) A:A + nu tr^2 A) / (2 (1 - nu^2)),
+    membrane and bending   W(E) + h^2/12 W(K),    W(A) = ((1 - nu) A:A + nu tr^2 A) / (2 (1 -
+    nu^2)),
                            E_ij = (r,i . r,j - ..)/2,    K_ij = sym(r,i . d,j) - ..
     shear                  kappa/(4 (1 + nu)) |r,i . d|^2
     |d| = 1                ((d . d - 1)/2)^2 / 2, as penalty

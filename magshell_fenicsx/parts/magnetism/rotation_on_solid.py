@@ -29,7 +29,9 @@ def magnetic_gradient(X: Expr, u: Expr, H: Expr, Br: Expr, G: Expr, h: Expr) -> 
 
 
 def magnetic_in_space(X: Expr, u: Expr, H: Expr, Br: Expr, P: Expr, h: Expr) -> Expr:
-    """Return the energy of a field known by values, less its value at u = 0; P see `field_at_displacement`."""
+    """Return the energy of a field known by values, less its value at u = 0; P see
+    `field_at_displacement`.
+    """
     B, change = field_at_displacement(P, u)
     return magnetic(X, u, H, Br, B, h) - ufl.dot(change, Br) / h
 

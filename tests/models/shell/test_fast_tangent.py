@@ -113,7 +113,9 @@ def test_matrix_is_reused_and_follows_state_and_amplitudes(shell: Shells) -> Non
 
 
 def test_stress_of_other_displacements(shell: Shells) -> None:
-    """v . K v changes by twice the integral of `densities.prestress` with the change of the strain, by a form."""
+    """v . K v changes by twice the integral of `densities.prestress` with the change of the strain,
+    by a form.
+    """
     model = shell(2)
     system, u, step, v = (
         model.system,

@@ -217,7 +217,8 @@ def test_a_half(model: Any, tmp_path: Path, polar: float, azimuth: float, error:
     states = [State(u.ravel(), at), State(bend.ravel(), at)]
     systems = whole.model.system, half.model.system
     energies = [
-        s.at_state(state).evaluate(t.energy) for s, state, t in zip(systems, states, terms, strict=True)
+        s.at_state(state).evaluate(t.energy)
+        for s, state, t in zip(systems, states, terms, strict=True)
     ]
     assert 2 * energies[1] == pytest.approx(energies[0], rel=1e-5)
     system, term, step = systems[1], terms[1], 3e-6
@@ -235,7 +236,10 @@ def test_a_half(model: Any, tmp_path: Path, polar: float, azimuth: float, error:
     assert np.linalg.norm(k @ v.ravel() - slope) < 1e-6 * np.linalg.norm(slope)
     term._u.x.array[:] = 0.0
     flat = term.even_and_odd_hessians(inexact=False)[0]
-    turned, times = flat.rotated_blocks(term._rotations(bend.ravel(), 0 * bend.ravel())), term._blocks.times
+    turned, times = (
+        flat.rotated_blocks(term._rotations(bend.ravel(), 0 * bend.ravel())),
+        term._blocks.times,
+    )
     stored, rest = flat.near_blocks, flat.near_blocks.copy()
     rest.data[flat.is_adjacent] = 0.0
     exact, rounding = (
