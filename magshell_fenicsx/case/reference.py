@@ -30,34 +30,38 @@ COMMON_KEYS = "keys of several kinds"
 HEAD = """\
 # The case file
 
-Every section and key, made from [case.schema.json](case.schema.json) by `magshell schema --markdown`. A case is YAML;
-an unknown key, a missing one or one out of bounds is refused with file and line. Rules between keys (which target
-goes with which control, for instance) stand in the text; `magshell check CASE.yaml` tells them all.
+Every section and key, made from [case.schema.json](case.schema.json) by `magshell schema
+--markdown`. A case is YAML; an unknown key, a missing one or one out of bounds is refused with file
+and line. Rules between keys (which target goes with which control, for instance) stand in the text;
+`magshell check CASE.yaml` tells them all.
 
-An editor that knows the schema completes keys, explains them and marks mistakes while one types: see
-[howto.md](howto.md#let-the-editor-help).
+An editor that knows the schema completes keys, explains them and marks mistakes while one types:
+see [howto.md](howto.md#let-the-editor-help).
 
-Any key can be given on the command line, `--set loading.points=40`, sections too: `--set "loading={kind: field}"`.
+Any key can be given on the command line, `--set loading.points=40`, sections too: `--set
+"loading={kind: field}"`.
 
-**Units.** Dimensionless unless a unit stands in the table. On hemispheres, discs and strips a length, Young's modulus
-and a flux density are text with a unit: `25.2 mm`, `1.8 MPa`, `60 mT`. On all other geometries either all lengths and
-Young's modulus have units, and points, a profile, loads and mesh.size may have (without they are in m, N, N/m, Pa; a
-moment is per length, in N); or nothing has, and everything is in one's own units. A flux density has a unit everywhere.
-In a case with units, whatever its geometry, a point, a body or a magnet whose numbers have no unit is in metres.
+**Units.** Dimensionless unless a unit stands in the table. On hemispheres, discs and strips a
+length, Young's modulus and a flux density are text with a unit: `25.2 mm`, `1.8 MPa`, `60 mT`. On
+all other geometries either all lengths and Young's modulus have units, and points, a profile, loads
+and mesh.size may have (without they are in m, N, N/m, Pa; a moment is per length, in N); or nothing
+has, and everything is in one's own units. A flux density has a unit everywhere. In a case with
+units, whatever its geometry, a point, a body or a magnet whose numbers have no unit is in metres.
 """
 
 
 COLUMNS_HEAD = """
 ## The columns of path.csv
 
-One row for each accepted point. The numbers are dimensionless: multiply a number by its unit to get the quantity in SI.
-A case with units has more columns at the end, which are in them already: those of "with units", `NAME_ux_mm` of
-points, and `NAME_fx_N` and `NAME_mx_N_m` of supports. Terminal, pictures, report and sweeps then show these.
-Named points add `NAME_ux`, `NAME_uy` and `NAME_uz`, in the unit of the shell's lengths. Where supports move, or with
-`reactions: true`, every support adds its reaction on the shell: the forces `NAME_fx`, `NAME_fy` and `NAME_fz`, and the
-moments `NAME_mx`, `NAME_my` and `NAME_mz` about the middle of the support's bounding box, where the support is now; in
-N and N m if the case has units, else in its own (over E R² and E R³ if it has no lengths). A user-defined energy adds a
-column with its name: its amplitude.
+One row for each accepted point. The numbers are dimensionless: multiply a number by its unit to get
+the quantity in SI. A case with units has more columns at the end, which are in them already: those
+of "with units", `NAME_ux_mm` of points, and `NAME_fx_N` and `NAME_mx_N_m` of supports. Terminal,
+pictures, report and sweeps then show these. Named points add `NAME_ux`, `NAME_uy` and `NAME_uz`, in
+the unit of the shell's lengths. Where supports move, or with `reactions: true`, every support adds
+its reaction on the shell: the forces `NAME_fx`, `NAME_fy` and `NAME_fz`, and the moments `NAME_mx`,
+`NAME_my` and `NAME_mz` about the middle of the support's bounding box, where the support is now; in
+N and N m if the case has units, else in its own (over E R² and E R³ if it has no lengths). A
+user-defined energy adds a column with its name: its amplitude.
 """
 AMPLITUDES_HEAD = """
 The column `amplitude` names the amplitude that varied:

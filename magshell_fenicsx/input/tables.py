@@ -212,8 +212,8 @@ def _csv_cells(text: str) -> _TableCells:
     for line, row in _rows(text, separator, begin):
         if len(row) != len(names):
             raise TableError(
-                f"has {len(names)} names in its header and {len(row)} columns in line {line}: every "
-                "row has as many cells as the header, and decimal points"
+                f"has {len(names)} names in its header and {len(row)} columns in line {line}: "
+                "every row has as many cells as the header, and decimal points"
             )
         for name, cell in zip(names, row, strict=True):
             value = _number(cell)

@@ -160,7 +160,8 @@ class Context:
         if edge is not None and not 0 <= polar < edge - 1:
             smallest_polar = getattr(self.shell, "hole", None) or 0
             raise ValueError(
-                f"{key}.at.polar: {polar:g} is not on the shell: allowed {smallest_polar:g} to {edge - 1:g}"
+                f"{key}.at.polar: {polar:g} is not on the shell: allowed {smallest_polar:g} to "
+                f"{edge - 1:g}"
             )
 
     @property

@@ -317,8 +317,8 @@ class Problem:
         if self.moves_freely or not any(map(_needs_inertia_alone, self.programme)):
             return ""
         return (
-            "; a shell that moves in time alone need not be held: let a field, for instance, act in "
-            "the history of the step of kind: time, and no load before it"
+            "; a shell that moves in time alone need not be held: let a field, for instance, act "
+            "in the history of the step of kind: time, and no load before it"
         )
 
     @property

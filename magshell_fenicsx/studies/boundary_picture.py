@@ -126,7 +126,7 @@ def _in_units(rows: Sequence[Row], load: str) -> tuple[list[Row], str]:
 def _plane(
     plane: Any, rows: Sequence[Row], content: Mapping[str, Any], empty: Sequence[float]
 ) -> None:
-    """Draw lines of both keys at which an instability occurs, by load, and marks where none does."""
+    """Draw lines of both keys at which an instability occurs, by load, and marks without one."""
     load_words = set[str]()
 
     def draw(x: Sequence[float], value: float, words: str, **style: Any) -> None:

@@ -165,7 +165,7 @@ class FieldVariables(Section):
 
 
 class DesignSection(Section):
-    """What `magshell design` varies, and for what; every other command takes the case without it."""
+    """What `magshell design` varies, and for what; other commands take the case without it."""
 
     objective: ObjectiveSection
     """What is wanted"""

@@ -232,8 +232,10 @@ SHOWN_COLUMNS = (
     ),
     *("output_s", "peak_mb", "factorisations", "iterations", "stopped"),
 )
-LEGEND = """Wall and CPU seconds are for the whole process with its files, kernels compiled; the phases are as in
-summary.json; the peak is the resident memory of all ranks. **Bold**: no other run is both faster and more accurate.
+LEGEND = """\
+Wall and CPU seconds are for the whole process with its files, kernels compiled; the phases are as
+in summary.json; the peak is the resident memory of all ranks. **Bold**: no other run is both
+faster and more accurate.
 """
 
 

@@ -47,10 +47,12 @@ C_DECLARATIONS = """
         int64_t degree, coarse_count, count;
         const double *of, *undeformed, *coarse, *fine, *X, *bounds;
     } Cells;
-    int64_t nearest(const Cells *, int64_t, const int64_t *, const int64_t *, const int64_t *, const uint8_t *,
-        const uint8_t *, const double *, const int64_t *, const double *, const double *, double, double, double,
+    int64_t nearest(const Cells *, int64_t, const int64_t *, const int64_t *, const int64_t *,
+        const uint8_t *, const uint8_t *, const double *, const int64_t *, const double *,
+        const double *, double, double, double,
         int64_t *, int64_t *, double *, double *, double *, double *, uint8_t *);
-    void places(int64_t, int64_t, const int64_t *, const int64_t *, const double *, const double *, double *);
+    void places(int64_t, int64_t, const int64_t *, const int64_t *, const double *, const double *,
+        double *);
 """
 
 

@@ -20,7 +20,8 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Indices = NDArray[np.int32]
 C_DECLARATIONS = """
-    void turn_blocks(int64_t, const int32_t *, const int32_t *, const int32_t *, const double *, const double *, double,
+    void turn_blocks(int64_t, const int32_t *, const int32_t *, const int32_t *, const double *,
+        const double *, double,
         const double *, const int64_t *, const double *, const int32_t *, const int32_t *, float *);
 """
 

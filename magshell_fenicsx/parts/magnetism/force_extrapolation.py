@@ -116,7 +116,7 @@ class ForceExtrapolation:
         return forces
 
     def extrapolation_holds_along(self, u: Array, step: Array) -> bool:
-        """Return whether forces are known at two states near each other and u, along a direction."""
+        """Return whether forces are known at two states near u, along a direction."""
         if not self._points or self._is_new_point(u):
             return False
         largest_distance, step_size = (
@@ -223,7 +223,7 @@ class PathPolynomial:
 
     @classmethod
     def from_points(cls, points: list[list[ForceState]]) -> "PathPolynomial":
-        """Return the polynomial through the last state of each point; the newest point is the last."""
+        """Return the polynomial through the last state of each point, the newest one last."""
         base, previous = points[-1][-1], points[-2][-1] if len(points) > 1 else None
         if previous is None or np.array_equal(previous.u, base.u):
             return cls(base, np.zeros_like(base.u), 1.0, np.zeros((0, len(base.forces))))
