@@ -17,7 +17,7 @@ the step began, which p changes too. So are loads that a step leaves and was not
 force at a depth.
 """
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import TypeAlias
@@ -378,42 +378,16 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
             break
         begin, c, by_mu = begins[record.step], dict[str, float](), dict[str, float]()
         if begin.scene and begin.scene is not scene:
-            if held_conjugates or loads:
-                names = ", ".join({*held_conjugates, *loads})
-                raise CaseError(
-                    f"{names}: as they were before {step.key}, in another model: no gradient"
-                )
+            _refuse_other_model([*held_conjugates, *loads], step)
             break
         state_before = system.with_moved_supports(begin.point.state)
         held_before = held_at(scene, begin, state_before)
         if part and place:
-            reused_amplitudes = {
-                name
-                for step_of_programme in earlier
-                for name in (step_of_programme.name, *held_by_step(step_of_programme))
-            } & place.state.mu.keys()
+            reused_amplitudes = _amplitudes_of(earlier) & place.state.mu.keys()
             for name in reused_amplitudes - place.rows.keys() - driven_amplitudes:
                 loads[name] = loads.get(name, 0.0) + by_load(part, name)
-        for name, row in held_conjugates.items():
-            assert place
-            law = step.load.hold[name]
-            if isinstance(law, Gas):
-                share, slope = enclosed_gas(scene, law.gas, state_before).by_begin(
-                    place.state.mu[name]
-                )
-                c[name], by_mu[name] = -row * share, row * slope
-                continue
-            potential_now, potential_before = (
-                system.potential(state.u, state.mu, name) for state in (place.state, state_before)
-            )
-            if abs(potential_now - potential_before) > CONJUGATE_TOLERANCE * max(
-                abs(potential_now), abs(scene.conjugate_unit(name))
-            ):
-                raise CaseError(
-                    f"{step.key}.hold.{name}: no gradient, as it is not held from the last point "
-                    "before the step"
-                )
-            c[name] = -row
+        if place:
+            c, by_mu = _by_held_conjugates(scene, step, held_conjugates, place, state_before)
         for name in loads.keys() & held_before.keys():
             by_mu[name] = by_mu.get(name, 0.0) + loads.pop(name)
             left_loads.add(name)
@@ -440,6 +414,60 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
             part = Adjoint(scene, [place_at_begin])
         record = begin
     return replace(adjoint, places=places, left_loads=frozenset(left_loads))
+
+
+def _refuse_other_model(names: Collection[str], step: ProgrammeStep) -> None:
+    """Refuse amplitudes whose values are those before a step, in another model."""
+    if names:
+        raise CaseError(
+            f"{', '.join(dict.fromkeys(names))}: as they were before {step.key}, in another "
+            "model: no gradient"
+        )
+
+
+def _amplitudes_of(steps: Iterable[ProgrammeStep]) -> set[str]:
+    """Return the amplitudes that steps drive or hold."""
+    return {name for step in steps for name in (step.name, *held_by_step(step))}
+
+
+def _by_held_conjugates(
+    scene: Scene,
+    step: ProgrammeStep,
+    held_conjugates: Mapping[str, float],
+    place: AdjointState,
+    state_before: State,
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return the derivatives of a result by the conjugates and the amplitudes before a step.
+
+    Parameters
+    ----------
+    held_conjugates
+        Amplitude -> derivative of the result by its conjugate, which the step holds.
+
+    Raises
+    ------
+    CaseError
+        If a conjugate is not held from the last point before the step.
+    """
+    system, c, by_mu = scene.model.system, dict[str, float](), dict[str, float]()
+    for name, row in held_conjugates.items():
+        law = step.load.hold[name]
+        if isinstance(law, Gas):
+            gas = enclosed_gas(scene, law.gas, state_before)
+            share, slope = gas.by_begin(place.state.mu[name])
+            c[name], by_mu[name] = -row * share, row * slope
+            continue
+        potential_now, potential_before = (
+            system.potential(state.u, state.mu, name) for state in (place.state, state_before)
+        )
+        size = max(abs(potential_now), abs(scene.conjugate_unit(name)))
+        if abs(potential_now - potential_before) > CONJUGATE_TOLERANCE * size:
+            raise CaseError(
+                f"{step.key}.hold.{name}: no gradient, as it is not held from the last point "
+                "before the step"
+            )
+        c[name] = -row
+    return c, by_mu
 
 
 def _driven_amplitudes(step: ProgrammeStep, mu: Mapping[str, float]) -> set[str]:
