@@ -22,7 +22,7 @@ from magshell_fenicsx.continuation.point import (
     Progress,
     StepOptions,
 )
-from magshell_fenicsx.continuation.snes import FAR
+from magshell_fenicsx.continuation.snes import DIVERGED, FAR
 from magshell_fenicsx.continuation.stepping import LEAST_PART, LOOKED_BACK, Ahead, Course, Far, Plan
 from magshell_fenicsx.continuation.system import Direction, State, Weighted, dot, followed, max_abs
 
@@ -49,6 +49,9 @@ ABOUT = (
 )
 FARTHER = 3.0  # states so many times as far apart as their tangents lead are not on one path
 SEEN = 1e-6  # in lengths of the system: smaller displacements count as zero
+# of the arc length, to which steps shrink before a first touch: from deeper inside a hard body the
+# correction is led astray
+TOUCH = 1e-6
 
 
 class NotANumber(RuntimeError):
@@ -343,7 +346,7 @@ class Path:
                         (None, self.as_base(tried.point)) if corners else (tried, tried.reason)
                     )
                 if isinstance(tried, str):
-                    course.failed(plan, tried, self.options.smallest)
+                    course.failed(plan, tried, self._smallest(tried))
                     continue
                 straight = self._cosine(here, tried) > self.options.straight
                 corner = corners or self._corner(here, tried)
@@ -554,6 +557,14 @@ class Path:
         return not far.point.turned_from(here) and not self.are_apart(
             here, self.seen_from(here, far.point)
         )
+
+    def _smallest(self, reason: str) -> float:
+        """The smallest step after a failure: a shorter one by arc length where a body may be just
+        ahead.
+        """
+        astray = reason in (FAR, DIVERGED) and self.newton.options.corners
+        smallest = self.options.smallest
+        return min(smallest, TOUCH) if astray and self.control == "arc" else smallest
 
     def are_apart(self, low: Point, high: Point, least: float = SEEN) -> bool:
         """Whether two points are farther apart than a path between them is long, as their tangents

@@ -18,6 +18,7 @@ from dolfinx.cpp.io import perm_gmsh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
+from magshell_fenicsx.mesh.partition import partitioner
 from magshell_fenicsx.mesh.patch import (
     Deviated,
     Deviation,
@@ -263,14 +264,18 @@ def distribute(patch: PatchMesh, comm: MPI.Comm) -> Midsurface:
 def create_mesh(
     comm: MPI.Comm, element: Any, cells: NDArray[np.int64], x: NDArray[np.float64]
 ) -> mesh.Mesh:
-    """A mesh on all ranks, from cells and node positions (n, 3) that every rank has."""
+    """A mesh on all ranks, from cells and node positions (n, 3) that every rank has.
+
+    Of the same cells it has the same numbers on the same ranks.
+    """
+    facet = element.basix_element.entity_closure_dofs[-2][0]
     first = comm.rank == 0
     return mesh.create_mesh(
         comm,
         cells=cells if first else cells[:0],
         x=x if first else x[:0],
         e=element,
-        partitioner=compat.shared_facets(),
+        partitioner=partitioner(cells, len(facet), comm.rank, comm.size),
     )
 
 

@@ -14,6 +14,7 @@ from dolfinx import fem, mesh
 from dolfinx.cpp.fem import pack_coefficients, pack_constants
 from dolfinx.cpp.fem.petsc import assemble_matrix as _assemble_matrix
 from dolfinx.cpp.fem.petsc import insert_diagonal
+from dolfinx.cpp.graph import AdjacencyList_int32
 from dolfinx.fem.forms import form_cpp_class, get_integration_domains
 from ffcx import compiler, naming
 from ffcx.codegeneration import get_include_path, jit
@@ -135,13 +136,9 @@ def bound(
     return fem.Form(made, kernels.ufcx, None, kernels)
 
 
-def shared_facets() -> Any:
-    """The partitioner for `create_mesh` that gives each rank one layer of ghosts."""
-    mode = mesh.GhostMode.shared_facet
-    try:
-        return mesh.create_cell_partitioner(mode)
-    except TypeError:
-        return mesh.create_cell_partitioner(mode, 2)  # cells at a facet, from dolfinx 0.11
+def adjacency(links: NDArray[np.int32], offsets: NDArray[np.int32]) -> Any:
+    """What a partitioner returns: the ranks of each cell, and where these begin."""
+    return AdjacencyList_int32(links, offsets)
 
 
 def interpolation_points(V: fem.FunctionSpace) -> NDArray[np.float64]:

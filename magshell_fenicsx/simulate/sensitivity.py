@@ -315,6 +315,9 @@ def touch_as_in(scene: Scene, other: Scene, state: State) -> None:
     """Take contact between shells in another scene on the same mesh as polynomials about a state of
     the first one.
     """
+    assert np.array_equal(scene.model.V.dofmap.list, other.model.V.dofmap.list), (
+        "they go by numbers"
+    )
     at = scene.model.system.at(state)
     of_one: Sequence[Any] = scene.model.touchings
     of_other: Sequence[Any] = other.model.touchings

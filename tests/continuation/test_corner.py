@@ -5,14 +5,16 @@ A softening spring, f = x^3 - 3 x^2 + 2 x, carries a body with x <= X but for th
 pulls at its other end by a linear spring, q = x + load/K. All of it is known in closed form.
 """
 
+from typing import Any
+
 import numpy as np
 import pytest
 from continuation.toys import Toy
 
-from magshell_fenicsx.continuation.newton import BorderedNewton
+from magshell_fenicsx.continuation.newton import BorderedNewton, Outcome
 from magshell_fenicsx.continuation.path import Path
 from magshell_fenicsx.continuation.point import Point, StepOptions
-from magshell_fenicsx.continuation.snes import NewtonOptions
+from magshell_fenicsx.continuation.snes import DIVERGED, NewtonOptions
 from magshell_fenicsx.continuation.stepping import Ahead
 from magshell_fenicsx.continuation.system import State, Vector
 from magshell_fenicsx.continuation.walk import Goal, Label, Walk
@@ -110,3 +112,30 @@ def test_a_path_passes_corners_just_ahead(places: list[float]) -> None:
     x = (3.0 + 6 * sum(at)) / (1 + 6 * len(at))
     assert label == "target"
     assert point.state.u == pytest.approx([(3.0 + x) / 2, x], rel=1e-6)
+
+
+class Shallow(BorderedNewton):
+    """A corrector that is led astray by guesses deeper inside a hard stop."""
+
+    stop, deepest = 0.0, 0.0
+
+    def solve(self, guess: State, *given: Any, **more: Any) -> Outcome:
+        if guess.u[1] - self.stop > self.deepest:
+            return Outcome(guess, False, 3, DIVERGED, np.inf)
+        return super().solve(guess, *given, **more)
+
+
+def test_a_path_comes_to_a_hard_stop_in_steps_shorter_than_its_shortest() -> None:
+    """Which is 1e-3 here; behind the stop x = (load + 6 X)/7, which moves a seventh as fast."""
+    first, begin, hard = 0.1, 0.5, 0.5704
+    newton = Shallow(rows_of_stops([hard]), NewtonOptions(fresh=0.0, patience=7, corners=True))
+    newton.stop, newton.deepest = hard, 1e-5
+    path = Path(newton, "load", "arc", StepOptions(first, 4 * first, 1e-2 * first))
+    start = path.start(State(np.array([begin, begin]), {"load": begin}))
+    seen = list[Point]()
+    for _, point in Walk(path, start, Goal("target", [0.6])):
+        seen.append(point)
+        newton.deepest = np.inf if point.state.u[1] > hard else newton.deepest
+    x = (0.6 + 6 * hard) / 7
+    assert seen[-1].state.u == pytest.approx([(0.6 + x) / 2, x], rel=1e-6)
+    assert len(seen) < 40, "it does not creep"

@@ -282,11 +282,6 @@ def test_by_fields_of_the_shape() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    reason="once in eight runs the gradient by a shell's thickness is no number of this problem: "
-    "on two ranks something reads memory that nothing has written",
-    strict=False,
-)
 def test_ranks(tmp_path: Path) -> None:
     """A run's section `gradients` on 1 and 2 ranks, of a displacement and a frequency, by numbers
     and the shape.

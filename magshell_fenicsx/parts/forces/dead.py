@@ -215,6 +215,9 @@ class DeadSection(PathStep):
     def step(self, change: float | None, now: Now) -> float | None:
         return abs(change) / self.points if self.control == "displacement" and change else None
 
+    def scale(self, now: Now) -> float:
+        return abs(self.factor or 1.0)
+
     def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:
         R, span = context.shell.reference, outline.span
         fixed = [load for load in self.loads if not load.varies]
