@@ -20,7 +20,6 @@ from dolfinx.cpp.io import perm_gmsh
 from mpi4py import MPI
 from numpy.typing import NDArray
 
-from magshell_fenicsx.mesh.partition import partitioner
 from magshell_fenicsx.mesh.patch import (
     DeviatedEmbedding,
     Deviation,
@@ -278,14 +277,13 @@ def create_mesh(
 
     Of the same cells it has the same numbers on the same ranks.
     """
-    facet = element.basix_element.entity_closure_dofs[-2][0]
     is_first_rank = comm.rank == 0
     return mesh.create_mesh(
         comm,
         cells=cells if is_first_rank else cells[:0],
         x=x if is_first_rank else x[:0],
         e=element,
-        partitioner=partitioner(cells, len(facet), comm.rank, comm.size),
+        partitioner=compat.shared_facet_partitioner(),
     )
 
 

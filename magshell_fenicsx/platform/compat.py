@@ -4,6 +4,7 @@ No other module depends on the version of dolfinx.
 """
 
 import ctypes
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
@@ -17,7 +18,6 @@ from dolfinx import fem, mesh
 from dolfinx.cpp.fem import pack_coefficients, pack_constants
 from dolfinx.cpp.fem.petsc import assemble_matrix as _assemble_matrix
 from dolfinx.cpp.fem.petsc import insert_diagonal
-from dolfinx.cpp.graph import AdjacencyList_int32
 from dolfinx.fem.forms import form_cpp_class, get_integration_domains
 from ffcx import compiler, naming
 from ffcx.codegeneration import get_include_path, jit
@@ -155,9 +155,18 @@ def _cpp_objects(objects: Sequence[Any]) -> list[Any]:
     return [wrapper._cpp_object for wrapper in objects]
 
 
-def adjacency(links: NDArray[np.int32], offsets: NDArray[np.int32]) -> Any:
-    """Return what a partitioner returns: the ranks of each cell, and where these begin."""
-    return AdjacencyList_int32(links, offsets)
+def shared_facet_partitioner() -> Any:
+    """Return the partitioner for `create_mesh` that gives each rank one layer of ghosts.
+
+    It divides the same cells in the same way each time: scenes on one mesh with other numbers of
+    the case give each other what touches by the numbers of cells and nodes.
+    """
+    os.environ["SCOTCH_PTHREAD_NUMBER"] = "1"  # with threads it divides in several ways
+    mode = mesh.GhostMode.shared_facet
+    try:
+        return mesh.create_cell_partitioner(mode)
+    except TypeError:
+        return mesh.create_cell_partitioner(mode, 2)  # cells at a facet, from dolfinx 0.11
 
 
 def interpolation_points(V: fem.FunctionSpace) -> NDArray[np.float64]:
