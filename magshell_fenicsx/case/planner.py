@@ -46,7 +46,7 @@ from magshell_fenicsx.parts.imperfections.modes import Mode, ModesSection
 from magshell_fenicsx.parts.imperfections.symmetry import (
     MAX_RIMS,
     LocalImperfection,
-    different,
+    distinct_rims,
     leaves,
     spots,
 )
@@ -153,7 +153,7 @@ def _modelled(
         axisymmetric=part.axisymmetric,
         vertices=points.of_steps,
         patch_rims={
-            name: in_frame(imperfections[key].inside, turn) for name, key in case.dimples.items()
+            name: in_frame(imperfections[key].is_within_rim, turn) for name, key in case.dimples.items()
         },
         deviations={
             key: in_frame(geometry.deviation, turn) for key, geometry in imperfections.items()
@@ -564,7 +564,7 @@ def _mesh_plan(
     )
     turned_outline = shell.turned_outline(part.turn)
     shape, size = _shape(turned_outline, part, size, points.charts.values())
-    rims = different(local)
+    rims = distinct_rims(local)
     _refuse_unfit_sector(case, part, rims)
     shape = _with_rims(shape, local, rims if len(rims) <= MAX_RIMS else (), size)
     if not part.axisymmetric:

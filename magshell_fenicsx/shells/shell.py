@@ -307,13 +307,13 @@ class ShellModel(ThinModel):
         """
         if not self.loads.natural:
             return None
-        natural = self.loads.natural.on(
+        natural = self.loads.natural.on_cells(
             self.midsurface.patches,
             _cell_count(self.midsurface),
             lambda given: user_field_polynomials(given, self.midsurface, cells),
         )
         self.loads = replace(self.loads, natural=natural)
-        return Shape.of(natural_field(natural, cells, self.V), natural, free_constants)
+        return Shape.from_field(natural_field(natural, cells, self.V), natural, free_constants)
 
     def _find_openings(self) -> tuple[Mapping[str, NDArray[np.int32]], bool]:
         """Return the edges where the pressed surface ends, and whether moving supports close it.

@@ -389,7 +389,10 @@ def _mirrored_formula(
         return False
     values, images = (
         np.stack(
-            [formula_function(v)(*places.T) for v in (one_load.vector or [one_load.pressure or 0.0])],
+            [
+                formula_function(v)(*places.T)
+                for v in (one_load.vector or [one_load.pressure or 0.0])
+            ],
             axis=-1,
         )
         for one_load, places in ((load, x), (other, image))

@@ -18,7 +18,7 @@ from magshell_fenicsx.mesh.patch import place_text
 from magshell_fenicsx.parts.imperfections.imperfection import (
     ImperfectionGeometry,
     ImperfectionSection,
-    over,
+    number_over,
 )
 from magshell_fenicsx.platform.input_files import Files
 from magshell_fenicsx.shape.reference_shell import ReferenceShell
@@ -61,7 +61,7 @@ class DataSection(FileKeys, ImperfectionSection):
     """CSV with a header or .npz, its path from the folder of the case"""
     amplitude: float = Field(default=1.0, ge=-1e3, le=1e3)
     """Factor of w0"""
-    noise: Annotated[float, over("h")] | None = Field(default=None, ge=0, le=50)
+    noise: Annotated[float, number_over("h")] | None = Field(default=None, ge=0, le=50)
     """Standard deviation of the noise in w0; 0: w0 is exact; estimated by default [h]"""
 
     def account(self) -> str:
@@ -81,16 +81,16 @@ class DataSection(FileKeys, ImperfectionSection):
                 _fits.clear()
             lengths = Lengths(ground.h, ground.R, ground.with_units)
             try:
-                _fits[fit_key] = _fitted(
+                _fits[fit_key] = _fit_of_scan(
                     self.noise, read_scan(self.path, lengths, self.files), ground
                 )
             except TableError as e:
                 raise CaseError(f"{key}.file: {self.file}: {e}") from None
-        fitted = _fits[fit_key]
+        fit = _fits[fit_key]
         return ImperfectionGeometry(
-            Factored(fitted.function, self.amplitude),
-            fitted.size,
-            account=f"{self.file}: {fitted.account}",
+            Factored(fit.function, self.amplitude),
+            fit.size,
+            account=f"{self.file}: {fit.account}",
         )
 
 
@@ -223,7 +223,7 @@ class _Fit:
     account: str
 
 
-def _fitted(standard: float | None, scan: Scan, ground: ReferenceShell) -> _Fit:
+def _fit_of_scan(standard: float | None, scan: Scan, ground: ReferenceShell) -> _Fit:
     """The smooth function; `standard` is the standard deviation of the noise over h, None to
     estimate it.
     """

@@ -16,7 +16,7 @@ from magshell_fenicsx.mesh.multi_shell import ShellPose
 from magshell_fenicsx.parts.imperfections.imperfection import (
     ImperfectionGeometry,
     ImperfectionSection,
-    over,
+    number_over,
 )
 from magshell_fenicsx.platform.input_files import read_vtk
 from magshell_fenicsx.shape.reference_shell import ON_AXIS, ReferenceShell
@@ -46,7 +46,8 @@ class ModesSection(FileKeys, ImperfectionSection):
 
     kind: Literal["modes"]
     amplitudes: Annotated[
-        list[Annotated[float, over("h"), Field(ge=-50, le=50)]], Field(min_length=1, max_length=20)
+        list[Annotated[float, number_over("h"), Field(ge=-50, le=50)]],
+        Field(min_length=1, max_length=20),
     ]
     """Largest w0 of each mode, the lowest mode first; positive: inwards where the mode is largest
     [h]"""

@@ -305,7 +305,7 @@ def spots(
     return local_imperfections
 
 
-def different(local: Iterable[LocalImperfection]) -> tuple[Array, ...]:
+def distinct_rims(local: Iterable[LocalImperfection]) -> tuple[Array, ...]:
     """Return the rims that need edges of elements; of nearly equal ones, the first."""
     rims: list[Array] = []
     for spot in local:

@@ -161,7 +161,8 @@ def account(context: Context, loads: "Loads") -> Account:
     if not loads.pressure:
         return Account(left_out=["pressure: not loaded by it (the volume is only reported)"])
     faces = ", ".join(
-        f"{name} from {'outside' if side > 0 else 'inside'}" for name, side in loads.pressed_sides.items()
+        f"{name} from {'outside' if side > 0 else 'inside'}"
+        for name, side in loads.pressed_sides.items()
     )
     return Account(
         [

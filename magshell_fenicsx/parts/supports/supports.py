@@ -111,7 +111,11 @@ def refuse_unknown(
     for name, condition in conditions.items():
         allowed = set(edges)
         allowed |= set(points) - {"pole"} if isinstance(condition, HeldComponents) else set()
-        allowed |= set(patches) if isinstance(condition, HeldComponents) or condition == "clamped" else set()
+        allowed |= (
+            set(patches)
+            if isinstance(condition, HeldComponents) or condition == "clamped"
+            else set()
+        )
         if name not in allowed:
             refuse_joined(f"boundary.{name}", name)
             allowed_names = ", ".join(sorted(allowed)) or "none"
@@ -371,14 +375,16 @@ def supports(
     named_supports: dict[str, Support] = {}
     supports_on_planes: dict[str, Support] = {}
     for name, condition in conditions.items():
-        components = condition.components if isinstance(condition, HeldComponents) else ALL_COMPONENTS
+        components = (
+            condition.components if isinstance(condition, HeldComponents) else ALL_COMPONENTS
+        )
         if condition in ("free", "symmetry"):
             continue
         nodes = None if condition == "clamped" else is_in_middle
         if condition == "plane":
             planes.append(plane := plane_of(r0, body.faces[name], name))
             constraints.append(support_along(V, 2, body.faces[name], plane.normal))
-            supports_on_planes[name] = Support.of(
+            supports_on_planes[name] = Support.from_conditions(
                 held_on(V, 2, body.faces[name], ALL_COMPONENTS), kind="plane"
             )
             continue
@@ -391,7 +397,7 @@ def supports(
         else:
             conditions_of_part = held_at_vertex(V, body.points[name], components)
         constraints += conditions_of_part
-        named_supports[name] = Support.of(
+        named_supports[name] = Support.from_conditions(
             conditions_of_part, kind="point" if name in body.points else "part"
         )
     return constraints, planes, named_supports | supports_on_planes
