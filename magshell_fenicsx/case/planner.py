@@ -41,14 +41,18 @@ from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.ability import Modelled
 from magshell_fenicsx.parts.bodies.body_contact import ContactBody
 from magshell_fenicsx.parts.bodies.body_setup import ContactZone, body_symmetry, contact_bodies
-from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry, flaws, in_frame
+from magshell_fenicsx.parts.imperfections.imperfection import (
+    ImperfectionGeometry,
+    imperfection_geometries,
+    in_frame,
+)
 from magshell_fenicsx.parts.imperfections.modes import Mode, ModesSection
 from magshell_fenicsx.parts.imperfections.symmetry import (
     MAX_RIMS,
     LocalImperfection,
     distinct_rims,
-    leaves,
-    spots,
+    imperfection_constraints,
+    local_imperfections,
 )
 from magshell_fenicsx.parts.laminate import laminate_of
 from magshell_fenicsx.parts.loads import Loads
@@ -153,7 +157,8 @@ def _modelled(
         axisymmetric=part.axisymmetric,
         vertices=points.of_steps,
         patch_rims={
-            name: in_frame(imperfections[key].is_within_rim, turn) for name, key in case.dimples.items()
+            name: in_frame(imperfections[key].is_within_rim, turn)
+            for name, key in case.dimples.items()
         },
         deviations={
             key: in_frame(geometry.deviation, turn) for key, geometry in imperfections.items()
@@ -306,7 +311,7 @@ class _ImperfectShell:
     def of(cls, case: Case) -> "_ImperfectShell":
         """Return the shell of a case."""
         material, reference = _material(case), reference_shell_of(case.shell)
-        imperfections = flaws(case.imperfections, reference)
+        imperfections = imperfection_geometries(case.imperfections, reference)
         last_steps = {step.name: step for step in case.programme}
         growing = {
             key for step in last_steps.values() for key in step.load.multiplies(step, case.context)
@@ -417,7 +422,9 @@ def _constraints(
     """Return the symmetry that each part of a case preserves, imperfections and bodies included."""
     one_by_one = bool(case.patches)
     constraints = symmetry_constraints(case, outline, energies)
-    constraints += leaves(shell.imperfections, shell.perfect, one_by_one=one_by_one)
+    constraints += imperfection_constraints(
+        shell.imperfections, shell.perfect, one_by_one=one_by_one
+    )
     constraints += [body_symmetry(contact) for contact in _body_contacts(case, shell.reference)]
     return constraints
 
@@ -535,7 +542,7 @@ def _mesh_plan(
     """
     local: list[LocalImperfection] = []
     if not isinstance(case.shell, MeshSurface):
-        local = spots(shell.imperfections.items(), shell.perfect, part.turn)
+        local = local_imperfections(shell.imperfections.items(), shell.perfect, part.turn)
     bodies = _body_contacts(case, replace(shell.reference, turn=part.turn))
     sampled_shell = replace(shell.reference, imperfect=outline)
     contact_regions = [
@@ -638,7 +645,13 @@ def _with_rims(
     shape: Chart, local: Sequence[LocalImperfection], rims: tuple[Array, ...], size: Grading
 ) -> Chart | RimmedGrid:
     """Return the shape with element edges along the rims."""
-    circles = tuple(dict.fromkeys(spot.radius for spot in local if spot.circle and spot.jumps))
+    circles = tuple(
+        dict.fromkeys(
+            local_imperfection.radius
+            for local_imperfection in local
+            if local_imperfection.circle and local_imperfection.jumps
+        )
+    )
     if isinstance(shape, Grid):
         return RimmedGrid(shape, rims) if rims else shape
     if isinstance(shape, DiscShape):

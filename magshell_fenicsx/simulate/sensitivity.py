@@ -31,7 +31,7 @@ from magshell_fenicsx.parts.imperfections.growth import grown_by
 from magshell_fenicsx.parts.imperfections.imperfection import (
     ImperfectionSection,
     LocalSection,
-    flaws,
+    imperfection_geometries,
     in_frame,
 )
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
@@ -417,7 +417,7 @@ def _deviation(scene: Scene, sections: Imperfections, key: str) -> Deviation:
     """Return the deviation of one of some imperfections, in the frame of the scene's model."""
     problem, number = scene.problem, list(sections).index(key)
     # by number: the geometries have random dimples one by one
-    geometries = flaws(sections, reference_shell_of(problem.context.shell))
+    geometries = imperfection_geometries(sections, reference_shell_of(problem.context.shell))
     geometry = list(geometries.values())[number]
     turned_deviation = in_frame(geometry.deviation, problem.azimuth)
     return _Mirrored(turned_deviation, problem.mirror) if problem.mirror else turned_deviation

@@ -231,7 +231,7 @@ class DeadSection(PathStep):
     def step(self, change: float | None, load_start: LoadStart) -> float | None:
         return abs(change) / self.points if self.control == "displacement" and change else None
 
-    def leaves(
+    def symmetry_constraints(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
         R, meridian = context.shell.reference, outline.meridian
@@ -288,7 +288,7 @@ class DeadSection(PathStep):
         ]
         return [
             SymmetryConstraint(reason, vectors, mirrors),
-            *(energy.leaves(outline) for energy in energies),
+            *(energy.symmetry_constraint(outline) for energy in energies),
         ]
 
     def named_points(self) -> list[str]:

@@ -84,7 +84,7 @@ class IndentationSection(PathStep):
                 "90: 0.714)"
             )
 
-    def leaves(
+    def symmetry_constraints(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
         place = self.place_on(step, context, outline)

@@ -319,7 +319,7 @@ class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
                 raise ValueError(f"shell.{key}: {e}") from None
 
 
-def flaws(
+def imperfection_geometries(
     imperfections: Mapping[str, ImperfectionSection], ground: ReferenceShell
 ) -> dict[str, ImperfectionGeometry]:
     """Key of each imperfection below `shell` -> what it brings."""

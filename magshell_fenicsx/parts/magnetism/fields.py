@@ -360,9 +360,11 @@ class MagneticSection(Section, Ability):
         }
         return {key: value for key, value in values.items() if isinstance(value, dict)}
 
-    def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
+    def symmetry_constraints(
+        self, context: Context, outline: "Outline"
+    ) -> list[SymmetryConstraint]:
         from magshell_fenicsx.parts.magnetism.magnetisation import (
-            leaves,
+            remanence_constraints,
         )  # the solver takes long to import
         from magshell_fenicsx.parts.magnetism.sensors import is_read
 
@@ -370,7 +372,7 @@ class MagneticSection(Section, Ability):
             [] if self.interaction == "none" else [SymmetryConstraint("parts act on each other")]
         )
         is_visible = strength(context) or is_read(context) or interacting
-        return interacting + (leaves(context, outline) if is_visible else [])
+        return interacting + (remanence_constraints(context, outline) if is_visible else [])
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
         from magshell_fenicsx.models.shell.spatial_fields import (

@@ -209,7 +209,7 @@ def _remanence(
     return section.vector(turn)
 
 
-def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
+def remanence_constraints(context: Context, outline: Outline) -> list[SymmetryConstraint]:
     """Remanence and applied field must both be symmetric to a plane, or both antisymmetric."""
     magnetic = context.section_of(MagneticSection)
     assert magnetic
@@ -367,7 +367,7 @@ def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
         return {"magnetic": magnetisation(magnetic, context, turn, patch_rims, to), **observed}
     if magnetic.remanent is None:
         return observed
-    (constraint,) = leaves(context, modelled.outline)
+    (constraint,) = remanence_constraints(context, modelled.outline)
     is_visible = constraint.not_axisymmetric is None or not modelled.axisymmetric
     if not is_visible or (modelled.plane and not constraint.mirrors(modelled.plane)):
         return observed

@@ -202,7 +202,7 @@ def _three_numbers(numbers: Array, *, stretch: bool) -> Array:
     )
 
 
-def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
+def natural_constraints(context: Context, outline: Outline) -> list[SymmetryConstraint]:
     """Return the symmetry that the natural shape preserves."""
     direction = first_direction(context) if is_anisotropic(context) else MERIDIAN
     fixed = not isinstance(direction, str) and all(isinstance(v, float | int) for v in direction)
