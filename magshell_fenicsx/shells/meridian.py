@@ -196,7 +196,7 @@ class MeridianModel(ThinModel):
         patches, cell_count = self.meridian.patches, len(self.meridian.order)
         for name in ("magnetic", "remanence"):
             if magnetisation := getattr(loads, name):
-                loads = replace(loads, **{name: magnetisation.on(patches, cell_count)})
+                loads = replace(loads, **{name: magnetisation.on_cells(patches, cell_count)})
         return loads
 
     def _growing_placement(self) -> PlacementAmplitudes | None:

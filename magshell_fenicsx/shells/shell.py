@@ -578,6 +578,6 @@ def _magnetisation_by_cell(loads: Loads, midsurface: Midsurface) -> Loads:
     """Return the loads with magnetisations in each cell in place of those of patches."""
     for name in ("magnetic", "remanence"):
         if magnetisation := getattr(loads, name):
-            in_cells = magnetisation.on(midsurface.patches, _cell_count(midsurface))
+            in_cells = magnetisation.on_cells(midsurface.patches, _cell_count(midsurface))
             loads = replace(loads, **{name: in_cells})
     return loads

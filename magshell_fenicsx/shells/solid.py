@@ -319,7 +319,7 @@ def _in_cells(field: Magnetisation, body: BodyMesh) -> Magnetisation:
     MeshError
         If the body has no such patch.
     """
-    by_cell = field.on(body.patches, len(body.layer_bounds))
+    by_cell = field.on_cells(body.patches, len(body.layer_bounds))
     if field.layers and not field.patches:
         return replace(by_cell, remanent=_layered(field.layers, body))
     return by_cell

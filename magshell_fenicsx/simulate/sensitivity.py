@@ -193,7 +193,7 @@ def _remanence_columns_of_shells(
         patches_of_cells, count = model.meridian.patches, len(model.meridian.order)
     without_field = dict.fromkeys(patches, np.zeros(3))
     alone = {
-        name: replace(field, patches={**without_field, name: remanence}).on(patches_of_cells, count)
+        name: replace(field, patches={**without_field, name: remanence}).on_cells(patches_of_cells, count)
         for name, remanence in patches.items()
     }
     return {

@@ -379,7 +379,7 @@ class PointFields:
                 else frame.rotated(self.Br, u)
             )
         if self._field:
-            fields["Ba"] = self._field.at(mu, frame.jet[0] + u[0])
+            fields["Ba"] = self._field.field_at(mu, frame.jet[0] + u[0])
         if self._field and self._field.soft:
             deformed_area_vector = np.cross(frame.jet[1] + u[1], frame.jet[2] + u[2])
             deformed_normal = deformed_area_vector / np.linalg.norm(

@@ -244,7 +244,7 @@ class ImperfectionSection(Section):
             Polar angle of the edge of a sphere (rad); None of other shells.
         """
 
-    def geometry(self, ground: ReferenceShell, key: str) -> ImperfectionGeometry:
+    def geometry(self, reference: ReferenceShell, key: str) -> ImperfectionGeometry:
         """Return its geometry on the perfect shell; `key` is its key, with dots.
 
         Raises
@@ -279,11 +279,11 @@ class LocalSection(ImperfectionSection):
         depth = abs(self.amplitude) / R_over_h
         _refuse_steep(depth, self.deviation.steepest * depth / self.half_width(R_over_h, nu))
 
-    def geometry(self, ground: ReferenceShell, key: str) -> ImperfectionGeometry:
-        of, width = self.deviation, self.half_width(ground.R_over_h, ground.nu)
-        place, distance = locate(self.at, ground, key)
-        size = min(DIMPLE_ELEMENT_SIZE / sqrt(ground.R_over_h), of.element_widths * width)
-        deviation = of(self.amplitude / ground.R_over_h, width, distance)
+    def geometry(self, reference: ReferenceShell, key: str) -> ImperfectionGeometry:
+        of, width = self.deviation, self.half_width(reference.R_over_h, reference.nu)
+        place, distance = locate(self.at, reference, key)
+        size = min(DIMPLE_ELEMENT_SIZE / sqrt(reference.R_over_h), of.element_widths * width)
+        deviation = of(self.amplitude / reference.R_over_h, width, distance)
         return ImperfectionGeometry(deviation, size, place, distance, of.reach * width, of.rim)
 
 
@@ -320,7 +320,9 @@ class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
 
 
 def imperfection_geometries(
-    imperfections: Mapping[str, ImperfectionSection], ground: ReferenceShell
+    imperfections: Mapping[str, ImperfectionSection], reference: ReferenceShell
 ) -> dict[str, ImperfectionGeometry]:
     """Key of each imperfection below `shell` -> what it brings."""
-    return {key: section.geometry(ground, f"shell.{key}") for key, section in imperfections.items()}
+    return {
+        key: section.geometry(reference, f"shell.{key}") for key, section in imperfections.items()
+    }

@@ -116,7 +116,7 @@ class ModesSection(FileKeys, ImperfectionSection):
             )
         self._shapes = tuple(part or _zero_mode for part in parts)
 
-    def geometry(self, ground: ReferenceShell, key: str) -> ImperfectionGeometry:
+    def geometry(self, reference: ReferenceShell, key: str) -> ImperfectionGeometry:
         """Return the geometry of the modes; those not yet computed are zero.
 
         Raises
@@ -124,9 +124,9 @@ class ModesSection(FileKeys, ImperfectionSection):
         CaseError
             If the file of a mode cannot be used.
         """
-        h = ground.h
+        h = reference.h
         if self.file is not None and self.shapes is None:
-            self.become((_read(self, ground.perfect.sample(), f"{key}.file: {self.file}"),))
+            self.become((_read(self, reference.perfect.sample(), f"{key}.file: {self.file}"),))
         shapes = self.shapes or ()
         amplitudes = tuple(a * h for a in self.amplitudes[: len(shapes)])
         waves = [getattr(shape, "m", None) for shape in shapes]

@@ -83,13 +83,13 @@ class RandomSection(ImperfectionSection):
             ) from None
         return {f"dimples.{i}": dimple for i, dimple in enumerate(sections)}
 
-    def geometry(self, ground: ReferenceShell, key: str) -> ImperfectionGeometry:
+    def geometry(self, reference: ReferenceShell, key: str) -> ImperfectionGeometry:
         """Return the geometry of the random field; elements resolve its length of correlation."""
         assert self.amplitude is not None
         assert self.length
-        length = half_width(self.length, ground.R_over_h, ground.nu)
+        length = half_width(self.length, reference.R_over_h, reference.nu)
         return ImperfectionGeometry(
-            Waves(self.amplitude / ground.R_over_h, length, self.seed), length
+            Waves(self.amplitude / reference.R_over_h, length, self.seed), length
         )
 
 

@@ -107,7 +107,7 @@ class AppliedSection(Direction):
         return (self.flux_density or 1.0) if self.sources else self.flux_density
 
     @property
-    def beside(self) -> bool:
+    def has_field_beside_sources(self) -> bool:
         """Whether there is a field beside that of the sources."""
         return bool(self.flux_density) if self.sources else True
 
@@ -502,7 +502,7 @@ class MagneticSection(Section, Ability):
             or not (self.remanent is None or self.remanent.flux_density)
         ):
             return units
-        if self.applied.beside:
+        if self.applied.has_field_beside_sources:
             return replace(units, applied=1e3 * self.tesla(units.E))
         return replace(units, strength=100 / strength(context))
 
