@@ -115,11 +115,11 @@ def make_problem(
     """
     if terms:
         case = case.with_terms([*case.own_terms, *terms])
-    shell = _ImperfectShell.of(case)
+    shell = _ImperfectShell.of_case(case)
     load_places = _load_places(case, shell.outline)
     for section in case.context.abilities:
         section.refuse_unfit_values(case.context, shell.sample)
-    formulas = _ResolvedFormulas.of(case, shell.outline, smooth)
+    formulas = _ResolvedFormulas.of_case(case, shell.outline, smooth)
     outline = formulas.sampled(shell.outline)
     refuse_unfit_formulas(
         formulas.formulas, outline.sample() if formulas.formulas else shell.sample
@@ -127,7 +127,7 @@ def make_problem(
     energies = surface_terms(case.context, case.own_terms)
     constraints = _constraints(case, shell, outline, energies)
     part = modelled_part(case, outline, constraints, plane)
-    points = _VertexPoints.of(case, load_places, outline, part)
+    points = _VertexPoints.of_case(case, load_places, outline, part)
     mesh = _mesh_plan(case, shell, outline, part, points, formulas, contact_places)
     modelled = _modelled(case, shell, part, mesh, points)
     loads = replace(
@@ -308,15 +308,15 @@ class _ImperfectShell:
     sample: Array
 
     @classmethod
-    def of(cls, case: Case) -> "_ImperfectShell":
+    def of_case(cls, case: Case) -> "_ImperfectShell":
         """Return the shell of a case."""
         material, reference = _material(case), reference_shell_of(case.shell)
         imperfections = imperfection_geometries(case.imperfections, reference)
         last_steps = {step.name: step for step in case.programme}
-        growing = {
+        growing_keys = {
             key for step in last_steps.values() for key in step.load.multiplies(step, case.context)
         }
-        constant = {*imperfections} - growing
+        constant = {*imperfections} - growing_keys
         outline = _imperfect_outline(reference.perfect, imperfections, constant, 0.0)
         sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else outline.sample()
         reference = replace(reference, imperfect=outline)
@@ -400,12 +400,12 @@ class _ResolvedFormulas:
     cells: Sequence[RefinedParts | None]
 
     @classmethod
-    def of(cls, case: Case, outline: Outline, smooth: Collection[str]) -> "_ResolvedFormulas":
+    def of_case(cls, case: Case, outline: Outline, smooth: Collection[str]) -> "_ResolvedFormulas":
         """Return the formulas of a case; those of the keys in `smooth` have no narrow details."""
         formulas = case_formulas(case.context)
         cells = [
-            None if each.spec.key in smooth else adaptive_cells(each.formulas, outline)
-            for each in formulas
+            None if placed.spec.key in smooth else adaptive_cells(placed.formulas, outline)
+            for placed in formulas
         ]
         return cls(formulas, cells)
 
@@ -431,8 +431,8 @@ def _constraints(
 
 def _body_contacts(case: Case, reference: ReferenceShell) -> tuple[ContactBody, ...]:
     """Return the contacts of a case with rigid bodies, in the frame of a reference shell."""
-    driven = {step.name for step in case.programme}
-    return contact_bodies(case.bodies, case.approaches, driven, reference)
+    driven_names = {step.name for step in case.programme}
+    return contact_bodies(case.bodies, case.approaches, driven_names, reference)
 
 
 @dataclass(frozen=True)
@@ -451,7 +451,7 @@ class _VertexPoints:
     of_steps: dict[str, str]
 
     @classmethod
-    def of(
+    def of_case(
         cls, case: Case, load_places: StepsAtPlaces, outline: Outline, part: ModelledPart
     ) -> "_VertexPoints":
         """Return the named points of a case, and those of loads at one place.
@@ -493,7 +493,7 @@ class _VertexPoints:
 
 @dataclass(frozen=True)
 class _MeshPlan:
-    """What is meshed, and how finely, in the model's frame.
+    """Shape that is meshed and element sizes, in the model's frame.
 
     Attributes
     ----------
