@@ -191,8 +191,8 @@ class MeridianModel(ThinModel):
     def _in_cells(self, loads: Loads) -> Loads:
         """Return the loads with functions and numbers of cells in place of formulas and patches."""
         formula_to_field = partial(formula_field, self.r0)
-        own = tuple(term.with_functions(formula_to_field) for term in loads.user_terms)
-        loads = replace(loads, user_terms=own)
+        user_terms = tuple(term.with_functions(formula_to_field) for term in loads.user_terms)
+        loads = replace(loads, user_terms=user_terms)
         patches, cell_count = self.meridian.patches, len(self.meridian.order)
         for name in ("magnetic", "remanence"):
             if magnetisation := getattr(loads, name):
@@ -224,7 +224,7 @@ class MeridianModel(ThinModel):
             natural_shape,
             free_constants,
             meridian.largest_fold(self.r0) > FOLD_ANGLE,
-            pressed=pressed_cells,
+            pressed_sides=pressed_cells,
             creases=Creases.of_joints(loads.joints, meridian) if loads.joints else None,
             cell_materials=self.cell_materials,
         )
@@ -448,7 +448,8 @@ class MeridianModel(ThinModel):
             return NOT_HELD + "move along (0, 0, 1)"
         if len(motions.transverse):
             turns_alone = (
-                len(motions.transverse) == 1 and np.abs(motions.transverse[0][2::3]).max() > AXIAL_TOLERANCE
+                len(motions.transverse) == 1
+                and np.abs(motions.transverse[0][2::3]).max() > AXIAL_TOLERANCE
             )
             return NOT_HELD + ("turn" if turns_alone else "move along (1, 0, 0)")
         return ""

@@ -286,7 +286,9 @@ class ThinModel(ModelBase):
         of them.
         """
         factory = self.factory
-        terms_and_facets = [(term, edges[term.on] if term.on else None) for term in self.loads.user_terms]
+        terms_and_facets = [
+            (term, edges[term.on] if term.on else None) for term in self.loads.user_terms
+        ]
         energies = [
             factory.user_energy(term, facets) for term, facets in terms_and_facets if term.density
         ]

@@ -243,10 +243,11 @@ class ShellModel(ThinModel):
                 vectors = user_field_polynomials(magnetisation.given, self.midsurface, cells)
                 loads = replace(loads, **{name: replace(magnetisation, remanent=vectors)})
         formula_to_field = partial(formula_field, self.r0)
-        own = (
-            term.with_functions(formula_to_field, self.midsurface.function) for term in loads.user_terms
+        user_terms = (
+            term.with_functions(formula_to_field, self.midsurface.function)
+            for term in loads.user_terms
         )
-        return replace(loads, user_terms=tuple(own))
+        return replace(loads, user_terms=tuple(user_terms))
 
     def _put_edges_in_planes(self) -> None:
         """Move the nodes of edges with the condition "plane" into their planes."""
@@ -294,7 +295,9 @@ class ShellModel(ThinModel):
             natural_shape,
             free_constants,
             is_folded,
-            pressed=side_field(loads.pressed_sides, midsurface) if loads.pressed_sides else None,
+            pressed_sides=side_field(loads.pressed_sides, midsurface)
+            if loads.pressed_sides
+            else None,
             creases=creases,
             cell_materials=self.cell_materials,
         )
@@ -320,7 +323,7 @@ class ShellModel(ThinModel):
 
         Sets `without_potential`.
         """
-        edges, pressed_cells = self.midsurface.edges, self.factory.pressed
+        edges, pressed_cells = self.midsurface.edges, self.factory.pressed_sides
         opening_edges = pressed_parts(edges, pressed_cells) if pressed_cells else edges
         free_edges, self.without_potential = edge_openings(self.r0, opening_edges, self._conditions)
         return opening_edges, enclosed(self.loads, free_edges, self.without_potential)
@@ -399,7 +402,7 @@ class ShellModel(ThinModel):
         origin: NDArray[np.float64] | None,
     ) -> EdgePressure:
         """Return the work of a live pressure on lids at the edges that move."""
-        pressed_cells, loads = self.factory.pressed, self.loads
+        pressed_cells, loads = self.factory.pressed_sides, self.loads
         in_planes = {
             name
             for name, condition in self._conditions.items()
