@@ -8,7 +8,7 @@ import traceback
 from pathlib import Path
 from typing import Annotated, Any
 
-from magshell_fenicsx import __version__, looking
+from magshell_fenicsx import __version__, inspection
 from magshell_fenicsx.command import (
     INVALID,
     STOPPED,
@@ -206,7 +206,7 @@ def sweep(
 
     folder = chosen_folder(out, f"{case.stem}_sweep")
     with exit_codes(stopped=(DiskError,)):
-        done = run_sweep(
+        outcome = run_sweep(
             case,
             over,
             set_ or [],
@@ -217,14 +217,15 @@ def sweep(
             part=part,
         )
     print_line(f"results in {folder}/")
-    if done.stopped:
+    if outcome.stopped:
         raise failure(
-            f"{done.stopped} of {len(done.points)} points stopped early; sweep.csv says why",
+            f"{outcome.stopped} of {len(outcome.points)} points stopped early; sweep.csv says why",
             STOPPED,
         )
-    if without := done.results.count(None):
+    if without := outcome.results.count(None):
         raise failure(
-            f"{without} of {len(done.points)} points gave no {result}; sweep.csv says why", STOPPED
+            f"{without} of {len(outcome.points)} points gave no {result}; sweep.csv says why",
+            STOPPED,
         )
 
 
@@ -259,10 +260,12 @@ def boundary(
 
     folder = chosen_folder(out, f"{case.stem}_boundary")
     with exit_codes(stopped=(DiskError, Stopped)):
-        done = boundary_map(case, over, set_ or [], folder, make_case=case_of_source, start=from_)
+        outcome = boundary_map(
+            case, over, set_ or [], folder, make_case=case_of_source, start=from_
+        )
     print_line(f"results in {folder}/")
-    if done.stopped:
-        raise failure(f"stopped early: {'; '.join(done.stopped)}", STOPPED)
+    if outcome.stopped:
+        raise failure(f"stopped early: {'; '.join(outcome.stopped)}", STOPPED)
 
 
 @app.command()
@@ -291,7 +294,7 @@ def study(
 
     folder = chosen_folder(out, f"{case.stem}_study")
     with exit_codes(stopped=(DiskError,)):
-        done = run_study(
+        outcome = run_study(
             case,
             over,
             set_ or [],
@@ -303,9 +306,10 @@ def study(
             out=folder,
         )
     print_line(f"results in {folder}/")
-    if done.without_result:
+    if outcome.without_result:
         raise failure(
-            f"{done.without_result} of {len(done.rows)} runs gave no {result}; study.csv says why",
+            f"{outcome.without_result} of {len(outcome.rows)} runs gave no {result}; "
+            "study.csv says why",
             STOPPED,
         )
 
@@ -351,7 +355,7 @@ def ensemble(  # noqa: PLR0913 - what a user gives
 
     folder = chosen_folder(out, f"{case.stem}_ensemble")
     with exit_codes(stopped=(DiskError,)):
-        done = run_ensemble(
+        outcome = run_ensemble(
             case,
             set_ or [],
             samples=samples,
@@ -364,13 +368,15 @@ def ensemble(  # noqa: PLR0913 - what a user gives
             delete_weakest=delete_weakest,
             resume=resume,
         )
-    if (mean := done.content["mean"]) is not None:
-        print_line(f"mean {result} = {mean:.6g} of {len(done.rows) - done.without_result} samples")
+    if (mean := outcome.content["mean"]) is not None:
+        print_line(
+            f"mean {result} = {mean:.6g} of {len(outcome.rows) - outcome.without_result} samples"
+        )
     print_line(f"results in {folder}/")
-    if done.without_result:
+    if outcome.without_result:
         raise failure(
-            f"{done.without_result} of {len(done.rows)} samples have no {result}; samples.csv says "
-            "why",
+            f"{outcome.without_result} of {len(outcome.rows)} samples have no {result}; "
+            "samples.csv says why",
             STOPPED,
         )
 
@@ -417,12 +423,12 @@ def identify(
 
     folder = chosen_folder(out, f"{case.stem}_identify")
     with exit_codes(stopped=(DiskError, Stopped)):
-        done = identify_parameters(
+        outcome = identify_parameters(
             case, data, set_ or [], folder, make_case=shared_case_of_source, say=print_line
         )
     print_line(f"results in {folder}/")
-    if done.fit.ended != "converged":
-        raise failure(f"stopped early: {done.fit.ended}", STOPPED)
+    if outcome.fit.ended != "converged":
+        raise failure(f"stopped early: {outcome.fit.ended}", STOPPED)
 
 
 @app.command()
@@ -452,7 +458,7 @@ def compare(
     folder = chosen_folder(out, f"{case.stem}_compare")
     with exit_codes(stopped=(DiskError, NothingLeft)):
         refinements = parse_refinements(shell, solid)
-        done = run_comparison(
+        outcome = run_comparison(
             case,
             set_ or [],
             refinements=refinements,
@@ -461,13 +467,13 @@ def compare(
             result=result,
             say=print_line,
         )
-    difference = done.content["difference"]
+    difference = outcome.content["difference"]
     if difference is not None:
         print_line(
-            f"{done.content['result']}: the solid differs from the shell by "
+            f"{outcome.content['result']}: the solid differs from the shell by "
             f"{100 * difference:+.3f} %"
         )
     print_line(f"results in {folder}/")
 
 
-app.add_typer(looking.app)
+app.add_typer(inspection.app)

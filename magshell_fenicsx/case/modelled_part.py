@@ -15,8 +15,8 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import ROUNDING, Y0_PLANE, Mirror, Sector, rotation
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, HeldComponents
-from magshell_fenicsx.parts.imperfections.imperfection import flaws
-from magshell_fenicsx.parts.imperfections.symmetry import leaves
+from magshell_fenicsx.parts.imperfections.imperfection import imperfection_geometries
+from magshell_fenicsx.parts.imperfections.symmetry import imperfection_constraints
 from magshell_fenicsx.parts.laminate import ShellLaminate
 from magshell_fenicsx.parts.supports.boundary import BoundarySection, EdgeCondition, HeldSection
 from magshell_fenicsx.shape.outline import Outline, reference_shell_of
@@ -114,11 +114,11 @@ def symmetry_constraints(
     context = case.context
     constraints = [shape_constraint(case.shell, outline)]
     for section in context.abilities:
-        constraints += section.leaves(context, outline)
+        constraints += section.symmetry_constraints(context, outline)
     for step in case.programme:
-        constraints += step.load.leaves(step, context, outline)
+        constraints += step.load.symmetry_constraints(step, context, outline)
     constraints.append(points_constraint(case.points.values(), case.shell.reference, outline))
-    constraints += [term.leaves(outline) for term in energies]
+    constraints += [term.symmetry_constraint(outline) for term in energies]
     return constraints
 
 
@@ -135,13 +135,16 @@ def own_mirror(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | 
     """
     reference_shell = reference_shell_of(case.shell)
     perfect = reference_shell.perfect
-    imperfections, one_by_one = flaws(case.imperfections, reference_shell), bool(case.patches)
+    imperfections, one_by_one = (
+        imperfection_geometries(case.imperfections, reference_shell),
+        bool(case.patches),
+    )
     constraints = [
         shape_constraint(case.shell, perfect),
-        *leaves(imperfections, perfect, one_by_one=one_by_one),
+        *imperfection_constraints(imperfections, perfect, one_by_one=one_by_one),
     ]
     if plies := ShellLaminate.from_context(case.context):
-        constraints += plies.leaves(case.context, perfect)
+        constraints += plies.symmetry_constraints(case.context, perfect)
     vectors = [unit(v) for constraint in constraints for v in constraint.vectors]
     if perfect.round and plane.through_e3:
         candidates: Sequence[Mirror] = [plane]

@@ -41,14 +41,18 @@ from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.ability import Modelled
 from magshell_fenicsx.parts.bodies.body_contact import ContactBody
 from magshell_fenicsx.parts.bodies.body_setup import ContactZone, body_symmetry, contact_bodies
-from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry, flaws, in_frame
+from magshell_fenicsx.parts.imperfections.imperfection import (
+    ImperfectionGeometry,
+    imperfection_geometries,
+    in_frame,
+)
 from magshell_fenicsx.parts.imperfections.modes import Mode, ModesSection
 from magshell_fenicsx.parts.imperfections.symmetry import (
     MAX_RIMS,
     LocalImperfection,
-    different,
-    leaves,
-    spots,
+    distinct_rims,
+    imperfection_constraints,
+    local_imperfections,
 )
 from magshell_fenicsx.parts.laminate import laminate_of
 from magshell_fenicsx.parts.loads import Loads
@@ -111,11 +115,11 @@ def make_problem(
     """
     if terms:
         case = case.with_terms([*case.own_terms, *terms])
-    shell = _ImperfectShell.of(case)
+    shell = _ImperfectShell.of_case(case)
     load_places = _load_places(case, shell.outline)
     for section in case.context.abilities:
         section.refuse_unfit_values(case.context, shell.sample)
-    formulas = _ResolvedFormulas.of(case, shell.outline, smooth)
+    formulas = _ResolvedFormulas.of_case(case, shell.outline, smooth)
     outline = formulas.sampled(shell.outline)
     refuse_unfit_formulas(
         formulas.formulas, outline.sample() if formulas.formulas else shell.sample
@@ -123,7 +127,7 @@ def make_problem(
     energies = surface_terms(case.context, case.own_terms)
     constraints = _constraints(case, shell, outline, energies)
     part = modelled_part(case, outline, constraints, plane)
-    points = _VertexPoints.of(case, load_places, outline, part)
+    points = _VertexPoints.of_case(case, load_places, outline, part)
     mesh = _mesh_plan(case, shell, outline, part, points, formulas, contact_places)
     modelled = _modelled(case, shell, part, mesh, points)
     loads = replace(
@@ -153,7 +157,8 @@ def _modelled(
         axisymmetric=part.axisymmetric,
         vertices=points.of_steps,
         patch_rims={
-            name: in_frame(imperfections[key].inside, turn) for name, key in case.dimples.items()
+            name: in_frame(imperfections[key].is_within_rim, turn)
+            for name, key in case.dimples.items()
         },
         deviations={
             key: in_frame(geometry.deviation, turn) for key, geometry in imperfections.items()
@@ -303,15 +308,15 @@ class _ImperfectShell:
     sample: Array
 
     @classmethod
-    def of(cls, case: Case) -> "_ImperfectShell":
+    def of_case(cls, case: Case) -> "_ImperfectShell":
         """Return the shell of a case."""
         material, reference = _material(case), reference_shell_of(case.shell)
-        imperfections = flaws(case.imperfections, reference)
+        imperfections = imperfection_geometries(case.imperfections, reference)
         last_steps = {step.name: step for step in case.programme}
-        growing = {
+        growing_keys = {
             key for step in last_steps.values() for key in step.load.multiplies(step, case.context)
         }
-        constant = {*imperfections} - growing
+        constant = {*imperfections} - growing_keys
         outline = _imperfect_outline(reference.perfect, imperfections, constant, 0.0)
         sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else outline.sample()
         reference = replace(reference, imperfect=outline)
@@ -395,12 +400,12 @@ class _ResolvedFormulas:
     cells: Sequence[RefinedParts | None]
 
     @classmethod
-    def of(cls, case: Case, outline: Outline, smooth: Collection[str]) -> "_ResolvedFormulas":
+    def of_case(cls, case: Case, outline: Outline, smooth: Collection[str]) -> "_ResolvedFormulas":
         """Return the formulas of a case; those of the keys in `smooth` have no narrow details."""
         formulas = case_formulas(case.context)
         cells = [
-            None if each.spec.key in smooth else adaptive_cells(each.formulas, outline)
-            for each in formulas
+            None if placed.spec.key in smooth else adaptive_cells(placed.formulas, outline)
+            for placed in formulas
         ]
         return cls(formulas, cells)
 
@@ -417,15 +422,17 @@ def _constraints(
     """Return the symmetry that each part of a case preserves, imperfections and bodies included."""
     one_by_one = bool(case.patches)
     constraints = symmetry_constraints(case, outline, energies)
-    constraints += leaves(shell.imperfections, shell.perfect, one_by_one=one_by_one)
+    constraints += imperfection_constraints(
+        shell.imperfections, shell.perfect, one_by_one=one_by_one
+    )
     constraints += [body_symmetry(contact) for contact in _body_contacts(case, shell.reference)]
     return constraints
 
 
 def _body_contacts(case: Case, reference: ReferenceShell) -> tuple[ContactBody, ...]:
     """Return the contacts of a case with rigid bodies, in the frame of a reference shell."""
-    driven = {step.name for step in case.programme}
-    return contact_bodies(case.bodies, case.approaches, driven, reference)
+    driven_names = {step.name for step in case.programme}
+    return contact_bodies(case.bodies, case.approaches, driven_names, reference)
 
 
 @dataclass(frozen=True)
@@ -444,7 +451,7 @@ class _VertexPoints:
     of_steps: dict[str, str]
 
     @classmethod
-    def of(
+    def of_case(
         cls, case: Case, load_places: StepsAtPlaces, outline: Outline, part: ModelledPart
     ) -> "_VertexPoints":
         """Return the named points of a case, and those of loads at one place.
@@ -486,7 +493,7 @@ class _VertexPoints:
 
 @dataclass(frozen=True)
 class _MeshPlan:
-    """What is meshed, and how finely, in the model's frame.
+    """Shape that is meshed and element sizes, in the model's frame.
 
     Attributes
     ----------
@@ -535,7 +542,7 @@ def _mesh_plan(
     """
     local: list[LocalImperfection] = []
     if not isinstance(case.shell, MeshSurface):
-        local = spots(shell.imperfections.items(), shell.perfect, part.turn)
+        local = local_imperfections(shell.imperfections.items(), shell.perfect, part.turn)
     bodies = _body_contacts(case, replace(shell.reference, turn=part.turn))
     sampled_shell = replace(shell.reference, imperfect=outline)
     contact_regions = [
@@ -564,7 +571,7 @@ def _mesh_plan(
     )
     turned_outline = shell.turned_outline(part.turn)
     shape, size = _shape(turned_outline, part, size, points.charts.values())
-    rims = different(local)
+    rims = distinct_rims(local)
     _refuse_unfit_sector(case, part, rims)
     shape = _with_rims(shape, local, rims if len(rims) <= MAX_RIMS else (), size)
     if not part.axisymmetric:
@@ -638,7 +645,13 @@ def _with_rims(
     shape: Chart, local: Sequence[LocalImperfection], rims: tuple[Array, ...], size: Grading
 ) -> Chart | RimmedGrid:
     """Return the shape with element edges along the rims."""
-    circles = tuple(dict.fromkeys(spot.radius for spot in local if spot.circle and spot.jumps))
+    circles = tuple(
+        dict.fromkeys(
+            local_imperfection.radius
+            for local_imperfection in local
+            if local_imperfection.circle and local_imperfection.jumps
+        )
+    )
     if isinstance(shape, Grid):
         return RimmedGrid(shape, rims) if rims else shape
     if isinstance(shape, DiscShape):

@@ -332,12 +332,14 @@ def _section(
     if not section["properties"]:
         return "\n".join([*lines, f"Allowed: {_allowed(section, titles)}."]) + "\n"
     texts = _key_texts(section, titles)
-    own = [text.item() for text in texts if text not in common]
-    shared = ", ".join(f"`{text.key}`" for text in texts if text in common)
-    if shared:
+    own_keys = [text.item() for text in texts if text not in common]
+    shared_keys = ", ".join(f"`{text.key}`" for text in texts if text in common)
+    if shared_keys:
         link = f"[{COMMON_KEYS}](#{anchor(f'{_family(title)}: {COMMON_KEYS}')})"
-        own += ["", f"And {link}: {shared}."] if own else [f"It has {link}: {shared}."]
-    lines += own
+        own_keys += (
+            ["", f"And {link}: {shared_keys}."] if own_keys else [f"It has {link}: {shared_keys}."]
+        )
+    lines += own_keys
     return "\n".join(lines) + "\n"
 
 

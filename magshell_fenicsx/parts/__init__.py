@@ -1,1 +1,1 @@
-"""The abilities, each in a room of its own, and the base of their sections and steps."""
+"""The abilities, each in a package of its own, and the base of their sections and steps."""

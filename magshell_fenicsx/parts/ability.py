@@ -319,7 +319,9 @@ class Ability:
         """Return its keys with values by patch -> the names of these."""
         return {}
 
-    def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
+    def symmetry_constraints(
+        self, context: Context, outline: "Outline"
+    ) -> list[SymmetryConstraint]:
         """Return the symmetry that it preserves of a shell."""
         return []
 

@@ -75,7 +75,7 @@ class GravityStep(BodyForceStep):
         """The unit vector (3,) of the acceleration."""
         return unit(np.array(self.direction))
 
-    def leaves(
+    def symmetry_constraints(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
         return [SymmetryConstraint(vectors=[self._unit_direction])]

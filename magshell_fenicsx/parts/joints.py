@@ -127,7 +127,9 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
                     )
                 joined_edges.add(name)
 
-    def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
+    def symmetry_constraints(
+        self, context: Context, outline: "Outline"
+    ) -> list[SymmetryConstraint]:
         """Return the planes that cross each joint: its edges are their own mirror images."""
         names = [name for section in self.sections for name in section.edges]
         return [

@@ -20,16 +20,16 @@ if TYPE_CHECKING:
     from magshell_fenicsx.parts.imperfections.dimple import DimpleSection
 
 REGISTERED: dict[str, tuple[str, ...]] = {
-    # room -> kinds in the order of the documentation
+    # package -> kinds in the order of the documentation
     "bodies": ("plane", "sphere", "cylinder", "rod", "box", "ellipsoid"),
     "imperfections": ("dimple", "gaussian", "formula", "data", "modes", "random"),
     "magnetism.sources": ("cylinder", "cuboid", "sphere", "ring", "coil", "grid", "formula"),
 }
 
 
-def section_of(room: str, kind: str) -> type[Section]:
+def section_of(package: str, kind: str) -> type[Section]:
     """Return the section of a kind: the one class in its file with this value of the key `kind`."""
-    module = import_module(f"{__package__}.{room}.{kind}")
+    module = import_module(f"{__package__}.{package}.{kind}")
     module_members = (
         member
         for member in vars(module).values()
@@ -46,8 +46,8 @@ def section_of(room: str, kind: str) -> type[Section]:
     return section
 
 
-def _any_of(room: str) -> Any:
-    sections = tuple(section_of(room, kind) for kind in REGISTERED[room])
+def _any_of(package: str) -> Any:
+    sections = tuple(section_of(package, kind) for kind in REGISTERED[package])
     return Annotated[Union[sections], ChosenByKey("kind")]  # noqa: UP007
 
 

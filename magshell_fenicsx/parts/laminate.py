@@ -226,7 +226,9 @@ class ShellLaminate(Ability):
                 "lay one at -angle, at the same distance from the middle",
             )
 
-    def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
+    def symmetry_constraints(
+        self, context: Context, outline: "Outline"
+    ) -> list[SymmetryConstraint]:
         """Return all symmetry of isotropic plies, else that of the directions if nothing twists."""
         return (
             []

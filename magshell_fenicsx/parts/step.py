@@ -243,7 +243,7 @@ class Step(Section):
         """Return a warning with the key, where a different load is often meant; None without."""
         return None
 
-    def leaves(
+    def symmetry_constraints(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
         """Return the symmetry that it preserves of a shell."""

@@ -83,7 +83,7 @@ class EnergyFactory:
         Applied fields, known by values, that were made.
     held_edges
         Edges whose energies were made: those that hold the normal, and those on mirror planes.
-    pressed
+    pressed_sides
         Side of a live pressure in each cell, (1,): 1 from outside, -1 from inside, 0 without;
         None for 1.
     creases
@@ -105,7 +105,7 @@ class EnergyFactory:
     has_folds: bool = False
     fields: list[AppliedField] = field(default_factory=list)
     held_edges: list[HeldEdge] = field(default_factory=list)
-    pressed: fem.Function | None = None
+    pressed_sides: fem.Function | None = None
     creases: Creases | None = None
     cell_materials: fem.Function | None = None
     saturated: list[PointField] = field(default_factory=list)
@@ -362,7 +362,7 @@ class EnergyFactory:
         swept, follower_work = (
             self._on_pressed(f) for f in (densities.swept_volume, densities.follower_pressure_work)
         )
-        parameters = (unit,) if self.pressed is None else (unit, self.pressed)
+        parameters = (unit,) if self.pressed_sides is None else (unit, self.pressed_sides)
         density = Density(
             swept, parameters, parts=VALUE_AND_FIRST, work=None if potential else follower_work
         )
@@ -370,9 +370,9 @@ class EnergyFactory:
 
     def _on_pressed(self, density_function: Callable[..., Expr]) -> Callable[..., Expr]:
         """Return the density of a pressure on the pressed cells alone, by a last parameter
-        `pressed`.
+        `pressed_sides`.
         """
-        if self.pressed is None:
+        if self.pressed_sides is None:
             return density_function
         return lambda *given: given[-1][0] * density_function(*given[:-1])
 
@@ -382,7 +382,7 @@ class EnergyFactory:
         """
         return self._volume_integral(
             self._on_pressed(densities.swept_volume),
-            *([] if self.pressed is None else [self.pressed]),
+            *([] if self.pressed_sides is None else [self.pressed_sides]),
         )
 
     def volume_change(self, origin: Array) -> ufl.Form:

@@ -191,12 +191,12 @@ class MeridianModel(ThinModel):
     def _in_cells(self, loads: Loads) -> Loads:
         """Return the loads with functions and numbers of cells in place of formulas and patches."""
         formula_to_field = partial(formula_field, self.r0)
-        own = tuple(term.with_functions(formula_to_field) for term in loads.user_terms)
-        loads = replace(loads, user_terms=own)
+        user_terms = tuple(term.with_functions(formula_to_field) for term in loads.user_terms)
+        loads = replace(loads, user_terms=user_terms)
         patches, cell_count = self.meridian.patches, len(self.meridian.order)
         for name in ("magnetic", "remanence"):
             if magnetisation := getattr(loads, name):
-                loads = replace(loads, **{name: magnetisation.on(patches, cell_count)})
+                loads = replace(loads, **{name: magnetisation.on_cells(patches, cell_count)})
         return loads
 
     def _growing_placement(self) -> PlacementAmplitudes | None:
@@ -224,7 +224,7 @@ class MeridianModel(ThinModel):
             natural_shape,
             free_constants,
             meridian.largest_fold(self.r0) > FOLD_ANGLE,
-            pressed=pressed_cells,
+            pressed_sides=pressed_cells,
             creases=Creases.of_joints(loads.joints, meridian) if loads.joints else None,
             cell_materials=self.cell_materials,
         )
@@ -235,23 +235,23 @@ class MeridianModel(ThinModel):
         """
         if not self.loads.natural:
             return None
-        natural = self.loads.natural.on(self.meridian.patches, len(self.meridian.order))
+        natural = self.loads.natural.on_cells(self.meridian.patches, len(self.meridian.order))
         self.loads = replace(self.loads, natural=natural)
         field = natural_field(natural, cell_geometry(self.r0), self.V)
-        return Shape.of(field, natural, free_constants)
+        return Shape.from_field(field, natural, free_constants)
 
     def _add_supports(self) -> dict[str, Support]:
         """Add the energies of clamped ends and of ends on a mirror plane; return the supports."""
         clamped_count = list(self.conditions.values()).count("clamped")
         supports_by_end = {}
-        for name, (facets, components) in self.held.named.items():
+        for name, (facets, components) in self.held.by_name.items():
             edge, turn = "", None
             if self.conditions[name] == "clamped":
                 edge = f"{name} clamped edges" if clamped_count > 1 else "clamped edges"
                 turn = rotation_of(self.loads, name, self.V)
                 self.energies.append(self.factory.clamped_edges(edge, facets, turn))
             constraints = held_on(self.V, 0, facets, components)
-            supports_by_end[name] = Support.of(constraints, edge, turn)
+            supports_by_end[name] = Support.from_conditions(constraints, edge, turn)
         if len(self.held.mirror):
             e3 = np.array([0.0, 0.0, 1.0])
             self.energies.append(self.factory.mirror_edges(self.held.mirror, e3))
@@ -311,7 +311,7 @@ class MeridianModel(ThinModel):
         self.system = FiniteElementSystem(
             self.u,
             [*terms, *self.shell_contacts, *self.t_junction_terms],
-            self.held.held(self.V),
+            self.held.axisymmetric_conditions(self.V),
             pattern_term,
             self.material.h,
             variables=SystemVariables(parameters, motion, histories),
@@ -436,19 +436,20 @@ class MeridianModel(ThinModel):
             return unresisted(waves, with_zeros, lambda: self.waves.tangent(state, m), comm)
 
         tangent = partial(self.system.tangent, state.u, state.mu)
-        axial = unresisted(motions.along, self.system.zero_at_supports, tangent, comm)
+        axial = unresisted(motions.axial, self.system.zero_at_supports, tangent, comm)
         return RigidMotions(
-            axial, unresisted_waves(motions.around, 0), unresisted_waves(motions.across, 1)
+            axial, unresisted_waves(motions.torsional, 0), unresisted_waves(motions.transverse, 1)
         )
 
     def free_motion(self, amplitudes: Amplitudes) -> str:
         """Return a rigid motion that is left free, as a message; empty if there is none."""
         motions = self.rigid_motions(amplitudes)
-        if len(motions.along):
+        if len(motions.axial):
             return NOT_HELD + "move along (0, 0, 1)"
-        if len(motions.across):
+        if len(motions.transverse):
             turns_alone = (
-                len(motions.across) == 1 and np.abs(motions.across[0][2::3]).max() > AXIAL_TOLERANCE
+                len(motions.transverse) == 1
+                and np.abs(motions.transverse[0][2::3]).max() > AXIAL_TOLERANCE
             )
             return NOT_HELD + ("turn" if turns_alone else "move along (1, 0, 0)")
         return ""

@@ -229,10 +229,10 @@ def _families(
     if isinstance(model, MeridianModel):
         free_motions = model.rigid_motions(rest.mu) if rest else None
         if free_motions:
-            axial_count, transverse_count = (len(free_motions.along), len(free_motions.across))
+            axial_count, transverse_count = (len(free_motions.axial), len(free_motions.transverse))
         else:
             axial_count, transverse_count = (0, 0)
-        torsions: list[Vector] = [*free_motions.around] if free_motions else []
+        torsions: list[Vector] = [*free_motions.torsional] if free_motions else []
         yield family_of_system("", model.system, axial_count)
         waves = model.symmetry_breaking_modes.waves
         wave_mass = f"{name}wave mass", wave_product(model, factor)

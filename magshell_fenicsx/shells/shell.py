@@ -243,11 +243,11 @@ class ShellModel(ThinModel):
                 vectors = user_field_polynomials(magnetisation.given, self.midsurface, cells)
                 loads = replace(loads, **{name: replace(magnetisation, remanent=vectors)})
         formula_to_field = partial(formula_field, self.r0)
-        own = (
+        user_terms = (
             term.with_functions(formula_to_field, self.midsurface.function)
             for term in loads.user_terms
         )
-        return replace(loads, user_terms=tuple(own))
+        return replace(loads, user_terms=tuple(user_terms))
 
     def _put_edges_in_planes(self) -> None:
         """Move the nodes of edges with the condition "plane" into their planes."""
@@ -295,7 +295,9 @@ class ShellModel(ThinModel):
             natural_shape,
             free_constants,
             is_folded,
-            pressed=side_field(loads.pressed_sides, midsurface) if loads.pressed_sides else None,
+            pressed_sides=side_field(loads.pressed_sides, midsurface)
+            if loads.pressed_sides
+            else None,
             creases=creases,
             cell_materials=self.cell_materials,
         )
@@ -308,20 +310,20 @@ class ShellModel(ThinModel):
         """
         if not self.loads.natural:
             return None
-        natural = self.loads.natural.on(
+        natural = self.loads.natural.on_cells(
             self.midsurface.patches,
             _cell_count(self.midsurface),
             lambda given: user_field_polynomials(given, self.midsurface, cells),
         )
         self.loads = replace(self.loads, natural=natural)
-        return Shape.of(natural_field(natural, cells, self.V), natural, free_constants)
+        return Shape.from_field(natural_field(natural, cells, self.V), natural, free_constants)
 
     def _find_openings(self) -> tuple[Mapping[str, NDArray[np.int32]], bool]:
         """Return the edges where the pressed surface ends, and whether moving supports close it.
 
         Sets `without_potential`.
         """
-        edges, pressed_cells = self.midsurface.edges, self.factory.pressed
+        edges, pressed_cells = self.midsurface.edges, self.factory.pressed_sides
         opening_edges = pressed_parts(edges, pressed_cells) if pressed_cells else edges
         free_edges, self.without_potential = edge_openings(self.r0, opening_edges, self._conditions)
         return opening_edges, enclosed(self.loads, free_edges, self.without_potential)
@@ -400,7 +402,7 @@ class ShellModel(ThinModel):
         origin: NDArray[np.float64] | None,
     ) -> EdgePressure:
         """Return the work of a live pressure on lids at the edges that move."""
-        pressed_cells, loads = self.factory.pressed, self.loads
+        pressed_cells, loads = self.factory.pressed_sides, self.loads
         in_planes = {
             name
             for name, condition in self._conditions.items()
@@ -579,6 +581,6 @@ def _magnetisation_by_cell(loads: Loads, midsurface: Midsurface) -> Loads:
     """Return the loads with magnetisations in each cell in place of those of patches."""
     for name in ("magnetic", "remanence"):
         if magnetisation := getattr(loads, name):
-            in_cells = magnetisation.on(midsurface.patches, _cell_count(midsurface))
+            in_cells = magnetisation.on_cells(midsurface.patches, _cell_count(midsurface))
             loads = replace(loads, **{name: in_cells})
     return loads

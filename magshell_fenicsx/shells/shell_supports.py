@@ -124,7 +124,7 @@ class ShellSupports:
         self.terms.append(self._factory.term(energy))
         self.constraints.append(support_along(self._V, 1, facets, plane.normal))
         edge_constraints = held_on(self._V, 1, facets, ALL_COMPONENTS)
-        return Support.of(edge_constraints, edge, kind="plane")
+        return Support.from_conditions(edge_constraints, edge, kind="plane")
 
     def _laminates_at(self, edge: str) -> list[Laminate]:
         """Return the plies of the shell that has an edge."""
@@ -150,7 +150,7 @@ class ShellSupports:
         constraints = self._constraints_of(name, components)
         self.constraints += constraints
         kind: SupportKind = "point" if name in self._midsurface.points else "part"
-        return Support.of(constraints, edge, turn, kind=kind)
+        return Support.from_conditions(constraints, edge, turn, kind=kind)
 
     def _constraints_of(self, name: str, components: tuple[int, ...]) -> list[fem.DirichletBC]:
         """Return the constraints of some components on an edge, on a patch or at a point."""

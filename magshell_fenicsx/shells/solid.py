@@ -116,8 +116,8 @@ class SolidModel(ModelBase):
         self.V = quadratic_space(body.mesh)
         self.u, self.r0 = fem.Function(self.V, name="u"), fem.Function(self.V, name="r0")
         self.r0.interpolate(lambda x: x)
-        own = tuple(term.with_functions(self._formula_field) for term in loads.user_terms)
-        self.loads = replace(loads, user_terms=own)
+        user_terms = tuple(term.with_functions(self._formula_field) for term in loads.user_terms)
+        self.loads = replace(loads, user_terms=user_terms)
         self.factory = factory = self._make_factory()
         self._pattern, *areal_distortion = factory.distortions()
         self._held, planes, self.supports = supports(body, self.r0, conditions)
@@ -319,7 +319,7 @@ def _in_cells(field: Magnetisation, body: BodyMesh) -> Magnetisation:
     MeshError
         If the body has no such patch.
     """
-    by_cell = field.on(body.patches, len(body.layer_bounds))
+    by_cell = field.on_cells(body.patches, len(body.layer_bounds))
     if field.layers and not field.patches:
         return replace(by_cell, remanent=_layered(field.layers, body))
     return by_cell

@@ -388,7 +388,7 @@ def _jump_of(edge: HeldEdge, r0: Jet, m: Expr) -> Callable[[Jet], Expr]:
 
 
 def _works(
-    model: "ShellModel | MeridianModel", given: _PrescribedStress | _StrainRates
+    model: "ShellModel | MeridianModel", stresses: _PrescribedStress | _StrainRates
 ) -> list[ufl.Form]:
     """Return the work of given stresses on the strains of u, and on edges as in C0 interior
     penalty.
@@ -396,8 +396,8 @@ def _works(
     Its gradient is the viscous forces. Smooth surfaces have no jumps, so that these need no memory:
     each step closes the edges that it opens.
     """
-    inside = _work_in_cells(model, given) + _work_on_interior_edges(model, given)
-    return [inside, *_works_on_held_edges(model, given)]
+    inner_work = _work_in_cells(model, stresses) + _work_on_interior_edges(model, stresses)
+    return [inner_work, *_works_on_held_edges(model, stresses)]
 
 
 def _small_strain_law(model: "ShellModel | MeridianModel", j: Jet, side: str = "") -> Law:
@@ -416,13 +416,13 @@ def _small_strain_law(model: "ShellModel | MeridianModel", j: Jet, side: str = "
 
 
 def _work_in_cells(
-    model: "ShellModel | MeridianModel", given: _PrescribedStress | _StrainRates
+    model: "ShellModel | MeridianModel", stresses: _PrescribedStress | _StrainRates
 ) -> ufl.Form:
     """Return the work of given stresses and moments in the cells."""
     domain = model.factory.domain
     r0, u = domain.j0, domain.jet(model.u)
     E, K = _strains(r0, u)
-    strain, bend = given.strain(r0, "")
+    strain, bend = stresses.strain(r0, "")
     up, law = kin.inverse_metric(r0), _small_strain_law(model, r0)
     stretching = work(law.stress(strain, up), E)
     bending = work(law.moment(strain, bend, up), K)
@@ -432,7 +432,7 @@ def _work_in_cells(
 
 
 def _work_on_interior_edges(
-    model: "ShellModel | MeridianModel", given: _PrescribedStress | _StrainRates
+    model: "ShellModel | MeridianModel", stresses: _PrescribedStress | _StrainRates
 ) -> ufl.Form:
     """Return the work on the jumps between cells."""
     factory, domain = model.factory, model.factory.domain
@@ -450,17 +450,17 @@ def _work_on_interior_edges(
     given_moment, moment, stiffness = 0, 0, 0
     for j, v, side, (nu1, nu2, _) in zip(r0s, us, sides, conormals, strict=True):
         edge, law = (kin.inverse_metric(j), (nu1, nu2), 1), _small_strain_law(model, j, side)
-        given_moment += law.edge_moment(*given.strain(j, side), *edge) / 2
+        given_moment += law.edge_moment(*stresses.strain(j, side), *edge) / 2
         moment += law.edge_moment(*_strains(j, v), *edge) / 2
         side_stiffness = law.edge_stiffness(kin.membrane_strain(j, v), *edge)
         stiffness += side_stiffness / 2 * model.sigma / domain.widths[0]
-    opening, jump = given.stiff_opening(domain, jump_of), jump_of(r0 + u)
+    opening, jump = stresses.stiff_opening(domain, jump_of), jump_of(r0 + u)
     stretch = (conormals[0][2] + conormals[1][2]) / 2
     return (given_moment * jump + opening * (moment + stiffness * jump)) * stretch * domain.dS()
 
 
 def _works_on_held_edges(
-    model: "ShellModel | MeridianModel", given: _PrescribedStress | _StrainRates
+    model: "ShellModel | MeridianModel", stresses: _PrescribedStress | _StrainRates
 ) -> list[ufl.Form]:
     """Return the works on edges that hold the normal, or lie on mirror planes, one by one."""
     factory, domain = model.factory, model.factory.domain
@@ -468,14 +468,14 @@ def _works_on_held_edges(
     E, K = _strains(r0, u)
     nu1, nu2, stretch = kin.conormal(r0, m)
     edge, law = (kin.inverse_metric(r0), (nu1, nu2), 1), _small_strain_law(model, r0)
-    given_moment = law.edge_moment(*given.strain(r0, ""), *edge)
+    given_moment = law.edge_moment(*stresses.strain(r0, ""), *edge)
     moment = law.edge_moment(E, K, *edge)
     stiffness = law.edge_stiffness(E, *edge) * model.sigma / domain.widths[1]
     works = []
     for held_edge in factory.held_edges:
         jump_of = _jump_of(held_edge, r0, m)
         modelled_sides = 1 if held_edge.plane is None else 2
-        opening, jump = given.stiff_opening(domain, jump_of), jump_of(r0 + u)
+        opening, jump = stresses.stiff_opening(domain, jump_of), jump_of(r0 + u)
         response = moment + modelled_sides * stiffness * jump
         density = given_moment * jump + opening * response
         works.append(density * stretch * domain.ds(held_edge.facets))

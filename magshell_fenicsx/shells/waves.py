@@ -85,7 +85,7 @@ class Waves:
         self._nonlinear_energies = [e for e in energies if not e.linear]
         self._points = WaveHessians(domain, system.u, self._nonlinear_energies, log)
         self._phi, self._energies, self._log = fem.Function(V, name="phi"), list[FormTerm](), log
-        self._held_once, self._held = supports.held_waves(V, 1), supports.held_waves(V, 2)
+        self._held_once, self._held = supports.wave_conditions(V, 1), supports.wave_conditions(V, 2)
         self._set_largest(largest_wave_number(meridian, system.length))
         self._set_system(system)
 

@@ -31,7 +31,7 @@ from magshell_fenicsx.parts.imperfections.growth import grown_by
 from magshell_fenicsx.parts.imperfections.imperfection import (
     ImperfectionSection,
     LocalSection,
-    flaws,
+    imperfection_geometries,
     in_frame,
 )
 from magshell_fenicsx.parts.magnetism.applied import AppliedField
@@ -156,7 +156,7 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
     field = scene.model.loads.magnetic
     if field is None or (field.soft and field.soft.alone) or scene.model.loads.interaction:
         return {}
-    rims_by_patch, one = scene.problem.within, np.ones(3)
+    rims_by_patch, unit_factor = scene.problem.within, np.ones(3)
     if field.patches and scene.problem.context.sections.get("shells"):
         return _remanence_columns_of_shells(scene, fold.state, field, field.patches)
     if not rims_by_patch:
@@ -165,9 +165,10 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
     def factor_of(patch: str) -> WithinRims:
         """Return the factor that is 1 within a patch, and 0 elsewhere."""
         rims = tuple(
-            (rim, one if name == patch else 0 * one) for name, rim in rims_by_patch.items()
+            (rim, unit_factor if name == patch else 0 * unit_factor)
+            for name, rim in rims_by_patch.items()
         )
-        return WithinRims(rims, one if patch == "rest" else 0 * one)
+        return WithinRims(rims, unit_factor if patch == "rest" else 0 * unit_factor)
 
     patches = (*rims_by_patch, "rest")
     alone = {patch: _RemanenceWithin(field.remanent, factor_of(patch)) for patch in patches}
@@ -193,7 +194,9 @@ def _remanence_columns_of_shells(
         patches_of_cells, count = model.meridian.patches, len(model.meridian.order)
     without_field = dict.fromkeys(patches, np.zeros(3))
     alone = {
-        name: replace(field, patches={**without_field, name: remanence}).on(patches_of_cells, count)
+        name: replace(field, patches={**without_field, name: remanence}).on_cells(
+            patches_of_cells, count
+        )
         for name, remanence in patches.items()
     }
     return {
@@ -420,7 +423,7 @@ def _deviation(scene: Scene, sections: Imperfections, key: str) -> Deviation:
     """Return the deviation of one of some imperfections, in the frame of the scene's model."""
     problem, number = scene.problem, list(sections).index(key)
     # by number: the geometries have random dimples one by one
-    geometries = flaws(sections, reference_shell_of(problem.context.shell))
+    geometries = imperfection_geometries(sections, reference_shell_of(problem.context.shell))
     geometry = list(geometries.values())[number]
     turned_deviation = in_frame(geometry.deviation, problem.azimuth)
     return _Mirrored(turned_deviation, problem.mirror) if problem.mirror else turned_deviation

@@ -211,9 +211,9 @@ def test_the_branch_of_a_ring_has_the_published_curvature(monkeypatch: pytest.Mo
     14 (1974). The ring is held by nothing, which a case is not allowed: a sector excludes its rigid
     motions.
     """
-    own = BoundarySection.leaves
+    own = BoundarySection.symmetry_constraints
     monkeypatch.setattr(
-        BoundarySection, "leaves", lambda self, context, outline: own(self, context, outline)[:-1]
+        BoundarySection, "symmetry_constraints", lambda self, context, outline: own(self, context, outline)[:-1]
     )
     h = 0.01
     shell = {

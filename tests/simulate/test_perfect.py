@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.input.source import CaseError, Source
-from magshell_fenicsx.parts.imperfections.imperfection import flaws
+from magshell_fenicsx.parts.imperfections.imperfection import imperfection_geometries
 from magshell_fenicsx.parts.imperfections.modes import ModesSection, Round
 from magshell_fenicsx.public import Scene, run
 from magshell_fenicsx.shape.outline import outline, reference_shell_of
@@ -69,7 +69,7 @@ def test_a_mode_computed_and_from_the_file_of_a_run(tmp_path: Path) -> None:
     x = outline(read.shell).sample()
     x = x[x[:, 2] > 0.05]
     one, other = (
-        next(iter(flaws(sections, reference_shell_of(read.shell)).values())).deviation(x) * 12
+        next(iter(imperfection_geometries(sections, reference_shell_of(read.shell)).values())).deviation(x) * 12
         for sections in (read.imperfections, computed.imperfections)
     )
     assert np.abs(other).max() == pytest.approx(0.1, rel=0.05)
@@ -207,4 +207,4 @@ def test_what_is_refused(tmp_path: Path) -> None:
         with pytest.raises(
             CaseError, match=rf"shell\.imperfections\.0\.file: {name}: is no mode file"
         ):
-            flaws(read.imperfections, reference_shell_of(read.shell))
+            imperfection_geometries(read.imperfections, reference_shell_of(read.shell))

@@ -172,7 +172,7 @@ def project_formula(
     if formulas:
         detail = _find_hidden_detail(values, formulas, cells, np.einsum("q,cqi->ci", w, f))
     else:
-        detail = _HiddenDetail.none(len(scale))
+        detail = _HiddenDetail.without_detail(len(scale))
     hidden_by_cell = scale * detail.hidden
     hidden_integral = float(cells.sum_over_ranks(hidden_by_cell))
     size += hidden_integral
@@ -272,7 +272,9 @@ class _HiddenDetail:
     open: float
 
     @classmethod
-    def none(cls, cells: int, variation: float = 0.0, open_: float = 0.0) -> "_HiddenDetail":
+    def without_detail(
+        cls, cells: int, variation: float = 0.0, open_: float = 0.0
+    ) -> "_HiddenDetail":
         no_parts = SubCells(np.empty(0, np.int64), np.empty((0, 0)), np.empty((0, 0)))
         return cls(np.zeros(cells), variation, no_parts, np.zeros(cells, bool), open_)
 
@@ -326,7 +328,7 @@ def _find_hidden_detail(
         np.add.at(integrals, batch.cell, np.einsum("pq,pqi->pi", w, values(x, normals)))
     differences = np.linalg.norm(integrals - sampled_integrals, axis=1)
     if not cells.sum_over_ranks(differences) > 0:
-        return _HiddenDetail.none(len(differences), refined.variation, refined.open)
+        return _HiddenDetail.without_detail(len(differences), refined.variation, refined.open)
     return _HiddenDetail(differences, refined.variation, parts, is_divided, refined.open)
 
 

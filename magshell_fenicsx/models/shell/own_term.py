@@ -366,7 +366,7 @@ class OwnTerm:
             return False
         return all(self._is_same(sample, image(*sample)) for sample in _random_samples())
 
-    def leaves(self, outline: Outline) -> SymmetryConstraint:
+    def symmetry_constraint(self, outline: Outline) -> SymmetryConstraint:
         """Return the symmetry that the term preserves."""
         turns = self.turns and all(p.turns(outline) for p in self.formula_parameters)
 

@@ -105,7 +105,8 @@ class RevolvedGatherer:
         model, fields = self._model, self._fields
         prescribed_fields = [values for values in (fields.Br, fields.susceptibility) if values.size]
         if model.loads.natural:
-            prescribed_fields += model.loads.natural.at(inside_cells(fields.jet[0]), fields.n0)
+            places = inside_cells(fields.jet[0])
+            prescribed_fields += model.loads.natural.tensors_at(places, fields.n0)
         if model.thickness is not None:
             prescribed_fields.append(self._swept.scalars(model.thickness))
         parts = smooth_parts(self._swept.ends, np.array([[0], [1]]), prescribed_fields, fields.n0)

@@ -181,7 +181,7 @@ class Stresses:
         self._law = material.law_in(made_of).at_point(
             r0[0], frame.t[..., 0, :], frame.t[..., 1, :], frame.n0
         )
-        self._natural = natural and natural.at(r0[0], self.frame.n0)
+        self._natural = natural and natural.tensors_at(r0[0], self.frame.n0)
         self._unit = material.bending_stiffness
 
     def values_of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
@@ -318,7 +318,7 @@ class PointFields:
         self._contacts, self._h, self._thins = contacts, material.h, material.law_in(made_of).thins
         self._frame, self._field, self._thickness = TangentFrame.from_jet(r0), field, thickness
         self._natural = (
-            natural.at(r0[0], self._frame.n0)
+            natural.tensors_at(r0[0], self._frame.n0)
             if natural and contacts and np.any(self._thins)
             else None
         )
@@ -383,7 +383,7 @@ class PointFields:
                 else frame.rotated(self.Br, u)
             )
         if self._field:
-            fields["Ba"] = self._field.at(mu, frame.jet[0] + u[0])
+            fields["Ba"] = self._field.field_at(mu, frame.jet[0] + u[0])
         if self._field and self._field.soft:
             deformed_area_vector = np.cross(frame.jet[1] + u[1], frame.jet[2] + u[2])
             deformed_normal = deformed_area_vector / np.linalg.norm(

@@ -199,7 +199,7 @@ class SurfaceGatherer:
         loads, fields = self._model.loads, self._fields
         prescribed = [fields.Br, fields.susceptibility]
         if loads.natural:
-            prescribed += loads.natural.at(inside_cells(r), fields.n0)
+            prescribed += loads.natural.tensors_at(inside_cells(r), fields.n0)
         thickness = self._thickness(self._reference_nodes)
         if self._model.midsurface.shells:
             prescribed.append(self._shell_numbers())

@@ -39,7 +39,7 @@ def contact_bodies(
     bodies: Mapping[str, BodySection],
     approaches: Mapping[str, str],
     driven_amplitudes: Collection[str],
-    ground: ReferenceShell,
+    reference: ReferenceShell,
 ) -> tuple[ContactBody, ...]:
     """Return the bodies of a case as a model has them.
 
@@ -55,7 +55,7 @@ def contact_bodies(
     CaseError
         If a body penetrates the undeformed shell, or one that moves overlaps another.
     """
-    contacts = [_contact(name, body, approaches[name], ground) for name, body in bodies.items()]
+    contacts = [_contact(name, body, approaches[name], reference) for name, body in bodies.items()]
     for i, body in enumerate(contacts):
         for other in contacts[i + 1 :]:
             if not {body.amplitude, other.amplitude} & {*driven_amplitudes}:
@@ -68,24 +68,26 @@ def contact_bodies(
     return tuple(contacts)
 
 
-def _contact(name: str, section: BodySection, approach: str, ground: ReferenceShell) -> ContactBody:
-    key, h, Q = f"bodies.{name}", ground.h, ground.Q
+def _contact(
+    name: str, section: BodySection, approach: str, reference: ReferenceShell
+) -> ContactBody:
+    key, h, Q = f"bodies.{name}", reference.h, reference.Q
     has_own_place = section.position is not None and "at" not in section.model_fields_set
-    if has_own_place and (ground.geometry == "mesh" or section.direction is not None):
-        places = ground.perfect.sample()
+    if has_own_place and (reference.geometry == "mesh" or section.direction is not None):
+        places = reference.perfect.sample()
         place = places[
-            np.linalg.norm(places - np.array(section.position) / ground.R, axis=1).argmin()
+            np.linalg.norm(places - np.array(section.position) / reference.R, axis=1).argmin()
         ]
     else:
-        place, _ = locate(section.at, ground, key)
-    chart = ground.perfect.inverse(place)
-    normal = ground.perfect.normal_near(chart)
-    start = place if len(chart) == 3 else ground.imperfect.embedding(chart[None])[0]
-    half = float(ground.half_thickness(start[None])[0])
+        place, _ = locate(section.at, reference, key)
+    chart = reference.perfect.inverse(place)
+    normal = reference.perfect.normal_near(chart)
+    start = place if len(chart) == 3 else reference.imperfect.embedding(chart[None])[0]
+    half = float(reference.half_thickness(start[None])[0])
     placed_body = place_body(
-        section, key, start, normal / np.linalg.norm(normal), half, Q, ground.R
+        section, key, start, normal / np.linalg.norm(normal), half, Q, reference.R
     )
-    D, size = h**2 / (12 * (1 - ground.nu**2)), section.blunt_radius / placed_body.R
+    D, size = h**2 / (12 * (1 - reference.nu**2)), section.blunt_radius / placed_body.R
     k = section.stiffness or DEFAULT_STIFFNESS * D / h**2 * (
         1.0 if size == inf else POINTED_STIFFNESS_FACTOR * (1 + 1 / size)
     )
@@ -101,7 +103,7 @@ def _contact(name: str, section: BodySection, approach: str, ground: ReferenceSh
         section.stiffness is not None,
         *((Q @ start, placed_body.front - Q @ start) if section.position is None else ()),
     )
-    depth = -least_gap(contact, ground)
+    depth = -least_gap(contact, reference)
     if depth > PENETRATION_TOLERANCE * h:
         position_key, hint = "position", "move it back"
         if section.position is None:
@@ -133,16 +135,16 @@ class ContactZone:
 
     @classmethod
     def of_body(
-        cls, contact: ContactBody, loads: Iterable[Step], ground: ReferenceShell
+        cls, contact: ContactBody, loads: Iterable[Step], reference: ReferenceShell
     ) -> "ContactZone":
         """Return the zone up to the largest approach of steps.
 
         Of a plane it is a ring up to sqrt(2 R a), of other bodies their front.
         """
-        h, size = ground.h, contact.size
+        h, size = reference.h, contact.size
         ring = 1.1 * sqrt(2 * (largest_approach(loads) or 10.0) * h)
         reach = min(ring + 0.5 * sqrt(h), size + sqrt(h))
-        return cls(ground.imperfect.inverse(contact.front), reach, size)
+        return cls(reference.imperfect.inverse(contact.front), reach, size)
 
     def features(self, outline: Outline, sizing: SizingContext, growth: float) -> list[Feature]:
         """Return small elements that show the ring of a contact, and a small body."""
@@ -198,12 +200,12 @@ def body_symmetry(contact: ContactBody) -> SymmetryConstraint:
     )
 
 
-def least_gap(contact: ContactBody, ground: ReferenceShell) -> float:
+def least_gap(contact: ContactBody, reference: ReferenceShell) -> float:
     """Return the least gap over R between a body and the face of the undeformed shell."""
-    outline = ground.imperfect
+    outline = reference.imperfect
 
     def gap(x: Array) -> Array:
-        return contact.gap(x @ ground.Q.T, 0.0, ground.half_thickness(x))[0]
+        return contact.gap(x @ reference.Q.T, 0.0, reference.half_thickness(x))[0]
 
     chart = outline.chart_samples()
     if chart is None:

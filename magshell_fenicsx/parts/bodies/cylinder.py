@@ -16,7 +16,7 @@ from magshell_fenicsx.shape.reference_shell import HALF_DRAWN_EXTENT, cylinder_l
 Array = NDArray[np.float64]
 
 
-class CylinderSection(BodySection):
+class CylinderBodySection(BodySection):
     """A cylinder without ends, its axis across the approach."""
 
     kind: Literal["cylinder"]

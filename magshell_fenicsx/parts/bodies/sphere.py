@@ -14,7 +14,7 @@ from magshell_fenicsx.shape.reference_shell import sphere_lines
 Array = NDArray[np.float64]
 
 
-class SphereSection(BodySection):
+class SphereBodySection(BodySection):
     """A ball."""
 
     kind: Literal["sphere"]

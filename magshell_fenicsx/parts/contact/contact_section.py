@@ -102,7 +102,9 @@ class ShellContact(KeyAbility[Sequence[GivenPair]]):
     def refuse_unfit(self, context: Context) -> None:
         refuse_unfit_pairs(self.sections, context)
 
-    def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
+    def symmetry_constraints(
+        self, context: Context, outline: "Outline"
+    ) -> list[SymmetryConstraint]:
         """Return all symmetry, but no meridian if a patch of a shell may touch."""
         names = {name for pair in self.sections for name in names_of(pair)} - {WHOLE_SHELL}
         return [patch_constraint("contact", names, context.shell)]

@@ -49,7 +49,7 @@ class _AreaVectors:
         return np.asarray(np.einsum("cqmi,cqi->cqm", self.by_node, self.normal))
 
 
-class CellNodes(Protocol):
+class CellsWithNodes(Protocol):
     """Cells with a basix element, and (cells, functions) the numbers of their nodes."""
 
     @property
@@ -86,7 +86,7 @@ class FaceOffsets:
 
     def __init__(
         self,
-        cells: CellNodes,
+        cells: CellsWithNodes,
         r0: Array,
         h: float,
         volume_factors: Array,

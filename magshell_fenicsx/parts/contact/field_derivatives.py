@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.free_parameters import Derivative, FreeParameter
 from magshell_fenicsx.assembly.nonlocal_terms import Entries
-from magshell_fenicsx.parts.contact.face_offsets import CellNodes, FaceOffsets
+from magshell_fenicsx.parts.contact.face_offsets import CellsWithNodes, FaceOffsets
 from magshell_fenicsx.parts.contact.gap_derivatives import distance_slopes, forces_on_nodes
 from magshell_fenicsx.parts.contact.projection import JoinedPlaces, Longs, Projections
 from magshell_fenicsx.parts.contact.segments import ContactPoints
@@ -80,7 +80,7 @@ class ContactState:
         Returns distances, normals, and beta with its nodes, of places; see `gap_geometry`.
     """
 
-    cells: CellNodes
+    cells: CellsWithNodes
     r0: Array
     u: Array
     offsets: FaceOffsets | None

@@ -234,7 +234,7 @@ class DeadSection(PathStep):
     def scale(self, load_start: LoadStart) -> float:
         return abs(self.factor or 1.0)
 
-    def leaves(
+    def symmetry_constraints(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
         R, meridian = context.shell.reference, outline.meridian
@@ -291,7 +291,7 @@ class DeadSection(PathStep):
         ]
         return [
             SymmetryConstraint(reason, vectors, mirrors),
-            *(energy.leaves(outline) for energy in energies),
+            *(energy.symmetry_constraint(outline) for energy in energies),
         ]
 
     def named_points(self) -> list[str]:

@@ -84,7 +84,7 @@ class IndentationSection(PathStep):
                 "90: 0.714)"
             )
 
-    def leaves(
+    def symmetry_constraints(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
         place = self.place_on(step, context, outline)
@@ -130,12 +130,12 @@ class IndentationSection(PathStep):
         self, step: ProgrammeStep, context: Context, outline: "Outline", chart_place: Array
     ) -> None:
         width = getattr(context.shell, "width", None) if context.shell.geometry == "strip" else None
-        room = (
+        distance_to_edge = (
             outline.edge - float(np.hypot(*chart_place[:2]))
             if outline.sphere
             else min(1.0, width or 1.0)
         )
-        largest = room * context.shell.R_over_h
+        largest = distance_to_edge * context.shell.R_over_h
         if self.patch and not 0.3 <= self.patch <= largest:
             raise CaseError(
                 f"{step.key}.patch: {self.patch:g}: allowed are 0 for a point, or 0.3 to "

@@ -18,7 +18,7 @@ from magshell_fenicsx.mesh.patch import place_text
 from magshell_fenicsx.parts.imperfections.imperfection import (
     ImperfectionGeometry,
     ImperfectionSection,
-    over,
+    number_over,
 )
 from magshell_fenicsx.platform.input_files import Files
 from magshell_fenicsx.shape.reference_shell import ReferenceShell
@@ -61,13 +61,13 @@ class DataSection(FileKeys, ImperfectionSection):
     """CSV with a header or .npz, its path from the folder of the case"""
     amplitude: float = Field(default=1.0, ge=-1e3, le=1e3)
     """Factor of w0"""
-    noise: Annotated[float, over("h")] | None = Field(default=None, ge=0, le=50)
+    noise: Annotated[float, number_over("h")] | None = Field(default=None, ge=0, le=50)
     """Standard deviation of the noise in w0; 0: w0 is exact; estimated by default [h]"""
 
     def account(self) -> str:
         return f"data of {self.file}"
 
-    def geometry(self, ground: ReferenceShell, key: str) -> ImperfectionGeometry:
+    def geometry(self, reference: ReferenceShell, key: str) -> ImperfectionGeometry:
         """Return the geometry of the measured imperfection, see `ImperfectionSection`.
 
         Raises
@@ -75,22 +75,22 @@ class DataSection(FileKeys, ImperfectionSection):
         CaseError
             If the file cannot be read, or its values are not of this shell.
         """
-        fit_key = (self.digest, str(self.path), str(self.noise), *ground.identity)
+        fit_key = (self.digest, str(self.path), str(self.noise), *reference.identity)
         if fit_key not in _fits:
             if len(_fits) > 3:
                 _fits.clear()
-            lengths = Lengths(ground.h, ground.R, ground.with_units)
+            lengths = Lengths(reference.h, reference.R, reference.with_units)
             try:
-                _fits[fit_key] = _fitted(
-                    self.noise, read_scan(self.path, lengths, self.files), ground
+                _fits[fit_key] = _fit_of_scan(
+                    self.noise, read_scan(self.path, lengths, self.files), reference
                 )
             except TableError as e:
                 raise CaseError(f"{key}.file: {self.file}: {e}") from None
-        fitted = _fits[fit_key]
+        fit = _fits[fit_key]
         return ImperfectionGeometry(
-            Factored(fitted.function, self.amplitude),
-            fitted.size,
-            account=f"{self.file}: {fitted.account}",
+            Factored(fit.function, self.amplitude),
+            fit.size,
+            account=f"{self.file}: {fit.account}",
         )
 
 
@@ -223,7 +223,7 @@ class _Fit:
     account: str
 
 
-def _fitted(standard: float | None, scan: Scan, ground: ReferenceShell) -> _Fit:
+def _fit_of_scan(standard: float | None, scan: Scan, reference: ReferenceShell) -> _Fit:
     """The smooth function; `standard` is the standard deviation of the noise over h, None to
     estimate it.
     """
@@ -231,8 +231,8 @@ def _fitted(standard: float | None, scan: Scan, ground: ReferenceShell) -> _Fit:
 
     from magshell_fenicsx.mesh.scattered_data import fit_scattered
 
-    h, surface = ground.h, ground.perfect.sample()
-    places, w0 = _on_surface(scan, ground, surface)
+    h, surface = reference.h, reference.perfect.sample()
+    places, w0 = _on_surface(scan, reference, surface)
     if not np.abs(w0).max() <= min(MAX_DEPTH_OVER_H * h, MAX_DEPTH_OVER_R):
         unit = (
             "; without a unit in the header, w0 is over h"
@@ -272,7 +272,7 @@ def _fitted(standard: float | None, scan: Scan, ground: ReferenceShell) -> _Fit:
     )
 
 
-def _on_surface(scan: Scan, ground: ReferenceShell, surface: Array) -> tuple[Array, Array]:
+def _on_surface(scan: Scan, reference: ReferenceShell, surface: Array) -> tuple[Array, Array]:
     """Places (n, 3) of the perfect surface and w0 (n,), over R."""
     import scipy
 
@@ -280,13 +280,13 @@ def _on_surface(scan: Scan, ground: ReferenceShell, surface: Array) -> tuple[Arr
     if "x" not in columns:
         assert w0 is not None
         polar = columns.get("polar")
-        if ground.geometry not in (("cylinder",) if polar is None else ("hemisphere", "cap")):
+        if reference.geometry not in (("cylinder",) if polar is None else ("hemisphere", "cap")):
             angles = (
                 "azimuth and z are of a cylinder"
                 if polar is None
                 else "polar and azimuth are of a sphere"
             )
-            raise TableError(f"{angles}; on geometry: {ground.geometry} give x, y, z")
+            raise TableError(f"{angles}; on geometry: {reference.geometry} give x, y, z")
         rho, z = (1.0, columns["z"]) if polar is None else (np.sin(polar), np.cos(polar))
         return np.column_stack(
             [rho * np.cos(columns["azimuth"]), rho * np.sin(columns["azimuth"]), z]
@@ -299,7 +299,7 @@ def _on_surface(scan: Scan, ground: ReferenceShell, surface: Array) -> tuple[Arr
             f"the place {place_text(x[row])} over R is {distance[row]:.3g} R from the shell: give "
             "the columns their unit, such as x [mm], or turn and move them to the shell's frame"
         )
-    places, heights = feet(ground.perfect, x)
+    places, heights = feet(reference.perfect, x)
     if w0 is None:
         return places, heights
     if np.abs(heights).max() > 0.02 + 2 * np.abs(w0).max():

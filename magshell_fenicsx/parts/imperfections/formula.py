@@ -34,7 +34,7 @@ class FormulaSection(ImperfectionSection):
     def account(self) -> str:
         return f"w0/h = {self.amplitude:g} ({self.w0})"
 
-    def geometry(self, ground: ReferenceShell, key: str) -> ImperfectionGeometry:
+    def geometry(self, reference: ReferenceShell, key: str) -> ImperfectionGeometry:
         """Return the geometry of the formula, see `ImperfectionSection`.
 
         The element size is 2.5/k of the shortest wave sin(k x) that it resembles.
@@ -44,8 +44,8 @@ class FormulaSection(ImperfectionSection):
         CaseError
             If it is not finite somewhere, or too deep.
         """
-        x = ground.perfect.sample()
-        deviation = ByFormula(self.w0, self.amplitude / ground.R_over_h)
+        x = reference.perfect.sample()
+        deviation = ByFormula(self.w0, self.amplitude / reference.R_over_h)
         bad_places = x[~(np.abs(deviation(x)) <= MAX_DEPTH)]
         if len(bad_places):
             place = ", ".join(f"{c:.3g}" for c in bad_places[0])

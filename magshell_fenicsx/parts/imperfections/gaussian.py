@@ -17,7 +17,7 @@ class Gaussian(Local):
     steepest: ClassVar[float] = sqrt(2) * exp(-0.5)
     # in half-widths phi_g: 2 % of the depth is left there
     reach: ClassVar[float] = 2.0
-    shown: ClassVar[float] = 0.4
+    element_widths: ClassVar[float] = 0.4
 
     @staticmethod
     def profile(squared: Array) -> Array:

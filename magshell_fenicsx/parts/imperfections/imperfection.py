@@ -28,7 +28,7 @@ CONTEXT = (
     "of imperfections"  # key of the context of a validation: scale -> size in m, none without units
 )
 UNITS = {"h": "h", "width": "the unit of a dimple's width"}
-SHOWN = 0.45  # of sqrt(R h): elements that show a dimple
+DIMPLE_ELEMENT_SIZE = 0.45  # of sqrt(R h): elements that show a dimple
 
 
 @dataclass(frozen=True)
@@ -65,7 +65,7 @@ class ImperfectionGeometry:
     account: str = ""
     sizes: Callable[[Array], Array] | None = None
 
-    def inside(self, places: Array) -> NDArray[np.bool_]:
+    def is_within_rim(self, places: Array) -> NDArray[np.bool_]:
         """Return whether places (n, 3) are within the rim."""
         assert self.distance
         return np.asarray(self.distance(places) < self.reach)
@@ -83,7 +83,7 @@ class Local:
         From its centre.
     steepest
         The largest slope of f(t²) by t.
-    reach, shown
+    reach, element_widths
         How far it reaches, and elements that show a narrow one, in widths.
     rim
         Whether the curvature jumps where it ends.
@@ -91,7 +91,7 @@ class Local:
 
     steepest: ClassVar[float]
     reach: ClassVar[float] = 1.0
-    shown: ClassVar[float] = inf
+    element_widths: ClassVar[float] = inf
     rim: ClassVar[bool] = False
     depth: float
     width: float
@@ -108,7 +108,7 @@ class Local:
 
 
 @dataclass(frozen=True)
-class Turned(Generic[Values]):
+class RotatedFunction(Generic[Values]):
     """A function of places (n, 3) in a frame whose axes are the rows of `axes`."""
 
     of_place: Callable[[Array], Values]
@@ -120,7 +120,7 @@ class Turned(Generic[Values]):
 
 def in_frame(of_place: Callable[[Array], Values], turn: float) -> Callable[[Array], Values]:
     """A function of places in a frame turned about e3 (rad)."""
-    return Turned(of_place, rotation(turn)) if turn else of_place
+    return RotatedFunction(of_place, rotation(turn)) if turn else of_place
 
 
 def half_width(width: float, R_over_h: float, nu: float) -> float:
@@ -129,7 +129,7 @@ def half_width(width: float, R_over_h: float, nu: float) -> float:
     return width / sqrt(sqrt(12 * (1 - nu**2)) * R_over_h)
 
 
-def over(scale: Literal["h", "width"]) -> BeforeValidator:
+def number_over(scale: Literal["h", "width"]) -> BeforeValidator:
     """A validator: a length with a unit -> a number over h, or in the unit of a dimple's width; or
     a number.
     """
@@ -244,7 +244,7 @@ class ImperfectionSection(Section):
             Polar angle of the edge of a sphere (rad); None of other shells.
         """
 
-    def geometry(self, ground: ReferenceShell, key: str) -> ImperfectionGeometry:
+    def geometry(self, reference: ReferenceShell, key: str) -> ImperfectionGeometry:
         """Return its geometry on the perfect shell; `key` is its key, with dots.
 
         Raises
@@ -259,9 +259,9 @@ class LocalSection(ImperfectionSection):
     """Base of those around a place, which have a profile: the class `deviation`."""
 
     deviation: ClassVar[type[Local]]
-    amplitude: Annotated[float, over("h")] = Field(ge=-50, le=50)
+    amplitude: Annotated[float, number_over("h")] = Field(ge=-50, le=50)
     """Depth δ, inwards; a bump is negative [h]"""
-    width: Annotated[float, over("width")] = Field(ge=0.05, le=50)
+    width: Annotated[float, number_over("width")] = Field(ge=0.05, le=50)
     """Half-width. A number is φo of a dimple, or φg of a Gaussian one, in radians times (√(12(1 -
     ν²)) R/h)^(1/2); a length with a unit is R φo, or R φg"""
     at: At = At.model_construct()
@@ -279,11 +279,11 @@ class LocalSection(ImperfectionSection):
         depth = abs(self.amplitude) / R_over_h
         _refuse_steep(depth, self.deviation.steepest * depth / self.half_width(R_over_h, nu))
 
-    def geometry(self, ground: ReferenceShell, key: str) -> ImperfectionGeometry:
-        of, width = self.deviation, self.half_width(ground.R_over_h, ground.nu)
-        place, distance = locate(self.at, ground, key)
-        size = min(SHOWN / sqrt(ground.R_over_h), of.shown * width)
-        deviation = of(self.amplitude / ground.R_over_h, width, distance)
+    def geometry(self, reference: ReferenceShell, key: str) -> ImperfectionGeometry:
+        of, width = self.deviation, self.half_width(reference.R_over_h, reference.nu)
+        place, distance = locate(self.at, reference, key)
+        size = min(DIMPLE_ELEMENT_SIZE / sqrt(reference.R_over_h), of.element_widths * width)
+        deviation = of(self.amplitude / reference.R_over_h, width, distance)
         return ImperfectionGeometry(deviation, size, place, distance, of.reach * width, of.rim)
 
 
@@ -319,8 +319,10 @@ class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
                 raise ValueError(f"shell.{key}: {e}") from None
 
 
-def flaws(
-    imperfections: Mapping[str, ImperfectionSection], ground: ReferenceShell
+def imperfection_geometries(
+    imperfections: Mapping[str, ImperfectionSection], reference: ReferenceShell
 ) -> dict[str, ImperfectionGeometry]:
     """Key of each imperfection below `shell` -> what it brings."""
-    return {key: section.geometry(ground, f"shell.{key}") for key, section in imperfections.items()}
+    return {
+        key: section.geometry(reference, f"shell.{key}") for key, section in imperfections.items()
+    }

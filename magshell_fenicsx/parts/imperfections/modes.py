@@ -16,7 +16,7 @@ from magshell_fenicsx.mesh.multi_shell import ShellPose
 from magshell_fenicsx.parts.imperfections.imperfection import (
     ImperfectionGeometry,
     ImperfectionSection,
-    over,
+    number_over,
 )
 from magshell_fenicsx.platform.input_files import read_vtk
 from magshell_fenicsx.shape.reference_shell import ON_AXIS, ReferenceShell
@@ -46,7 +46,8 @@ class ModesSection(FileKeys, ImperfectionSection):
 
     kind: Literal["modes"]
     amplitudes: Annotated[
-        list[Annotated[float, over("h"), Field(ge=-50, le=50)]], Field(min_length=1, max_length=20)
+        list[Annotated[float, number_over("h"), Field(ge=-50, le=50)]],
+        Field(min_length=1, max_length=20),
     ]
     """Largest w0 of each mode, the lowest mode first; positive: inwards where the mode is largest
     [h]"""
@@ -115,7 +116,7 @@ class ModesSection(FileKeys, ImperfectionSection):
             )
         self._shapes = tuple(part or _zero_mode for part in parts)
 
-    def geometry(self, ground: ReferenceShell, key: str) -> ImperfectionGeometry:
+    def geometry(self, reference: ReferenceShell, key: str) -> ImperfectionGeometry:
         """Return the geometry of the modes; those not yet computed are zero.
 
         Raises
@@ -123,9 +124,9 @@ class ModesSection(FileKeys, ImperfectionSection):
         CaseError
             If the file of a mode cannot be used.
         """
-        h = ground.h
+        h = reference.h
         if self.file is not None and self.shapes is None:
-            self.become((_read(self, ground.perfect.sample(), f"{key}.file: {self.file}"),))
+            self.become((_read(self, reference.perfect.sample(), f"{key}.file: {self.file}"),))
         shapes = self.shapes or ()
         amplitudes = tuple(a * h for a in self.amplitudes[: len(shapes)])
         waves = [getattr(shape, "m", None) for shape in shapes]

@@ -17,7 +17,7 @@ from magshell_fenicsx.parts.imperfections.imperfection import (
     ImperfectionGeometry,
     ImperfectionSection,
     half_width,
-    over,
+    number_over,
     sizes_noted,
 )
 from magshell_fenicsx.shape.reference_shell import ReferenceShell
@@ -37,9 +37,9 @@ class RandomSection(ImperfectionSection):
     kind: Literal["random"]
     seed: int = Field(ge=0, le=2**63 - 1)
     """Chooses one of the random shapes"""
-    amplitude: Annotated[float, over("h")] | None = Field(default=None, ge=-50, le=50)
+    amplitude: Annotated[float, number_over("h")] | None = Field(default=None, ge=-50, le=50)
     """Standard deviation δ of the field [h]"""
-    length: Annotated[float, over("width")] | None = Field(default=None, ge=0.05, le=1e3)
+    length: Annotated[float, number_over("width")] | None = Field(default=None, ge=0.05, le=1e3)
     """Length of correlation ℓ of the field, in the unit of a dimple's width"""
     dimples: DefectsSection | None = None
     """Random dimples, in place of amplitude and length; on spheres"""
@@ -83,13 +83,13 @@ class RandomSection(ImperfectionSection):
             ) from None
         return {f"dimples.{i}": dimple for i, dimple in enumerate(sections)}
 
-    def geometry(self, ground: ReferenceShell, key: str) -> ImperfectionGeometry:
+    def geometry(self, reference: ReferenceShell, key: str) -> ImperfectionGeometry:
         """Return the geometry of the random field; elements resolve its length of correlation."""
         assert self.amplitude is not None
         assert self.length
-        length = half_width(self.length, ground.R_over_h, ground.nu)
+        length = half_width(self.length, reference.R_over_h, reference.nu)
         return ImperfectionGeometry(
-            Waves(self.amplitude / ground.R_over_h, length, self.seed), length
+            Waves(self.amplitude / reference.R_over_h, length, self.seed), length
         )
 
 

@@ -128,7 +128,7 @@ class _Sum:
         return False if differs > 2 * EQUALITY_TOLERANCE * np.abs(depths).sum() else None
 
 
-def leaves(
+def imperfection_constraints(
     imperfections: Mapping[str, ImperfectionGeometry], perfect: Outline, *, one_by_one: bool
 ) -> list[SymmetryConstraint]:
     """Return the symmetry that imperfections preserve.
@@ -259,7 +259,7 @@ class LocalImperfection:
         ]
 
 
-def spots(
+def local_imperfections(
     imperfections: Iterable[tuple[str, ImperfectionGeometry]], perfect: Outline, turn: float
 ) -> list[LocalImperfection]:
     """The local imperfections of a case in the chart of a frame that is turned about e3 (rad).
@@ -305,13 +305,13 @@ def spots(
     return local_imperfections
 
 
-def different(local: Iterable[LocalImperfection]) -> tuple[Array, ...]:
+def distinct_rims(local: Iterable[LocalImperfection]) -> tuple[Array, ...]:
     """Return the rims that need edges of elements; of nearly equal ones, the first."""
     rims: list[Array] = []
-    for spot in local:
-        rim = spot.rim
+    for local_imperfection in local:
+        rim = local_imperfection.rim
         if rim is not None and all(
-            np.abs(rim - other).max() > RIM_TOLERANCE * spot.size for other in rims
+            np.abs(rim - other).max() > RIM_TOLERANCE * local_imperfection.size for other in rims
         ):
             rims.append(rim)
     return tuple(rims)
@@ -365,9 +365,12 @@ def contour(
     return np.asarray(centre + high[:, None] * rays)
 
 
-def images(spot: LocalImperfection, perfect: Outline) -> list[Array]:
+def images(local_imperfection: LocalImperfection, perfect: Outline) -> list[Array]:
     """Return its centre (2,), and the images of this across glued sides of a grid."""
     if not (grid := perfect.grid):
-        return [spot.centre]
+        return [local_imperfection.centre]
     steps = product(*((-1, 0, 1) if glued else (0,) for glued in grid.glued))
-    return [spot.centre + np.multiply(step, np.subtract(grid.high, grid.low)) for step in steps]
+    return [
+        local_imperfection.centre + np.multiply(step, np.subtract(grid.high, grid.low))
+        for step in steps
+    ]

@@ -202,7 +202,7 @@ class AppliedField:
         self, at_rest: tuple[Array, Array, Array], x: Array
     ) -> tuple[Array, Array, Array]:
         """Return B, G and H of the field at rest and the moving ones together, at places x."""
-        self._fields_at_places = [moving.at(x, self.mu) for moving in self._moving_fields]
+        self._fields_at_places = [moving.field_at(x, self.mu) for moving in self._moving_fields]
         fields = [at_rest, *(at_places.value for at_places in self._fields_at_places)]
         B, G, H = (np.sum(part, axis=0) for part in zip(*fields, strict=True))
         return B, G, H
@@ -215,7 +215,7 @@ class AppliedField:
         ]
         for field, B in [
             *at_rest,
-            *((moving.at_rest, moving.at(x[None], self.mu).B) for moving in self._moving_fields),
+            *((moving.at_rest, moving.field_at(x[None], self.mu).B) for moving in self._moving_fields),
         ]:
             if not np.isfinite(B).all():
                 description = getattr(

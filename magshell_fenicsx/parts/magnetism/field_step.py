@@ -145,7 +145,7 @@ class RotationSection(Step):
             )
             raise ValueError(f"{step.key}.to: must be neither parallel nor opposite to {subject}")
 
-    def leaves(
+    def symmetry_constraints(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
         return [SymmetryConstraint("the field turns", [self.to.vector()])]

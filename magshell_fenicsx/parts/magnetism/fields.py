@@ -107,7 +107,7 @@ class AppliedSection(Direction):
         return (self.flux_density or 1.0) if self.sources else self.flux_density
 
     @property
-    def beside(self) -> bool:
+    def has_field_beside_sources(self) -> bool:
         """Whether there is a field beside that of the sources."""
         return bool(self.flux_density) if self.sources else True
 
@@ -360,9 +360,11 @@ class MagneticSection(Section, Ability):
         }
         return {key: value for key, value in values.items() if isinstance(value, dict)}
 
-    def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
+    def symmetry_constraints(
+        self, context: Context, outline: "Outline"
+    ) -> list[SymmetryConstraint]:
         from magshell_fenicsx.parts.magnetism.magnetisation import (
-            leaves,
+            remanence_constraints,
         )  # the solver takes long to import
         from magshell_fenicsx.parts.magnetism.sensors import is_read
 
@@ -370,7 +372,7 @@ class MagneticSection(Section, Ability):
             [] if self.interaction == "none" else [SymmetryConstraint("parts act on each other")]
         )
         is_visible = strength(context) or is_read(context) or interacting
-        return interacting + (leaves(context, outline) if is_visible else [])
+        return interacting + (remanence_constraints(context, outline) if is_visible else [])
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
         from magshell_fenicsx.models.shell.spatial_fields import (
@@ -500,7 +502,7 @@ class MagneticSection(Section, Ability):
             or not (self.remanent is None or self.remanent.flux_density)
         ):
             return units
-        if self.applied.beside:
+        if self.applied.has_field_beside_sources:
             return replace(units, applied=1e3 * self.tesla(units.E))
         return replace(units, strength=100 / strength(context))
 

@@ -148,7 +148,7 @@ class ForceExtrapolation:
             and 2 * np.abs(self._rotations(u, earlier_u)[:, :3]).max() < ROTATION_TOLERANCE
         ):
             return
-        rotated = D.turned(self._rotations(u, u_of_D))
+        rotated = D.rotated_blocks(self._rotations(u, u_of_D))
         if rotated is None and earlier_u is not None:
             return
         self._D, self._rotated_u = D, u

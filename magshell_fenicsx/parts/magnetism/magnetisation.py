@@ -209,12 +209,14 @@ def _remanence(
     return section.vector(turn)
 
 
-def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
+def remanence_constraints(context: Context, outline: Outline) -> list[SymmetryConstraint]:
     """Remanence and applied field must both be symmetric to a plane, or both antisymmetric."""
     magnetic = context.section_of(MagneticSection)
     assert magnetic
-    formulas = magnetic.applied.components if magnetic.applied.beside else None
-    without_uniform_field = formulas or not magnetic.applied.beside or not strength(context)
+    formulas = magnetic.applied.components if magnetic.applied.has_field_beside_sources else None
+    without_uniform_field = (
+        formulas or not magnetic.applied.has_field_beside_sources or not strength(context)
+    )
     directions = magnetic.remanent.directions() if magnetic.remanent else []
     remanences = [_on_patch(d, context, 0.0) for d in directions]
     vectors = [v for v in remanences if not callable(v)] + (
@@ -313,7 +315,7 @@ def _axisymmetry_of_formulas(
     """Return for each formula, and for the sources, whether it is the same around e3."""
     meridian = outline.meridian
     remanence = magnetic.remanent.components if magnetic.remanent else None
-    applied = magnetic.applied.components if magnetic.applied.beside else None
+    applied = magnetic.applied.components if magnetic.applied.has_field_beside_sources else None
     is_axisymmetric = dict[str, bool]()
     if remanence and not isinstance(remanence, UserField):
         is_axisymmetric["the formula of the remanence"] = bool(
@@ -367,7 +369,7 @@ def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
         return {"magnetic": magnetisation(magnetic, context, turn, patch_rims, to), **observed}
     if magnetic.remanent is None:
         return observed
-    (constraint,) = leaves(context, modelled.outline)
+    (constraint,) = remanence_constraints(context, modelled.outline)
     is_visible = constraint.not_axisymmetric is None or not modelled.axisymmetric
     if not is_visible or (modelled.plane and not constraint.mirrors(modelled.plane)):
         return observed

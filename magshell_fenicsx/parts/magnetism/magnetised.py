@@ -88,7 +88,7 @@ class Magnetisation:
         """Whether the applied flux density is uniform."""
         return self.gradient is None and self.in_space is None
 
-    def at(self, mu: Mapping[str, float], r: NDArray[np.float64]) -> NDArray[np.float64]:
+    def field_at(self, mu: Mapping[str, float], r: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the applied flux density (..., 3) at deformed places r (..., 3).
 
         A uniform one has the magnitude lambda_m.
@@ -99,7 +99,7 @@ class Magnetisation:
         if self.in_space:
             x = r.reshape(-1, 3)
             B = self.in_space(x)[0] + sum(
-                (field.at(x, mu).value[0] for field in self.driven), np.zeros(3)
+                (field.field_at(x, mu).value[0] for field in self.driven), np.zeros(3)
             )
             return np.asarray(lambda_m * B.reshape(r.shape))
         uniform = lambda_m * self.applied
@@ -113,12 +113,14 @@ class Magnetisation:
         """Return 1 if mirror images continue the applied field, -1 if opposites do; collective."""
         x = r0.x.array.reshape(-1, 3)
         x = x[:: len(x) // PLACES + 1]
-        images = self.at(mu, mirror.image(x)) @ mirror.reflection
+        images = self.field_at(mu, mirror.image(x)) @ mirror.reflection
         return float(
-            np.sign(r0.function_space.mesh.comm.allreduce(float(np.sum(images * self.at(mu, x)))))
+            np.sign(
+                r0.function_space.mesh.comm.allreduce(float(np.sum(images * self.field_at(mu, x))))
+            )
         )
 
-    def on(self, patches: Mapping[str, NDArray[np.bool_]], cells: int) -> "Magnetisation":
+    def on_cells(self, patches: Mapping[str, NDArray[np.bool_]], cells: int) -> "Magnetisation":
         """Return the magnetisation with patterns in place of values of named patches.
 
         `patches` has the cells of each patch, of `cells` on this rank.

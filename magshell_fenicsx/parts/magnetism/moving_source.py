@@ -43,7 +43,7 @@ class MovingField:
         """Names of the amplitudes."""
         return (*(motion.name for motion in self.motions), *self.factors)
 
-    def at(self, x: Array, mu: Mapping[str, float]) -> "FieldAtPlaces":
+    def field_at(self, x: Array, mu: Mapping[str, float]) -> "FieldAtPlaces":
         """Return the field at places x (n, 3) over R, for amplitudes mu."""
         Q, t = combined_motion(self.motions, mu)
         B, G, H = self.at_rest((x - t) @ Q)

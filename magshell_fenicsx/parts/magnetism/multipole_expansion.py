@@ -38,7 +38,7 @@ class Surface:
     dual_basis: tuple[Array, Array]
 
     @classmethod
-    def of(cls, nodes: Array, tables: Array) -> "Surface":
+    def from_nodes(cls, nodes: Array, tables: Array) -> "Surface":
         r, a1, a2 = np.tensordot(nodes, tables, axes=(1, 2)).transpose(3, 0, 2, 1)
         m = np.cross(a1, a2)
         size = np.linalg.norm(m, axis=-1, keepdims=True)
@@ -95,7 +95,9 @@ class MultipoleExpansion:
 
     def place_charges(self, nodes: Array) -> PlacedCharges:
         """Return the charges on cells with nodes (cells, k, 3)."""
-        surfaces = [Surface.of(nodes[cells], points.tables) for cells, points in self._kinds]
+        surfaces = [
+            Surface.from_nodes(nodes[cells], points.tables) for cells, points in self._kinds
+        ]
         heights = [points.t[..., None] * points.heights for _, points in self._kinds]
         points_of_kinds = zip(surfaces, heights, strict=True)
         x = [

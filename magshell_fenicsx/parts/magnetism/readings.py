@@ -238,5 +238,5 @@ def field_at(
         view.loads.magnetic,
     )
     if applied_field and np.any(applied_factor):
-        B = B + applied_factor * applied_field.at(state.mu, places)
+        B = B + applied_factor * applied_field.field_at(state.mu, places)
     return np.asarray(B @ rotation(view.azimuth))

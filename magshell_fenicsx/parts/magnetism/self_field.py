@@ -251,7 +251,7 @@ class SelfField:
                 else frame.rotated(Br, u)
             )
         if soft:
-            B = magnetisation.at(mu, r0[0] + u[0])
+            B = magnetisation.field_at(mu, r0[0] + u[0])
             J = J + soft.scale**2 * soft.polarisation(r0[0], frame.n0, n, B)
         r1, r2 = r0[1] + u[1], r0[2] + u[2]
         area_vector = np.cross(r1, r2)

@@ -101,7 +101,7 @@ class SelfFieldOfSolid(SelfField):
             J = np.einsum("cqij,cqj->cqi", carrier, Br)
         if soft:
             n = unit(np.asarray(np.linalg.solve(np.swapaxes(F, -1, -2), n0[..., None]))[..., 0])
-            B = magnetisation.at(mu, X[0] + u[0])
+            B = magnetisation.field_at(mu, X[0] + u[0])
             J = J + soft.scale**2 * soft.polarisation(X[0], n0, n, B)
         return F, J
 

@@ -189,7 +189,7 @@ class TimeSection(Step):
                 except ValueError as e:
                     raise ValueError(f"{key}.history.{name}: {level}: {e}") from None
 
-    def leaves(
+    def symmetry_constraints(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
         if not self.velocity:

@@ -23,10 +23,10 @@ EQUALITY_TOLERANCE = 1e-9  # over the largest value: smaller differences are rou
 MERIDIAN = "meridian"
 
 
-def natural(context: Context, turn: float, within: Mapping[str, InsideRim]) -> Natural | None:
+def natural(context: Context, turn: float, patch_rims: Mapping[str, InsideRim]) -> Natural | None:
     """Return the natural shape in a frame turned by `turn` about e3 (rad); None without one.
 
-    `within` has the rims of patches by name, see `Problem`.
+    `patch_rims` has the rims of patches by name, see `Problem`.
     """
     section = context.section_of(NaturalSection)
     if section is None:
@@ -57,7 +57,8 @@ def natural(context: Context, turn: float, within: Mapping[str, InsideRim]) -> N
             return vectors
         rest = vectors.get("rest", np.zeros(3))
         return WithinRims(
-            tuple((inside, vectors.get(name, rest)) for name, inside in within.items()), rest
+            tuple((is_inside, vectors.get(name, rest)) for name, is_inside in patch_rims.items()),
+            rest,
         )
 
     curvature, stretch = (
@@ -72,7 +73,7 @@ def frame(context: Context, turn: float) -> Pattern:
 
     The model's frame is turned by `turn` about e3 (rad).
     """
-    direction = along(context)
+    direction = first_direction(context)
     if direction == MERIDIAN:
         return meridians
     return FormulaVectors(
@@ -83,7 +84,7 @@ def frame(context: Context, turn: float) -> Pattern:
     )
 
 
-def along(context: Context) -> list[float | str] | str:
+def first_direction(context: Context) -> list[float | str] | str:
     """Return the first direction of the frame, the default one without a natural shape."""
     flat = isinstance(context.shell, MeshSurface | PlateSurface)
     flat = flat or (isinstance(context.shell, ShellSection) and context.shell.geometry == "strip")
@@ -108,7 +109,7 @@ def not_axisymmetric_because(context: Context, outline: Outline) -> str | None:
     """Return why the natural shape is not axisymmetric about e3; None if it is."""
     section = context.section_of(NaturalSection)
     assert section
-    direction, R = along(context), context.shell.reference
+    direction, R = first_direction(context), context.shell.reference
     k = components(section.curvature)
     patch_constraint = section.curvature.values() if isinstance(section.curvature, dict) else []
     if any(len(c) == 3 and c[2] not in (0, "0") for c in map(components, [k, *patch_constraint])):
@@ -129,7 +130,7 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
     assert section
     if section.user_fields:
         return False
-    x, R, direction = outline.sample(), context.shell.reference, along(context)
+    x, R, direction = outline.sample(), context.shell.reference, first_direction(context)
 
     def is_mirrored(text: float | str, sign: float = 1.0) -> bool:
         values, of_image = (
@@ -201,9 +202,9 @@ def _three_numbers(numbers: Array, *, stretch: bool) -> Array:
     )
 
 
-def leaves(context: Context, outline: Outline) -> list[SymmetryConstraint]:
+def natural_constraints(context: Context, outline: Outline) -> list[SymmetryConstraint]:
     """Return the symmetry that the natural shape preserves."""
-    direction = along(context) if is_anisotropic(context) else MERIDIAN
+    direction = first_direction(context) if is_anisotropic(context) else MERIDIAN
     fixed = not isinstance(direction, str) and all(isinstance(v, float | int) for v in direction)
     vectors = [unit(np.array(direction, dtype=float))] if fixed else []
     return [

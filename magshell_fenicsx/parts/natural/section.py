@@ -160,10 +160,14 @@ class NaturalSection(Section, Ability):
         values = {f"natural.{key}": getattr(self, key) for key in ("curvature", "stretch")}
         return {key: value for key, value in values.items() if isinstance(value, dict)}
 
-    def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
-        from magshell_fenicsx.parts.natural.planned import leaves  # the solver takes long to import
+    def symmetry_constraints(
+        self, context: Context, outline: "Outline"
+    ) -> list[SymmetryConstraint]:
+        from magshell_fenicsx.parts.natural.planned import (
+            natural_constraints,  # the solver takes long to import
+        )
 
-        return leaves(context, outline)
+        return natural_constraints(context, outline)
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
         from magshell_fenicsx.parts.natural.shape import (

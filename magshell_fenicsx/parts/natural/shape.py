@@ -80,10 +80,10 @@ class Natural:
     @property
     def amplitudes(self) -> tuple[str, ...]:
         """Names of the amplitudes."""
-        given = {CURVATURE: self.curvature, STRETCH: self.stretch}
-        return tuple(name for name, value in given.items() if value is not None)
+        values_by_amplitude = {CURVATURE: self.curvature, STRETCH: self.stretch}
+        return tuple(name for name, value in values_by_amplitude.items() if value is not None)
 
-    def on(
+    def on_cells(
         self,
         patches: Mapping[str, NDArray[np.bool_]],
         cells: int,
@@ -109,7 +109,7 @@ class Natural:
             **{key: pattern_of(value) for key, value in varying.items() if pattern_of},
         )
 
-    def at(self, r0: Array, n0: Array) -> tuple[Array, Array, Array]:
+    def tensors_at(self, r0: Array, n0: Array) -> tuple[Array, Array, Array]:
         """Return T and kappa (..., 3, 3) in space, and t (...), at undeformed places.
 
         Places and normals are (cells, nodes, 3).
@@ -177,7 +177,7 @@ def natural_field(natural: Natural, cells: CellGeometry, V: fem.FunctionSpace) -
     r0, n0, _ = cells.evaluate(element.points)
     try:
         _refuse_unfit(natural, r0, n0)
-        T, kappa, t = natural.at(r0, n0)
+        T, kappa, t = natural.tensors_at(r0, n0)
     except MeshError as e:
         message = str(e)
     if problems := [text for text in V.mesh.comm.allgather(message) if text]:
@@ -189,7 +189,7 @@ def natural_field(natural: Natural, cells: CellGeometry, V: fem.FunctionSpace) -
     values = _numbers(T, kappa, t)
     if any(getattr(value, "by_formula", False) for value in (natural.stretch, natural.curvature)):
         fitted_numbers = project_formula(
-            lambda x, n: _numbers(*natural.at(x, n)),
+            lambda x, n: _numbers(*natural.tensors_at(x, n)),
             cells,
             values,
             element,
@@ -229,11 +229,12 @@ class Shape:
     stretch: fem.Constant | None
 
     @classmethod
-    def of(cls, field: fem.Function, natural: Natural, shared: Constants) -> "Shape":
-        """Return the shape with amplitudes from `shared`, which all terms of a model use."""
+    def from_field(cls, field: fem.Function, natural: Natural, constants: Constants) -> "Shape":
+        """Return the shape with amplitudes from `constants`, which all terms of a model use."""
         domain = field.function_space.mesh
         amplitudes = {
-            name: shared.setdefault(name, fem.Constant(domain, 0.0)) for name in natural.amplitudes
+            name: constants.setdefault(name, fem.Constant(domain, 0.0))
+            for name in natural.amplitudes
         }
         return cls(field, amplitudes.get(CURVATURE), amplitudes.get(STRETCH))
 
@@ -313,16 +314,18 @@ def _forms(
 def grown(density: Density, shape: Shape) -> Density:
     """Return a density with natural forms, from one that takes `natural`."""
 
-    def of(*arguments: Expr) -> Expr:
+    def with_natural_forms(*arguments: Expr) -> Expr:
         count = len(arguments) - len(shape.parameters)
-        given, (field, *amplitudes) = arguments[:count], arguments[count:]
-        r0 = given[0]
+        of_density, (field, *amplitudes) = arguments[:count], arguments[count:]
+        r0 = of_density[0]
         if isinstance(r0, Jet):
-            return density.function(*given, natural=shape.forms(r0, field, *amplitudes))
+            return density.function(*of_density, natural=shape.forms(r0, field, *amplitudes))
         sides = tuple(shape.forms(j, side, *amplitudes) for j, side in zip(r0, field, strict=True))
-        return density.function(*given, natural=sides)
+        return density.function(*of_density, natural=sides)
 
-    return replace(density, function=of, parameters=(*density.parameters, *shape.parameters))
+    return replace(
+        density, function=with_natural_forms, parameters=(*density.parameters, *shape.parameters)
+    )
 
 
 def covariant(r0: Jet, field: Expr, first: int) -> Expr:
@@ -362,7 +365,7 @@ def _tensor(components: Array, t1: Array, t2: Array) -> Array:
 
 
 def body_shape(
-    natural: Natural, body: BodyMesh, V: fem.FunctionSpace, shared: dict[str, fem.Constant]
+    natural: Natural, body: BodyMesh, V: fem.FunctionSpace, constants: dict[str, fem.Constant]
 ) -> Shape:
     """Return the natural shape of a solid; collective.
 
@@ -371,7 +374,7 @@ def body_shape(
     MeshError
         As `natural_field`, or if the body has no such patch.
     """
-    natural = natural.on(body.patches, len(body.layer_bounds))
+    natural = natural.on_cells(body.patches, len(body.layer_bounds))
     _, normals = body_positions_and_normals(V)
     Z = fem.functionspace(V.mesh, ("Lagrange", V.element.basix_element.degree, (1,)))
     z = body.at_nodes(Z, (body.heights - MIDSURFACE_HEIGHT) * body.thickness)[Z.dofmap.list]
@@ -381,7 +384,7 @@ def body_shape(
     rows = field.x.array.reshape(-1, HEIGHT_AT + 1)
     shell_numbers = numbers.x.array.reshape(-1, SIZE)[numbers.function_space.dofmap.list]
     rows[Q.dofmap.list] = np.concatenate([shell_numbers, normals, z[..., None]], axis=-1)
-    return Shape.of(field, natural, shared)
+    return Shape.from_field(field, natural, constants)
 
 
 def growth_in_body(shape: Shape, field: Expr, *amplitudes: Expr) -> Expr:

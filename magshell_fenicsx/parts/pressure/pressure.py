@@ -77,11 +77,11 @@ class PressureSection(PathStep):
                 "shells"
             )
 
-    def leaves(
+    def symmetry_constraints(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
         return [
-            *super().leaves(step, context, outline),
+            *super().symmetry_constraints(step, context, outline),
             patch_constraint(f"{step.key}.on", self.on or (), context.shell),
         ]
 

@@ -123,7 +123,9 @@ class BoundarySection(Section, Ability):
             for condition in self.conditions().values()
         )
 
-    def leaves(self, context: Context, outline: "Outline") -> list[SymmetryConstraint]:
+    def symmetry_constraints(
+        self, context: Context, outline: "Outline"
+    ) -> list[SymmetryConstraint]:
         """A half that is loaded does not see rigid motions across its plane: it needs a support
         against all.
         """

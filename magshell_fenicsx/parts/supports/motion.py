@@ -135,7 +135,7 @@ class EdgeSection(PathStep):
                         f"(clamped, hinged or held) can move: {', '.join(held_names) or 'nothing'}"
                     )
 
-    def leaves(
+    def symmetry_constraints(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
         R = context.shell.reference

@@ -24,18 +24,18 @@ class RigidMotions:
 
     Attributes
     ----------
-    along
+    axial
         Displacements (n, nodes times 2) along e3.
-    around
+    torsional
         Waves m = 0 around e3, as coefficients (U + V, V, W), (n, nodes times 3).
-    across
+    transverse
         Waves m = 1 that move the shell across e3 or turn it about an axis across it, likewise. Each
         has a twin.
     """
 
-    along: Array
-    around: Array
-    across: Array
+    axial: Array
+    torsional: Array
+    transverse: Array
 
 
 @dataclass(frozen=True)
@@ -50,7 +50,7 @@ class Supports:
         Where the displacements normal to e3 and along e3 are zero.
     mirror
         Where a plane normal to e3 mirrors the shell.
-    named
+    by_name
         Name of an end, or of a point on the axis -> facets, and the components of (U, W) that are
         held there.
     """
@@ -59,14 +59,14 @@ class Supports:
     horizontal: Facets
     axial: Facets
     mirror: Facets
-    named: Mapping[str, tuple[Facets, tuple[int, ...]]]
+    by_name: Mapping[str, tuple[Facets, tuple[int, ...]]]
     meridian: Meridian
 
-    def held(self, V: fem.FunctionSpace) -> list[fem.DirichletBC]:
+    def axisymmetric_conditions(self, V: fem.FunctionSpace) -> list[fem.DirichletBC]:
         """Return the conditions on the axisymmetric displacement (U, W)."""
         return [_zero(V, self.axis, 0), _zero(V, self.horizontal, 0), _zero(V, self.axial, 1)]
 
-    def held_waves(self, V: fem.FunctionSpace, m: int) -> list[fem.DirichletBC]:
+    def wave_conditions(self, V: fem.FunctionSpace, m: int) -> list[fem.DirichletBC]:
         """Return the conditions on the coefficients (U + V, V, W) of waves m.
 
         A wave m = 1 may move the axis across itself.
@@ -79,7 +79,7 @@ class Supports:
         ]
 
     def unknowns_of_waves(self, r0: fem.Function, m: int) -> NDArray[np.int32]:
-        """Return the unknowns (U + V, V, W) of waves m that are zero, as in `held_waves`, without
+        """Return the unknowns (U + V, V, W) of waves m that are zero, as in `wave_conditions`, without
         their space.
 
         The nodes of the spaces of displacements and of waves have the same numbers.
@@ -93,19 +93,25 @@ class Supports:
 
     def rigid_motions(self, r0: fem.Function) -> RigidMotions:
         """Return the rigid motions of each shell, or of those joined, whatever holds them."""
-        along_motions, around_waves, across_waves = list[Array](), list[Array](), list[Array]()
+        axial_motions, torsional_waves, transverse_waves = (
+            list[Array](),
+            list[Array](),
+            list[Array](),
+        )
         places = r0.x.array.reshape(-1, 2)
         for cells in self.meridian.bodies:
-            rho, z, one = np.zeros((3, len(places)))
+            rho, z, ones = np.zeros((3, len(places)))
             nodes = r0.function_space.dofmap.list[cells]
-            one[nodes], (rho[nodes], z[nodes]) = 1.0, np.moveaxis(places[nodes], -1, 0)
-            zero = 0.0 * one
-            along_motions.append(np.column_stack([zero, one]).ravel())
-            around_waves.append(np.column_stack([rho, rho, zero]).ravel())
-            across_waves += [
-                np.column_stack(wave).ravel() for wave in ([zero, -one, zero], [zero, -z, -rho])
+            ones[nodes], (rho[nodes], z[nodes]) = 1.0, np.moveaxis(places[nodes], -1, 0)
+            zero = 0.0 * ones
+            axial_motions.append(np.column_stack([zero, ones]).ravel())
+            torsional_waves.append(np.column_stack([rho, rho, zero]).ravel())
+            transverse_waves += [
+                np.column_stack(wave).ravel() for wave in ([zero, -ones, zero], [zero, -z, -rho])
             ]
-        return RigidMotions(np.array(along_motions), np.array(around_waves), np.array(across_waves))
+        return RigidMotions(
+            np.array(axial_motions), np.array(torsional_waves), np.array(transverse_waves)
+        )
 
 
 def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Supports:

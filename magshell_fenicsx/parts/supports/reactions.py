@@ -42,7 +42,7 @@ class Reaction:
         """
         return Reaction(S @ self.force, -S @ self.moment, point)
 
-    def whole(self, mirror: Mirror) -> "Reaction":
+    def of_both_halves(self, mirror: Mirror) -> "Reaction":
         """Return the whole reaction of a support that is its own image, from that of a half."""
         return Reaction(
             mirror.sum_over_images(self.force),
@@ -143,7 +143,7 @@ def _of_whole(half: Mapping[str, Reaction], mirror: Mirror) -> dict[str, Reactio
             )
     for name, reaction in half.items():
         if mirror.image_of_edge(name) == name:
-            reactions_of_whole[name] = reaction.whole(mirror)
+            reactions_of_whole[name] = reaction.of_both_halves(mirror)
     return reactions_of_whole
 
 

@@ -48,7 +48,7 @@ class Support:
     kind: SupportKind = "part"
 
     @classmethod
-    def of(
+    def from_conditions(
         cls,
         conditions: Iterable[fem.DirichletBC],
         edge: str = "",

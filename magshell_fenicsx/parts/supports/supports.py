@@ -384,7 +384,7 @@ def supports(
         if condition == "plane":
             planes.append(plane := plane_of(r0, body.faces[name], name))
             constraints.append(support_along(V, 2, body.faces[name], plane.normal))
-            supports_on_planes[name] = Support.of(
+            supports_on_planes[name] = Support.from_conditions(
                 held_on(V, 2, body.faces[name], ALL_COMPONENTS), kind="plane"
             )
             continue
@@ -397,7 +397,7 @@ def supports(
         else:
             conditions_of_part = held_at_vertex(V, body.points[name], components)
         constraints += conditions_of_part
-        named_supports[name] = Support.of(
+        named_supports[name] = Support.from_conditions(
             conditions_of_part, kind="point" if name in body.points else "part"
         )
     return constraints, planes, named_supports | supports_on_planes

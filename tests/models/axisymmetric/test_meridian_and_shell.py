@@ -32,7 +32,7 @@ def displacement(phi: Array) -> tuple[Array, Array]:
         Magnetisation(tangential, E3, "second_consistent", law="rotation"),
         Magnetisation(tangential, E3, gradient=np.diag([0.5, 0.5, -1.0]), law="rotation"),
         Magnetisation(
-            WithinRims(((REACH.inside, -E3),), E3), E3, gradient=np.diag([0.5, 0.5, -1.0])
+            WithinRims(((REACH.is_within_rim, -E3),), E3), E3, gradient=np.diag([0.5, 0.5, -1.0])
         ),
     ],
 )

@@ -199,7 +199,7 @@ def test_definite_or_not(seed: int, triangle: bool) -> None:
         return float(np.linalg.eigvalsh((A + t * (B - A))[np.ix_(free, free)])[0])
 
     seen = {
-        banded.positive(bands, np.array([1.0 - t, t])): least(t) > 0
+        banded.is_positive_definite(bands, np.array([1.0 - t, t])): least(t) > 0
         for t in np.linspace(0, 0.99, 40)
     }
     assert seen == {True: True, False: False}

@@ -101,7 +101,7 @@ def test_plate_on_an_elastic_hinge() -> None:
 @pytest.mark.parametrize("density", [ring, hinge])
 def test_residual_and_tangent(density: Any) -> None:
     """Of the point derivatives against those of the forms."""
-    loads = Loads(pressure=True, own=(ms.OwnTerm("own", density, on="rim"),))
+    loads = Loads(pressure=True, user_terms=(ms.OwnTerm("own", density, on="rim"),))
     model = ShellModel(hemisphere(0.8), Material(NU, 0.05), 2, {}, loads)
     u, mu = random_displacement(model, 1e-2), {"pressure": 0.3, "own": 1.3}
     assert tangent_difference(model.system, u, mu) <= 1e-12

@@ -222,7 +222,7 @@ def test_what_no_term_can_be(name: str, of: Density, said: str) -> None:
 def test_residual_and_tangent(name: str) -> None:
     """Of the point derivatives against those of the forms; on a shell that has all other terms too."""
     of, parameters, *_ = DENSITIES[name]
-    loads = Loads(pressure=True, magnetic=TILTED, own=(OwnTerm("own", of, parameters),))
+    loads = Loads(pressure=True, magnetic=TILTED, user_terms=(OwnTerm("own", of, parameters),))
     model = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": "clamped"}, loads)
     u = random_displacement(model, 1e-2)
     for mu in (
@@ -237,7 +237,7 @@ def test_residual_and_tangent(name: str) -> None:
 def test_load_is_the_derivative_of_the_potential(name: str) -> None:
     """Central differences along a random displacement."""
     of, parameters, *_ = DENSITIES[name]
-    loads = Loads(own=(OwnTerm("own", of, parameters),))
+    loads = Loads(user_terms=(OwnTerm("own", of, parameters),))
     system = ShellModel(hemisphere(0.8), Material(0.3, 0.05), 2, {"rim": "clamped"}, loads).system
     model_u, v = (
         system.zero_at_supports(1e-2 * np.random.default_rng(i).standard_normal(system.size))
@@ -383,7 +383,7 @@ def test_parameters_need_no_new_kernel() -> None:
             Material(0.3, 0.05),
             2,
             {"rim": "clamped"},
-            Loads(own=(OwnTerm("own", weight, (g,)),)),
+            Loads(user_terms=(OwnTerm("own", weight, (g,)),)),
         )
         for g in (E3, 2 * E3)
     ]

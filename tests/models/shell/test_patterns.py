@@ -66,7 +66,7 @@ def test_patches_jump_at_the_rim() -> None:
     uniform = -2 * np.pi * 2 / 3
     cap = -2 * np.pi * (2 / 3 - c + c**3 / 3)
     cap_only = ImperfectionGeometry(Dimple(0.0, phi_o), distance=AT_POLE, reach=phi_o)
-    jumps = WithinRims(((cap_only.inside, -UP),), UP)
+    jumps = WithinRims(((cap_only.is_within_rim, -UP),), UP)
     assert swelling(model(jumps, circle=phi_o)) == pytest.approx(uniform - 2 * cap, rel=1e-4)
 
 

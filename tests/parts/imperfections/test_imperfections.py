@@ -15,8 +15,11 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import Mirror
 from magshell_fenicsx.mesh.patch import DeviatedEmbedding, check_orientation
 from magshell_fenicsx.parts.imperfections.gaussian import Gaussian
-from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry, flaws
-from magshell_fenicsx.parts.imperfections.symmetry import leaves
+from magshell_fenicsx.parts.imperfections.imperfection import (
+    ImperfectionGeometry,
+    imperfection_geometries,
+)
+from magshell_fenicsx.parts.imperfections.symmetry import imperfection_constraints
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shape.outline import outline, reference_shell_of
 from magshell_fenicsx.shape.reference_shell import AngularDistance
@@ -179,8 +182,8 @@ def test_symmetry_by_numbers_is_that_by_values(kind: str) -> None:
             for polar, azimuth, depth, width in places
         ]
         every += [{"kind": "formula", "w0": "0*x"}] * formula
-        (left,) = leaves(
-            flaws(shaped("hemisphere", *every).imperfections, ground), drawn, one_by_one=False
+        (left,) = imperfection_constraints(
+            imperfection_geometries(shaped("hemisphere", *every).imperfections, ground), drawn, one_by_one=False
         )
         return [left.mirrors(Mirror.through_axis(np.radians(azimuth))) for azimuth in (30.0, 70.0)]
 
@@ -222,14 +225,14 @@ def test_symmetry_of_many_imperfections_is_found_by_their_numbers() -> None:
         *({"kind": "gaussian", "amplitude": 0.1, "width": 2.0, "at": at} for at in ats),
     )
     drawn, found = outline(case.shell), dict[str, ImperfectionGeometry]()
-    for key, flaw in flaws(case.imperfections, reference_shell_of(case.shell)).items():
+    for key, flaw in imperfection_geometries(case.imperfections, reference_shell_of(case.shell)).items():
         deviation = flaw.deviation
         assert isinstance(deviation, Gaussian)
         assert isinstance(deviation.distance, AngularDistance)
         found[key] = replace(
             flaw, deviation=replace(deviation, distance=Unasked(deviation.distance.axis))
         )
-    (left,) = leaves(found, drawn, one_by_one=False)
+    (left,) = imperfection_constraints(found, drawn, one_by_one=False)
     assert len(left.azimuths) == 400
     assert not any(left.mirrors(Mirror.through_axis(a)) for a in left.azimuths)
 

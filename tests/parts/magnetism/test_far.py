@@ -7,12 +7,12 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.parts.magnetism import coulomb, tree
+from magshell_fenicsx.parts.magnetism.corotated_stiffness import BlockRotation
 from magshell_fenicsx.parts.magnetism.coulomb import InteractingCharges
 from magshell_fenicsx.parts.magnetism.magnetised_cells import MagnetisedShell
 from magshell_fenicsx.parts.magnetism.multipole_expansion import CellNodes, InteractionHessian
 from magshell_fenicsx.parts.magnetism.multipoles import harmonics, translations
 from magshell_fenicsx.parts.magnetism.pairs import Stiffness
-from magshell_fenicsx.parts.magnetism.corotated_stiffness import BlockRotation
 
 Array = NDArray[np.float64]
 H, SIDES = 0.02, 5

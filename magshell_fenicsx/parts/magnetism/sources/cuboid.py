@@ -23,19 +23,19 @@ class CuboidSection(MagnetSection):
     """Edges along its own axes [m]"""
 
     @property
-    def half(self) -> Array:
+    def half_edges(self) -> Array:
         """Half its edges (3,) in m."""
         return np.array(self.dimension) / 2
 
     def values(self, magnets: ModuleType) -> Values:
-        magnet = magnets.Cuboid(dimension=2 * self.half, polarization=self.vector)
+        magnet = magnets.Cuboid(dimension=2 * self.half_edges, polarization=self.vector)
         return magnet.getB  # type: ignore[no-any-return]
 
     def distance(self, x: Array) -> Array:
-        return to_box(np.abs(x) - self.half)
+        return to_box(np.abs(x) - self.half_edges)
 
     def lines(self) -> list[Array]:
-        return box_lines(-self.half, self.half)
+        return box_lines(-self.half_edges, self.half_edges)
 
     def solid(self) -> Solid:
-        return drawn_bodies.block(self.half)
+        return drawn_bodies.block(self.half_edges)

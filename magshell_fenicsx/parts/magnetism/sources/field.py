@@ -122,7 +122,7 @@ def in_space(
     if not applied.sources and not rotations:
         return by_formula, ()
     parts = list[FieldInSpace]()
-    if applied.beside:
+    if applied.has_field_beside_sources:
         G = Q @ np.array(applied.gradient or np.zeros((3, 3))) @ Q.T
         parts.append(by_formula or Linear(applied.uniform * applied.vector(turn), G))
     moving_fields = list[MovingField]()
@@ -199,7 +199,7 @@ def values(context: Context) -> list[Callable[[Array], Array]]:
     def field_at(mu: dict[str, float]) -> Callable[[Array], Array]:
         return lambda x: np.asarray(
             field_at_rest(x)[0]
-            + sum((field.at(x, mu).value[0] for field in moving_fields), np.zeros(3))
+            + sum((field.field_at(x, mu).value[0] for field in moving_fields), np.zeros(3))
         )
 
     return [field_at(mu) for mu in mus]
