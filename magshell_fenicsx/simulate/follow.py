@@ -124,6 +124,7 @@ def follow(
                     last, scene = record.label, record.scene or scene
                     yield _recorded(scene, step, record, remark, where)
         except (Stopped, NotANumber) as e:
+            _say_of_point_forces(scene, remark, where)
             names = scene.model.system.strange
             strange = (
                 f"; where it was tried last, {' and '.join(names)} was not a number"
@@ -172,6 +173,7 @@ def _recorded(
     at = record.scene or scene
     if record.said:
         remark(where + record.said)
+    _say_of_point_forces(at, remark, where)
     state, moving = record.point.state, bool((record.clock or {}).get("kinetic"))
     refused = scene.journal.noted(
         lambda: Finding({"said": penetration_refused(at, state, moving=moving)})
@@ -179,6 +181,11 @@ def _recorded(
     if refused["said"]:
         raise Stopped(refused["said"])
     return replace(record, step=step.number, scene=at, shown=at.displacement)
+
+
+def _say_of_point_forces(scene: Scene, remark: Callable[[str], None], where: str) -> None:
+    for said in scene.at_point_forces.taken():
+        remark(where + said)
 
 
 def pulling(scene: Scene, state: State) -> dict[str, float]:

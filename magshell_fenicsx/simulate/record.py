@@ -14,6 +14,11 @@ if TYPE_CHECKING:
 
 Label = Literal["start", "field", "step", "target", "fold", "bifurcation", "solution"]
 
+AT_POINT_FORCES = (
+    "there it bends to radii below its thickness, where no shell theory holds and results depend on the mesh; "
+    "spread the force: patch of kind: indentation, a pressure by formula, or a body"
+)
+
 
 @dataclass(frozen=True)
 class Record:
@@ -73,6 +78,36 @@ class Record:
         """
         assert self.shown, "of a record of follow or trace"
         return self.shown(self.point.state)
+
+
+@dataclass
+class LeftOut:
+    """Instabilities of point forces that were left out, which is said once of each force.
+
+    Attributes
+    ----------
+    points
+        Names of points of which it was said.
+    unsaid
+        Sentences that nobody has taken.
+    """
+
+    points: set[str] = field(default_factory=set)
+    unsaid: list[str] = field(default_factory=list)
+
+    def note(self, point: str, at: str, modes: str) -> None:
+        """Note the first instability at a point, with the value of the amplitude."""
+        if point not in self.points:
+            self.points.add(point)
+            self.unsaid.append(
+                f"from {at} on modes are unstable within a thickness of the point force at {point} ({modes} first), "
+                f"and left out: {AT_POINT_FORCES}"
+            )
+
+    def taken(self) -> list[str]:
+        """The sentences, which are said from now on."""
+        said, self.unsaid = self.unsaid, []
+        return said
 
 
 class Stopped(RuntimeError):

@@ -41,11 +41,11 @@ from magshell_fenicsx.problem.limits import refuse_beyond_memory
 from magshell_fenicsx.problem.problem import Problem, meridian_vertices
 from magshell_fenicsx.quantities.registry import Sizes
 from magshell_fenicsx.shells.meridian import MeridianModel
+from magshell_fenicsx.simulate.record import LeftOut, Record
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shells.shell import ShellModel
     from magshell_fenicsx.shells.solid import SolidModel
-    from magshell_fenicsx.simulate.record import Record
 
 Array = NDArray[np.float64]
 NOT_COUNTED = "boundary: the shell moves freely: its unstable directions are not counted"
@@ -248,6 +248,11 @@ class Scene:
         return Watch(self.model.excluded_modes)
 
     @cached_property
+    def at_point_forces(self) -> LeftOut:
+        """The instabilities at point forces that were left out."""
+        return LeftOut()
+
+    @cached_property
     def unshown(self) -> list[str]:
         """What the mesh misses of the problem's formulas, in words; collective."""
         model, formulas = self.model, written(self.problem.context)
@@ -435,7 +440,7 @@ class Scene:
         place = problem.mirror, problem.azimuth
         return Sight(self.model, problem.length, problem.modulus, *place, problem.reactions, sense)
 
-    def to_magpylib(self, record: "Record", parts: int = 8) -> Any:
+    def to_magpylib(self, record: Record, parts: int = 8) -> Any:
         """The magnetised shell of a record as a source of magpylib, of charged triangles;
         collective.
 

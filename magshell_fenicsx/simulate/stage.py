@@ -46,8 +46,7 @@ class Stage:
 
     def point(self, point: Point) -> Point:
         """A point of the step's path with the model's displacement and amplitudes."""
-        du = self.device.displacement(point.du) if self.device else point.du
-        return replace(point, state=self.leave(point.state), du=du)
+        return replace(point, state=self.leave(point.state), du=self.displacement(point.du))
 
     def on(self, scene: Scene) -> "Stage":
         """The same step on another scene, with the same values of what is held."""
@@ -65,7 +64,11 @@ class Stage:
         held.
         """
         held = self.scene.model.system.held
-        return self.device.padded(held(self.device.displacement(x))) if self.device else held(x)
+        return self.padded(held(self.displacement(x)))
+
+    def displacement(self, x: Vector) -> Vector:
+        """The model's displacement of a vector of the step's system."""
+        return self.device.displacement(x) if self.device else x
 
     def path(self, name: str, control: Control, options: StepOptions, scale: float = 1.0) -> Path:
         """A path of the step's system.

@@ -20,7 +20,8 @@ from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.continuation.walk import Goal, Walk
 from magshell_fenicsx.continuation.watch import Crossing
 from magshell_fenicsx.quantities.registry import amplitude
-from magshell_fenicsx.simulate.record import Record, Stopped
+from magshell_fenicsx.simulate.point_forces import point_of_crossing, point_of_instability
+from magshell_fenicsx.simulate.record import AT_POINT_FORCES, Label, Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import LONGEST, Stage
 from magshell_fenicsx.simulate.touch import (
@@ -175,13 +176,16 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
             for label, point in walk:
                 mode, located = "", label in ("fold", "bifurcation")
                 beyond = walk.done or abs(point.state.mu[path.name]) > furthest
-                excluded = list(_excluded(path, watch.pass_to(point, look=located or beyond)))
+                excluded = list(
+                    _excluded(stage, path, watch.pass_to(point, look=located or beyond))
+                )
                 if excluded and goal.until == "bifurcation":
                     yield excluded[0]
                     break
                 yield from excluded
                 if excluded and goal.until == "limit":
                     furthest = min(furthest, BEYOND * abs(excluded[0].point.state.mu[path.name]))
+                label = _label_of(stage, path, label, point, ends=walk.done)
                 if label == "bifurcation":
                     crossing_at_point = branching(
                         _by_arc(stage, path), point, partial(passes, stage)
@@ -205,7 +209,7 @@ def _followed(stage: Stage, walk: Walk, branches: int) -> Records:
                 _why(stage.scene, path, e, walk.points) + fold + stage.scene.nowhere(),
                 e.final,
             )
-        excluded = list(_excluded(path, watch.end()))
+        excluded = list(_excluded(stage, path, watch.end()))
         if excluded and lost and goal.until == "bifurcation":
             yield excluded[0]
             lost = ""
@@ -327,17 +331,17 @@ def branch(stage: Stage, path: Path, start: Point, goal: Goal, number: int) -> R
     yield Record("step", path.name, start, branch=number, excluded_pivots=watch.unstable)
     try:
         for label, point in walk:
-            for record in _excluded(
-                path, watch.pass_to(point, look=walk.done or label in ("fold", "bifurcation"))
-            ):
+            look = walk.done or label in ("fold", "bifurcation")
+            for record in _excluded(stage, path, watch.pass_to(point, look=look)):
                 yield replace(record, branch=number)
+            label = _label_of(stage, path, label, point, ends=walk.done)
             said = words_of_cluster(stage.scene, walk, point)
             yield Record(
                 label, path.name, point, branch=number, excluded_pivots=watch.unstable, said=said
             )
     except PathStopped as e:
         lost = _why(stage.scene, path, e, walk.points)
-    for record in _excluded(path, watch.end()):
+    for record in _excluded(stage, path, watch.end()):
         yield replace(record, branch=number)
     if lost:
         raise Stopped(lost)
@@ -365,7 +369,9 @@ def _fold_ahead(stage: Stage, walk: Walk, within: float) -> list[Record]:
     passed: list[Record] = []
     try:
         for label, point in Walk(by_arc, start, Goal("limit", steps=20)):
-            passed += _excluded(by_arc, stage.scene.watch.pass_to(point, look=label == "fold"))
+            passed += _excluded(
+                stage, by_arc, stage.scene.watch.pass_to(point, look=label == "fold")
+            )
             if abs(point.state.mu[name] - last.s) > within:
                 return []
             if label == "fold":
@@ -378,9 +384,35 @@ def _fold_ahead(stage: Stage, walk: Walk, within: float) -> list[Record]:
     return []
 
 
-def _excluded(path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
-    """Records of the points where excluded modes become unstable or stable."""
+def _label_of(stage: Stage, path: Path, label: Label, point: Point, *, ends: bool) -> Label:
+    """The label of a point of a walk: that of a step where an instability is one of a point force.
+
+    Raises
+    ------
+    Stopped
+        If such an instability ends the walk.
+    """
+    if label not in ("fold", "bifurcation"):
+        return label
+    at = point_of_instability(stage, path, label, point)
+    value = amount(stage.scene, path.name, point.state.mu[path.name])
+    if at and ends:
+        raise Stopped(
+            f"at {value} the shell gives way within a thickness of the point force at {at}: {AT_POINT_FORCES}"
+        )
+    if at:
+        stage.scene.at_point_forces.note(at, value, f"a {label}")
+    return "step" if at else label
+
+
+def _excluded(stage: Stage, path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
+    """Records of the points where excluded modes become unstable or stable, but for those of a
+    point force."""
     for crossing in crossings:
+        if at := point_of_crossing(stage, path, crossing):
+            value = amount(stage.scene, path.name, crossing.point.state.mu[path.name])
+            stage.scene.at_point_forces.note(at, value, crossing.label)
+            continue
         yield Record(
             "bifurcation",
             path.name,
