@@ -459,6 +459,9 @@ class Walk:
         path, from which the walk goes on in place of the second; None if that is accepted. It
         raises `StepTooLong` if it must not be. Where no solution is found with such amplitudes it
         is asked again, and may accept the second point now.
+    refused
+        Why no instability or target may be at a point; "" if one may. The step that has passed it
+        is repeated in shorter ones, at whose ends `renew` is asked.
 
     Attributes
     ----------
@@ -478,7 +481,9 @@ class Walk:
         start: Point,
         goal: Goal,
         renew: Callable[[Point, Point], State | None] | None = None,
+        refused: Callable[[Point], str] = lambda point: "",
     ) -> None:
+        self._refused = refused
         self.path, self.goal, self.points, self._renew = path, goal, [start], renew
         self.done = False
         self.clusters: list[tuple[Point, Point]] = []
@@ -522,6 +527,9 @@ class Walk:
                 except PathStopped as e:  # the step had left the branch: approach in shorter steps
                     shorter, why = abs(point.s - low.s) / 4, "an instability cannot be located"
                     why = str(e) if isinstance(e, TargetMissed) else why
+                    break
+                if why := next(filter(None, (self._refused(each[1]) for each in between)), ""):
+                    shorter = abs(point.s - low.s) / 4
                     break
                 for label, event, self.done in between:
                     yield label, event

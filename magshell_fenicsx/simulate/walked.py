@@ -29,6 +29,7 @@ from magshell_fenicsx.simulate.touch import (
     closer_points,
     of_its_own,
     passes,
+    penetration_refused,
     recall_cuts,
     refuse_crossing,
     refuse_passing,
@@ -85,7 +86,7 @@ def _walk(stage: Stage, path: Path, start: Point, goal: Goal) -> Walk:
     """A walk on which bodies become stiffer, and shells are cut anew and get closer points where
     these move an instability; magnets on the way and returning bodies end it."""
     checks = _Checks(stage, path, goal.until != "points")
-    checks.walk = walk = Walk(path, start, goal, checks)
+    checks.walk = walk = Walk(path, start, goal, checks, checks.too_deep)
     return walk
 
 
@@ -133,6 +134,20 @@ class _Checks:
             self._cut_at, changed = low.s, found["cuts"]
             recall_cuts(self._stage, high, changed)
         return State(low.state.u, {**low.state.mu, **changed}) if changed else None
+
+    def too_deep(self, point: Point) -> str:
+        """How deep what touches is at a point between two of the walk, where a penalty would rise;
+        "" where none is beyond its bound."""
+        scene = self._stage.scene
+        if not (scene.model.contacts or scene.model.touchings):
+            return ""
+
+        def find() -> Finding:
+            state = self._stage.leave(point.state)
+            said = penetration_refused(scene, state)
+            return Finding({"said": said if said and stiffnesses(scene, state) else ""})
+
+        return str(self._path.noted(find).values["said"])
 
     def _finding(self, low: Point, high: Point) -> Finding:
         """Find out why the second of two points is refused, or which amplitudes change before it is
