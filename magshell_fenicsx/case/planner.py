@@ -237,7 +237,7 @@ def make_problem(
         supports=supports,
         reactions=bool(all_loads.moves) if case.reactions is None else case.reactions,
         pressed=tuple((each.size, each.reach) for each in touched),
-        warnings=_warnings(case, sample),
+        warnings=_warnings(case, sample, perfect),
         lambda_m=case.lambda_m,
         unknowns=0.0 if span else unknowns_of(context, _cells(shape, size, plane)),
         patched=bool(case.patches),
@@ -332,12 +332,13 @@ def _loads(case: Case, modelled: Modelled) -> Loads:
     return Loads(**fields)
 
 
-def _warnings(case: Case, places: Array) -> tuple[str, ...]:
+def _warnings(case: Case, places: Array, outline: Outline) -> tuple[str, ...]:
     """What is unphysical at places (n, 3) of the undeformed shell, or often meant in another way,
     in words."""
     context = case.context
     abilities = (part.warning(context, places) for part in context.abilities)
-    steps = (step.load.warning(step) for step in case.programme)
+    R = case.shell.reference
+    steps = (step.load.warning(step, outline, R) for step in case.programme)
     return tuple(said for said in (*abilities, *steps, _wrong_unit(case, places)) if said)
 
 

@@ -233,8 +233,11 @@ class Step(Section):
         """The line of `magshell check`, if nothing else says it."""
         return ""
 
-    def warning(self, step: ProgrammeStep) -> str | None:
-        """What is often meant in another way, with the key; None if nothing is."""
+    def warning(self, step: ProgrammeStep, outline: "Outline", length: float) -> str | None:
+        """What is often meant in another way, with the key; None if nothing is.
+
+        Places of the outline times `length` are those of formulas.
+        """
         return None
 
     def leaves(self, step: ProgrammeStep, context: Context, outline: "Outline") -> list[Leaves]:

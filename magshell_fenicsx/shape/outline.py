@@ -107,6 +107,12 @@ class Outline:
             return np.vstack([in_space(nodes), self.also])
         return np.vstack([self.embedding(chart), self.also])
 
+    def with_normals(self) -> tuple[Array, Array] | None:
+        """Places (n, 3) all over the surface with their outward unit normals; None of a mesh file
+        and of several shells."""
+        chart = None if self.span and self.span.pieces else self.charts()
+        return None if chart is None else (self.embedding(chart), self.normal(chart))
+
     def looked_at(self, places: Array) -> "Outline":
         """With these places among its samples."""
         return replace(self, also=places, span=self.span and replace(self.span, also=places))

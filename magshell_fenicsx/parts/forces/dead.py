@@ -61,6 +61,7 @@ def _or_formula(unit: str) -> Any:
 
 
 Varying = float | str
+ALONG_NORMAL = 1e-6  # of the largest load: a smaller part across normals is rounding of its formula
 PerLength = Annotated[list[Annotated[Varying, _or_formula("newton/metre")]], Three]
 PerArea = Annotated[list[Annotated[Varying, _or_formula("pascal")]], Three]
 VaryingPressure = Annotated[Varying, _or_formula("pascal")]
@@ -195,19 +196,22 @@ class DeadSection(PathStep):
         for i, load in enumerate(self.loads):
             context.has_point(f"{step.key}.loads.{i}.at", load.at)
 
-    def warning(self, step: ProgrammeStep) -> str | None:
+    def warning(self, step: ProgrammeStep, outline: "Outline", length: float) -> str | None:
         """A pressure by formula keeps its direction, where that of a fluid would turn with the
-        surface."""
-        varying = next(
-            (i for i, load in enumerate(self.loads) if isinstance(load.pressure, str)), None
-        )
-        if varying is None:
-            return None
-        return (
-            f"{step.key}.loads.{varying}.pressure: dead: per undeformed area, fixed to the material and along the "
-            "undeformed normal; a live one, as of a fluid, turns with the surface (a ring buckles at 3/4 of the dead "
-            "one) and is the same everywhere: kind: pressure"
-        )
+        surface; components along the normals of a curved surface are one."""
+        for i, load in enumerate(self.loads):
+            if isinstance(load.pressure, str):
+                key = "pressure"
+            elif load.per_area and load.varies and is_normal(load.per_area, outline, length):
+                key = "per_area"
+            else:
+                continue
+            return (
+                f"{step.key}.loads.{i}.{key}: dead: per undeformed area, fixed to the material and along the "
+                "undeformed normal; a live one, as of a fluid, turns with the surface (a ring buckles at 3/4 of "
+                "the dead one) and is the same everywhere: kind: pressure"
+            )
+        return None
 
     def first(self, change: float, now: Now, *, by_load: bool) -> float:
         return change / self.points if by_load else copysign(1e-3, change)
@@ -305,6 +309,18 @@ def load_turns(load: DeadLoadSection, span: Span, R: float) -> bool:
     if load.vector is None:
         return scalar_turns(str(load.pressure), span, R)
     return vector_turns([str(v) for v in load.vector], span, R)
+
+
+def is_normal(components: Sequence[Varying], outline: "Outline", length: float) -> bool:
+    """Return whether a load by formulas is along the undeformed normals of a curved surface."""
+    sampled = outline.with_normals()
+    if sampled is None:
+        return False
+    places, normals = sampled
+    load = np.stack([function(v)(*(length * places).T) for v in components], axis=-1)
+    across = np.linalg.norm(np.cross(load, normals), axis=1).max()
+    is_curved = np.linalg.norm(np.ptp(normals, axis=0)) > ROUNDING
+    return bool(is_curved and across < ALONG_NORMAL * np.linalg.norm(load, axis=1).max())
 
 
 def is_image(
