@@ -52,7 +52,7 @@ def modes_after(result: Result, folder: Path, say: Say) -> None:
         On every rank, if something cannot be written.
     """
     wanted = result.scene.problem.stability
-    if result.singular or wanted:
+    if result.singular or (wanted and not result.refused):
         writer = _Writer(result, folder, say)
         writer.null_vectors()
         if wanted:
@@ -232,7 +232,7 @@ def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
         On every rank, if something cannot be written.
     """
     section, scene = result.scene.problem.frequencies, result.scene
-    if section is None:
+    if section is None or result.refused:
         return
     if scene.model.without_potential and scene.problem.loads.pressure:
         say(

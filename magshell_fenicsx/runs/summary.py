@@ -171,6 +171,11 @@ class Result:
         return self.elsewhere.get(row, self.scene)
 
     @property
+    def refused(self) -> bool:
+        """Whether the run stopped at the undeformed shell, which is unstable: it has no modes."""
+        return bool(self.rows) and int(self.rows[0]["negative_pivots"]) > 0
+
+    @property
     def history(self) -> Table:
         """The columns of path.csv; `history.to_pandas()` is a frame of pandas."""
         return table(self.rows, self.scene.extra_columns)
