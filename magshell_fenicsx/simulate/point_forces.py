@@ -16,8 +16,9 @@ from magshell_fenicsx.simulate.stage import Stage
 def point_of_crossing(stage: Stage, path: Path, crossing: Crossing) -> str:
     """The point force within a thickness of which an excluded mode is; "" if it is one of the
     shell. Collective."""
-    model = stage.scene.model
-    family = next(each for each in model.excluded_modes.families if each.label == crossing.label)
+    excluded = stage.scene.model.excluded_modes
+    assert excluded, "they have crossed"
+    family = next(each for each in excluded.families if each.label == crossing.label)
 
     def mode() -> Vector:
         return nearest_to_zero(family.factor_at(stage.leave(crossing.point.state)))[1]

@@ -17,11 +17,11 @@ from magshell_fenicsx.continuation.point import (
     StepTooLong,
 )
 from magshell_fenicsx.continuation.system import State
-from magshell_fenicsx.continuation.walk import Goal, Walk
+from magshell_fenicsx.continuation.walk import Goal, Label, Walk
 from magshell_fenicsx.continuation.watch import Crossing
 from magshell_fenicsx.quantities.registry import amplitude
 from magshell_fenicsx.simulate.point_forces import point_of_crossing, point_of_instability
-from magshell_fenicsx.simulate.record import AT_POINT_FORCES, Label, Record, Stopped
+from magshell_fenicsx.simulate.record import AT_POINT_FORCES, Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import LONGEST, Stage
 from magshell_fenicsx.simulate.touch import (
