@@ -30,11 +30,12 @@ def places_of_point_forces(model: Model, loads: Loads) -> Mapping[str, Array]:
     """
     names = {force.point for force in loads.forces.values() if not force.patch}
     names |= {load.point for load in loads.all_dead if isinstance(load, PointForce)}
+    ordered = sorted(names)  # the same order on all ranks
     if model.axisymmetric:
-        at = {name: model.meridian.points[name][:1] for name in names}
+        at = {name: model.meridian.points[name][:1] for name in ordered}
         return {name: model.meridian.section(np.array(s))[0] for name, s in at.items()}
     surface = model.midsurface if model.thin else None
-    return {name: surface.points[name] for name in names} if surface else {}
+    return {name: surface.points[name] for name in ordered} if surface else {}
 
 
 def point_of_mode(
