@@ -177,6 +177,8 @@ def run(
         print_line(f"energy barrier = {result.barrier:.9g} E h R^2")
     print_line(f"results in {folder}/")
     if result.stopped:
+        for remark in result.remarks:
+            print_line(f"warning: {remark}")
         raise failure(f"stopped early: {result.stopped}", STOPPED)
     if world().rank == 0:
         print_line(sentence_of(folder))

@@ -220,7 +220,7 @@ def _problem(
         supports=supports,
         reactions=bool(loads.moves) if case.reactions is None else case.reactions,
         body_contacts=tuple((region.size, region.reach) for region in mesh.contact_regions),
-        warnings=_warnings(case, places),
+        warnings=_warnings(case, places, shell.reference.perfect),
         lambda_m=case.lambda_m,
         unknowns=unknowns,
         patched=bool(case.patches),
@@ -715,14 +715,15 @@ def _thickness(case: Case, turn: float) -> Thickness | None:
     return Thickness(in_model_frame, formulas=formula_group([in_case_frame], Q))
 
 
-def _warnings(case: Case, places: Array) -> tuple[str, ...]:
+def _warnings(case: Case, places: Array, outline: Outline) -> tuple[str, ...]:
     """Return warnings of what is unphysical, or often meant in another way.
 
-    `places` (n, 3) are all over the undeformed shell.
+    `places` (n, 3) are all over the undeformed shell, whose perfect outline is given.
     """
     context = case.context
     warnings = [part.warning(context, places) for part in context.abilities]
-    warnings += [step.load.warning(step) for step in case.programme]
+    R = case.shell.reference
+    warnings += [step.load.warning(step, outline, R) for step in case.programme]
     warnings.append(_unit_warning(case, places))
     return tuple(warning for warning in warnings if warning)
 

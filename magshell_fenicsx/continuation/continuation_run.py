@@ -522,6 +522,9 @@ class ContinuationRun:
         second; None if the second is accepted. It raises `StepTooLong` if the second must not be
         accepted. Where no solution is found with the other values it is called again, and may
         accept the second point then.
+    refuse
+        Return why no instability or target may be at a point; "" if one may. The step that has
+        passed it is repeated in shorter ones, at whose ends `renew` is called.
 
     Attributes
     ----------
@@ -541,7 +544,9 @@ class ContinuationRun:
         start: Point,
         goal: ContinuationGoal,
         renew: Callable[[Point, Point], State | None] | None = None,
+        refuse: Callable[[Point], str] = lambda point: "",
     ) -> None:
+        self._refuse = refuse
         self.path, self.goal, self.points, self._renew = path, goal, [start], renew
         self.done = False
         self.clusters: list[tuple[Point, Point]] = []
@@ -565,12 +570,9 @@ class ContinuationRun:
                 if renewal:
                     shorter_step, reason = renewal[0], renewal[1] or reason
                     break
-                try:
-                    events = self._events_between(low, point)
-                except PathStopped as e:  # the step had left the branch: approach in shorter steps
-                    shorter_step = abs(point.s - low.s) / 4
-                    is_missed = isinstance(e, TargetMissed)
-                    reason = str(e) if is_missed else "an instability cannot be located"
+                events, refusal = self._accepted_events(low, point)
+                if refusal:  # approach in shorter steps
+                    shorter_step, reason = abs(point.s - low.s) / 4, refusal
                     break
                 for label, event, self.done in events:
                     yield label, event
@@ -684,6 +686,17 @@ class ContinuationRun:
         if self._by_arc and goal.targets and goal.until in ("target", "limit"):
             return end_near_last_target(self.path, goal.quantity, goal.targets[-1], s, predictors)
         return s
+
+    def _accepted_events(
+        self, low: Point, high: Point
+    ) -> tuple[list[tuple[Label, Point, bool]], str]:
+        """Return the events between two points, and why the step must be shorter; "" if not."""
+        try:
+            events = self._events_between(low, high)
+        except PathStopped as e:  # the step had left the branch
+            return [], str(e) if isinstance(e, TargetMissed) else "an instability cannot be located"
+        refusals = (self._refuse(point) for _, point, _ in events)
+        return events, next(filter(None, refusals), "")
 
     def _events_between(self, low: Point, high: Point) -> list[tuple[Label, Point, bool]]:
         """Return the instabilities and, with arc length, targets between two points.

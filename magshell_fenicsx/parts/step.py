@@ -239,8 +239,11 @@ class Step(Section):
         """Return its line of `magshell check`, if nothing else says it."""
         return ""
 
-    def warning(self, step: ProgrammeStep) -> str | None:
-        """Return a warning with the key, where a different load is often meant; None without."""
+    def warning(self, step: ProgrammeStep, outline: "Outline", length: float) -> str | None:
+        """Return a warning with the key, where a different load is often meant; None without.
+
+        Places of the outline times `length` are those of formulas.
+        """
         return None
 
     def symmetry_constraints(

@@ -55,7 +55,7 @@ def modes_after(result: Result, folder: Path, say: Say) -> None:
         On every rank, if something cannot be written.
     """
     section = result.scene.problem.stability
-    if result.singular or section:
+    if result.singular or (section and not result.is_refused):
         writer = _ModeWriter(result, folder, say)
         writer.null_vectors()
         if section:
@@ -268,7 +268,7 @@ def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
         On every rank, if something cannot be written.
     """
     section, scene = result.scene.problem.frequencies, result.scene
-    if section is None:
+    if section is None or result.is_refused:
         return
     if scene.model.without_potential and scene.problem.loads.pressure:
         say(

@@ -180,6 +180,11 @@ class Result:
         return self.scenes_of_rows.get(row, self.scene)
 
     @property
+    def is_refused(self) -> bool:
+        """Whether the run stopped at the undeformed shell, which is unstable: it has no modes."""
+        return bool(self.rows) and int(self.rows[0]["negative_pivots"]) > 0
+
+    @property
     def history(self) -> Table:
         """Columns of path.csv; `history.to_pandas()` is a frame of pandas."""
         return table(self.rows, self.scene.extra_columns)

@@ -141,6 +141,15 @@ class Outline:
             return np.vstack([space_embedding(nodes), self.extra_samples])
         return np.vstack([self.embedding(chart), self.extra_samples])
 
+    def samples_with_normals(self) -> tuple[Array, Array] | None:
+        """Return places (n, 3) all over the surface with their outward unit normals.
+
+        None of a mesh file and of several shells.
+        """
+        is_of_several_shells = self.meridian and self.meridian.shell_meridians
+        chart = None if is_of_several_shells else self.chart_samples()
+        return None if chart is None else (self.embedding(chart), self.normal(chart))
+
     def with_samples(self, places: Array) -> "Outline":
         """Return the outline with places (n, 3) among its samples."""
         meridian = self.meridian and replace(self.meridian, narrow_places=places)

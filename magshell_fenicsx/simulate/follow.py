@@ -77,6 +77,7 @@ def follow(
                 remark(run.place + text)
             yield from run.records_beyond()
         except (Stopped, NotANumber) as e:
+            run.remark_on_point_forces(run.scene)
             if not run.has_answer or step is not steps[-1]:
                 raise Stopped(run.reason(e)) from None
             remark(f"{BEYOND_INSTABILITY}{run.reason(e)}")
@@ -262,6 +263,11 @@ class _StepRun:
             yield self._completed(record)
         self.end = stream.end
 
+    def remark_on_point_forces(self, scene: Scene) -> None:
+        """Say which instabilities at point forces were left out since the last call."""
+        for sentence in scene.point_force_modes.take():
+            self._remark(self.place + sentence)
+
     @property
     def _is_released_at_bifurcation(self) -> bool:
         return self._step.until == "bifurcation" and self.label == "bifurcation"
@@ -277,6 +283,7 @@ class _StepRun:
         scene, state = record.scene or self.scene, record.point.state
         if record.said:
             self._remark(self.place + record.said)
+        self.remark_on_point_forces(scene)
         is_moving = bool((record.clock or {}).get("kinetic"))
         recorded = scene.journal.recorded_values(
             lambda: RecordedValues({"said": penetration_message(scene, state, moving=is_moving)})

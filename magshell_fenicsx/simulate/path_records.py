@@ -5,7 +5,7 @@ modes that the model excludes are watched; and where load control fails, the pat
 length.
 """
 
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import pairwise
@@ -29,6 +29,7 @@ from magshell_fenicsx.simulate.contact_control import (
     better_cuts,
     closer_points,
     passes,
+    penetration_message,
     raised_stiffnesses,
     recall_cuts,
     refuse_crossing,
@@ -36,12 +37,14 @@ from magshell_fenicsx.simulate.contact_control import (
     refuse_return,
     with_own_contact,
 )
-from magshell_fenicsx.simulate.record import Record, Stopped
+from magshell_fenicsx.simulate.point_forces import point_of_crossing, point_of_instability
+from magshell_fenicsx.simulate.record import AT_POINT_FORCES, Label, Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import LONGEST, Stage
 
 # load at which a path ends, over that of the first excluded instability
 MAX_RATIO_TO_EXCLUDED = 2.0
+LOCATED = ("fold", "bifurcation")
 MAX_CONTACT_CHANGES = 10  # times that a first point gets stiffer penalties or new cuts
 FIRST_STEP_REDUCTION = (
     1 / 16
@@ -84,9 +87,8 @@ def follow_path(
     Stopped
         If the path is lost.
     """
-    records = RecordStream(
-        _records_in_stage(stage, checked_run(stage, path, start, goal), branches)
-    )
+    run = checked_run(stage, path, start, goal)
+    records = RecordStream(_StageRecords(stage, run, branches).records())
     advance = stage.scene.model.system.advance
     earlier_mu = start.state.mu
     for record in records:
@@ -103,7 +105,7 @@ def checked_run(stage: Stage, path: Path, start: Point, goal: ContinuationGoal) 
     instability. Magnets on the way and returning bodies end it.
     """
     checks = _Checks(stage, path, goal.until != "points")
-    checks.walk = walk = ContinuationRun(path, start, goal, checks)
+    checks.walk = walk = ContinuationRun(path, start, goal, checks, checks.too_deep)
     return walk
 
 
@@ -152,6 +154,23 @@ class _Checks:
             recall_cuts(self._stage, high, changed)
         return State(low.state.u, {**low.state.mu, **changed}) if changed else None
 
+    def too_deep(self, point: Point) -> str:
+        """Return how deep contacts are at a point between two of the run.
+
+        It is "" where none is beyond its bound, or no penalty would rise.
+        """
+        scene = self._stage.scene
+        if not (scene.model.contacts or scene.model.shell_contacts):
+            return ""
+
+        def find() -> RecordedValues:
+            state = self._stage.leave(point.state)
+            message = penetration_message(scene, state)
+            may_rise = bool(message) and bool(raised_stiffnesses(scene, state))
+            return RecordedValues({"said": message if may_rise else ""})
+
+        return str(self._path.recorded_values(find).values["said"])
+
     def _finding(self, low: Point, high: Point) -> RecordedValues:
         """Return why the second of two points is refused, or which amplitudes change.
 
@@ -178,103 +197,128 @@ class _Checks:
         return RecordedValues({"stiffer": stiffer, "cuts": cuts or closer})
 
 
-def _records_in_stage(stage: Stage, walk: ContinuationRun, branches: int) -> Records:
-    """Yield the records of `follow_path`, with points of the stage's system.
+class _StageRecords:
+    """Records of `follow_path`, with points of the stage's system.
 
-    The return value is the state at the end of the last run.
+    One run follows the other: in shorter steps, or by arc length, where load control fails.
+
+    Parameters
+    ----------
+    branches
+        See `follow_path`.
     """
-    stage.scene.progress.doing("looking for modes that the model excludes")
-    path, start, goal = walk.path, walk.points[0], walk.goal
-    finest = path.options.smallest
-    if path.control == "load" and goal.targets:
-        walk.path = _ending_early(path, path.options.first, finest)
-    records_ahead: list[Record] = []  # a fold that load control cannot pass
-    crossing, fold, stop_reason, final, monitor = None, "", "", False, stage.scene.stability_monitor
-    furthest = np.inf  # amplitude, once an excluded mode is unstable
-    for applied in stage.scene.model.fields:
-        applied.lost = ""
-    monitor.begin(path, start, stage.leave)
-    onward: ContinuationRun | None = walk
-    while onward:
-        walk, path, onward = onward, onward.path, None
-        try:
-            for label, point in walk:
-                mode, located = "", label in ("fold", "bifurcation")
-                is_beyond = walk.done or abs(point.state.mu[path.name]) > furthest
-                excluded = list(
-                    _excluded_records(path, monitor.pass_to(point, evaluate=located or is_beyond))
+
+    def __init__(self, stage: Stage, run: ContinuationRun, branches: int) -> None:
+        self._stage, self._first_run, self._branches = stage, run, branches
+        self._goal, self._monitor = run.goal, stage.scene.stability_monitor
+        self._branch_switch: BranchSwitch | None = None
+        self._fold_text = ""  # of the last fold
+        self._furthest = np.inf  # amplitude, once an excluded mode is unstable
+        self._stop_reason, self._is_final = "", False
+
+    def records(self) -> Records:
+        """Yield the records; the return value is the state at the end of the last run."""
+        stage, goal, run = self._stage, self._goal, self._first_run
+        stage.scene.progress.doing("looking for modes that the model excludes")
+        path, finest = run.path, run.path.options.smallest
+        if path.control == "load" and goal.targets:
+            run.path = _ending_early(path, path.options.first, finest)
+        for applied in stage.scene.model.fields:
+            applied.lost = ""
+        self._monitor.begin(path, run.points[0], stage.leave)
+        records_ahead: list[Record] = []  # a fold that load control cannot pass
+        onward: ContinuationRun | None = run
+        while onward:
+            run, path, onward = onward, onward.path, None
+            has_ended = yield from self._records_of_run(run, path)
+            if has_ended:
+                break
+            if self._stop_reason:
+                records_ahead, onward = _after_stop(stage, run, finest, final=self._is_final)
+            if onward:
+                is_by_arc = onward.path.control == "arc"
+                stage.scene.progress.doing(
+                    "going on by arc length" if is_by_arc else "in shorter steps"
                 )
+                self._stop_reason = ""
+                self._monitor.begin(onward.path, onward.points[0], stage.leave)
+        yield from records_ahead
+        reason = self._reason(path, records_ahead)
+        if reason:
+            raise Stopped(reason)
+        if self._branches and self._branch_switch:
+            yield from _branches(stage, path, self._branch_switch, goal, self._branches)
+        return run.points[-1].state
+
+    def _records_of_run(self, run: ContinuationRun, path: Path) -> Generator[Record, None, bool]:
+        """Yield the records of one run; return whether an excluded instability ends the path."""
+        stage, goal = self._stage, self._goal
+        try:
+            for label, point in run:
+                is_located = label in LOCATED
+                is_beyond = run.done or abs(point.state.mu[path.name]) > self._furthest
+                crossings = self._monitor.pass_to(point, evaluate=is_located or is_beyond)
+                excluded = list(_excluded_records(stage, path, crossings))
                 if excluded and goal.until == "bifurcation":
                     yield excluded[0]
                     break
                 yield from excluded
-                if excluded and goal.until == "limit":
-                    furthest = min(
-                        furthest, MAX_RATIO_TO_EXCLUDED * abs(excluded[0].point.state.mu[path.name])
-                    )
-                if label == "bifurcation":
-                    crossing_at_point = switch_branch(
-                        _arc_length_path(stage, path), point, partial(passes, stage)
-                    )
-                    crossing = crossing or crossing_at_point
-                    mode = (
-                        ("symmetric" if crossing_at_point.symmetric else "asymmetric")
-                        if crossing_at_point
-                        else ""
-                    )
-                if label == "fold":
-                    value = amount(stage.scene, path.name, point.state.mu[path.name])
-                    fold = f"; the last fold is at {value}"
-                remark = cluster_remark(stage.scene, walk, point)
-                yield Record(
-                    label, path.name, point, mode, excluded_pivots=monitor.unstable, said=remark
-                )
-                if abs(point.state.mu[path.name]) > furthest:
+                self._limit(path, excluded)
+                yield self._record(run, path, label, point)
+                if abs(point.state.mu[path.name]) > self._furthest:
                     break
         except PathStopped as e:
-            stop_reason, final = (
-                _stop_message(stage.scene, path, e, walk.points)
-                + fold
-                + stage.scene.lost_field_text(),
-                e.final,
-            )
-        excluded = list(_excluded_records(path, monitor.end()))
-        if excluded and stop_reason and goal.until == "bifurcation":
+            message = _stop_message(stage.scene, path, e, run.points)
+            self._stop_reason = message + self._fold_text + stage.scene.lost_field_text()
+            self._is_final = e.final
+        excluded = list(_excluded_records(stage, path, self._monitor.end()))
+        if excluded and self._stop_reason and goal.until == "bifurcation":
             yield excluded[0]
-            stop_reason = ""
-            break
+            self._stop_reason = ""
+            return True
         yield from excluded
-        if excluded and goal.until == "limit":
-            furthest = min(
-                furthest, MAX_RATIO_TO_EXCLUDED * abs(excluded[0].point.state.mu[path.name])
+        self._limit(path, excluded)
+        return False
+
+    def _limit(self, path: Path, excluded: Sequence[Record]) -> None:
+        """Let a path to a limit end at a multiple of the first excluded instability."""
+        if excluded and self._goal.until == "limit":
+            amplitude_there = abs(excluded[0].point.state.mu[path.name])
+            self._furthest = min(self._furthest, MAX_RATIO_TO_EXCLUDED * amplitude_there)
+
+    def _record(self, run: ContinuationRun, path: Path, label: Label, point: Point) -> Record:
+        """Return the record of a point of a run."""
+        stage, mode = self._stage, ""
+        label = _label_of(stage, path, label, point, ends=run.done)
+        if label == "bifurcation":
+            by_arc = _arc_length_path(stage, path)
+            switch = switch_branch(by_arc, point, partial(passes, stage))
+            self._branch_switch = self._branch_switch or switch
+            if switch:
+                mode = "symmetric" if switch.symmetric else "asymmetric"
+        if label == "fold":
+            value = amount(stage.scene, path.name, point.state.mu[path.name])
+            self._fold_text = f"; the last fold is at {value}"
+        remark = cluster_remark(stage.scene, run, point)
+        unstable = self._monitor.unstable
+        return Record(label, path.name, point, mode, excluded_pivots=unstable, said=remark)
+
+    def _reason(self, path: Path, records_ahead: Sequence[Record]) -> str:
+        """Return why the path has stopped, in words; empty if it has reached its goal."""
+        scene, reason = self._stage.scene, self._stop_reason
+        if records_ahead:
+            at = amount(scene, path.name, records_ahead[-1].point.state.mu[path.name])
+            target = amount(scene, path.name, self._goal.targets[-1])
+            reason = (
+                f"load control cannot pass the fold at {at}, before its target, {target}; {reason}"
             )
-        if stop_reason:
-            records_ahead, onward = _after_stop(stage, walk, finest, final=final)
-        if onward:
-            stage.scene.progress.doing(
-                "going on by arc length" if onward.path.control == "arc" else "in shorter steps"
+        if self._monitor.unlocated:
+            why = (
+                "a mode that the reduced model excludes is unstable from an unknown point on: "
+                f"{self._monitor.unlocated}"
             )
-            stop_reason = ""
-            monitor.begin(onward.path, onward.points[0], stage.leave)
-    yield from records_ahead
-    if records_ahead:
-        value_here = amount(stage.scene, path.name, records_ahead[-1].point.state.mu[path.name])
-        target = amount(stage.scene, path.name, goal.targets[-1])
-        stop_reason = (
-            f"load control cannot pass the fold at {value_here}, before its target, {target}; "
-            f"{stop_reason}"
-        )
-    if monitor.unlocated:
-        why = (
-            "a mode that the reduced model excludes is unstable from an unknown point on: "
-            f"{monitor.unlocated}"
-        )
-        stop_reason = f"{stop_reason}; {why}" if stop_reason else why
-    if stop_reason:
-        raise Stopped(stop_reason)
-    if branches and crossing:
-        yield from _branches(stage, path, crossing, goal, branches)
-    return walk.points[-1].state
+            reason = f"{reason}; {why}" if reason else why
+        return reason
 
 
 def _after_stop(
@@ -391,10 +435,10 @@ def follow_branch(
     yield Record("step", path.name, start, branch=number, excluded_pivots=monitor.unstable)
     try:
         for label, point in walk:
-            for record in _excluded_records(
-                path, monitor.pass_to(point, evaluate=walk.done or label in ("fold", "bifurcation"))
-            ):
+            crossings = monitor.pass_to(point, evaluate=walk.done or label in LOCATED)
+            for record in _excluded_records(stage, path, crossings):
                 yield replace(record, branch=number)
+            label = _label_of(stage, path, label, point, ends=walk.done)
             remark = cluster_remark(stage.scene, walk, point)
             yield Record(
                 label,
@@ -406,7 +450,7 @@ def follow_branch(
             )
     except PathStopped as e:
         stop_reason = _stop_message(stage.scene, path, e, walk.points)
-    for record in _excluded_records(path, monitor.end()):
+    for record in _excluded_records(stage, path, monitor.end()):
         yield replace(record, branch=number)
     if stop_reason:
         raise Stopped(stop_reason)
@@ -434,9 +478,8 @@ def _fold_ahead(stage: Stage, walk: ContinuationRun, reach: float) -> list[Recor
     passed: list[Record] = []
     try:
         for label, point in ContinuationRun(by_arc, start, ContinuationGoal("limit", steps=20)):
-            passed += _excluded_records(
-                by_arc, stage.scene.stability_monitor.pass_to(point, evaluate=label == "fold")
-            )
+            crossings = stage.scene.stability_monitor.pass_to(point, evaluate=label == "fold")
+            passed += _excluded_records(stage, by_arc, crossings)
             if abs(point.state.mu[name] - last.s) > reach:
                 return []
             if label == "fold":
@@ -451,9 +494,40 @@ def _fold_ahead(stage: Stage, walk: ContinuationRun, reach: float) -> list[Recor
     return []
 
 
-def _excluded_records(path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
-    """Yield records of the points where excluded modes become unstable or stable."""
+def _label_of(stage: Stage, path: Path, label: Label, point: Point, *, ends: bool) -> Label:
+    """Return the label of a point of a run; an instability of a point force is a step.
+
+    Raises
+    ------
+    Stopped
+        If such an instability ends the run.
+    """
+    if label not in LOCATED:
+        return label
+    force_point = point_of_instability(stage, path, label, point)
+    if not force_point:
+        return label
+    value = amount(stage.scene, path.name, point.state.mu[path.name])
+    if ends:
+        raise Stopped(
+            f"at {value} the shell gives way within a thickness of the point force at "
+            f"{force_point}: {AT_POINT_FORCES}"
+        )
+    stage.scene.point_force_modes.note(force_point, value, f"a {label}")
+    return "step"
+
+
+def _excluded_records(stage: Stage, path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
+    """Yield records of the points where excluded modes become unstable or stable.
+
+    Those of a point force are noted and left out.
+    """
     for crossing in crossings:
+        force_point = point_of_crossing(stage, path, crossing)
+        if force_point:
+            value = amount(stage.scene, path.name, crossing.point.state.mu[path.name])
+            stage.scene.point_force_modes.note(force_point, value, crossing.label)
+            continue
         yield Record(
             "bifurcation",
             path.name,

@@ -14,6 +14,11 @@ if TYPE_CHECKING:
 
 Label = Literal["start", "field", "step", "target", "fold", "bifurcation", "solution"]
 
+AT_POINT_FORCES = (
+    "there it bends to radii below its thickness, where no shell theory holds and results depend "
+    "on the mesh; spread the force: patch of kind: indentation, a pressure by formula, or a body"
+)
+
 
 @dataclass(frozen=True)
 class Record:
@@ -75,6 +80,36 @@ class Record:
         """
         assert self.shown, "of a record of follow or trace"
         return self.shown(self.point.state)
+
+
+@dataclass
+class PointForceModes:
+    """The instabilities at point forces that were left out, with one sentence for each force.
+
+    Attributes
+    ----------
+    points
+        Names of points that have a sentence.
+    sentences
+        Those that nobody has taken.
+    """
+
+    points: set[str] = field(default_factory=set)
+    sentences: list[str] = field(default_factory=list)
+
+    def note(self, point: str, at: str, modes: str) -> None:
+        """Note the first instability at a point, with the value of the amplitude."""
+        if point not in self.points:
+            self.points.add(point)
+            self.sentences.append(
+                f"from {at} on modes are unstable within a thickness of the point force at {point} "
+                f"({modes} first), and left out: {AT_POINT_FORCES}"
+            )
+
+    def take(self) -> list[str]:
+        """Return the sentences that nobody has taken."""
+        sentences, self.sentences = self.sentences, []
+        return sentences
 
 
 class Stopped(RuntimeError):

@@ -41,11 +41,11 @@ from magshell_fenicsx.problem.memory import refuse_beyond_memory
 from magshell_fenicsx.problem.problem import Problem, meridian_vertices
 from magshell_fenicsx.quantities.registry import Sizes
 from magshell_fenicsx.shells.meridian import MeridianModel
+from magshell_fenicsx.simulate.record import PointForceModes, Record
 
 if TYPE_CHECKING:
     from magshell_fenicsx.shells.shell import ShellModel
     from magshell_fenicsx.shells.solid import SolidModel
-    from magshell_fenicsx.simulate.record import Record
 
 Array = NDArray[np.float64]
 NOT_COUNTED = "boundary: the shell moves freely: its unstable directions are not counted"
@@ -274,6 +274,11 @@ class Scene:
         return StabilityMonitor(self.model.symmetry_breaking_modes)
 
     @cached_property
+    def point_force_modes(self) -> PointForceModes:
+        """The instabilities at point forces that were left out."""
+        return PointForceModes()
+
+    @cached_property
     def unresolved(self) -> list[str]:
         """Details of the problem's formulas that the mesh misses, in words; collective."""
         model, formulas = self.model, case_formulas(self.problem.context)
@@ -484,7 +489,7 @@ class Scene:
             self.model, problem.length, problem.modulus, *place, problem.reactions, sense
         )
 
-    def to_magpylib(self, record: "Record", parts: int = 8) -> Any:
+    def to_magpylib(self, record: Record, parts: int = 8) -> Any:
         """Return the magnetised shell of a record as a source of magpylib; collective.
 
         It is of charged triangles, in m and T; of a case without units over R and |Br|. Each side

@@ -58,8 +58,7 @@ class Stage:
 
     def point(self, point: Point) -> Point:
         """Return a point of the step's path with the model's displacement and amplitudes."""
-        du = self.device.displacement(point.du) if self.device else point.du
-        return replace(point, state=self.leave(point.state), du=du)
+        return replace(point, state=self.leave(point.state), du=self.displacement(point.du))
 
     def on_scene(self, scene: Scene) -> "Stage":
         """Return the stage of the same step on another scene, with the same held values."""
@@ -79,9 +78,11 @@ class Stage:
         It has zeros for the unknown amplitudes and at supports.
         """
         zero_at_supports = self.scene.model.system.zero_at_supports
-        if self.device is None:
-            return zero_at_supports(x)
-        return self.device.padded(zero_at_supports(self.device.displacement(x)))
+        return self.padded(zero_at_supports(self.displacement(x)))
+
+    def displacement(self, x: Vector) -> Vector:
+        """Return the model's displacement of a vector of the step's system."""
+        return self.device.displacement(x) if self.device else x
 
     def path(self, name: str, control: Control, options: StepOptions, scale: float = 1.0) -> Path:
         """Return a path of the step's system.

@@ -13,7 +13,13 @@ from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.parts.step_course import Drive, Gas, GasSection, StepCourse, StepStart
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.simulate.contact_control import state_at_first_contact, support_motion_limit
-from magshell_fenicsx.simulate.path_records import Records, RecordStream, follow_path, off_path
+from magshell_fenicsx.simulate.path_records import (
+    LOCATED,
+    Records,
+    RecordStream,
+    follow_path,
+    off_path,
+)
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import Stage, make_stage
@@ -22,8 +28,6 @@ from magshell_fenicsx.simulate.symmetry_switch import (
     follow_switched_branch,
     switch_symmetry,
 )
-
-LOCATED = ("fold", "bifurcation")
 
 
 def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:

@@ -211,6 +211,27 @@ def test_a_renewal_that_need_not_be_leaves_the_steps() -> None:
     assert steps == pytest.approx([point.s for _, point in walked(goal, 0.1, 0.2)], rel=1e-12)
 
 
+def test_a_refused_target_is_approached_in_shorter_steps() -> None:
+    """As where a body is too deep there, and its stiffness rises at the end of a step: the last
+    accepted point is then near it. A target that is refused for ever ends the walk with the reason.
+    """
+    given = ContinuationGoal("target", [0.3], "load")
+    walk = ContinuationRun(*begin(0.3, 0.6), given)
+    assert len([*walk]) < 4
+    near = ContinuationRun(*begin(0.3, 0.6), given, None, lambda point: refused(near, point, 0.05))
+
+    def refused(run: ContinuationRun, point: Point, within: float) -> str:
+        here = run.points[-1].state.mu["load"]
+        return "too deep" if abs(point.state.mu["load"] - here) > within else ""
+
+    *_, (label, last) = near
+    assert label == "target"
+    assert last.state.mu["load"] == pytest.approx(0.3, rel=1e-9)
+    assert last.state.mu["load"] - near.points[-2].state.mu["load"] <= 0.05
+    with pytest.raises(PathStopped, match="too deep"):
+        list(ContinuationRun(*begin(0.3, 0.6), given, None, lambda point: "too deep"))
+
+
 def test_targets_between_two_points_take_few_iterations_in_any_order() -> None:
     """Long steps with several targets within each, passed upwards and downwards: the polynomial is
     a good guess.

@@ -17,7 +17,7 @@ from scipy.linalg import eigh
 from scipy.optimize import brentq
 from scipy.special import ive, jv
 
-from magshell_fenicsx import Case, Scene
+from magshell_fenicsx import Case, Scene, run
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.shells.modes import ShellModes
 from magshell_fenicsx.simulate.follow import follow
@@ -444,3 +444,21 @@ def test_a_sector_has_the_frequencies_of_the_whole_shell(tmp_path: Path) -> None
         waves[0][:3], rel=5e-3
     )  # each wave and its twin
     assert found["5"][0][1:8:2][:3] == pytest.approx(waves[0][:3], rel=5e-3)
+
+
+def test_no_modes_of_a_refused_state(tmp_path: Path) -> None:
+    """A penalty too small makes the undeformed plate unstable: that is said, and no frequency."""
+    case = {
+        "shell": {"geometry": "disc", "radius_to_thickness": 100, "poisson_ratio": 0.3},
+        "boundary": {"rim": "clamped"},
+        "mesh": {"size": 0.5, "penalty": 0.3},
+        "symmetry": "half",
+        "frequencies": {"count": 2},
+        "stability": {"at": "end", "modes": 1},
+    }
+    said = list[str]()
+    result = run(Case.model_validate(case), tmp_path / "out", say=said.append, pictures=False)
+    assert result.stopped
+    assert result.stopped.startswith("the undeformed shell is unstable")
+    assert not result.frequencies
+    assert not any("lowest" in line for line in said)

@@ -213,7 +213,9 @@ def test_the_branch_of_a_ring_has_the_published_curvature(monkeypatch: pytest.Mo
     """
     own = BoundarySection.symmetry_constraints
     monkeypatch.setattr(
-        BoundarySection, "symmetry_constraints", lambda self, context, outline: own(self, context, outline)[:-1]
+        BoundarySection,
+        "symmetry_constraints",
+        lambda self, context, outline: own(self, context, outline)[:-1],
     )
     h = 0.01
     shell = {

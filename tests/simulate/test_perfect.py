@@ -69,7 +69,10 @@ def test_a_mode_computed_and_from_the_file_of_a_run(tmp_path: Path) -> None:
     x = outline(read.shell).sample()
     x = x[x[:, 2] > 0.05]
     one, other = (
-        next(iter(imperfection_geometries(sections, reference_shell_of(read.shell)).values())).deviation(x) * 12
+        next(
+            iter(imperfection_geometries(sections, reference_shell_of(read.shell)).values())
+        ).deviation(x)
+        * 12
         for sections in (read.imperfections, computed.imperfections)
     )
     assert np.abs(other).max() == pytest.approx(0.1, rel=0.05)

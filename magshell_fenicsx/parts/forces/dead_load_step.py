@@ -72,6 +72,8 @@ def _or_formula(unit: str) -> Any:
 
 
 Varying = float | str
+# part of the largest load: a smaller part across normals is rounding of its formula
+NORMAL_TOLERANCE = 1e-6
 PerLength = Annotated[list[Annotated[Varying, _or_formula("newton/metre")]], Three]
 PerArea = Annotated[list[Annotated[Varying, _or_formula("pascal")]], Three]
 VaryingPressure = Annotated[Varying, _or_formula("pascal")]
@@ -211,19 +213,24 @@ class DeadSection(PathStep):
         for i, load in enumerate(self.loads):
             context.has_point(f"{step.key}.loads.{i}.at", load.at)
 
-    def warning(self, step: ProgrammeStep) -> str | None:
-        """Return that a pressure by formula keeps its direction, unlike that of a fluid."""
-        varying = next(
-            (i for i, load in enumerate(self.loads) if isinstance(load.pressure, str)), None
-        )
-        if varying is None:
-            return None
-        return (
-            f"{step.key}.loads.{varying}.pressure: dead: per undeformed area, fixed to the "
-            "material and along the undeformed normal; a live one, as of a fluid, turns with the "
-            "surface (a ring buckles at 3/4 of the dead one) and is the same everywhere: kind: "
-            "pressure"
-        )
+    def warning(self, step: ProgrammeStep, outline: "Outline", length: float) -> str | None:
+        """Return that a pressure by formula keeps its direction, unlike that of a fluid.
+
+        Components along the normals of a curved surface are such a pressure.
+        """
+        for i, load in enumerate(self.loads):
+            if isinstance(load.pressure, str):
+                key = "pressure"
+            elif load.per_area and load.varies and is_normal(load.per_area, outline, length):
+                key = "per_area"
+            else:
+                continue
+            return (
+                f"{step.key}.loads.{i}.{key}: dead: per undeformed area, fixed to the material and "
+                "along the undeformed normal; a live one, as of a fluid, turns with the surface (a "
+                "ring buckles at 3/4 of the dead one) and is the same everywhere: kind: pressure"
+            )
+        return None
 
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
         return change / self.points if by_load else copysign(1e-3, change)
@@ -354,6 +361,18 @@ def load_turns(load: DeadLoadSection, meridian: MeridianChart, R: float) -> bool
     if load.vector is None:
         return scalar_is_axisymmetric(str(load.pressure), meridian, R)
     return vector_is_axisymmetric([str(v) for v in load.vector], meridian, R)
+
+
+def is_normal(components: Sequence[Varying], outline: "Outline", length: float) -> bool:
+    """Return whether a load by formulas is along the undeformed normals of a curved surface."""
+    sampled = outline.samples_with_normals()
+    if sampled is None:
+        return False
+    places, normals = sampled
+    load = np.stack([formula_function(v)(*(length * places).T) for v in components], axis=-1)
+    across = np.linalg.norm(np.cross(load, normals), axis=1).max()
+    is_curved = np.linalg.norm(np.ptp(normals, axis=0)) > ROUNDING
+    return bool(is_curved and across < NORMAL_TOLERANCE * np.linalg.norm(load, axis=1).max())
 
 
 def is_image(

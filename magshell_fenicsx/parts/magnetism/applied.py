@@ -215,7 +215,10 @@ class AppliedField:
         ]
         for field, B in [
             *at_rest,
-            *((moving.at_rest, moving.field_at(x[None], self.mu).B) for moving in self._moving_fields),
+            *(
+                (moving.at_rest, moving.field_at(x[None], self.mu).B)
+                for moving in self._moving_fields
+            ),
         ]:
             if not np.isfinite(B).all():
                 description = getattr(

@@ -79,8 +79,9 @@ class Supports:
         ]
 
     def unknowns_of_waves(self, r0: fem.Function, m: int) -> NDArray[np.int32]:
-        """Return the unknowns (U + V, V, W) of waves m that are zero, as in `wave_conditions`, without
-        their space.
+        """Return the unknowns (U + V, V, W) of waves m that are zero, as `wave_conditions` does.
+
+        It needs no space of these waves.
 
         The nodes of the spaces of displacements and of waves have the same numbers.
         """

@@ -198,6 +198,8 @@ def test_potential_is_refused_where_it_is_none() -> None:
         ({"pressure": "1e-6*(1 + 0*z)"}, True),
         ({"pressure": 1e-6}, False),
         ({"per_area": [0, 0, "1e-6*x"]}, False),
+        ({"per_area": ["-1e-6*z*x", "-1e-6*z*y", "-1e-6*z*z"]}, True),
+        ({"per_area": ["-1e-6*z*x", "-1e-6*z*y", 0]}, False),
     ],
 )
 def test_warning_of_a_dead_pressure_by_formula(load_: dict[str, Any], warned: bool) -> None:
@@ -213,5 +215,7 @@ def test_warning_of_a_dead_pressure_by_formula(load_: dict[str, Any], warned: bo
     warnings = make_problem(case).warnings
     assert len(warnings) == warned
     assert all(
-        said.startswith("loading.loads.1.pressure: dead: per undeformed area") for said in warnings
+        said.startswith(f"loading.loads.1.{key}: dead: per undeformed area")
+        for said in warnings
+        for key in load_
     )

@@ -183,7 +183,9 @@ def test_symmetry_by_numbers_is_that_by_values(kind: str) -> None:
         ]
         every += [{"kind": "formula", "w0": "0*x"}] * formula
         (left,) = imperfection_constraints(
-            imperfection_geometries(shaped("hemisphere", *every).imperfections, ground), drawn, one_by_one=False
+            imperfection_geometries(shaped("hemisphere", *every).imperfections, ground),
+            drawn,
+            one_by_one=False,
         )
         return [left.mirrors(Mirror.through_axis(np.radians(azimuth))) for azimuth in (30.0, 70.0)]
 
@@ -225,7 +227,9 @@ def test_symmetry_of_many_imperfections_is_found_by_their_numbers() -> None:
         *({"kind": "gaussian", "amplitude": 0.1, "width": 2.0, "at": at} for at in ats),
     )
     drawn, found = outline(case.shell), dict[str, ImperfectionGeometry]()
-    for key, flaw in imperfection_geometries(case.imperfections, reference_shell_of(case.shell)).items():
+    for key, flaw in imperfection_geometries(
+        case.imperfections, reference_shell_of(case.shell)
+    ).items():
         deviation = flaw.deviation
         assert isinstance(deviation, Gaussian)
         assert isinstance(deviation.distance, AngularDistance)

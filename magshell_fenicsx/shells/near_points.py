@@ -1,0 +1,100 @@
+"""The part of a mode that lies within a thickness of a point force, where no shell theory holds.
+
+Under a point force a shell without transverse shear bends without limit: its curvature K grows as
+the logarithm of the distance. The second variation of the bending energy along stretches is of the
+order of h^2 K^2 of the membrane's stiffness, and negative, so that where K exceeds about 1/h modes
+around the point become unstable, at loads that fall with the size of elements there. They are
+known by where they are: the gradient of a mode of the shell extends over sqrt(R h) and more, theirs
+over a part of h.
+"""
+
+from collections.abc import Mapping
+
+import basix
+import numpy as np
+from numpy.typing import NDArray
+
+from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.models.shell.parameters import PointForce
+from magshell_fenicsx.parts.loads import Loads
+from magshell_fenicsx.shells.mass import Model
+
+Array = NDArray[np.float64]
+MIN_SHARE_AT_POINT = 0.5  # of the squared gradient of a mode that is one of a point force
+
+
+def places_of_point_forces(model: Model, loads: Loads) -> Mapping[str, Array]:
+    """Return the undeformed places over R of all point forces of a shell, by the names of points.
+
+    A solid has none: there a force is spread over a patch.
+    """
+    names = {force.point for force in loads.forces.values() if not force.patch}
+    names |= {load.point for load in loads.all_dead if isinstance(load, PointForce)}
+    ordered = sorted(names)  # the same order on all ranks
+    if model.axisymmetric:
+        at = {name: model.meridian.points[name][:1] for name in ordered}
+        return {name: model.meridian.section(np.array(s))[0] for name, s in at.items()}
+    surface = model.midsurface if model.thin else None
+    return {name: surface.points[name] for name in ordered} if surface else {}
+
+
+def point_of_mode(
+    model: Model, places: Mapping[str, Array], mode: Vector, waves: int | None = None
+) -> str:
+    """Return the point within a thickness of which `MIN_SHARE_AT_POINT` of a mode is.
+
+    It is "" if there is none. Collective.
+
+    Parameters
+    ----------
+    places
+        See `places_of_point_forces`.
+    mode
+        This rank's part of a displacement, or the coefficients (U + V, V, W) of so many `waves`
+        around the axis.
+    """
+    x, squares = squared_gradient(model, mode, waves)
+    comm = model.system.comm if not model.axisymmetric else None
+
+    def total(values: Array) -> float:
+        mine = float(values.sum())
+        return float(comm.allreduce(mine)) if comm else mine
+
+    whole = total(squares)
+    for name, place in places.items():
+        near = np.linalg.norm(x - place, axis=-1) < model.material.h
+        if total(squares[near]) > MIN_SHARE_AT_POINT * whole:
+            return name
+    return ""
+
+
+def squared_gradient(model: Model, mode: Vector, waves: int | None) -> tuple[Array, Array]:
+    """Return places (cells, points, 2 or 3) on this rank, and the squared gradient of a mode along
+    the undeformed surface there, times the area."""
+    V, element = model.V, model.V.element.basix_element
+    X, weights = basix.make_quadrature(V.mesh.basix_cell(), 2 * element.degree)
+    owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
+    nodes, shapes = V.dofmap.list[:owned], element.tabulate(1, X)[..., 0]
+
+    def jets(values: Array) -> Array:
+        """(1 + dim, cells, points, components) of values at nodes."""
+        return np.asarray(np.einsum("dqn,cni->dcqi", shapes, values[nodes]))
+
+    r = jets(model.r0.x.array.reshape(-1, V.dofmap.bs))
+    if not model.axisymmetric:
+        v = jets(model.system.with_ghosts(mode[: model.system.size]).reshape(-1, 3))
+        metric = np.einsum("acqi,bcqi->cqab", r[1:], r[1:])
+        inverse = np.linalg.inv(metric)
+        squares = np.einsum("cqab,acqi,bcqi->cq", inverse, v[1:], v[1:])
+        return r[0], squares * np.sqrt(np.linalg.det(metric)) * weights
+    if waves is None:
+        U, W = np.moveaxis(mode[: model.system.size].reshape(-1, 2), 1, 0)
+        v = jets(np.column_stack([U, 0 * U, W]))
+    else:
+        P, Q, W = np.moveaxis(mode.reshape(-1, 3), 1, 0)
+        v = jets(np.column_stack([P - Q, Q, W]))
+    m, rho, speed = waves or 0, r[0, ..., 0], np.linalg.norm(r[1], axis=-1)
+    U, Q, W = np.moveaxis(v[0], -1, 0)
+    around = (U + m * Q) ** 2 + (m * U + Q) ** 2 + (m * W) ** 2
+    along = np.sum(v[1] ** 2, axis=-1)
+    return r[0], (along / speed**2 + around / rho**2) * rho * speed * weights

@@ -1,0 +1,59 @@
+"""Instabilities within a thickness of a point force: they are none of the shell, and are not
+reported; see `shells.near_points`.
+"""
+
+from collections.abc import Callable
+
+from magshell_fenicsx.continuation.modes import NoEigenpair, nearest_to_zero
+from magshell_fenicsx.continuation.path import Path
+from magshell_fenicsx.continuation.point import Point, RecordedValues
+from magshell_fenicsx.continuation.stability_monitor import Crossing
+from magshell_fenicsx.continuation.system import Vector
+from magshell_fenicsx.shells.near_points import places_of_point_forces, point_of_mode
+from magshell_fenicsx.simulate.stage import Stage
+
+
+def point_of_crossing(stage: Stage, path: Path, crossing: Crossing) -> str:
+    """Return the point force within a thickness of which a symmetry-breaking mode is.
+
+    It is "" for a mode of the shell. Collective.
+    """
+    modes = stage.scene.model.symmetry_breaking_modes
+    assert modes, "they have crossed"
+    family = next(family for family in modes.families if family.label == crossing.label)
+
+    def mode() -> Vector:
+        return nearest_to_zero(family.factor_at(stage.leave(crossing.point.state)))[1]
+
+    return _recorded_point(stage, path, mode, getattr(family, "m", None))
+
+
+def point_of_instability(stage: Stage, path: Path, label: str, point: Point) -> str:
+    """Return the point force within a thickness of which the mode of a fold or a bifurcation is.
+
+    It is "" for a mode of the shell. The mode of a fold is the path's tangent. Collective.
+    """
+
+    def mode() -> Vector:
+        if label == "fold":
+            return stage.displacement(point.du)
+        return stage.displacement(nearest_to_zero(stage.newton.factor_at(point.state))[1])
+
+    return _recorded_point(stage, path, mode)
+
+
+def _recorded_point(
+    stage: Stage, path: Path, mode: Callable[[], Vector], waves: int | None = None
+) -> str:
+    model = stage.scene.model
+    places = places_of_point_forces(model, stage.scene.problem.loads)
+    if not places:
+        return ""
+
+    def find() -> RecordedValues:
+        try:
+            return RecordedValues({"point": point_of_mode(model, places, mode(), waves)})
+        except NoEigenpair:
+            return RecordedValues({"point": ""})
+
+    return str(path.recorded_values(find).values["point"])
