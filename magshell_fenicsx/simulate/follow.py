@@ -11,12 +11,17 @@ from magshell_fenicsx.continuation.system import State, max_abs
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.quantities.registry import OWN_MODES
 from magshell_fenicsx.simulate.contact_control import penetration_message
-from magshell_fenicsx.simulate.path_records import Records, RecordStream, amount, follow_path
+from magshell_fenicsx.simulate.path_records import (
+    LOCATED,
+    Records,
+    RecordStream,
+    amount,
+    follow_path,
+)
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.stage import load_stage
 from magshell_fenicsx.simulate.steps import (
-    LOCATED,
     follow_branch_of_step,
     held_conjugates_of_step,
     records_of,

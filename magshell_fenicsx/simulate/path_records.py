@@ -438,10 +438,10 @@ def follow_branch(
             crossings = monitor.pass_to(point, evaluate=walk.done or label in LOCATED)
             for record in _excluded_records(stage, path, crossings):
                 yield replace(record, branch=number)
-            label = _label_of(stage, path, label, point, ends=walk.done)
+            record_label = _label_of(stage, path, label, point, ends=walk.done)
             remark = cluster_remark(stage.scene, walk, point)
             yield Record(
-                label,
+                record_label,
                 path.name,
                 point,
                 branch=number,

@@ -29,7 +29,6 @@ from magshell_fenicsx.shells.revolution import nodal_normals
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.steps import LOCATED
 from magshell_fenicsx.simulate.transfer import all_nodes_of_shells, nodes_of_shells
 
 if TYPE_CHECKING:  # one of them is built

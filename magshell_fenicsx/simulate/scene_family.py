@@ -35,7 +35,6 @@ from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.sensitivity import stage_of_record
 from magshell_fenicsx.simulate.shared_forms import SharedForms
 from magshell_fenicsx.simulate.stage import Stage
-from magshell_fenicsx.simulate.steps import LOCATED
 from magshell_fenicsx.simulate.transfer import transfer
 
 MakeProblem = Callable[[float], Problem]  # from a value of the number

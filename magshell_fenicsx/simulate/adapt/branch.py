@@ -23,7 +23,6 @@ from magshell_fenicsx.simulate.adapt.tolerance import (
 from magshell_fenicsx.simulate.follow import follow
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
-from magshell_fenicsx.simulate.steps import LOCATED
 
 
 def branched(
