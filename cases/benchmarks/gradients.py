@@ -27,7 +27,12 @@ from magshell_fenicsx.simulate.gradients.adjoint import Adjoint
 from magshell_fenicsx.simulate.gradients.gradient import derivative
 from magshell_fenicsx.simulate.gradients.instabilities import FOLDS, LostResult, instabilities
 from magshell_fenicsx.simulate.gradients.results import adjoint_at_end
-from magshell_fenicsx.simulate.perturbation import KEYS_WITHOUT_GRADIENT, number_at_key, problem_on_mesh_of, scale_at_key
+from magshell_fenicsx.simulate.perturbation import (
+    KEYS_WITHOUT_GRADIENT,
+    number_at_key,
+    problem_on_mesh_of,
+    scale_at_key,
+)
 from magshell_fenicsx.simulate.record import Record
 
 STEP, LONG = (

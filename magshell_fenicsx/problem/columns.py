@@ -11,8 +11,8 @@ import numpy as np
 
 from magshell_fenicsx.input.section import case_sizes
 from magshell_fenicsx.input.source import CaseError
-from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.ability import Context
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.registered import OBSERVABLES
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.quantities.quantity import DISTANCE, TURN, Unit

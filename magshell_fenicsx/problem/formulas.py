@@ -25,20 +25,20 @@ from magshell_fenicsx.mesh.mirror import rotation
 from magshell_fenicsx.mesh.msh import MeshFile, read_msh, space_embedding
 from magshell_fenicsx.mesh.patch import PatchMesh
 from magshell_fenicsx.mesh.shapes import DiscShape, PlaneShape, StripShape
-from magshell_fenicsx.models.shell.formula_projection import (
-    CellGeometry,
-    project_formula,
-    sampling_points,
-)
-from magshell_fenicsx.models.shell.thickness import MIN_THICKNESS_FACTOR, MAX_THICKNESS_FACTOR
 from magshell_fenicsx.models.shell.adaptive_sampling import (
     Lattice,
     RefinedParts,
     SubCells,
     refine_where_hidden,
 )
-from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry
+from magshell_fenicsx.models.shell.formula_projection import (
+    CellGeometry,
+    project_formula,
+    sampling_points,
+)
+from magshell_fenicsx.models.shell.thickness import MAX_THICKNESS_FACTOR, MIN_THICKNESS_FACTOR
 from magshell_fenicsx.parts.ability import Context, Formulas
+from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionGeometry
 from magshell_fenicsx.shape.outline import ANY_GRADING, Outline
 
 Array = NDArray[np.float64]

@@ -14,9 +14,9 @@ from pydantic import Field, model_validator
 
 from magshell_fenicsx.input.section import Section, or_number
 from magshell_fenicsx.mesh.grading import Feature, Grading, LineFeature, RingFeature
-from magshell_fenicsx.parts.step_course import SizingContext
 from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.step import Step
+from magshell_fenicsx.parts.step_course import SizingContext
 from magshell_fenicsx.parts.supports.boundary import BoundarySection
 from magshell_fenicsx.shape.shell_sections import MeshSurface
 

@@ -4,10 +4,10 @@ from collections import Counter
 from math import degrees
 
 from magshell_fenicsx.mesh.mirror import Mirror, Sector, plane_text
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.imperfections.symmetry import MAX_RIMS
 from magshell_fenicsx.parts.laminate import laminate_account
 from magshell_fenicsx.parts.loads import Loads
-from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.registered import PART_CLASSES, accounts, parts_of
 from magshell_fenicsx.parts.rubber import law_account, laws_of
 from magshell_fenicsx.problem.problem import SolidBody, solid_body_of

@@ -29,11 +29,11 @@ from magshell_fenicsx.models.shell.parameters import Condition, Material, defaul
 from magshell_fenicsx.models.shell.spatial_fields import InsideRim
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.models.solid.body_densities import MooneyRivlin
+from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.imperfections.imperfection import ImperfectionSection
 from magshell_fenicsx.parts.imperfections.modes import Mode
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.fields import MagneticSection
-from magshell_fenicsx.parts.ability import Context
 from magshell_fenicsx.parts.step import ProgrammeStep
 from magshell_fenicsx.problem.mesh_sizes import MeshSection, SolidSection
 from magshell_fenicsx.problem.requests import (

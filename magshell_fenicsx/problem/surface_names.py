@@ -13,8 +13,8 @@ from magshell_fenicsx.models.shell.kinematics import SECOND_DERIVATIVES
 from magshell_fenicsx.models.shell.own_term import OwnTerm
 from magshell_fenicsx.models.shell.parameters import Condition, HeldComponents
 from magshell_fenicsx.models.shell.thickness import Thickness, patch_of
-from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.ability import Context
+from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.pressure.openings import moving_edges, without_potential
 from magshell_fenicsx.parts.registered import OBSERVABLES, parts_of
 from magshell_fenicsx.parts.supports.supports import refuse_unknown

@@ -364,11 +364,7 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
         )
         earlier = scene.problem.programme[: record.step - 1]
         driven_amplitudes |= _driven_amplitudes(step, record.point.state.mu)
-        held_conjugates = (
-            {name: place.rows[name] for name in held_by_step(step) if place.rows.get(name)}
-            if place
-            else {}
-        )
+        held_conjugates = _rows_of_held(step, place) if place else {}
         if record.step not in begins:
             if held_conjugates:
                 raise CaseError(
@@ -387,33 +383,11 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
         state_before = system.with_moved_supports(begin.point.state)
         held_before = held_at(scene, begin, state_before)
         if part and place:
-            reused_amplitudes = {
-                name
-                for step_of_programme in earlier
-                for name in (step_of_programme.name, *held_by_step(step_of_programme))
-            } & place.state.mu.keys()
+            reused_amplitudes = _amplitudes_of_steps(earlier) & place.state.mu.keys()
             for name in reused_amplitudes - place.rows.keys() - driven_amplitudes:
                 loads[name] = loads.get(name, 0.0) + by_load(part, name)
-        for name, row in held_conjugates.items():
-            assert place
-            law = step.load.hold[name]
-            if isinstance(law, Gas):
-                share, slope = enclosed_gas(scene, law.gas, state_before).by_begin(
-                    place.state.mu[name]
-                )
-                c[name], by_mu[name] = -row * share, row * slope
-                continue
-            potential_now, potential_before = (
-                system.potential(state.u, state.mu, name) for state in (place.state, state_before)
-            )
-            if abs(potential_now - potential_before) > CONJUGATE_TOLERANCE * max(
-                abs(potential_now), abs(scene.conjugate_unit(name))
-            ):
-                raise CaseError(
-                    f"{step.key}.hold.{name}: no gradient, as it is not held from the last point "
-                    "before the step"
-                )
-            c[name] = -row
+        if place:
+            c, by_mu = _terms_of_held(scene, step, place.state, state_before, held_conjugates)
         for name in loads.keys() & held_before.keys():
             by_mu[name] = by_mu.get(name, 0.0) + loads.pop(name)
             left_loads.add(name)
@@ -421,9 +395,7 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
             places[place_number] = replace(place, follows=frozenset(held_conjugates))
         part = None
         if c or any(by_mu.values()):
-            slope_u = np.zeros(system.size)
-            for name, c_i in c.items():
-                slope_u += c_i * system.load(state_before.u, state_before.mu, name)
+            slope_u = _sum_of_loads(scene, state_before, c)
             w, rows = solved(scene, state_before, Functional(0.0, slope_u, by_mu, c), held_before)
             gas = with_gas(held_before)
             place_at_begin = AdjointState(
@@ -440,6 +412,70 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
             part = Adjoint(scene, [place_at_begin])
         record = begin
     return replace(adjoint, places=places, left_loads=frozenset(left_loads))
+
+
+def _sum_of_loads(scene: Scene, state: State, factors: Mapping[str, float]) -> Vector:
+    """Return the sum of the load vectors at a state, each times the factor of its amplitude."""
+    system, total = scene.model.system, np.zeros(scene.model.system.size)
+    for name, factor in factors.items():
+        total += factor * system.load(state.u, state.mu, name)
+    return total
+
+
+def _rows_of_held(step: ProgrammeStep, place: AdjointState) -> dict[str, float]:
+    """Return amplitude whose conjugate a step holds -> adjoint of that equation, where not zero."""
+    return {name: place.rows[name] for name in held_by_step(step) if place.rows.get(name)}
+
+
+def _amplitudes_of_steps(steps: Sequence[ProgrammeStep]) -> set[str]:
+    """Return the amplitudes that steps drive, or whose conjugates they hold."""
+    return {name for step in steps for name in (step.name, *held_by_step(step))}
+
+
+def _terms_of_held(
+    scene: Scene,
+    step: ProgrammeStep,
+    state: State,
+    state_before: State,
+    rows: Mapping[str, float],
+) -> tuple[dict[str, float], dict[str, float]]:
+    """Return how a place depends on the state before its step, by conjugates that the step holds.
+
+    Parameters
+    ----------
+    state, state_before
+        The states at the place, and where the step began.
+    rows
+        Amplitude whose conjugate is held -> adjoint of the equation that holds it.
+
+    Returns
+    -------
+    c, by_mu
+        Amplitude -> factor of dPi/dmu of the state before, and derivative by its amplitude.
+
+    Raises
+    ------
+    CaseError
+        If one is not held from the state before on.
+    """
+    system, c, by_mu = scene.model.system, dict[str, float](), dict[str, float]()
+    for name, row in rows.items():
+        law = step.load.hold[name]
+        if isinstance(law, Gas):
+            gas = enclosed_gas(scene, law.gas, state_before)
+            share, slope = gas.by_begin(state.mu[name])
+            c[name], by_mu[name] = -row * share, row * slope
+            continue
+        potential = system.potential(state.u, state.mu, name)
+        change = potential - system.potential(state_before.u, state_before.mu, name)
+        scale = max(abs(potential), abs(scene.conjugate_unit(name)))
+        if abs(change) > CONJUGATE_TOLERANCE * scale:
+            raise CaseError(
+                f"{step.key}.hold.{name}: no gradient, as it is not held from the last point "
+                "before the step"
+            )
+        c[name] = -row
+    return c, by_mu
 
 
 def _driven_amplitudes(step: ProgrammeStep, mu: Mapping[str, float]) -> set[str]:

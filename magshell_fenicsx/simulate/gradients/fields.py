@@ -6,7 +6,7 @@ magnitude, the factor of the thickness, the natural curvature in the case's fram
 w0 of the drawn shape along the normal of the perfect one. Of a deviation see `shape`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -92,7 +92,6 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
             f"{name}: what a sensor reads has no gradient by this field; allowed are remanence, "
             "magnitude"
         )
-    knowing = [term for term in model.system.terms if isinstance(term, FieldDifferentiable)]
     if name == "deviation" and (
         model.contacts or getattr(scene.problem.loads.magnetic, "in_space", None)
     ):
@@ -100,60 +99,10 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
             "deviation: no gradient beside bodies, or in a field that is known at points of space"
         )
 
-    def at_place(
-        number: int, place: AdjointState, coefficient_or_name: str | PlacementField
-    ) -> tuple[fem.Function, list[Array]]:
-        """The field, of a name or itself, and what a place gives, whose state is set."""
-        if origin:
-            expand_shell_contact(origin.scene, scene, origin.places[number].state)
-        shares, w = _shares(adjoint, number, place, name), _contracted(scene, place)
-        coefficient = (
-            coefficient_or_name
-            if isinstance(coefficient_or_name, str)
-            else coefficient_or_name.name
-        )
-        f = next(
-            (
-                c
-                for s in shares
-                for c in s.term.form.coefficients()
-                if c is coefficient_or_name or c.name == coefficient_or_name
-            ),
-            None,
-        )
-        known_gradients = [
-            field_and_gradient
-            for term in knowing
-            if (field_and_gradient := _known_gradient(term, place, w, coefficient))
-        ]
-        f = f or next((field_and_gradient for field_and_gradient, _ in known_gradients), None)
-        if f is None and slope and slope.field is not None and coefficient == slope.field.name:
-            f = slope.field
-        if f is None or (not model.thin and coefficient != "Br"):
-            raise CaseError(f"{name}: the case has no such field: no result depends on it")
-        if model.thin and coefficient_or_name == "r0":
-            shares += of_measures(model, shares, w)
-        forces = [gradient_at_points for _, gradient_at_points in known_gradients] + [
-            summed(shares, f, model.u, w, model.kernels)
-        ]
-        if slope and slope.by_field is not None and slope.field is not None and not number:
-            forces += [slope.by_field] if coefficient == slope.field.name else []
-        if (
-            model.thin
-            and coefficient_or_name == "r0"
-            and (by_vertices := of_widths(model, shares, w)) is not None
-        ):
-            forces[-1][:, : by_vertices.shape[1]] += by_vertices  # vertices are the first nodes
-        if coefficient_or_name == "r0":
-            forces[-1] += of_normals(adjoint, place, first=not number)
-        if name == "thickness" and scene.problem.loads.contacts:
-            forces.append(_of_starts(scene, shares, f, w))
-        return f, forces
-
     def over_all_places(coefficient_or_name: str | PlacementField) -> tuple[fem.Function, Array]:
         parts = [
             model.system.at_state(place.state).evaluate(
-                partial(at_place, number, place, coefficient_or_name)
+                partial(_field_at_place, adjoint, origin, name, number, place, coefficient_or_name)
             )
             for number, place in enumerate(adjoint.places)
         ]
@@ -168,19 +117,99 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
     if kind.project:
         forces = kind.project(scene, f, forces, places, normals)
     if model.thin and name == "deviation":
-        shares = [
-            share
-            for i, place in enumerate(adjoint.places)
-            for share in _shares(adjoint, i, place, name)
-        ]
-        for field in fields_of_placement([share.term for share in shares]):
-            if scene.comm.allreduce(any(rate.any() for rate in rates(model, field, normals))):
-                _, by_rate = over_all_places(field)
-                contracted = (
-                    np.sum(by_rate * rate, axis=(1, 2)) for rate in rates(model, field, normals)
-                )
-                forces = forces + np.stack(list(contracted), axis=1)[..., None]
+        for field in _placement_fields(adjoint, name, normals):
+            _, by_rate = over_all_places(field)
+            contracted = (
+                np.sum(by_rate * rate, axis=(1, 2)) for rate in rates(model, field, normals)
+            )
+            forces = forces + np.stack(list(contracted), axis=1)[..., None]
     return FieldGradient(f, forces, places, normals)
+
+
+def _field_at_place(
+    adjoint: Adjoint,
+    origin: Adjoint | None,
+    name: str,
+    number: int,
+    place: AdjointState,
+    coefficient_or_name: str | PlacementField,
+) -> tuple[fem.Function, list[Array]]:
+    """Return a field, and its gradients that a place gives, whose state is set.
+
+    Parameters
+    ----------
+    origin, name
+        See `by_field`.
+    coefficient_or_name
+        The field, or its name in the terms.
+    """
+    scene, model, slope = adjoint.scene, adjoint.scene.model, adjoint.slope
+    knowing = [term for term in model.system.terms if isinstance(term, FieldDifferentiable)]
+    if origin:
+        expand_shell_contact(origin.scene, scene, origin.places[number].state)
+    shares, w = _shares(adjoint, number, place, name), _contracted(scene, place)
+    coefficient = (
+        coefficient_or_name if isinstance(coefficient_or_name, str) else coefficient_or_name.name
+    )
+    f = next(
+        (
+            c
+            for s in shares
+            for c in s.term.form.coefficients()
+            if c is coefficient_or_name or c.name == coefficient_or_name
+        ),
+        None,
+    )
+    known_gradients = [
+        field_and_gradient
+        for term in knowing
+        if (field_and_gradient := _known_gradient(term, place, w, coefficient))
+    ]
+    f = f or next((field_and_gradient for field_and_gradient, _ in known_gradients), None)
+    if f is None and slope and slope.field is not None and coefficient == slope.field.name:
+        f = slope.field
+    if f is None or (not model.thin and coefficient != "Br"):
+        raise CaseError(f"{name}: the case has no such field: no result depends on it")
+    if model.thin and coefficient_or_name == "r0":
+        shares += of_measures(model, shares, w)
+    forces = [gradient_at_points for _, gradient_at_points in known_gradients] + [
+        summed(shares, f, model.u, w, model.kernels)
+    ]
+    if slope and slope.by_field is not None and slope.field is not None and not number:
+        forces += [slope.by_field] if coefficient == slope.field.name else []
+    if (
+        model.thin
+        and coefficient_or_name == "r0"
+        and (by_vertices := of_widths(model, shares, w)) is not None
+    ):
+        forces[-1][:, : by_vertices.shape[1]] += by_vertices  # vertices are the first nodes
+    if coefficient_or_name == "r0":
+        forces[-1] += of_normals(adjoint, place, first=not number)
+    if name == "thickness" and scene.problem.loads.contacts:
+        forces.append(_of_starts(scene, shares, f, w))
+    return f, forces
+
+
+def _placement_fields(adjoint: Adjoint, name: str, normals: Array) -> Iterator[PlacementField]:
+    """Yield the fields of an adjoint's terms that change with the placement; collective.
+
+    Parameters
+    ----------
+    name
+        See `by_field`.
+    normals
+        Directions in which places move.
+    """
+    scene, model = adjoint.scene, adjoint.scene.model
+    assert model.thin
+    shares = [
+        share
+        for i, place in enumerate(adjoint.places)
+        for share in _shares(adjoint, i, place, name)
+    ]
+    for field in fields_of_placement([share.term for share in shares]):
+        if scene.comm.allreduce(any(rate.any() for rate in rates(model, field, normals))):
+            yield field
 
 
 def _shares(adjoint: Adjoint, number: int, place: AdjointState, name: str) -> list[WeightedTerm]:

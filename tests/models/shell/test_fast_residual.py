@@ -16,8 +16,8 @@ from magshell_fenicsx.assembly.finite_element_system import FiniteElementSystem
 from magshell_fenicsx.assembly.kernels import KernelLog
 from magshell_fenicsx.models.shell import gradients
 from magshell_fenicsx.models.shell.parameters import Condition, Force, Material
-from magshell_fenicsx.models.shell.spatial_fields import tangential
 from magshell_fenicsx.models.shell.residual import FastResidual
+from magshell_fenicsx.models.shell.spatial_fields import tangential
 from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.parts.magnetism.magnetised import Magnetisation
 from magshell_fenicsx.shells.shell import ShellModel
