@@ -27,6 +27,7 @@ from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shells.modes import ShellMode, ShellModes
 from magshell_fenicsx.shells.revolution import nodal_normals
 from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.path_records import LOCATED
 from magshell_fenicsx.simulate.record import Stopped
 from magshell_fenicsx.simulate.scene import Scene
 from magshell_fenicsx.simulate.transfer import all_nodes_of_shells, nodes_of_shells

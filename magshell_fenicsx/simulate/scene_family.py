@@ -25,6 +25,7 @@ from magshell_fenicsx.mesh.patch import MeshError
 from magshell_fenicsx.problem.columns import own_amplitudes
 from magshell_fenicsx.problem.problem import Problem
 from magshell_fenicsx.shells.waves import Waves
+from magshell_fenicsx.simulate.path_records import LOCATED
 from magshell_fenicsx.simulate.perturbation import (
     chart_bounds,
     problem_on_mesh_of,

@@ -21,6 +21,7 @@ from magshell_fenicsx.simulate.adapt.tolerance import (
     rounds,
 )
 from magshell_fenicsx.simulate.follow import follow
+from magshell_fenicsx.simulate.path_records import LOCATED
 from magshell_fenicsx.simulate.record import Record, Stopped
 from magshell_fenicsx.simulate.scene import Scene
 

@@ -17,7 +17,7 @@ the step began, which p changes too. So are loads that a step leaves and was not
 force at a depth.
 """
 
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import TypeAlias
@@ -364,11 +364,7 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
         )
         earlier = scene.problem.programme[: record.step - 1]
         driven_amplitudes |= _driven_amplitudes(step, record.point.state.mu)
-        held_conjugates = (
-            {name: place.rows[name] for name in held_by_step(step) if place.rows.get(name)}
-            if place
-            else {}
-        )
+        held_conjugates = _rows_of_held(step, place) if place else {}
         if record.step not in begins:
             if held_conjugates:
                 raise CaseError(
@@ -378,16 +374,20 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
             break
         begin, c, by_mu = begins[record.step], dict[str, float](), dict[str, float]()
         if begin.scene and begin.scene is not scene:
-            _refuse_other_model([*held_conjugates, *loads], step)
+            if held_conjugates or loads:
+                names = ", ".join({*held_conjugates, *loads})
+                raise CaseError(
+                    f"{names}: as they were before {step.key}, in another model: no gradient"
+                )
             break
         state_before = system.with_moved_supports(begin.point.state)
         held_before = held_at(scene, begin, state_before)
         if part and place:
-            reused_amplitudes = _amplitudes_of(earlier) & place.state.mu.keys()
+            reused_amplitudes = _amplitudes_of_steps(earlier) & place.state.mu.keys()
             for name in reused_amplitudes - place.rows.keys() - driven_amplitudes:
                 loads[name] = loads.get(name, 0.0) + by_load(part, name)
         if place:
-            c, by_mu = _by_held_conjugates(scene, step, held_conjugates, place, state_before)
+            c, by_mu = _terms_of_held(scene, step, place.state, state_before, held_conjugates)
         for name in loads.keys() & held_before.keys():
             by_mu[name] = by_mu.get(name, 0.0) + loads.pop(name)
             left_loads.add(name)
@@ -395,9 +395,7 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
             places[place_number] = replace(place, follows=frozenset(held_conjugates))
         part = None
         if c or any(by_mu.values()):
-            slope_u = np.zeros(system.size)
-            for name, c_i in c.items():
-                slope_u += c_i * system.load(state_before.u, state_before.mu, name)
+            slope_u = _sum_of_loads(scene, state_before, c)
             w, rows = solved(scene, state_before, Functional(0.0, slope_u, by_mu, c), held_before)
             gas = with_gas(held_before)
             place_at_begin = AdjointState(
@@ -416,52 +414,62 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
     return replace(adjoint, places=places, left_loads=frozenset(left_loads))
 
 
-def _refuse_other_model(names: Collection[str], step: ProgrammeStep) -> None:
-    """Refuse amplitudes whose values are those before a step, in another model."""
-    if names:
-        raise CaseError(
-            f"{', '.join(dict.fromkeys(names))}: as they were before {step.key}, in another "
-            "model: no gradient"
-        )
+def _sum_of_loads(scene: Scene, state: State, factors: Mapping[str, float]) -> Vector:
+    """Return the sum of the load vectors at a state, each times the factor of its amplitude."""
+    system, total = scene.model.system, np.zeros(scene.model.system.size)
+    for name, factor in factors.items():
+        total += factor * system.load(state.u, state.mu, name)
+    return total
 
 
-def _amplitudes_of(steps: Iterable[ProgrammeStep]) -> set[str]:
-    """Return the amplitudes that steps drive or hold."""
+def _rows_of_held(step: ProgrammeStep, place: AdjointState) -> dict[str, float]:
+    """Return amplitude whose conjugate a step holds -> adjoint of that equation, where not zero."""
+    return {name: place.rows[name] for name in held_by_step(step) if place.rows.get(name)}
+
+
+def _amplitudes_of_steps(steps: Sequence[ProgrammeStep]) -> set[str]:
+    """Return the amplitudes that steps drive, or whose conjugates they hold."""
     return {name for step in steps for name in (step.name, *held_by_step(step))}
 
 
-def _by_held_conjugates(
+def _terms_of_held(
     scene: Scene,
     step: ProgrammeStep,
-    held_conjugates: Mapping[str, float],
-    place: AdjointState,
+    state: State,
     state_before: State,
+    rows: Mapping[str, float],
 ) -> tuple[dict[str, float], dict[str, float]]:
-    """Return the derivatives of a result by the conjugates and the amplitudes before a step.
+    """Return how a place depends on the state before its step, by conjugates that the step holds.
 
     Parameters
     ----------
-    held_conjugates
-        Amplitude -> derivative of the result by its conjugate, which the step holds.
+    state, state_before
+        The states at the place, and where the step began.
+    rows
+        Amplitude whose conjugate is held -> adjoint of the equation that holds it.
+
+    Returns
+    -------
+    c, by_mu
+        Amplitude -> factor of dPi/dmu of the state before, and derivative by its amplitude.
 
     Raises
     ------
     CaseError
-        If a conjugate is not held from the last point before the step.
+        If one is not held from the state before on.
     """
     system, c, by_mu = scene.model.system, dict[str, float](), dict[str, float]()
-    for name, row in held_conjugates.items():
+    for name, row in rows.items():
         law = step.load.hold[name]
         if isinstance(law, Gas):
             gas = enclosed_gas(scene, law.gas, state_before)
-            share, slope = gas.by_begin(place.state.mu[name])
+            share, slope = gas.by_begin(state.mu[name])
             c[name], by_mu[name] = -row * share, row * slope
             continue
-        potential_now, potential_before = (
-            system.potential(state.u, state.mu, name) for state in (place.state, state_before)
-        )
-        size = max(abs(potential_now), abs(scene.conjugate_unit(name)))
-        if abs(potential_now - potential_before) > CONJUGATE_TOLERANCE * size:
+        potential = system.potential(state.u, state.mu, name)
+        change = potential - system.potential(state_before.u, state_before.mu, name)
+        scale = max(abs(potential), abs(scene.conjugate_unit(name)))
+        if abs(change) > CONJUGATE_TOLERANCE * scale:
             raise CaseError(
                 f"{step.key}.hold.{name}: no gradient, as it is not held from the last point "
                 "before the step"

@@ -6,7 +6,7 @@ magnitude, the factor of the thickness, the natural curvature in the case's fram
 w0 of the drawn shape along the normal of the perfect one. Of a deviation see `shape`.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import TYPE_CHECKING
@@ -85,124 +85,131 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
     other = _with_field(adjoint, name)
     if other is not scene:
         return by_field(_transferred(adjoint, other), name, adjoint)
-    _refuse_field(adjoint, name)
-    derivative, model = _FieldDerivative(adjoint, name, origin), scene.model
-    f, forces = derivative.over_all_places(FIELDS[name].coefficient)
-    places, normals = (v[: len(forces)] for v in places_of(scene, f))
-    if name == "deviation":
-        places, normals = _perfect(scene, places, normals)
-    project = FIELDS[name].project
-    if project:
-        forces = project(scene, f, forces, places, normals)
-    if model.thin and name == "deviation":
-        shares = [
-            share
-            for i, place in enumerate(adjoint.places)
-            for share in _shares(adjoint, i, place, name)
-        ]
-        for field in fields_of_placement([share.term for share in shares]):
-            if scene.comm.allreduce(any(rate.any() for rate in rates(model, field, normals))):
-                _, by_rate = derivative.over_all_places(field)
-                contracted = (
-                    np.sum(by_rate * rate, axis=(1, 2)) for rate in rates(model, field, normals)
-                )
-                forces = forces + np.stack(list(contracted), axis=1)[..., None]
-    return FieldGradient(f, forces, places, normals)
-
-
-def _refuse_field(adjoint: Adjoint, name: str) -> None:
-    """Refuse fields by which a scene, or a sensor's result, has no gradient."""
-    scene = adjoint.scene
-    if adjoint.slope and name in ("thickness", "deviation"):
+    model, kind = scene.model, FIELDS[name]
+    slope = adjoint.slope
+    if slope and name in ("thickness", "deviation"):
         raise CaseError(
             f"{name}: what a sensor reads has no gradient by this field; allowed are remanence, "
             "magnitude"
         )
-    has_field_in_space = getattr(scene.problem.loads.magnetic, "in_space", None)
-    if name == "deviation" and (scene.model.contacts or has_field_in_space):
+    if name == "deviation" and (
+        model.contacts or getattr(scene.problem.loads.magnetic, "in_space", None)
+    ):
         raise CaseError(
             "deviation: no gradient beside bodies, or in a field that is known at points of space"
         )
 
-
-@dataclass(frozen=True)
-class _FieldDerivative:
-    """The derivatives of an adjoint's places by a field of a scene.
-
-    Attributes
-    ----------
-    origin
-        The adjoint in the scene that was solved, if it is another one.
-    """
-
-    adjoint: Adjoint
-    name: str
-    origin: Adjoint | None
-
-    def over_all_places(self, field: str | PlacementField) -> tuple[fem.Function, Array]:
-        """Return the field, by name or itself, and the sum of what all places give; collective."""
-        system = self.adjoint.scene.model.system
+    def over_all_places(coefficient_or_name: str | PlacementField) -> tuple[fem.Function, Array]:
         parts = [
-            system.at_state(place.state).evaluate(partial(self._at_place, number, place, field))
-            for number, place in enumerate(self.adjoint.places)
+            model.system.at_state(place.state).evaluate(
+                partial(_field_at_place, adjoint, origin, name, number, place, coefficient_or_name)
+            )
+            for number, place in enumerate(adjoint.places)
         ]
-        forces = [force for _, forces_of_place in parts for force in forces_of_place]
-        return parts[-1][0], np.sum(forces, axis=0)
+        return parts[-1][0], np.sum(
+            [gradient_at_place for _, of_place in parts for gradient_at_place in of_place], axis=0
+        )
 
-    def _at_place(
-        self, number: int, place: AdjointState, field: str | PlacementField
-    ) -> tuple[fem.Function, list[Array]]:
-        """Return the field, and what a place gives, whose state is set."""
-        adjoint, scene, name = self.adjoint, self.adjoint.scene, self.name
-        model, slope = scene.model, adjoint.slope
-        if self.origin:
-            expand_shell_contact(self.origin.scene, scene, self.origin.places[number].state)
-        shares, w = _shares(adjoint, number, place, name), _contracted(scene, place)
-        coefficient = field if isinstance(field, str) else field.name
-        known_gradients = [
-            field_and_gradient
-            for term in model.system.terms
-            if isinstance(term, FieldDifferentiable)
-            and (field_and_gradient := _known_gradient(term, place, w, coefficient))
-        ]
-        f = self._function(field, shares, [f for f, _ in known_gradients])
-        if model.thin and field == "r0":
-            shares += of_measures(model, shares, w)
-        forces = [gradient_at_points for _, gradient_at_points in known_gradients]
-        forces.append(summed(shares, f, model.u, w, model.kernels))
-        if slope and slope.by_field is not None and slope.field is not None and not number:
-            forces += [slope.by_field] if coefficient == slope.field.name else []
-        if field == "r0":
-            by_vertices = of_widths(model, shares, w) if model.thin else None
-            if by_vertices is not None:  # vertices are the first nodes
-                forces[-1][:, : by_vertices.shape[1]] += by_vertices
-            forces[-1] += of_normals(adjoint, place, first=not number)
-        if name == "thickness" and scene.problem.loads.contacts:
-            forces.append(_of_starts(scene, shares, f, w))
-        return f, forces
+    f, forces = over_all_places(kind.coefficient)
+    places, normals = (v[: len(forces)] for v in places_of(scene, f))
+    if name == "deviation":
+        places, normals = _perfect(scene, places, normals)
+    if kind.project:
+        forces = kind.project(scene, f, forces, places, normals)
+    if model.thin and name == "deviation":
+        for field in _placement_fields(adjoint, name, normals):
+            _, by_rate = over_all_places(field)
+            contracted = (
+                np.sum(by_rate * rate, axis=(1, 2)) for rate in rates(model, field, normals)
+            )
+            forces = forces + np.stack(list(contracted), axis=1)[..., None]
+    return FieldGradient(f, forces, places, normals)
 
-    def _function(
-        self,
-        field: str | PlacementField,
-        shares: Sequence[WeightedTerm],
-        known_fields: Sequence[fem.Function],
-    ) -> fem.Function:
-        """Return the function of a field that terms, or a sensor, depend on.
 
-        Raises
-        ------
-        CaseError
-            If none does.
-        """
-        slope, coefficient = self.adjoint.slope, field if isinstance(field, str) else field.name
-        functions = (c for share in shares for c in share.term.form.coefficients())
-        f = next((c for c in functions if c is field or c.name == field), None)
-        f = f or next(iter(known_fields), None)
-        if f is None and slope and slope.field is not None and coefficient == slope.field.name:
-            f = slope.field
-        if f is None or (not self.adjoint.scene.model.thin and coefficient != "Br"):
-            raise CaseError(f"{self.name}: the case has no such field: no result depends on it")
-        return f
+def _field_at_place(
+    adjoint: Adjoint,
+    origin: Adjoint | None,
+    name: str,
+    number: int,
+    place: AdjointState,
+    coefficient_or_name: str | PlacementField,
+) -> tuple[fem.Function, list[Array]]:
+    """Return a field, and its gradients that a place gives, whose state is set.
+
+    Parameters
+    ----------
+    origin, name
+        See `by_field`.
+    coefficient_or_name
+        The field, or its name in the terms.
+    """
+    scene, model, slope = adjoint.scene, adjoint.scene.model, adjoint.slope
+    knowing = [term for term in model.system.terms if isinstance(term, FieldDifferentiable)]
+    if origin:
+        expand_shell_contact(origin.scene, scene, origin.places[number].state)
+    shares, w = _shares(adjoint, number, place, name), _contracted(scene, place)
+    coefficient = (
+        coefficient_or_name if isinstance(coefficient_or_name, str) else coefficient_or_name.name
+    )
+    f = next(
+        (
+            c
+            for s in shares
+            for c in s.term.form.coefficients()
+            if c is coefficient_or_name or c.name == coefficient_or_name
+        ),
+        None,
+    )
+    known_gradients = [
+        field_and_gradient
+        for term in knowing
+        if (field_and_gradient := _known_gradient(term, place, w, coefficient))
+    ]
+    f = f or next((field_and_gradient for field_and_gradient, _ in known_gradients), None)
+    if f is None and slope and slope.field is not None and coefficient == slope.field.name:
+        f = slope.field
+    if f is None or (not model.thin and coefficient != "Br"):
+        raise CaseError(f"{name}: the case has no such field: no result depends on it")
+    if model.thin and coefficient_or_name == "r0":
+        shares += of_measures(model, shares, w)
+    forces = [gradient_at_points for _, gradient_at_points in known_gradients] + [
+        summed(shares, f, model.u, w, model.kernels)
+    ]
+    if slope and slope.by_field is not None and slope.field is not None and not number:
+        forces += [slope.by_field] if coefficient == slope.field.name else []
+    if (
+        model.thin
+        and coefficient_or_name == "r0"
+        and (by_vertices := of_widths(model, shares, w)) is not None
+    ):
+        forces[-1][:, : by_vertices.shape[1]] += by_vertices  # vertices are the first nodes
+    if coefficient_or_name == "r0":
+        forces[-1] += of_normals(adjoint, place, first=not number)
+    if name == "thickness" and scene.problem.loads.contacts:
+        forces.append(_of_starts(scene, shares, f, w))
+    return f, forces
+
+
+def _placement_fields(adjoint: Adjoint, name: str, normals: Array) -> Iterator[PlacementField]:
+    """Yield the fields of an adjoint's terms that change with the placement; collective.
+
+    Parameters
+    ----------
+    name
+        See `by_field`.
+    normals
+        Directions in which places move.
+    """
+    scene, model = adjoint.scene, adjoint.scene.model
+    assert model.thin
+    shares = [
+        share
+        for i, place in enumerate(adjoint.places)
+        for share in _shares(adjoint, i, place, name)
+    ]
+    for field in fields_of_placement([share.term for share in shares]):
+        if scene.comm.allreduce(any(rate.any() for rate in rates(model, field, normals))):
+            yield field
 
 
 def _shares(adjoint: Adjoint, number: int, place: AdjointState, name: str) -> list[WeightedTerm]:
