@@ -67,13 +67,13 @@ class LawKeys(Section):
 
 
 @dataclass(frozen=True)
-class Rubber(Ability):
+class RubberMaterial(Ability):
     """A law of rubber."""
 
     law: str
 
     @classmethod
-    def from_context(cls, context: Context) -> "Rubber | None":
+    def from_context(cls, context: Context) -> "RubberMaterial | None":
         """Return the first of several shells that is of rubber."""
         laws = (law for law in laws_of(context) if law not in ("koiter", "laminate"))
         return next((cls(law) for law in laws), None)

@@ -14,7 +14,7 @@ from magshell_fenicsx.continuation.modes import ModesNotFound
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.parts.imperfections.imperfection import in_frame
 from magshell_fenicsx.parts.imperfections.modes import (
-    Mirrored,
+    MirroredMode,
     Mode,
     OfShells,
     Shape,
@@ -121,7 +121,7 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
             return on_surface(x[nodes], w[nodes], x[nodes])
         nodes_and_images = np.concatenate([nodes, node_count + nodes])
         function = on_surface(x[nodes_and_images], w[nodes_and_images], x[nodes])
-        return in_frame(Mirrored(function, mirror, sign), -scene.problem.azimuth)
+        return in_frame(MirroredMode(function, mirror, sign), -scene.problem.azimuth)
 
     nodes_of_shell = [np.flatnonzero(is_own) for is_own in is_of_shell]
     if len(nodes_of_shell) < 2:

@@ -409,7 +409,7 @@ class DeviationDifference:
 
 
 @dataclass(frozen=True)
-class _Mirrored:
+class _MirroredDeviation:
     """The mean of a deviation and its image: its part that half of a shell has."""
 
     deviation: Deviation
@@ -426,7 +426,9 @@ def _deviation(scene: Scene, sections: Imperfections, key: str) -> Deviation:
     geometries = imperfection_geometries(sections, reference_shell_of(problem.context.shell))
     geometry = list(geometries.values())[number]
     turned_deviation = in_frame(geometry.deviation, problem.azimuth)
-    return _Mirrored(turned_deviation, problem.mirror) if problem.mirror else turned_deviation
+    return (
+        _MirroredDeviation(turned_deviation, problem.mirror) if problem.mirror else turned_deviation
+    )
 
 
 def with_deviation(scene: Scene, deviation: Deviation) -> Scene:

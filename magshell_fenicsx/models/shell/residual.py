@@ -352,7 +352,7 @@ Serve = Callable[[Sequence[PointTerm]], FastResidual]
 
 
 @dataclass
-class Slope:
+class ParameterDerivative:
     """A term's derivative by parameters, with the amplitude of the term."""
 
     name: str
@@ -392,11 +392,13 @@ def point_parameters(
     return parameters
 
 
-def slopes(p: fem.Constant, terms: Sequence[PointTerm], words: str, serve: Serve) -> list[Slope]:
+def slopes(
+    p: fem.Constant, terms: Sequence[PointTerm], words: str, serve: Serve
+) -> list[ParameterDerivative]:
     """Return the derivatives, by a parameter, of those terms that it enters."""
     entered = [term for term in terms if any(q is p for q in term.density.parameters)]
     derivatives = [
-        Slope(f"{term.name} {words}", term.amplitude, derivative_by(term.density, p))
+        ParameterDerivative(f"{term.name} {words}", term.amplitude, derivative_by(term.density, p))
         for term in entered
     ]
     points = serve(derivatives) if derivatives else None

@@ -25,7 +25,7 @@ from magshell_fenicsx.parts.contact.projection import (
     Cells,
     Longs,
     Projections,
-    SearchLimits,
+    ProjectionLimits,
     UndeformedPairs,
     jets,
     near_spheres,
@@ -283,7 +283,7 @@ class ClosestPointSearch:
         pairs: tuple[Longs, Longs],
         cell: Longs,
         max_distance: float,
-    ) -> SearchLimits:
+    ) -> ProjectionLimits:
         """Return how far the nearest place of a separate surface is at most.
 
         Its nearest node within the largest distance is a place.
@@ -308,7 +308,7 @@ class ClosestPointSearch:
                 tree = scipy.spatial.cKDTree(r[nodes, :3])
                 distance, _ = tree.query(x[own_points, :3], distance_upper_bound=max_distance)
                 reach[own_points] = distance + variation + 2 * DISTANCE_TOLERANCE * self._h
-        return SearchLimits(are_separate[number[pairs[0]], number[pairs[1]]], reach)
+        return ProjectionLimits(are_separate[number[pairs[0]], number[pairs[1]]], reach)
 
     def projections_in_cells(
         self, points: ContactPoints, u: Array, r: Array, reach: float, *, least_only: bool = False

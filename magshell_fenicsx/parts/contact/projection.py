@@ -277,7 +277,7 @@ class UndeformedPairs:
 
 
 @dataclass(frozen=True)
-class SearchLimits:
+class ProjectionLimits:
     """How far the nearest place of a point is at most, where no other one is asked for.
 
     Attributes
@@ -329,7 +329,7 @@ def nearest_places(
     reach: float,
     max_distance: float = np.inf,
     undeformed: UndeformedPairs | None = None,
-    limits: SearchLimits | None = None,
+    limits: ProjectionLimits | None = None,
 ) -> tuple[Longs, Projections]:
     """Return the places of cells nearest to points, with the numbers of their pairs.
 
@@ -354,7 +354,7 @@ def nearest_places(
     nodal = r[cells.nodes[used_cells]]
     no_flags = np.zeros(len(cell), dtype=bool)
     positions, reference = nodal[..., :3], undeformed or UndeformedPairs(no_flags, r, x, 0.0)
-    search_limits = limits or SearchLimits(no_flags, np.zeros(len(x)))
+    search_limits = limits or ProjectionLimits(no_flags, np.zeros(len(x)))
     centres = positions.mean(axis=1)
     radii = CELL_RADIUS_FACTOR * np.linalg.norm(positions - centres[:, None], axis=2).max(axis=1)
     bounds = np.column_stack(

@@ -167,7 +167,7 @@ class Round:
 
 
 @dataclass(frozen=True)
-class Mirrored:
+class MirroredMode:
     """A mode on one side of a plane, and its image with a sign on the other: symmetric to the last
     digit.
     """

@@ -89,12 +89,12 @@ class RandomSection(ImperfectionSection):
         assert self.length
         length = half_width(self.length, reference.R_over_h, reference.nu)
         return ImperfectionGeometry(
-            Waves(self.amplitude / reference.R_over_h, length, self.seed), length
+            RandomWaves(self.amplitude / reference.R_over_h, length, self.seed), length
         )
 
 
 @dataclass(frozen=True)
-class Waves:
+class RandomWaves:
     """w0(x) = delta sqrt(2/N) sum_j cos(k_j . x/length + phase_j), k_j normal, phase_j uniform.
 
     The mean over seeds is zero, the covariance is delta^2 exp(-d^2/(2 length^2)) (Shinozuka and

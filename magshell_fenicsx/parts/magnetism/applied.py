@@ -230,7 +230,7 @@ class AppliedField:
 
 
 @dataclass(eq=False)
-class Amplitude:
+class FieldAmplitude:
     """The amplitude of a moving field, which takes the place of a constant in a form.
 
     Attributes
@@ -264,7 +264,7 @@ class Amplitude:
 
     def second_derivatives(self, q: Any) -> Sequence[Derivative]:
         """Return d2Pi/dmu dq by another amplitude, a constant, or a `q` with this method."""
-        if not isinstance(q, Amplitude):
+        if not isinstance(q, FieldAmplitude):
             if hasattr(q, "second_derivatives"):
                 derivatives: Sequence[Derivative] = q.second_derivatives(self)
                 return derivatives
@@ -321,7 +321,7 @@ def field_parameters(
             if isinstance(t, FormTerm) and field.polynomial in t.form.coefficients()
         ]
         for name in field.names:
-            p = Amplitude(field, name, terms_of_field, u, log)
+            p = FieldAmplitude(field, name, terms_of_field, u, log)
             slopes = p.slopes()
             for slope in slopes:
                 slope.compile_residual()

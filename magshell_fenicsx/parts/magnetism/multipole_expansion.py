@@ -30,7 +30,7 @@ SECOND_DERIVATIVES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # as in p
 
 
 @dataclass(frozen=True)
-class Surface:
+class SurfacePoints:
     """Places, normals and dual bases (rows, P, 3) of points on the mid-surface."""
 
     r: Array
@@ -38,7 +38,7 @@ class Surface:
     dual_basis: tuple[Array, Array]
 
     @classmethod
-    def from_nodes(cls, nodes: Array, tables: Array) -> "Surface":
+    def from_nodes(cls, nodes: Array, tables: Array) -> "SurfacePoints":
         r, a1, a2 = np.tensordot(nodes, tables, axes=(1, 2)).transpose(3, 0, 2, 1)
         m = np.cross(a1, a2)
         size = np.linalg.norm(m, axis=-1, keepdims=True)
@@ -62,7 +62,7 @@ class PlacedCharges:
     """
 
     Y: Array
-    surfaces: list[Surface]
+    surfaces: list[SurfacePoints]
     heights: list[Array]
 
 
@@ -96,7 +96,7 @@ class MultipoleExpansion:
     def place_charges(self, nodes: Array) -> PlacedCharges:
         """Return the charges on cells with nodes (cells, k, 3)."""
         surfaces = [
-            Surface.from_nodes(nodes[cells], points.tables) for cells, points in self._kinds
+            SurfacePoints.from_nodes(nodes[cells], points.tables) for cells, points in self._kinds
         ]
         heights = [points.t[..., None] * points.heights for _, points in self._kinds]
         points_of_kinds = zip(surfaces, heights, strict=True)

@@ -201,14 +201,14 @@ Branches = Annotated[list[BranchSection], Field(max_length=20)]
 
 
 @dataclass(frozen=True)
-class Viscosity(Ability):
+class ViscousMaterial(Ability):
     """The viscosity and relaxation of a shell."""
 
     viscosity: float | str | None
     branches: Sequence[BranchSection]
 
     @classmethod
-    def from_context(cls, context: Context) -> "Viscosity | None":
+    def from_context(cls, context: Context) -> "ViscousMaterial | None":
         shell = context.shell
         return (
             cls(shell.viscosity, shell.relaxation)

@@ -25,7 +25,7 @@ from magshell_fenicsx.assembly.terms import FormTerm, LinearTerm, Term, factor_o
 from magshell_fenicsx.continuation.system import State
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.models.shell import spatial_fields
-from magshell_fenicsx.models.shell.residual import Slope
+from magshell_fenicsx.models.shell.residual import ParameterDerivative
 from magshell_fenicsx.models.shell.spatial_fields import PlacementField, Uniform
 from magshell_fenicsx.models.shell.thickness import Thickness
 from magshell_fenicsx.parts.natural.planned import frame
@@ -269,7 +269,7 @@ def _of_parameters(scene: Scene, place: AdjointState, name: str) -> list[Weighte
     system, c, shares = scene.model.system, place.conjugates, list[WeightedTerm]()
     for parameter in c.keys() & system.parameters.keys():
         for slope in system.parameters[parameter].slopes:
-            if isinstance(slope, Slope) and not slope.density.on_edges:
+            if isinstance(slope, ParameterDerivative) and not slope.density.on_edges:
                 slope = _as_form(scene, slope)
             if not isinstance(slope, FormTerm):
                 raise CaseError(
@@ -281,7 +281,7 @@ def _of_parameters(scene: Scene, place: AdjointState, name: str) -> list[Weighte
     return shares
 
 
-def _as_form(scene: Scene, slope: Slope) -> FormTerm:
+def _as_form(scene: Scene, slope: ParameterDerivative) -> FormTerm:
     """A derivative at points as a form."""
     assert scene.model.thin
     domain = scene.model.domain

@@ -8,7 +8,7 @@ import pytest
 from magshell_fenicsx.case.case import Case
 from magshell_fenicsx.case.planner import make_problem
 from magshell_fenicsx.input.source import CaseError, Source
-from magshell_fenicsx.parts.imperfections.random import Waves
+from magshell_fenicsx.parts.imperfections.random import RandomWaves
 
 DIMPLES = {"count": 4, "amplitude": {"kind": "uniform", "above": 0.2, "below": 1.0}, "width": 2.0}
 
@@ -34,7 +34,7 @@ def test_size_and_correlation_of_the_field() -> None:
     errors.
     """
     x = np.column_stack([np.linspace(0, 0.6, 13), np.zeros(13), np.ones(13)])
-    w0 = np.array([Waves(1.0, 0.2, seed)(x) for seed in range(400)])
+    w0 = np.array([RandomWaves(1.0, 0.2, seed)(x) for seed in range(400)])
     correlation = np.mean(w0[:, :1] * w0, axis=0)
     assert np.mean(w0**2) == pytest.approx(1, abs=0.09)
     assert correlation == pytest.approx(np.exp(-((x[:, 0] / 0.2) ** 2) / 2), abs=3 / np.sqrt(400))
@@ -46,9 +46,9 @@ def test_size_and_correlation_of_the_field() -> None:
 def test_a_seed_is_one_field_everywhere() -> None:
     """The values are written down here: no machine, version or number of places may change them."""
     x = np.array([[0.0, 0.0, 1.0], [0.6, 0.0, 0.8], [0.0, -1.0, 0.0]])
-    assert Waves(1.0, 0.3, 7)(x) == pytest.approx(WRITTEN, abs=1e-12)
+    assert RandomWaves(1.0, 0.3, 7)(x) == pytest.approx(WRITTEN, abs=1e-12)
     many = np.tile(x, (1400, 1))
-    assert Waves(1.0, 0.3, 7)(many)[-3:] == pytest.approx(WRITTEN, abs=1e-12)
+    assert RandomWaves(1.0, 0.3, 7)(many)[-3:] == pytest.approx(WRITTEN, abs=1e-12)
 
 
 WRITTEN = [-0.18993069089806358, 0.31557400662418295, 1.7947743670257714]

@@ -35,7 +35,7 @@ class Linear:
 
 
 @dataclass(frozen=True)
-class Sum:
+class FieldSum:
     """The sum of some fields, perhaps of none."""
 
     parts: Sequence[FieldInSpace]
@@ -135,7 +135,7 @@ def in_space(
     if rotations:
         moving_fields += [MovingField(part, rotations) for part in parts]
         parts = []
-    return Sum(parts), tuple(moving_fields)
+    return FieldSum(parts), tuple(moving_fields)
 
 
 def _moving_source(
