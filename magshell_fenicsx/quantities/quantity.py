@@ -263,8 +263,9 @@ class Quantity:
 
         Examples
         --------
-        >>> [Quantity("", "", "", "load", symbol).ascii_symbol for symbol in ("p/p_c", "λ_m",
-        "ΔV/R³")] ['p/pc', 'lambda_m', 'dV/R^3']
+        >>> symbols = ("p/p_c", "λ_m", "ΔV/R³")
+        >>> [Quantity("", "", "", "load", symbol).ascii_symbol for symbol in symbols]
+        ['p/pc', 'lambda_m', 'dV/R^3']
         """
         return plain_text(re.sub(r"(?<=[A-Za-z])_", "", self.symbol)) or self.words
 

@@ -233,8 +233,10 @@ def _unit(result: str) -> str:
 
     Examples
     --------
-    >>> [_unit(name) for name in ("buckling_pressure_Pa", "tip_uz_mm", "w_mm", "knockdown",
-    "w_over_h", "hertz_2")] ['Pa', 'mm', 'mm', 'load', 'h', 'Hz']
+    >>> [_unit(name) for name in ("buckling_pressure_Pa", "tip_uz_mm", "w_mm")]
+    ['Pa', 'mm', 'mm']
+    >>> [_unit(name) for name in ("knockdown", "w_over_h", "hertz_2")]
+    ['load', 'h', 'Hz']
     """
     if matched := re.fullmatch(r"(omega2|hertz)_\d+", result):
         return {"omega2": "omega2", "hertz": "Hz"}[matched[1]]

@@ -137,8 +137,9 @@ def correlation(x: Array, y: Array) -> tuple[float, float]:
 
     Examples
     --------
-    >>> [round(float(each), 4) for each in correlation(np.arange(4.0), np.arange(4.0))]  # 2 of 24
-    orders [1.0, 0.0833]
+    >>> x = np.arange(4.0)
+    >>> [round(float(each), 4) for each in correlation(x, x)]  # 2 of 24 orders
+    [1.0, 0.0833]
     """
     from scipy.stats import permutation_test, rankdata, spearmanr
 

@@ -23,8 +23,10 @@ def key_words(key: str, unit: str = "") -> str:
     --------
     >>> key_words("magnetic.applied.flux_density"), key_words("shell.radius_to_thickness")
     ('applied flux density', 'radius over thickness  $R/h$')
-    >>> key_words("shell.defect.amplitude"), key_words("shell.defect.amplitude", "mm"),
-    key_words("loading.0.factor") ('amplitude over $h$', 'amplitude', 'factor of step 1')
+    >>> key_words("shell.defect.amplitude"), key_words("shell.defect.amplitude", "mm")
+    ('amplitude over $h$', 'amplitude')
+    >>> key_words("loading.0.factor")
+    'factor of step 1'
     >>> key_words("magnetic.applied.sources.0.position.2"), key_words("shell.polar")
     ('position z', 'polar angle of shell')
     """
@@ -65,8 +67,10 @@ def load_text(row: Mapping[str, Any], name: str) -> str:
 
     Examples
     --------
-    >>> load_text({"load": 0.5}, "pressure"), load_text({"load": 0.5, "pressure_Pa": 61.25},
-    "pressure") ('p/pc = 0.5', 'p = 61.25 Pa')
+    >>> load_text({"load": 0.5}, "pressure")
+    'p/pc = 0.5'
+    >>> load_text({"load": 0.5, "pressure_Pa": 61.25}, "pressure")
+    'p = 61.25 Pa'
     """
     load_quantity = shown_quantity(amplitude(name).column, row)
     return f"{load_quantity.ascii_symbol} = {row.get(load_quantity.name, row['load']):.9g}" + (
@@ -90,9 +94,10 @@ def result_words(result: str) -> str:
 
     Examples
     --------
-    >>> result_words("tip_fz"), result_words("omega2_1"), result_words("hertz_2"),
-    result_words("knockdown") ('$f_z$ of tip', '$\\\\omega_{1}^2 \\\\rho R^2/E$', 'frequency 2',
-    'knockdown factor $k_\\\\mathrm{d}$')
+    >>> result_words("tip_fz"), result_words("omega2_1")
+    ('$f_z$ of tip', '$\\\\omega_{1}^2 \\\\rho R^2/E$')
+    >>> result_words("hertz_2"), result_words("knockdown")
+    ('frequency 2', 'knockdown factor  $k_\\\\mathrm{d}$')
     >>> result_words("tip_uz_mm"), result_words("buckling_pressure_Pa")
     ('$u_z$ of tip', 'buckling pressure')
     """

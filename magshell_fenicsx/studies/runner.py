@@ -230,8 +230,10 @@ def remaining_time_text(seconds: float, prefix: str = "about ") -> str:
 
     Examples
     --------
-    >>> remaining_time_text(600.0), remaining_time_text(8.0), remaining_time_text(30.0, "at most
-    about ") (', about 10 min left', '', ', at most about 30 s left')
+    >>> remaining_time_text(600.0), remaining_time_text(8.0)
+    (', about 10 min left', '')
+    >>> remaining_time_text(30.0, "at most about ")
+    ', at most about 30 s left'
     """
     if seconds < LEAST_LEFT:
         return ""
@@ -246,8 +248,10 @@ def _remaining_by_count(seconds: float, done_count: int, count: int) -> str:
 
     Examples
     --------
-    >>> _remaining_by_count(60.0, 1, 11), _remaining_by_count(60.0, 10, 11),
-    _remaining_by_count(90.0, 4, 5) (', about 10 min left', '', ', about 22 s left')
+    >>> _remaining_by_count(60.0, 1, 11), _remaining_by_count(60.0, 10, 11)
+    (', about 10 min left', '')
+    >>> _remaining_by_count(90.0, 4, 5)
+    ', about 22 s left'
     """
     return remaining_time_text(seconds * (count / done_count - 1))
 

@@ -61,7 +61,7 @@ def test_the_remanence_is_drawn_on_the_edges_of_the_shell(
         np.array([[0.0, 0, 0], [2, 0, 0], [np.nan] * 3, [2, 1, 0], [0, 1, 0]]),
     )
     vary: Any = SimpleNamespace(
-        controls=SimpleNamespace(places=places, around=False),
+        controls=SimpleNamespace(places=places, is_axisymmetric=False),
         vectors=lambda x: np.eye(3),
         remanence=SimpleNamespace(planar=False),
         fields=[],
