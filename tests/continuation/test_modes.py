@@ -1,5 +1,6 @@
 """The eigenpair nearest to zero, and the lowest ones, of matrices whose spectra are known."""
 
+import os
 import subprocess
 import sys
 
@@ -180,10 +181,10 @@ def shared() -> None:
 @pytest.mark.slow
 def test_same_on_any_number_of_ranks() -> None:
     """Value and vector, but for its sign, though the start depends on the rows of each rank."""
-    found = []
+    found, env = [], {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     for ranks in (1, 2):
         command = [*mpirun(ranks), sys.executable, __file__]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+        done = subprocess.run(command, capture_output=True, text=True, check=False, env=env)
         assert done.returncode == 0, done.stderr
         found.append(np.loadtxt(done.stdout.splitlines()))
     for other in found[1:]:

@@ -238,7 +238,8 @@ class SurfaceContact(ContactTerm):
 
         Blocks of places in the same pair of cells are summed.
         """
-        places, joined_places, (_, slope, curvature) = self._active_set()
+        active_set = self._active_set()
+        places, joined_places, (_, slope, curvature) = active_set
         if not len(places.point):
             return no_entries()
         is_blurred = joined_places.several[joined_places.group]
@@ -251,9 +252,8 @@ class SurfaceContact(ContactTerm):
         blocks = self._blocks(places.select(order), weight[order], first[order], second[order])
         rows, columns, values = (list(parts) for parts in zip(*blocks, strict=True))
         if joined_places.several.any():
-            for parts, added in zip(
-                (rows, columns, values), self._entries_of_joints(), strict=True
-            ):
+            of_joints = self._entries_of_joints(*active_set)
+            for parts, added in zip((rows, columns, values), of_joints, strict=True):
                 parts.append(added)
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
 
@@ -287,9 +287,15 @@ class SurfaceContact(ContactTerm):
             blocks.append((i.ravel(), j.ravel(), sums.ravel()))
         return blocks
 
-    def _entries_of_joints(self) -> Entries:
-        """Return what places that are joined as one have besides the entries of each."""
-        places, joined_places, (_, slope, curvature) = self._active_set()
+    def _entries_of_joints(
+        self, places: Projections, joined_places: JoinedPlaces, penalties: Penalty
+    ) -> Entries:
+        """Return what places that are joined as one have besides the entries of each.
+
+        The active set is an argument: to find it is collective, and joined places may lie on one
+        rank only.
+        """
+        _, slope, curvature = penalties
         is_blurred = joined_places.several[joined_places.group]
         _, n, beta, nodes = self._geometry(places.select(is_blurred))
         slopes = joined_places.weight[is_blurred, None, None] * distance_slopes(

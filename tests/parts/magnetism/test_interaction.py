@@ -483,7 +483,7 @@ def test_gradient_beside_a_neighbour(model: Any, tmp_path: Path) -> None:
         return run(case_of(tmp_path / "strips.msh", 0.2, "20 MPa", **sections))
 
     found, key, d = ran(BR), "magnetic.remanent.flux_density", 1e-4
-    slope = gradient_of(found.scene, found.latest, of="tip_uz_mm", by=key)[key]
+    slope = gradient_of(found.scene, found.last_record, of="tip_uz_mm", by=key)[key]
     tips = [ran(BR + side * d).rows[-1]["tip_uz_mm"] for side in (1, -1)]
     assert slope == pytest.approx((tips[0] - tips[1]) / (2 * d), rel=1e-5)
 
@@ -636,7 +636,7 @@ def test_gradients_by_thickness_and_shape_beside_a_neighbour(
         return float(tips[0] - tips[1]) / (2 * d)
 
     found = ran()
-    by = gradient_of(found.scene, found.latest, of="tip_uz_mm", by=["thickness", "deviation"])
+    by = gradient_of(found.scene, found.last_record, of="tip_uz_mm", by=["thickness", "deviation"])
     x = by["thickness"].places[..., :1]
     thicker = slope(1e-3, lambda e: {"thickness_factor": f"1 + {e!r}*x"})
     assert by["thickness"].along(x) == pytest.approx(thicker, rel=1e-6)
@@ -664,7 +664,7 @@ def test_gradient_by_the_remanence_of_a_neighbour(model: Any, tmp_path: Path) ->
         return run(case_of(tmp_path / "strips.msh", 0.2, "20 MPa", **sections))
 
     found, d = ran(0.0), 1e-3
-    by = gradient_of(found.scene, found.latest, of="tip_uz_mm", by="remanence")["remanence"]
+    by = gradient_of(found.scene, found.last_record, of="tip_uz_mm", by="remanence")["remanence"]
     x, y, z = np.moveaxis(by.places, -1, 0)
     tips = [ran(side * d).rows[-1]["tip_uz_mm"] for side in (1, -1)]
     assert by.along(np.stack([x, y, z * x], axis=-1)) == pytest.approx(
