@@ -45,22 +45,25 @@ PETSC_PREFIXES = (
 
 
 def _hand_over_to_petsc(words: list[str]) -> None:
-    """Take PETSc's options, which come last, off the words of a command; PETSc reads them when it
-    is imported.
+    """Take PETSc's options off the words of a command; changes `words`.
+
+    They come last in a command. PETSc reads them from the environment when it is imported.
     """
-    first = next((i for i, word in enumerate(words) if word.startswith(PETSC_PREFIXES)), len(words))
-    for word in words[first:]:
+    first_option = next(
+        (i for i, word in enumerate(words) if word.startswith(PETSC_PREFIXES)), len(words)
+    )
+    for word in words[first_option:]:
         if word.startswith("--") or word.endswith((".yaml", ".yml")):
             sys.exit(
                 failure(
-                    f"{word} comes after {words[first]}: options of PETSc come last", INVALID
+                    f"{word} comes after {words[first_option]}: options of PETSc come last", INVALID
                 ).exit_code
             )
-    if words[first:]:
+    if words[first_option:]:
         os.environ["PETSC_OPTIONS"] = " ".join(
-            [os.environ.get("PETSC_OPTIONS", ""), *words[first:]]
+            [os.environ.get("PETSC_OPTIONS", ""), *words[first_option:]]
         )
-    del words[first:]
+    del words[first_option:]
 
 
 def case_of_source(source: Any) -> Any:

@@ -65,9 +65,9 @@ def case_files(incomplete: str) -> list[str]:
 
 
 def left_to_the_shell() -> list[str]:
-    """Return no completions, so that the shell completes files.
+    """Return no completions, so that the shell completes names of files.
 
-    By default it would only add a blank.
+    By default the shell would only add a blank.
     """
     return []
 
@@ -89,7 +89,7 @@ Over = Annotated[
 
 
 def result_option(begin: str = "") -> Any:
-    """Return the option that names a result; `begin` is that of its help."""
+    """Return the option that names a result; its help starts with `begin`."""
     return typer.Option(
         "--result",
         metavar="NAME",
@@ -119,7 +119,7 @@ Runs = Annotated[
 
 
 def points_of(text: str | None) -> list[int]:
-    """Return the numbers of points in `--shapes`.
+    """Return the numbers of points in `--shapes`, such as "0,12,40"; none without the option.
 
     Raises
     ------
@@ -140,7 +140,10 @@ def folder_option(default: str) -> Any:
 
 
 def chosen_folder(out: str | None, default: str) -> Path:
-    """Return the folder of an option, or the default one in results/."""
+    """Return the folder that an option names, or the default folder in results/.
+
+    The command ends if the option is no usable folder.
+    """
     from magshell_fenicsx.output.store.folder import user_folder
 
     with exit_codes():
@@ -155,7 +158,18 @@ def picture_options(
     camera: str | None,
     ranges: Sequence[str],
 ) -> dict[str, Any]:
-    """Return the options that a command has, as keys of the section `output`.
+    """Return the options of pictures as keys of the section `output`; options of None are left out.
+
+    Parameters
+    ----------
+    formats
+        Kinds of files, such as "svg,pdf".
+    width, dpi, font_size
+        Width of a picture in mm, pixels per inch, and size of text in points.
+    camera
+        "POLAR,AZIMUTH" in degrees.
+    ranges
+        Texts "FIELD=LOW:HIGH".
 
     Raises
     ------
@@ -181,7 +195,13 @@ def picture_options(
 
 
 def _numbers(text: str, separator: str, message: str) -> tuple[float, float]:
-    """Return two numbers; `message` is that of a refusal."""
+    """Return the two numbers of a text, joined by a separator.
+
+    Raises
+    ------
+    CaseError
+        With `message`, if the text has not two numbers.
+    """
     try:
         first, second = map(float, text.split(separator))
     except ValueError:
@@ -196,9 +216,14 @@ def print_line(line: str) -> None:
 
 
 def failure(message: str, code: int) -> typer.Exit:
-    """Print the message of an error once, and return the end of this rank.
+    """Print the message of an error once, and return the exception that ends this rank.
 
-    All ranks are ended if the others have no error.
+    The caller raises it. If the other ranks have no error, all ranks are aborted at once.
+
+    Parameters
+    ----------
+    code
+        Exit code: `INVALID` or `STOPPED`.
     """
     comm = world()
     if comm.size > 1 and not _all_fail(comm):
@@ -214,33 +239,44 @@ def failure(message: str, code: int) -> typer.Exit:
 
 
 def _all_fail(comm: Any) -> bool:
-    """Return whether all ranks come here within a delay, as they do with an error of all."""
+    """Return whether all ranks come here within a delay, as they do with an error of all ranks.
+
+    Parameters
+    ----------
+    comm
+        Communicator of all ranks; each sends a message to every other rank.
+    """
     from mpi4py import MPI
 
-    others = [rank for rank in range(comm.size) if rank != comm.rank]
-    end = time.monotonic() + MAX_DELAY_OF_ERRORS
-    for rank in others:
+    other_ranks = [rank for rank in range(comm.size) if rank != comm.rank]
+    deadline = time.monotonic() + MAX_DELAY_OF_ERRORS
+    for rank in other_ranks:
         comm.Isend(bytearray(1), rank, FAILURE_TAG)
     # no collective: others may be in one
-    requests = [comm.Irecv(bytearray(1), rank, FAILURE_TAG) for rank in others]
+    requests = [comm.Irecv(bytearray(1), rank, FAILURE_TAG) for rank in other_ranks]
     while not MPI.Request.Testall(requests):
-        if time.monotonic() > end:
+        if time.monotonic() > deadline:
             return False
         time.sleep(0.01)
     return True
 
 
 def refuse_lost() -> None:
-    """End a command whose only result is what it prints, if that was not written."""
+    """End a command whose only result is printed text, if this text was not written."""
     if terminal.output_failures:
         raise failure(f"stopped early: {terminal.output_failures[0]}", STOPPED)
 
 
 @contextmanager
 def exit_codes(stopped: tuple[type[Exception], ...] = ()) -> Iterator[None]:
-    """Turn an invalid input or an early stop into a message and its exit code.
+    """Turn an invalid input or an early stop into a message and the exit code of the command.
 
-    An early stop is also a kernel that cannot be written.
+    A kernel that cannot be written counts as an early stop too.
+
+    Parameters
+    ----------
+    stopped
+        Exceptions of an early stop.
     """
     try:
         yield

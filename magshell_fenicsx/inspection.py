@@ -144,7 +144,7 @@ def check(case: CaseFile, set_: Settings = None) -> None:
 
 @contextmanager
 def placing_messages(case: "Case") -> Iterator[None]:
-    """Give messages of the block the place of their key in the case file."""
+    """Context in which messages of a `CaseError` get the place of their key in the case file."""
     try:
         yield
     except CaseError as e:

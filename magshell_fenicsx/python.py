@@ -67,7 +67,7 @@ class Shell:
         is, its named points, its elements (`{"size": "2 mm"}`) and its remanence, as a case has
         them under `shells`.
     keys
-        What else a case has under `shell`: thickness, youngs_modulus, poisson_ratio, ... The
+        Further keys of a case under `shell`: thickness, youngs_modulus, poisson_ratio, ... The
         thickness times `thickness_factor`, a formula of the place x, y, z over R or a function, is
         that of each place. A function is interpolated with x in the coordinates of the mesh, in mm
         for instance; a formula never has these.
@@ -141,7 +141,7 @@ class Shell:
             self._keys["radius"] = f"{half_extent!r} {unit or 'm'}" if has_units else half_extent
 
     def one_of_several(self) -> Keys:
-        """Return the keys of a case under `shells` and the shell's name."""
+        """Return the section of a case for this shell, under `shells` and the shell's name."""
         keys = {
             key: self.plain_value(value, key)
             for key, value in self._member_keys.items()
@@ -150,7 +150,13 @@ class Shell:
         return {"shell": self.section(), "boundary": {}, **keys}
 
     def section(self) -> Keys:
-        """Return the keys of a case under `shell`."""
+        """Return the section `shell` of a case.
+
+        Raises
+        ------
+        CaseError
+            If the shell has keys that only one of several shells may have, but no name.
+        """
         member_keys = [key for key, value in self._member_keys.items() if value is not None]
         if self.name is None and member_keys:
             raise CaseError(
@@ -160,7 +166,15 @@ class Shell:
         return {key: self.plain_value(value, f"shell.{key}") for key, value in self._keys.items()}
 
     def plain_value(self, value: Any, key: str) -> Any:
-        """Return a value as a case file has it, or a function on the mesh."""
+        """Return a value as a case file has it: plain lists, mappings, numbers and text.
+
+        A function on the mesh becomes a `UserField`.
+
+        Parameters
+        ----------
+        key
+            Key of the value in the case, for messages.
+        """
         if isinstance(value, fem.Function):
             return self.user_field(value, key)
         if isinstance(value, np.ndarray | np.generic):
@@ -172,12 +186,17 @@ class Shell:
         return value
 
     def user_field(self, function: fem.Function, key: str) -> UserField:
-        """Return a function on the mesh as a case has it.
+        """Return a function on the shell's dolfinx mesh as a field of a case.
+
+        Parameters
+        ----------
+        key
+            Key of the function in the case, for messages.
 
         Raises
         ------
         MeshError
-            If it is on another mesh, or of a space that is none of polynomials.
+            If the function is on another mesh, or its space is not one of polynomials.
         CaseError
             If the shell has no mesh.
         """
@@ -188,14 +207,14 @@ class Shell:
 
 @dataclass(frozen=True)
 class ProblemPart:
-    """Part that `Problem` is made of: a section of a case, or a step of its programme.
+    """Part of a `Problem`: a section of a case, or a step of its programme.
 
     Attributes
     ----------
     key
         Key of the section; "loading" of a step.
     keys
-        Shell -> the keys of the section.
+        Function of the shell with the keys of the section and their values.
     """
 
     key: str
@@ -203,15 +222,21 @@ class ProblemPart:
 
 
 def Section(key: str, **keys: Any) -> ProblemPart:
-    """Any section of a case, in its words: `Section("foundation", stiffness=0.02)`,
-    `Section("natural", ...)`.
+    """Any section of a case, in its words: `Section("foundation", stiffness=0.02)`, ...
 
-    One that is a list is a keyword of `Problem`: `joints=[...]`, `contact=[...]`.
+    A section that is a list is a keyword of `Problem` instead: `joints=[...]`, `contact=[...]`.
+
+    Parameters
+    ----------
+    key
+        Name of the section in a case, such as "natural".
+    keys
+        Keys of the section.
 
     Raises
     ------
     CaseError
-        If the section or a key of it is none of a case.
+        If a case has no such section, or the section has no such key.
     """
     if key not in Case.model_fields:
         raise CaseError(f"{NAME}: {key}: {unknown(key, Case.model_fields, 'section')}")
@@ -224,13 +249,19 @@ def Section(key: str, **keys: Any) -> ProblemPart:
 
 
 def Step(kind: str, **keys: Any) -> ProblemPart:
-    """A step of the programme, of any kind of a case: "dead", "indentation", "field", "natural",
-    "contact", ...
+    """A step of the programme, of any kind that a case has.
+
+    Parameters
+    ----------
+    kind
+        "dead", "indentation", "field", "natural", "contact", ...
+    keys
+        Further keys of the step in a case.
 
     Raises
     ------
     CaseError
-        If the kind or a key of it is none of a case.
+        If a case has no such kind, or the step has no such key.
     """
     kind = dict(FORMER_KINDS).get(kind, kind)
     if kind not in STEPS:
@@ -247,7 +278,15 @@ def Pressure(**keys: Any) -> ProblemPart:
 
 
 def Force(at: Mapping[str, Any] | str, **keys: Any) -> ProblemPart:
-    """A force along the inward normal, at a named point, or at angles as in a case."""
+    """A force along the inward normal at one point.
+
+    Parameters
+    ----------
+    at
+        Name of a point, or angles as in a case.
+    keys
+        Further keys of the step "indentation".
+    """
     return Step("indentation", at={"point": at} if isinstance(at, str) else at, **keys)
 
 
@@ -262,7 +301,15 @@ def Hinged(*names: str) -> ProblemPart:
 
 
 def Held(name: str, components: str) -> ProblemPart:
-    """An edge, a patch or a named point without displacements along some axes, such as "xz"."""
+    """A support without displacements along some axes.
+
+    Parameters
+    ----------
+    name
+        An edge, a patch or a named point.
+    components
+        Axes along which it cannot move, such as "xz".
+    """
     return _supports({"held": list(components)}, [name])
 
 
@@ -272,6 +319,7 @@ def OnPlane(*names: str) -> ProblemPart:
 
 
 def _supports(condition: Any, names: Sequence[str]) -> ProblemPart:
+    """Return a part that gives several named edges, patches or points one support condition."""
     return ProblemPart("boundary", lambda shell: dict.fromkeys(names, condition))
 
 
@@ -294,6 +342,7 @@ def Field(
     """
 
     def magnetic_keys(shell: Shell) -> Keys:
+        """Return the section `magnetic` of a case with this shell."""
         dimensionless = lambda_m is not None
         section: Keys = {
             "remanent": _flux(remanent, shell, "magnetic.remanent", dimensionless=dimensionless),
@@ -310,19 +359,19 @@ def Field(
 def _refuse_metres(
     extents: NDArray[np.float64], radius: float | str | None, thickness: str
 ) -> None:
-    """Check that the bounds of a mesh without a unit are those of a shell in metres.
+    """Check that the bounds of a mesh without a unit may be those of a shell in metres.
 
     Parameters
     ----------
     extents
-        (3,) of the mesh along its axes.
+        (3,), lengths of the mesh along its axes.
     radius, thickness
-        As they were given.
+        As the user has given them; a radius of None is not compared.
 
     Raises
     ------
     CaseError
-        If they are far from the radius, or from what a thickness goes with.
+        If the largest extent is far from the radius, or from that of a shell with this thickness.
     """
     extent = float(extents.max())
     bounds = " x ".join(f"{length:.4g}" for length in extents)
@@ -341,7 +390,13 @@ def _refuse_metres(
 
 
 def _in_metres(length: Any) -> float | None:
-    """Return a length in metres; None if it is no positive one, which is refused elsewhere."""
+    """Return a length in metres; None if it is no positive length, which is refused elsewhere.
+
+    Parameters
+    ----------
+    length
+        Number, or text with a unit.
+    """
     try:
         metres = float(in_units("metre")(length))
     except (TypeError, ValueError):
@@ -350,26 +405,46 @@ def _in_metres(length: Any) -> float | None:
 
 
 def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys:
-    """Return a flux density in the words of a case."""
+    """Return a remanence or an applied field as a case has it under `magnetic`.
+
+    Parameters
+    ----------
+    value
+        See `Field`.
+    key
+        "magnetic.remanent" or "magnetic.applied".
+    dimensionless
+        Whether vectors are over their magnitudes, rather than in tesla.
+
+    Raises
+    ------
+    CaseError
+        If it is no vector of three numbers or formulas.
+    """
 
     def of_size(tesla: float) -> Keys:
+        """Return the key of a magnitude in tesla; no key in a dimensionless problem."""
         return {} if dimensionless else {"flux_density": f"{tesla!r} T"}
 
-    kind = {"kind": "expression"} if key.endswith("remanent") else {}
+    expression_kind = {"kind": "expression"} if key.endswith("remanent") else {}
     if isinstance(value, Mapping):
         return {name: shell.plain_value(item, f"{key}.{name}") for name, item in value.items()}
     if isinstance(value, str):
         return {"kind": value}
     if isinstance(value, fem.Function):
         field = shell.user_field(value, key)
-        size = 1.0 if dimensionless else float(np.linalg.norm(field.largest)) or 1.0
-        return {**kind, "components": field.mapped(lambda B: np.asarray(B / size)), **of_size(size)}
+        magnitude = 1.0 if dimensionless else float(np.linalg.norm(field.largest)) or 1.0
+        return {
+            **expression_kind,
+            "components": field.mapped(lambda B: np.asarray(B / magnitude)),
+            **of_size(magnitude),
+        }
     components = shell.plain_value(value, key)
     if not isinstance(components, list) or len(components) != 3:
         raise CaseError(f"{NAME}: {key}: {components}: a vector has three components")
     has_direction = any(components) or not dimensionless  # zero has a size, and no direction
     if not has_direction or any(isinstance(item, str) for item in components):
-        return {**kind, "components": list(map(str, components)), **of_size(1.0)}
+        return {**expression_kind, "components": list(map(str, components)), **of_size(1.0)}
     try:
         x, y, z = map(float, components)
     except (TypeError, ValueError):
@@ -388,13 +463,13 @@ def Problem(
     symmetry: Literal["auto", "none", "half", "axisymmetric"] | None = None,
     **sections: Any,
 ) -> problem.Problem:
-    """A complete problem, for `follow`, `Scene` and what takes one.
+    """A complete problem, for `follow`, `Scene` and other functions that take a problem.
 
     Parameters
     ----------
     shell
-        What is computed; or several, each with a name: `Clamped("upper.rim")` then holds the rim of
-        `upper`.
+        The shell that is computed; or several, each with a name: `Clamped("upper.rim")` then holds
+        the rim of `upper`.
     parts
         Supports, fields, steps and other sections, and one's own energies. The steps are a
         programme in this order; before a single one the natural shape grows and the field is
@@ -402,29 +477,33 @@ def Problem(
     points
         Name -> place, in the lengths of the shell; of a mesh a vertex, in its coordinates.
     degree
-        Of the displacement.
+        Polynomial degree of the displacement.
     symmetry
         As in a case; by default all of a mesh, and of other shapes the smallest part that all
         allow.
     sections
-        Others of a case, by key.
+        Other sections of a case, by key.
 
     Raises
     ------
     CaseError, MeshError
         One message with every mistake; on every rank.
     """
-    several = list(shell) if isinstance(shell, list | tuple) else []
-    if several:
-        shell = several[0]
-        _refuse_unfit_shells(several)
+    member_shells = list(shell) if isinstance(shell, list | tuple) else []
+    if member_shells:
+        shell = member_shells[0]
+        _refuse_unfit_shells(member_shells)
     if not isinstance(shell, Shell):
         raise CaseError(f"{NAME}: {shell!r}: the first argument is what ms.Shell gives")
-    data = {**_shell_data(shell, several), "boundary": {}, **shell.plain_value(sections, "case")}
-    steps, terms = list[Keys](), list[OwnTerm]()
+    case_data = {
+        **_shell_data(shell, member_shells),
+        "boundary": {},
+        **shell.plain_value(sections, "case"),
+    }
+    steps, own_terms = list[Keys](), list[OwnTerm]()
     for part in parts:
         if isinstance(part, OwnTerm):
-            terms.append(_on_mesh(part, shell))
+            own_terms.append(_on_mesh(part, shell))
         elif not isinstance(part, ProblemPart):
             raise CaseError(
                 f"{NAME}: {part!r}: allowed are what ms.Clamped, ms.Field, ms.Step, ... give, and "
@@ -433,35 +512,37 @@ def Problem(
         elif part.key == "loading":
             steps.append(part.keys(shell))
         else:
-            _join(data, part.key, part.keys(shell))
-    if steps and "loading" in data:
+            _join(case_data, part.key, part.keys(shell))
+    if steps and "loading" in case_data:
         raise CaseError(f"{NAME}: loading: is given twice, as steps and as a section")
     if steps:
-        data["loading"] = steps[0] if len(steps) == 1 else steps
-    _join(data, "points", shell.plain_value(points or {}, "points"))
-    if several:
-        _distribute(data)
+        case_data["loading"] = steps[0] if len(steps) == 1 else steps
+    _join(case_data, "points", shell.plain_value(points or {}, "points"))
+    if member_shells:
+        _distribute(case_data)
     if degree is not None:
-        _join(data, "mesh", {"degree": degree})
+        _join(case_data, "mesh", {"degree": degree})
     if symmetry or shell.user_mesh:
-        data["symmetry"] = symmetry or "none"
-    return Case.from_source(Source(NAME, data, files=shell.files)).with_terms(terms).problem()
+        case_data["symmetry"] = symmetry or "none"
+    return (
+        Case.from_source(Source(NAME, case_data, files=shell.files)).with_terms(own_terms).problem()
+    )
 
 
 def _shell_data(shell: Shell, several: Sequence[Shell]) -> Keys:
-    """Return the data of a case of a shell, or of several."""
+    """Return the section `shell` of a case; of several shells the section `shells`, by name."""
     if not several:
         return {"shell": shell.section()}
     return {"shells": {member.name: member.one_of_several() for member in several}}
 
 
 def _refuse_unfit_shells(several: Sequence[Any]) -> None:
-    """Check that several shells have names of their own, and geometries.
+    """Check that each of several shells has its own name, and a geometry rather than a mesh.
 
     Raises
     ------
     CaseError
-        If one has not.
+        If a shell has no name or a mesh, or two shells have the same name.
     """
     for shell in several:
         if not isinstance(shell, Shell) or not shell.name:
@@ -480,31 +561,40 @@ def _refuse_unfit_shells(several: Sequence[Any]) -> None:
 
 
 def _distribute(data: Keys) -> None:
-    """Give each of several shells its own supports and points.
+    """Move supports and points of several shells into the section of each shell, in place.
+
+    Their names begin with that of a shell and a dot, as in "upper.rim".
 
     Raises
     ------
     CaseError
-        If a name does not begin with that of a shell and a dot.
+        If a name does not begin so.
     """
     for key in ("boundary", "points"):
         for name, value in data.pop(key).items():
-            shell, dot, own_name = name.partition(".")
+            shell, dot, name_in_shell = name.partition(".")
             if not dot or shell not in data["shells"]:
                 raise CaseError(
                     f"{NAME}: {key}.{name}: begins with the name of a shell: "
                     f"{next(iter(data['shells']))}.rim"
                 )
-            _join(data["shells"][shell], key, {own_name: value})
+            _join(data["shells"][shell], key, {name_in_shell: value})
 
 
 def _join(data: Keys, key: str, added: Keys) -> None:
-    """Add keys to a section, in which nothing may be given twice.
+    """Add keys to a section of `data`, in which nothing may be given twice.
+
+    Parameters
+    ----------
+    key
+        Name of the section; it is made if it is missing.
+    added
+        Keys of the section with their values.
 
     Raises
     ------
     CaseError
-        If something is, with another value.
+        If a key is given already, with another value.
     """
     section = data.get(key, {})
     if not isinstance(section, dict):

@@ -29,12 +29,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class EntityRule:
-    """A quadrature on the reference cell, of a cell or of an edge with one or two sides.
+    """A quadrature on the reference cell, over a cell or over an edge with one or two sides.
 
     Attributes
     ----------
     points
-        (q, 2) for each side: the same points in space.
+        (q, 2) for each side: the same points in space, in the reference coordinates of its cell.
     tables
         Shape functions at these points, for each side.
     weights
@@ -53,7 +53,9 @@ class EntityBatch:
     Attributes
     ----------
     cells
-        (n,) local cells, for each side.
+        (n,) for each side: local cells.
+    rule
+        The quadrature that all of them share.
     geometry
         (n, 2 sides + 1): the covectors of the edge in the reference coordinates of each side (see
         `shape_tables.edge_covector`), and the width of the cells over it; (n, 0) for cells.
@@ -65,7 +67,7 @@ class EntityBatch:
 
     @property
     def size(self) -> int:
-        """Number of quadrature points of all entities."""
+        """Number of the quadrature points of all entities."""
         return len(self.cells[0]) * len(self.rule.weights)
 
 
@@ -74,17 +76,33 @@ CellMask: TypeAlias = NDArray[np.bool_] | None
 
 
 def cell_batches(V: fem.FunctionSpace, degree: int, mask: CellMask = None) -> list[EntityBatch]:
-    """Return batches of the owned cells."""
-    X, w = cell_rule(degree)
-    rule = EntityRule((X,), (ShapeTable.tabulate(V.element.basix_element, X),), w)
+    """Return batches of the owned cells of a mesh of triangles.
+
+    Parameters
+    ----------
+    V
+        Space of the shape functions.
+    degree
+        Degree of the quadrature.
+    mask
+        (local cells,): which cells count; None: all.
+    """
+    points, weights = cell_rule(degree)
+    rule = EntityRule((points,), (ShapeTable.tabulate(V.element.basix_element, points),), weights)
     cells = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)
     counted = cells if mask is None else cells[mask[cells]]
-    chunks = _chunks(counted, len(w))
+    chunks = _chunks(counted, len(weights))
     return [EntityBatch((chunk,), rule, np.empty((len(chunk), 0))) for chunk in chunks]
 
 
 def interior_batches(V: fem.FunctionSpace, degree: int, mask: CellMask = None) -> list[EntityBatch]:
-    """Return batches of the owned interior edges."""
+    """Return batches of the owned interior edges, with two sides.
+
+    Parameters
+    ----------
+    mask
+        (local cells,): an edge counts with one of its cells; None: all edges.
+    """
     cells, edges, reversed_edges = interior_edges(V)
     kinds = np.column_stack([edges, reversed_edges.astype(np.int32)])
     return list(_edge_batches(V, degree, *_masked(cells, kinds, mask)))
@@ -93,14 +111,22 @@ def interior_batches(V: fem.FunctionSpace, degree: int, mask: CellMask = None) -
 def boundary_batches(
     V: fem.FunctionSpace, degree: int, facets: NDArray[np.int32], mask: CellMask = None
 ) -> list[EntityBatch]:
-    """Return batches of those boundary edges that this rank owns."""
+    """Return batches of some boundary edges, as far as this rank owns them.
+
+    Parameters
+    ----------
+    facets
+        Local numbers of the edges.
+    mask
+        (local cells,): an edge counts with its cell; None: all edges.
+    """
     return list(_edge_batches(V, degree, *_masked(*boundary_edges(V, facets), mask)))
 
 
 def _masked(
     cells: NDArray[np.int32], kinds: NDArray[np.int32], mask: CellMask
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the rows of edges that count."""
+    """Return the rows of cells and kinds (n, ...) of edges that count with one of their cells."""
     rows = slice(None) if mask is None else mask[cells].any(axis=1)
     return cells[rows], kinds[rows]
 
@@ -108,7 +134,7 @@ def _masked(
 def interior_edges(
     V: fem.FunctionSpace,
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.bool_]]:
-    """Return the owned interior edges.
+    """Return the owned interior edges of a mesh of triangles.
 
     Returns
     -------
@@ -118,11 +144,12 @@ def interior_edges(
     """
     topology = V.mesh.topology
     topology.create_connectivity(1, 2)
-    links = topology.connectivity(1, 2)
+    cells_of_edges = topology.connectivity(1, 2)
     facets = np.flatnonzero(
-        np.diff(links.offsets[: topology.index_map(1).size_local + 1]) == 2
+        # edges with two cells
+        np.diff(cells_of_edges.offsets[: topology.index_map(1).size_local + 1]) == 2
     ).astype(np.int32)
-    cells = links.array[links.offsets[facets][:, None] + np.arange(2)]
+    cells = cells_of_edges.array[cells_of_edges.offsets[facets][:, None] + np.arange(2)]
     edges = np.column_stack([_local_edges(V, facets, cells[:, side]) for side in range(2)])
     starts = [_corner(V, cells[:, side], edges[:, side]) for side in range(2)]
     return cells, edges, starts[0] != starts[1]
@@ -131,12 +158,23 @@ def interior_edges(
 def boundary_edges(
     V: fem.FunctionSpace, facets: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the owned ones of some boundary edges: cells and numbers in the cell, both (n, 1)."""
+    """Return the cells of some boundary edges, as far as this rank owns them.
+
+    Parameters
+    ----------
+    facets
+        Local numbers of the edges.
+
+    Returns
+    -------
+    tuple
+        Cells (n, 1), and local numbers of the edge in each cell (n, 1).
+    """
     topology = V.mesh.topology
     topology.create_connectivity(1, 2)
-    links = topology.connectivity(1, 2)
+    cells_of_edges = topology.connectivity(1, 2)
     facets = facets[facets < topology.index_map(1).size_local]
-    cells = links.array[links.offsets[facets]]
+    cells = cells_of_edges.array[cells_of_edges.offsets[facets]]
     return cells[:, None], _local_edges(V, facets, cells)[:, None]
 
 
@@ -147,8 +185,10 @@ def _edge_batches(
 
     Parameters
     ----------
+    degree
+        Degree of the quadrature.
     cells
-        (n, sides).
+        (n, sides): the cells of each edge.
     kinds
         (n, ...): local numbers of the edge in the cell of each side and, with two sides, whether
         the cells run along it in opposite directions.
@@ -160,12 +200,12 @@ def _edge_batches(
             edge_rule(degree, int(edge), is_reversed)
             for edge, is_reversed in zip(kind[:sides], reversed_sides, strict=True)
         ]
-        X, w = tuple(points for points, _ in rules), rules[0][1]
-        tables = tuple(ShapeTable.tabulate(V.element.basix_element, x) for x in X)
-        rule = EntityRule(X, tables, w)
+        points_of_sides, weights = tuple(points for points, _ in rules), rules[0][1]
+        tables = tuple(ShapeTable.tabulate(V.element.basix_element, x) for x in points_of_sides)
+        rule = EntityRule(points_of_sides, tables, weights)
         covectors = np.concatenate([edge_covector(int(edge)) for edge in kind[:sides]])
         edges = np.flatnonzero((kinds == kind).all(axis=1)).astype(np.int32)
-        for chunk in _chunks(edges, len(w)):
+        for chunk in _chunks(edges, len(weights)):
             cells_of_sides = tuple(np.ascontiguousarray(side) for side in cells[chunk].T)
             width = edge_width(V, cells_of_sides, np.full(len(chunk), kind[0]))
             geometry = np.column_stack([np.tile(covectors, (len(chunk), 1)), width])
@@ -173,7 +213,13 @@ def _edge_batches(
 
 
 def _chunks(entities: NDArray[np.int32], points: int) -> list[NDArray[np.int32]]:
-    """Return entities, with this number of points each, in parts of at most `MAX_BATCH_POINTS`."""
+    """Split entities into parts whose points are at most `MAX_BATCH_POINTS`, or one entity.
+
+    Parameters
+    ----------
+    points
+        Number of quadrature points of each entity.
+    """
     size = max(MAX_BATCH_POINTS // points, 1)
     return [entities[i : i + size] for i in range(0, len(entities), size)]
 
@@ -181,7 +227,7 @@ def _chunks(entities: NDArray[np.int32], points: int) -> list[NDArray[np.int32]]
 def _local_edges(
     V: fem.FunctionSpace, facets: NDArray[np.int32], cells: NDArray[np.int32]
 ) -> NDArray[np.int32]:
-    """Return the local number of each facet in its cell."""
+    """Return the local number 0 to 2 of each facet in its cell, (n,)."""
     V.mesh.topology.create_connectivity(2, 1)
     edges = V.mesh.topology.connectivity(2, 1).array.reshape(-1, 3)[cells]
     return np.asarray(np.argmax(edges == facets[:, None], axis=1), dtype=np.int32)
@@ -190,26 +236,36 @@ def _local_edges(
 def _corner(
     V: fem.FunctionSpace, cells: NDArray[np.int32], edges: NDArray[np.int32]
 ) -> NDArray[np.int32]:
-    """Return the vertex at which an edge starts in a cell."""
-    first = np.array(EDGES)[:, 0][edges]
-    return np.asarray(compat.geometry_dofs(V.mesh)[cells, first])
+    """Return the vertex at which each edge starts in its cell.
+
+    Parameters
+    ----------
+    cells, edges
+        (n,): cells, and local numbers of the edges in them.
+    """
+    first_corners = np.array(EDGES)[:, 0][edges]
+    return np.asarray(compat.geometry_dofs(V.mesh)[cells, first_corners])
 
 
 def edge_width(
     V: fem.FunctionSpace, cells: tuple[NDArray[np.int32], ...], edges: NDArray[np.int32]
 ) -> NDArray[np.float64]:
-    """Return the width of cells over their edge in the flat mesh: mean area over edge length.
+    """Return the mean area of the cells at each edge over the edge's length, (n,).
+
+    This is their width in the flat mesh.
 
     Parameters
     ----------
     cells
-        (n,) for each side.
+        (n,) for each of the one or two sides.
     edges
-        (n,) local numbers of the edge on side 0.
+        (n,): local numbers of the edge in the cell on side 0.
     """
     corners = [V.mesh.geometry.x[compat.geometry_dofs(V.mesh)[side]] for side in cells]
     areas = [
-        np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1) / 2 for x in corners
+        np.linalg.norm(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]), axis=1)
+        / 2
+        for places in corners
     ]
     start, end = (corners[0][np.arange(len(edges)), ends] for ends in np.array(EDGES)[edges].T)
     return np.asarray(sum(areas) / len(areas) / np.linalg.norm(end - start, axis=1))
@@ -218,9 +274,16 @@ def edge_width(
 class Contraction:
     """The contraction K[ac, bd] = sum over points and pairs i, j of w D_i[a] D_j[b] H[ic, jd].
 
-    D_i are the shape functions' derivatives, H the Hessians at points. Products of two D are the
-    same for all entities of a rule. For a symmetric (skew) block they are symmetric (skew) in a, b,
-    so only a <= b is computed.
+    D_i are the shape functions' derivatives, H the Hessians at points; a and b count functions, c
+    and d components. Products of two D are the same for all entities of a rule. For a symmetric
+    (skew) block they are symmetric (skew) in a, b, so only a <= b is computed.
+
+    Parameters
+    ----------
+    rule
+        The quadrature with its shape functions.
+    pairs
+        The pairs i, j of derivatives that occur.
     """
 
     def __init__(self, rule: EntityRule, pairs: BlockPairs) -> None:
@@ -230,7 +293,14 @@ class Contraction:
         self._cross = tables[0].cross(w, tables[1], pairs.cross) if pairs.cross else None
 
     def within_side(self, blocks: "HessianBlocks", side: int) -> Array:
-        """Return the element matrices of one side.
+        """Return the element matrices of the cells on one side.
+
+        Parameters
+        ----------
+        blocks
+            The Hessians at the points of a batch.
+        side
+            Number of the side, 0 or 1.
 
         Returns
         -------
@@ -252,6 +322,11 @@ class Contraction:
 
 class HessianBlocks:
     """Hessians at the points of a batch, ordered for the contraction.
+
+    Parameters
+    ----------
+    pairs
+        The pairs of vectors whose blocks the terms have, all together.
 
     Attributes
     ----------
@@ -277,20 +352,30 @@ class HessianBlocks:
         ----------
         values
             As `point_hessian` returns them; they are overwritten.
+        pairs
+            The pairs of vectors whose blocks this term has.
         """
         values *= factor
-        first = 0
+        first_column = 0
         for target, all_pairs, term_pairs in self._targets(pairs):
             entities, components, points, _ = target.shape
-            last = first + components * len(term_pairs)
-            block = values[:, first:last].reshape(entities, points, components, len(term_pairs))
+            end_column = first_column + components * len(term_pairs)
+            # each target has consecutive columns of the values
+            block = values[:, first_column:end_column].reshape(
+                entities, points, components, len(term_pairs)
+            )
             target[..., _positions(all_pairs, term_pairs)] += block.transpose(0, 2, 1, 3)
-            first = last
+            first_column = end_column
 
     def _targets(
         self, pairs: BlockPairs
     ) -> Iterator[tuple[Array, tuple[IndexPair, ...], tuple[IndexPair, ...]]]:
-        """Iterate over arrays, their pairs and a term's pairs, in the order of `point_hessian`."""
+        """Iterate over the arrays of blocks, in the order of the values of `point_hessian`.
+
+        Yields
+        ------
+        The array, the pairs of vectors for which it has blocks, and the pairs that a term has.
+        """
         for symmetric, skew in zip(self.symmetric, self.skew, strict=True):
             yield symmetric, self._pairs.within_side, pairs.within_side
             yield skew, self._pairs.skew, pairs.skew
@@ -298,6 +383,19 @@ class HessianBlocks:
 
 
 def _product(H: Array, products: Array) -> Array:
+    """Return Hessians times products of shape functions, summed over points and pairs.
+
+    Parameters
+    ----------
+    H
+        (entities, components, points, pairs).
+    products
+        (points * pairs, functions).
+
+    Returns
+    -------
+    (entities, components, functions).
+    """
     entities, components = H.shape[:2]
     flat = np.asarray(H.reshape(entities * components, -1) @ products)
     return flat.reshape(entities, components, -1)
@@ -306,7 +404,7 @@ def _product(H: Array, products: Array) -> Array:
 def _positions(
     all_pairs: tuple[IndexPair, ...], term_pairs: tuple[IndexPair, ...]
 ) -> slice | list[int]:
-    """Return the indices of a term's pairs among all, as a slice if they are contiguous."""
+    """Return the indices of a term's pairs among all pairs, as a slice if they are contiguous."""
     positions = [all_pairs.index(pair) for pair in term_pairs]
     if positions and positions == list(range(positions[0], positions[-1] + 1)):
         return slice(positions[0], positions[-1] + 1)
@@ -317,18 +415,19 @@ Ints = NDArray[np.int32]
 
 
 def add_cell_products(y: Array, K: Array, nodes: Ints, x: Array) -> None:
-    """Add the products of element matrices with a vector.
+    """Add the products of the element matrices of cells with a vector to another one.
 
     Parameters
     ----------
     y, x
-        (nodes, 3): the result and the vector.
+        (nodes, 3): the result, which is changed, and the vector.
     K
         (cells, 9, pairs a <= b), see `BlockMatrix.add_cells`.
     nodes
-        (cells, functions).
+        (cells, functions): local nodes of each cell.
     """
     a, b = np.triu_indices(nodes.shape[1])
+    # (cells, pairs a <= b, 3, 3): symmetric plus skew parts
     blocks = np.empty((len(K), len(a), 3, 3))
     for number, (c, d) in enumerate(COMPONENTS):
         blocks[:, :, c, d] = blocks[:, :, d, c] = K[:, number]
@@ -343,12 +442,14 @@ def add_cell_products(y: Array, K: Array, nodes: Ints, x: Array) -> None:
 
 
 def add_coupling_products(y: Array, K: Array, rows: Ints, columns: Ints, x: Array) -> None:
-    """Add the products of blocks that couple two cells, and of their transposes, with a vector.
+    """Add the products of blocks that couple two cells with a vector to another one.
+
+    The transposed blocks are added too.
 
     Parameters
     ----------
     y, x
-        (nodes, 3): the result and the vector.
+        (nodes, 3): the result, which is changed, and the vector.
     K
         (pairs of cells, 9, functions^2), see `BlockMatrix.add_coupling`.
     rows, columns

@@ -46,15 +46,15 @@ class DenseHessian(Protocol):
     Attributes
     ----------
     near_blocks
-        (3 local nodes with ghosts, 3 all nodes) the blocks between nodes near each other, each
-        row's columns in order.
+        (3 local nodes with ghosts, 3 all nodes): the (3, 3) blocks between nodes near each other,
+        each row's columns in order.
     """
 
     @property
     def near_blocks(self) -> bsr_array: ...
 
     def times_far(self, v: Array) -> Array:
-        """Return the product of all other entries with vectors; collective.
+        """Return the product of all entries outside `near_blocks` with vectors. Collective.
 
         Parameters
         ----------
@@ -79,7 +79,7 @@ class DenseTerm(Term, Protocol):
         """Add factor dPi/du to b, extrapolated from forces at earlier states; collective."""
 
     def extrapolation_holds_along(self, step: Array) -> bool:
-        """Return whether extrapolated forces are accurate along a direction; collective.
+        """Return whether extrapolated forces are accurate along a direction. Collective.
 
         Parameters
         ----------
@@ -90,14 +90,14 @@ class DenseTerm(Term, Protocol):
 
 @dataclass(frozen=True)
 class SinglePrecisionBlocks:
-    """A matrix of (3, 3) blocks in single precision.
+    """A sparse matrix of (3, 3) blocks in single precision, for fast products.
 
     Attributes
     ----------
     starts
-        (rows of blocks + 1,) number of the first block of each row.
+        (rows of blocks + 1,): number of the first block of each row.
     columns
-        (blocks,) each row's in order.
+        (blocks,): the column of each block, ascending within a row.
     values
         (blocks, 3, 3).
     upper
@@ -111,26 +111,33 @@ class SinglePrecisionBlocks:
 
     @classmethod
     def from_blocks(cls, A: bsr_array, *, upper: bool) -> "SinglePrecisionBlocks":
-        """Return a copy of a matrix; if `upper`, the matrix is symmetric."""
+        """Return a copy of a matrix in single precision.
+
+        Parameters
+        ----------
+        upper
+            Whether only the blocks on and above the diagonal are kept; A must be symmetric then.
+        """
         if not upper:
             starts = np.asarray(A.indptr, dtype=np.int32)
             columns = np.asarray(A.indices, dtype=np.int32)
             return cls(starts, columns, A.data.astype(np.float32), upper)
         is_upper = np.repeat(np.arange(len(A.indptr) - 1), np.diff(A.indptr)) <= A.indices
+        # the number of upper blocks before the first block of each row
         starts = np.append(0, np.cumsum(is_upper, dtype=np.int32))[A.indptr].astype(np.int32)
         columns = A.indices[is_upper].astype(np.int32)
         return cls(starts, columns, A.data[is_upper].astype(np.float32), upper)
 
 
 class BlockProducts:
-    """Products of matrices of (3, 3) blocks with vectors; the constructor is collective."""
+    """Products of matrices of (3, 3) blocks with vectors, in C; the constructor is collective."""
 
     def __init__(self, comm: MPI.Comm) -> None:
         source = Path(__file__).with_name("dense_tangent.c")
         self._ffi, self._lib = load_native(source, C_DECLARATIONS, comm)
 
     def times(self, A: bsr_array | SinglePrecisionBlocks, v: Array) -> Array:
-        """Return A v."""
+        """Return A v, both over the unknowns of nodes (3 nodes,)."""
         pointer, lib = self._ffi.from_buffer, self._lib
         if isinstance(A, SinglePrecisionBlocks):
             starts, columns = A.starts, A.columns
@@ -155,24 +162,24 @@ class BlockProducts:
 
 
 def _three_times(v: Array) -> Array:
-    """Return (nodes, 9): the three components of each node, three times."""
+    """Return (nodes, 9): the three components of each node, three times, for the C code."""
     return np.tile(v.reshape(-1, 3), 3)
 
 
 @dataclass(frozen=True)
 class ScaledHessian:
-    """The Hessian of a term times a factor.
+    """The Hessian of a term times a factor, in the rows of this rank's own unknowns.
 
     Attributes
     ----------
     near_blocks
-        Stored blocks in the rows of this rank's own unknowns.
+        Stored blocks, summed over the ranks.
     single_blocks
         The same in single precision, for products that need not be better.
     hessian
-        The Hessian, for its products.
+        The Hessian, for its products with entries that are not stored.
     left_out
-        Entries that are not counted, since the sparse matrix has them.
+        Entries that are not counted, since the sparse matrix has them; None: all count.
     """
 
     factor: float
@@ -187,6 +194,13 @@ class DenseRemainder:
     """Scaled Hessians without the rows and columns of supports.
 
     It is a `continuation.system.DenseCorrection`.
+
+    Attributes
+    ----------
+    matrix
+        The object that multiplies and sums Hessians.
+    parts
+        The Hessians, whose sum this is.
     """
 
     matrix: "DenseTangent"
@@ -205,12 +219,14 @@ class DenseRemainder:
         return DenseRemainder(self.matrix, parts)
 
     def multiple_of(self, other: DenseCorrection) -> float:
-        """Return the factor between this correction and another; 0 if it is no known multiple."""
+        """Return c if this correction is c times another one; 0 if it is no known multiple."""
         if not isinstance(other, DenseRemainder) or len(other.parts) != len(self.parts):
             return 0.0
         pairs = list(zip(self.parts, other.parts, strict=True))
-        factors = {mine.factor / theirs.factor for mine, theirs in pairs}
-        same_hessians = all(mine.hessian is theirs.hessian for mine, theirs in pairs)
+        factors = {own_part.factor / other_part.factor for own_part, other_part in pairs}
+        same_hessians = all(
+            own_part.hessian is other_part.hessian for own_part, other_part in pairs
+        )
         return factors.pop() if len(factors) == 1 and same_hessians else 0.0
 
     def added_to(self, K: PETSc.Mat) -> PETSc.Mat:
@@ -225,16 +241,19 @@ class DenseTangent:
 
     Parameters
     ----------
+    V
+        Space of the displacement.
     clamped
         Homogeneous Dirichlet conditions.
 
     Attributes
     ----------
     fixed
-        Whether unknowns are clamped: the own ones, and all.
+        Whether unknowns are clamped: an array of the own ones, and one of all.
     """
 
     def __init__(self, V: fem.FunctionSpace, clamped: Sequence[fem.DirichletBC]) -> None:
+        """Gather which unknowns are clamped, and the owners of ghosts. Collective."""
         comm, nodes = V.mesh.comm, V.dofmap.index_map
         self._owned, self._ghosts = nodes.size_local, nodes.num_ghosts
         self._first, self._count = nodes.local_range[0], nodes.size_global
@@ -255,21 +274,28 @@ class DenseTangent:
         self._latest_common: tuple[bsr_array, csr_array] | None = None
 
     def _create_dense(self) -> tuple[Array, Array, PETSc.Mat]:
-        """Return entries in columns of own unknowns, those in others, and their matrix.
+        """Create a matrix of PETSc with all entries. Collective.
 
-        The matrix shares the memory of both arrays.
+        Returns
+        -------
+        The entries in columns of own unknowns, those in columns of others, and the matrix, which
+        shares the memory of both arrays.
         """
-        n, first, total = 3 * self._owned, 3 * self._first, 3 * self._count
+        n, first_column, column_count = 3 * self._owned, 3 * self._first, 3 * self._count
         kind = PETSc.IntType
-        inner, outer = np.zeros((n, n)), np.zeros((n, total - n))
+        inner, outer = np.zeros((n, n)), np.zeros((n, column_count - n))
         inner_starts = np.arange(0, n * n + 1, n or 1, dtype=kind)[: n + 1]
-        if total > n:
-            outer_starts = np.arange(0, n * (total - n) + 1, total - n, dtype=kind)[: n + 1]
+        if column_count > n:
+            outer_starts = np.arange(0, n * (column_count - n) + 1, column_count - n, dtype=kind)[
+                : n + 1
+            ]
         else:
             outer_starts = np.zeros(n + 1, dtype=kind)
         arrays = [(inner_starts, np.tile(np.arange(n, dtype=kind), n), inner.reshape(-1))]
         if self.comm.size > 1:
-            others = np.delete(np.arange(total, dtype=kind), np.s_[first : first + n])
+            others = np.delete(
+                np.arange(column_count, dtype=kind), np.s_[first_column : first_column + n]
+            )
             arrays.append((outer_starts, np.tile(others, n), outer.reshape(-1)))
         size = ((n, None), (n, None))
         K = PETSc.Mat().createAIJWithArrays(
@@ -283,9 +309,22 @@ class DenseTangent:
     def corrected(
         self, K: PETSc.Mat, terms: Sequence[tuple[float, DenseTerm]], *, inexact: bool = False
     ) -> CorrectedTangent:
-        """Return a sparse matrix with terms times factors: their entries in it, and the remainder.
+        """Return a sparse matrix with the tangents of terms, as K + D. Collective.
 
-        Entries of the terms that K has are added to it. Collective.
+        Entries that K has are added to it. All other entries of the terms make up D.
+
+        Parameters
+        ----------
+        K
+            The sparse matrix, which is changed.
+        terms
+            Pairs of a factor and its term.
+        inexact
+            Whether the tangents may belong to an earlier state.
+
+        Returns
+        -------
+        K with the correction D; its lagged part is the whole tangent of the terms.
         """
         starts, columns, values = K.getValuesCSR()
         scaled = [self.scaled_hessian(factor, term, inexact=inexact) for factor, term in terms]
@@ -303,7 +342,12 @@ class DenseTangent:
     ) -> csr_array:
         """Return a term's entries, without its factor, in the pattern of a sparse matrix.
 
-        They are computed once for each pattern.
+        They are computed once for each pattern, and are zero at supports.
+
+        Parameters
+        ----------
+        starts, columns
+            The pattern in compressed sparse rows, of own unknowns.
         """
         latest = self._latest_common
         if latest is not None and latest[0] is part.near_blocks:
@@ -319,8 +363,11 @@ class DenseTangent:
         return common
 
     def sum(self, K: PETSc.Mat, parts: Sequence[ScaledHessian]) -> PETSc.Mat:
-        """Return a sparse matrix plus scaled Hessians, with all entries. Collective."""
-        n, first, (own_fixed, all_fixed) = 3 * self._owned, 3 * self._first, self.fixed
+        """Return a sparse matrix plus scaled Hessians, with all entries. Collective.
+
+        The next call overwrites the result.
+        """
+        n, first_column, (own_fixed, all_fixed) = 3 * self._owned, 3 * self._first, self.fixed
         self._dense = inner, outer, matrix = self._dense or self._create_dense()
         # On one rank the rows are the matrix's own memory.
         rows = inner if self.comm.size == 1 else np.empty((n, 3 * self._count))
@@ -331,15 +378,23 @@ class DenseTangent:
         starts, columns, values = K.getValuesCSR()
         rows[np.repeat(np.arange(n), np.diff(starts)), columns] += values
         if self.comm.size > 1:
-            inner[:] = rows[:, first : first + n]
-            outer[:] = np.delete(rows, np.s_[first : first + n], axis=1)
+            inner[:] = rows[:, first_column : first_column + n]
+            outer[:] = np.delete(rows, np.s_[first_column : first_column + n], axis=1)
         matrix.stateIncrease()
         return matrix
 
     def scaled_hessian(
         self, factor: float, term: DenseTerm, *, inexact: bool = False
     ) -> ScaledHessian:
-        """Return the Hessian of a term, its stored blocks summed over the ranks. Collective."""
+        """Return the Hessian of a term times a factor. Collective.
+
+        Its stored blocks are summed over the ranks, once for each Hessian.
+
+        Parameters
+        ----------
+        inexact
+            Whether it may be the Hessian of an earlier state.
+        """
         hessian = term.hessian(inexact=inexact)
         blocks = self._blocks_of_terms.get(term.name)
         if blocks is None or blocks[0] is not hessian:
@@ -353,19 +408,19 @@ class DenseTangent:
         return self._all_rows(self.scaled_hessian(1.0, term))
 
     def product(self, parts: Sequence[ScaledHessian], x: Array, *, single: bool = False) -> Array:
-        """Return scaled Hessians times a vector, supports too. Collective.
+        """Return the sum of scaled Hessians times a vector, without constraints. Collective.
 
         Parameters
         ----------
         x
-            Of all unknowns.
+            (3 all nodes,): the vector, the same on every rank.
         single
             Whether stored blocks are taken in single precision.
 
         Returns
         -------
         Array
-            Of own unknowns.
+            (3 own nodes,).
         """
         product = np.zeros(3 * self._owned)
         for part in parts:
@@ -377,68 +432,102 @@ class DenseTangent:
         return product
 
     def times(self, terms: Sequence[tuple[float, DenseTerm]], v: Array) -> Array:
-        """Return the terms' product with a vector, both with ghosts. Collective.
+        """Return the tangents of terms times a vector, both with ghosts. Collective.
 
         Ghosts are zero in the product.
+
+        Parameters
+        ----------
+        terms
+            Pairs of a factor and its term.
         """
         n = 3 * self._owned
         x, product = np.concatenate(self.comm.allgather(v[:n])), np.zeros_like(v)
-        parts = [self.scaled_hessian(factor, term) for factor, term in terms]
-        product[:n] = self.product(parts, x)
+        hessians = [self.scaled_hessian(factor, term) for factor, term in terms]
+        product[:n] = self.product(hessians, x)
         return product
 
     def _all_rows(self, part: ScaledHessian) -> Array:
-        """Return all entries of own rows, without the factor."""
+        """Return all entries of own rows of a Hessian, without its factor. Collective.
+
+        Products with unit vectors give the entries that are not stored.
+        """
         left_out = 0.0 if part.left_out is None else part.left_out.toarray()
         rows = part.near_blocks.toarray() - left_out
-        for first in range(0, 3 * self._count, PRODUCT_COLUMNS):
-            count = min(PRODUCT_COLUMNS, 3 * self._count - first)
-            unit_vectors = np.eye(3 * self._count, count, -first)
+        for first_column in range(0, 3 * self._count, PRODUCT_COLUMNS):
+            count = min(PRODUCT_COLUMNS, 3 * self._count - first_column)
+            unit_vectors = np.eye(3 * self._count, count, -first_column)
             far = part.hessian.times_far(unit_vectors).reshape(-1, 3, count)
-            rows[:, first : first + PRODUCT_COLUMNS] += self._sum_rows(far).reshape(len(rows), -1)
+            rows[:, first_column : first_column + PRODUCT_COLUMNS] += self._sum_rows(far).reshape(
+                len(rows), -1
+            )
         return np.asarray(rows)
 
     def _sum_rows(self, rows: Array) -> Array:
-        """Return the rows of own nodes, from (local nodes, ...) of all ranks."""
+        """Return the sum over ranks of the rows of own nodes. Collective.
+
+        Parameters
+        ----------
+        rows
+            (local nodes, ...): this rank's parts, those of ghosts after own ones.
+        """
         if self.comm.size == 1:
             return rows
-        own, ghosts = rows[: self._owned].copy(), rows[self._owned :]
+        own_rows, ghosts = rows[: self._owned].copy(), rows[self._owned :]
         sent = [(self._ghost_numbers[i], ghosts[i]) for i in self._ghosts_of_ranks]
         for numbers, received in self.comm.alltoall(sent):
-            np.add.at(own, numbers - self._first, received)
-        return own
+            np.add.at(own_rows, numbers - self._first, received)
+        return own_rows
 
     def _sum_blocks(self, rows: bsr_array) -> bsr_array:
-        """Return the rows of own unknowns, from those of local unknowns of all ranks."""
+        """Return the sum over ranks of the rows of own unknowns. Collective.
+
+        Parameters
+        ----------
+        rows
+            (3 local nodes, 3 all nodes): this rank's part, rows of ghosts after own ones.
+        """
         if self.comm.size == 1:
             return rows
         n = 3 * self._owned
-        own, ghosts = rows.tocsr()[:n], rows.tocsr()[n:].tocoo()
+        own_rows, ghosts = rows.tocsr()[:n], rows.tocsr()[n:].tocoo()
         sent = list[tuple[NDArray[np.generic], ...]]()
         for nodes in self._ghosts_of_ranks:
             mask = np.isin(ghosts.row // 3, nodes)
+            # global rows of the entries that the rank owns
             row = 3 * self._ghost_numbers[ghosts.row[mask] // 3] + ghosts.row[mask] % 3
             sent.append((row, ghosts.col[mask], ghosts.data[mask]))
-        for row, column, data in self.comm.alltoall(sent):
-            own = own + csr_array((data, (row - 3 * self._first, column)), own.shape)
-        blocks = own.tobsr((3, 3))
+        for row, column, values in self.comm.alltoall(sent):
+            own_rows = own_rows + csr_array(
+                (values, (row - 3 * self._first, column)), own_rows.shape
+            )
+        blocks = own_rows.tobsr((3, 3))
         blocks.sort_indices()
         return blocks
 
     @cached_property
     def _ghosts_of_ranks(self) -> list[NDArray[np.intp]]:
-        """The ghosts that each rank owns, counted from the first ghost."""
+        """For each rank the ghosts that it owns, counted from the first ghost."""
         return [np.flatnonzero(self._ghost_owners == rank) for rank in range(self.comm.size)]
 
 
 def _entries(blocks: bsr_array, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:
-    """Return entries of a matrix of blocks whose columns are in order; zero where no block is."""
+    """Return entries of a matrix of (3, 3) blocks; zero where there is no block.
+
+    Parameters
+    ----------
+    blocks
+        The matrix, each row's columns in order.
+    rows, columns
+        (n,) places of the entries.
+    """
     width, count = blocks.shape[1] // 3, len(blocks.indptr) - 1
     block_rows = np.repeat(np.arange(count, dtype=np.int64), np.diff(blocks.indptr))
     block_keys = block_rows * width + blocks.indices
     entry_keys = rows.astype(np.int64) // 3 * width + columns // 3
     if not len(block_keys):
         return np.zeros(len(entry_keys))
+    # keys row * width + column ascend, so that a search finds each block
     positions = np.minimum(np.searchsorted(block_keys, entry_keys), len(block_keys) - 1)
     values = blocks.data[positions, rows % 3, columns % 3]
     return np.where(block_keys[positions] == entry_keys, values, 0.0)

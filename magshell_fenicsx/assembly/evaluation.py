@@ -45,13 +45,18 @@ class Evaluation:
     All values are functions of the state alone, whatever was evaluated before, and an evaluation
     changes nothing that another one sees. Results that terms compute from displacement and
     amplitudes are shared by all evaluations of a state; see `memo.Memo`.
+
+    Parameters
+    ----------
+    u, mu
+        The state: displacement of own unknowns, and amplitudes by name.
     """
 
     def __init__(self, system: "FiniteElementSystem", u: Vector, mu: Amplitudes) -> None:
         self._system, self._u, self._mu = system, u, mu
 
     def evaluate(self, function: Callable[[], Result]) -> Result:
-        """Return the result of a function at the state.
+        """Return the result of a function, called with the system at the state.
 
         The function may read the system's u, the placement and the constants in forms.
         """
@@ -59,7 +64,7 @@ class Evaluation:
         return function()
 
     def evaluate_forms(self, function: Callable[[], Result]) -> Result:
-        """Return the result of a function that assembles compiled forms at the state.
+        """Return the result of a function that assembles compiled forms, called at the state.
 
         Compiled forms take the fields of terms as they are, so these are renewed before.
         """
@@ -69,7 +74,10 @@ class Evaluation:
         return function()
 
     def energies(self) -> dict[str, float]:
-        """Return the potential of each term by name, without its amplitude. Collective."""
+        """Return the potential Pi_i of each term by name, without its amplitude. Collective.
+
+        The potential of a live pressure includes the volume that lids sweep.
+        """
         system, mu = self._system_at_state, self._mu
         potentials = {t.name: float(system.comm.allreduce(t.energy())) for t in system.terms}
         pressure = system.edge_pressure
@@ -78,7 +86,10 @@ class Evaluation:
         return potentials
 
     def stored_energy(self) -> float:
-        """Return the energy without the potentials of loads. Collective."""
+        """Return the energy without the potentials of loads, on every rank. Collective.
+
+        It is the sum of the terms without an amplitude, or with one that is a coordinate.
+        """
         system, mu = self._system_at_state, self._mu
         local = sum(
             factor_of(t.amplitude, mu) * t.energy()
@@ -93,7 +104,7 @@ class Evaluation:
         return float(self._system.comm.allreduce(local))
 
     def gradient(self, forms: Sequence[fem.Form]) -> Vector:
-        """Return the sum of compiled linear forms, zero at supports. Collective."""
+        """Return the sum of compiled linear forms at the state, zero at supports. Collective."""
         local: NDArray[np.float64] = np.zeros_like(self._system.u.x.array)
 
         def add() -> None:
@@ -104,14 +115,22 @@ class Evaluation:
         return self._system._summed(local)
 
     def summed(self, local: NDArray[np.float64]) -> Vector:
-        """Return a vector of local nodes, ghosts too, summed over all ranks; zero at supports."""
+        """Return a vector of local nodes, ghosts too, summed over all ranks; zero at supports.
+
+        The result has own unknowns only. Collective.
+        """
         return self._system._summed(local)
 
     def residual(self, *, inexact: bool = False) -> Vector:
-        """Return dPi/du, zero at supports; `inexact` as in `InexactSystem`. Collective.
+        """Return dPi/du at own unknowns, zero at supports. Collective.
 
         Along directions in which oblique supports hold nodes it is u itself. The names of terms
         that are not numbers are put into the system's `nan_terms`.
+
+        Parameters
+        ----------
+        inexact
+            Whether forces of dense terms may be extrapolated, see `InexactSystem`.
         """
         system = self._system_at_state
         factors = system._factors(self._mu)
@@ -121,20 +140,25 @@ class Evaluation:
                 system.nan_terms = self._nan_terms(factors)
         else:
             dofmap = system.u.function_space.dofmap
-            first = dofmap.index_map.local_range[0] * dofmap.index_map_bs
+            first_unknown = dofmap.index_map.local_range[0] * dofmap.index_map_bs
             gradients = [
                 system._summed(system._gradient({name: factor})) for name, factor in factors.items()
             ]
-            noisy = [system.noise.on_vector(gradient, first) for gradient in gradients]
+            noisy = [system.noise.on_vector(gradient, first_unknown) for gradient in gradients]
             residual = np.asarray(np.sum(noisy, axis=0))
         if system.projection is None:
             return residual
         return residual + system.projection.constrained_part(self._u)
 
     def _nan_terms(self, factors: Mapping[str, float]) -> list[str]:
-        """Return the terms whose energy or gradient is not a number; collective.
+        """Return the names of the terms whose energy or gradient is not a number. Collective.
 
-        A term may say why, in its attribute `no_number`.
+        A term may say why, in its attribute `no_number`, which follows its name.
+
+        Parameters
+        ----------
+        factors
+            Term name -> its factor; terms with the factor zero do not count.
         """
         system = self._system
         used = [t for t in system.terms if factors[t.name]]
@@ -144,9 +168,14 @@ class Evaluation:
         return names or ["the sum of all terms"]
 
     def forces(self, name: str = "") -> Vector:
-        """Return dPi/du at all nodes, of all terms or of one. Collective.
+        """Return dPi/du at all own nodes, supports too. Collective.
 
-        Of all terms it is at supports the force of these on the shell.
+        Of all terms it is at supports the force of the supports on the shell.
+
+        Parameters
+        ----------
+        name
+            Name of a single term, without its amplitude; "": all terms with their amplitudes.
         """
         system, mu = self._system_at_state, self._mu
         local = system._gradient({name: 1.0} if name else system._factors(mu))
@@ -156,7 +185,10 @@ class Evaluation:
         return system._summed(local, constrained=False)
 
     def stiffness_along(self, v: Vector) -> Vector:
-        """Return K v of all terms, not zero at supports, by differences of fourth order."""
+        """Return K v of all terms, not zero at supports, by differences of fourth order.
+
+        Collective.
+        """
         system = self._system
         step, product = system.step_along(v, DIFFERENCE_STEP), np.zeros(system.size)
         for multiple, weight in DIFFERENCE_WEIGHTS.items():
@@ -168,7 +200,13 @@ class Evaluation:
         return product
 
     def load(self, name: str, *, constrained: bool = True) -> Vector:
-        """Return d2Pi/du dmu; zero at supports if `constrained`. Collective."""
+        """Return d2Pi/du dmu of the amplitude `name`. Collective.
+
+        Parameters
+        ----------
+        constrained
+            Whether it is zero at supports.
+        """
         system = self._system_at_state
         column = system._column(self._mu, name)
         pressure = system.edge_pressure
@@ -177,7 +215,10 @@ class Evaluation:
         return system._summed(column, constrained=constrained)
 
     def potential(self, name: str) -> float:
-        """Return dPi/dmu, on every rank. Collective."""
+        """Return dPi/dmu of the amplitude `name`, on every rank. Collective.
+
+        The amplitude moves supports, is a free parameter, or multiplies terms.
+        """
         system, mu = self._system_at_state, self._mu
         moving = system.moving
         if moving and name in moving.names:
@@ -192,9 +233,9 @@ class Evaluation:
         return float(system.comm.allreduce(local)) + system.lid_potential(mu, name)
 
     def curvature(self, name: str, other: str) -> float:
-        """Return d2Pi/dmu_i dmu_j, on every rank. Collective.
+        """Return d2Pi/dmu_i dmu_j of two amplitudes, on every rank. Collective.
 
-        One of the two amplitudes is a coordinate of the system.
+        One of the two is a coordinate of the system: it moves supports or is a free parameter.
         """
         system, mu = self._system_at_state, self._mu
         moving = system.moving
@@ -220,7 +261,7 @@ class Evaluation:
         *,
         inexact: bool = False,
     ) -> PETSc.Mat | CorrectedTangent | SkewedTangent:
-        """Assemble d2Pi/du2, see `FiniteElementSystem.tangent`. Collective."""
+        """Assemble d2Pi/du2 at the state, see `FiniteElementSystem.tangent`. Collective."""
         system = self._system
         with system.assembly:
             stress_of = [(weight, system.with_ghosts(v, self._mu)) for weight, v in stress]
@@ -239,7 +280,15 @@ class Evaluation:
 
 @dataclass
 class Noise:
-    """Random factors 1 + level x with x between -1 and 1; each call draws the next ones."""
+    """Random factors 1 + level x with x between -1 and 1; each call draws the next ones.
+
+    Attributes
+    ----------
+    level
+        Relative size of the noise.
+    seed
+        Runs with the same seed draw the same factors.
+    """
 
     level: float
     seed: int = 0
@@ -254,7 +303,7 @@ class Noise:
         return cls(float(words[0]), int(words[1]) if len(words) > 1 else 0)
 
     def on_vector(self, b: Array, first: int) -> Array:
-        """Return a vector with noise.
+        """Return a vector of own entries with noise.
 
         Parameters
         ----------
@@ -265,16 +314,25 @@ class Noise:
         return b * self._factors(rows, np.zeros(1, dtype=np.uint64))
 
     def on_matrix(self, K: PETSc.Mat) -> None:
-        """Add noise to an assembled matrix, in place."""
+        """Multiply the entries of an assembled matrix by random factors, in place. Collective.
+
+        Entries at i, j and j, i get the same factor.
+        """
         starts, columns, values = K.getValuesCSR()
-        first = K.getOwnershipRange()[0]
-        rows = np.repeat(np.arange(first, first + len(starts) - 1), np.diff(starts))
-        low, high = (f(rows, columns).astype(np.uint64) for f in (np.minimum, np.maximum))
+        first_row = K.getOwnershipRange()[0]
+        rows = np.repeat(np.arange(first_row, first_row + len(starts) - 1), np.diff(starts))
+        low, high = (choose(rows, columns).astype(np.uint64) for choose in (np.minimum, np.maximum))
         K.setValuesCSR(starts, columns, values * self._factors(low, high))
         K.assemble()
 
     def _factors(self, i: NDArray[np.uint64], j: NDArray[np.uint64]) -> Array:
-        """Return factors from a hash of the indices, the seed and the number of the call."""
+        """Return random factors from a hash of the indices, the seed and the number of the call.
+
+        Parameters
+        ----------
+        i, j
+            Indices of the entries; arrays that broadcast.
+        """
         self._calls += 1
         x = i * np.uint64(0x9E3779B97F4A7C15) ^ j * np.uint64(0xC2B2AE3D27D4EB4F)
         x ^= np.uint64((self.seed * 0x165667B19E3779F9 + self._calls * 0x27D4EB2F165667C5) % 2**64)

@@ -21,12 +21,14 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class WeightedTerm:
-    """A term Pi with its weights in a gradient.
+    """A term Pi(u; f) with its weights in a gradient by the field f.
 
     Attributes
     ----------
+    term
+        The term.
     energy
-        Factor of the derivative of Pi by the field f.
+        Factor of the derivative of Pi by f.
     work
         Factor of the derivative of dPi/du[w] by f, w a given vector.
     """
@@ -42,11 +44,14 @@ class FieldGradient:
 
     Attributes
     ----------
+    field
+        The field.
     forces
-        (cells, nodes, components) of this rank's own cells; the components are the field's.
+        (cells, nodes, components): the derivatives in this rank's own cells; the components are the
+        field's.
     places, normals
-        (cells, nodes, 3) of these nodes, undeformed, over R; of a deviation those of the perfect
-        shell.
+        (cells, nodes, 3): undeformed places, over R, and normals at these nodes; of a deviation
+        those of the perfect shell.
     """
 
     field: fem.Function
@@ -55,27 +60,37 @@ class FieldGradient:
     normals: Array
 
     def along(self, change: Array) -> float:
-        """Return the derivative along a change (cells, nodes, components); collective."""
+        """Return the derivative along a change of the field. Collective.
+
+        Parameters
+        ----------
+        change
+            (cells, nodes, components), as `forces`.
+        """
         return float(self._sum(np.sum(self.forces * change)))
 
     def cells(self) -> Array:
-        """Return derivatives (cells, components) by a field that is constant within each cell.
+        """Return the derivatives by a field that is constant within each cell.
 
-        Cells are this rank's own.
+        Returns
+        -------
+        Array
+            (cells, components) of this rank's own cells.
         """
         return np.asarray(self.forces.sum(axis=1))
 
     def within(self, cells: NDArray[np.bool_]) -> Array:
-        """Return derivatives (components,) by a field that is constant in a patch; collective.
+        """Return the derivatives (components,) by a field that is constant in a patch. Collective.
 
         Parameters
         ----------
         cells
-            Which of this rank's own cells are in the patch.
+            (cells,): which of this rank's own cells are in the patch.
         """
         return np.asarray(self._sum(self.forces[cells].sum(axis=(0, 1))))
 
     def _sum(self, local: Any) -> Any:
+        """Return the sum over all ranks of a number or an array."""
         return self.field.function_space.mesh.comm.allreduce(local)
 
 
@@ -86,20 +101,24 @@ def derivatives_by_field(
     w: fem.Function,
     log: KernelLog,
 ) -> Array:
-    """Return the sum of the weighted terms' derivatives by f; collective.
+    """Return the sum of the weighted terms' derivatives by a field f. Collective.
 
     A field that is continuous, such as a placement, changes in each cell alone: the sum over cells
     that share a node is the derivative by the node's own value.
 
     Parameters
     ----------
+    weighted_terms
+        The terms; those without the field are left out.
     u, w
         The displacement of the terms, and the vector along which their residual is taken.
+    log
+        Requests the compiled kernels.
 
     Returns
     -------
     Array
-        (cells, nodes, components) on this rank's own cells.
+        (cells, nodes, components) in this rank's own cells.
     """
     domain = f.function_space.mesh
     Q = broken_space(f.function_space)
@@ -108,6 +127,7 @@ def derivatives_by_field(
         energy = weighted.term.form
         if f not in energy.coefficients():
             continue
+        # order 0 is the energy itself, order 1 its derivative along w
         for order, factor in enumerate((weighted.energy, weighted.work)):
             if not domain.comm.allreduce(abs(factor)):
                 continue
@@ -123,7 +143,7 @@ def derivatives_by_field(
 
 
 def broken_space(V: fem.FunctionSpace) -> fem.FunctionSpace:
-    """Return the space with the same element, discontinuous between cells."""
+    """Return the space with the same element as V, discontinuous between cells."""
     element = V.element.basix_element
     if element.discontinuous:
         return V

@@ -54,15 +54,15 @@ DENSE_DIFFERENCE_STEP = 1e-5
 
 @dataclass(frozen=True)
 class SystemVariables:
-    """What varies in a system besides u.
+    """What varies in a system besides the displacement u.
 
     Attributes
     ----------
     parameters
         Free parameters of terms, by name.
     moving
-        Prescribed displacement E(mu) of nodes among the supported ones. Increments of u are zero
-        there, and whatever u holds there is replaced by E(mu).
+        Prescribed displacement E(mu) of nodes among the supported ones; None: no support moves.
+        Increments of u are zero there, and whatever u holds there is replaced by E(mu).
     history
         History variables, stored in a state next to its load parameters: name -> the number in the
         terms, and its value where a state has none.
@@ -74,12 +74,14 @@ class SystemVariables:
 
 
 class FiniteElementSystem:
-    """Sum of terms for a displacement u with supports.
+    """Sum of energy terms for a displacement u with supports; a `continuation.system.System`.
 
     Parameters
     ----------
     u
         The displacement in the terms' forms; it is overwritten.
+    terms
+        The energies, each with the amplitude that multiplies it.
     supports
         Constraints where u, or a component of it in any direction, is zero.
     pattern
@@ -87,9 +89,10 @@ class FiniteElementSystem:
     length
         See `System`.
     assembler
-        Computes the tangent with the same supports, instead of the terms' forms.
+        Computes the tangent with the same supports, instead of the terms' forms; None: the forms
+        do.
     gradients
-        Computes the residual, instead of the terms' forms.
+        Computes the residual, instead of the terms' forms; None: the forms do.
     variables
         What varies besides u.
 
@@ -98,7 +101,7 @@ class FiniteElementSystem:
     u
         The displacement in the terms' forms: that of the latest evaluation.
     history
-        The given ones, and the reference angles of edges under moments.
+        The given history variables, and the reference angles of edges under moments.
     nan_terms
         Names of the terms that were not numbers at the latest residual that was none.
     coordinates
@@ -153,24 +156,35 @@ class FiniteElementSystem:
             self._K_free = fem_petsc.create_matrix(pattern.tangent_form) if moving else None
 
     def _set_supports(self, V: fem.FunctionSpace, supports: Sequence[Constraint]) -> None:
-        """Sort the supports into Dirichlet conditions and a projection."""
-        self.clamped = [c for c in supports if isinstance(c, fem.DirichletBC)]
-        oblique = [c for c in supports if isinstance(c, ObliqueSupport)]
+        """Sort the supports: Dirichlet conditions, and a projection for those in any direction."""
+        self.clamped = [
+            constraint for constraint in supports if isinstance(constraint, fem.DirichletBC)
+        ]
+        oblique = [constraint for constraint in supports if isinstance(constraint, ObliqueSupport)]
         self.projection = Projection(V, oblique, self.clamped) if oblique else None
         no_dofs = np.empty(0, dtype=np.int32)
-        fixed = np.unique(np.concatenate([no_dofs, *(bc.dof_indices()[0] for bc in self.clamped)]))
-        self._fixed = fixed[fixed < self.size]
+        fixed_dofs = np.unique(
+            np.concatenate([no_dofs, *(bc.dof_indices()[0] for bc in self.clamped)])
+        )
+        self._fixed = fixed_dofs[fixed_dofs < self.size]
 
     def with_number(self, name: str, number: SettableNumber, value: float) -> "FiniteElementSystem":
-        """Return the same system with one more number of its terms.
+        """Return the same system with one more number of its terms that a state may set.
 
-        All states that do not have the number by this name have the given value of it.
+        Parameters
+        ----------
+        name
+            Name of the number among the amplitudes of a state.
+        number
+            The number in the terms.
+        value
+            Its value in all states without that name.
         """
-        other = copy(self)
-        other._settings = {name: (number, value)} | self._settings
+        system = copy(self)
+        system._settings = {name: (number, value)} | self._settings
         if self._assembler is None:
-            other._K = self._K.duplicate()
-        return other
+            system._K = self._K.duplicate()
+        return system
 
     @property
     def has_dense_terms(self) -> bool:
@@ -182,9 +196,14 @@ class FiniteElementSystem:
         return Evaluation(self, state.u, state.mu)
 
     def advance(self, state: State, before: Amplitudes) -> State:
-        """Return an accepted state with its history, from the amplitudes of the state before.
+        """Return an accepted state with its new history: the angles of edges under moments.
 
-        Edges under moments turn by less than half a turn in a step.
+        Edges under moments turn by less than half a turn in a step. Collective.
+
+        Parameters
+        ----------
+        before
+            Amplitudes and history of the accepted state before.
         """
         if not self._angle_terms:
             return state
@@ -195,15 +214,20 @@ class FiniteElementSystem:
         return State(state.u, state.mu | angles)
 
     def with_moved_supports(self, state: State) -> State:
-        """Return the state with the displacement of the nodes that move in its u."""
+        """Return a state whose u has the displacement E(mu) of the nodes that move. Collective."""
         if not self.moving:
             return state
         return State(self.with_ghosts(state.u, state.mu)[: self.size], state.mu)
 
     def with_ghosts(self, u: Vector, mu: Amplitudes | None = None) -> NDArray[np.float64]:
-        """Return the displacement of all local nodes, with E(mu) where nodes move if mu is given.
+        """Return the displacement of all local nodes, ghosts included. Collective.
 
-        Collective.
+        Parameters
+        ----------
+        u
+            Displacement of own nodes.
+        mu
+            Amplitudes. If they are given, nodes that move have the displacement E(mu) instead.
         """
         self._b.x.array[: self.size] = u
         self._b.x.scatter_forward()
@@ -217,14 +241,23 @@ class FiniteElementSystem:
         return Evaluation(self, u, mu).residual(inexact=inexact)
 
     def extrapolation_holds_along(self, u: Vector, mu: Amplitudes, du: Vector) -> bool:
-        """Return whether extrapolated forces are accurate along du, see `InexactSystem`."""
+        """Return whether extrapolated forces are accurate along du. Collective.
+
+        See `continuation.system.InexactSystem`.
+        """
         step = self.with_ghosts(du)
         terms = self.dense_terms.terms if self.dense_terms else ()
         evaluation = self.at_state(State(u, dict(mu)))
         return all(evaluation.evaluate(lambda: [t.extrapolation_holds_along(step) for t in terms]))
 
     def forces(self, u: Vector, mu: Amplitudes, name: str = "") -> Vector:
-        """Return dPi/du at all nodes, see `Evaluation.forces`. Collective."""
+        """Return dPi/du at all nodes, see `Evaluation.forces`. Collective.
+
+        Parameters
+        ----------
+        name
+            Name of a single term; "": all terms, with their amplitudes.
+        """
         return Evaluation(self, u, mu).forces(name)
 
     def load(self, u: Vector, mu: Amplitudes, name: str, *, constrained: bool = True) -> Vector:
@@ -236,7 +269,7 @@ class FiniteElementSystem:
         return Evaluation(self, u, mu).potential(name)
 
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
-        """Return d2Pi/dmu_i dmu_j, on every rank. Collective.
+        """Return d2Pi/dmu_i dmu_j of two amplitudes, on every rank. Collective.
 
         It is zero between amplitudes that multiply their terms.
         """
@@ -245,7 +278,7 @@ class FiniteElementSystem:
         return Evaluation(self, u, mu).curvature(name, other)
 
     def energies(self, u: Vector, mu: Amplitudes | None = None) -> dict[str, float]:
-        """Return the potential of each term, see `Evaluation.energies`. Collective.
+        """Return the potential of each term by name, see `Evaluation.energies`. Collective.
 
         Supports do not move if no amplitudes are given.
         """
@@ -268,8 +301,10 @@ class FiniteElementSystem:
 
         Parameters
         ----------
+        stress
+            Weighted displacements whose stress replaces that of u, see `System.tangent`.
         times
-            Factors of the tangents of some terms, by name.
+            Term name -> further factor of its tangent; None: no further factors.
         inexact
             Whether the dense terms may have the tangent of an earlier state.
         """
@@ -282,12 +317,13 @@ class FiniteElementSystem:
         return u
 
     def _constrain(self, u: Vector) -> None:
+        """Make a vector zero at clamped unknowns and along oblique supports, in place."""
         u[self._fixed] = 0
         if self.projection:
             self.projection.project(u)
 
     def _put(self, u: Vector, mu: Amplitudes) -> None:
-        """Set the displacement, the numbers in terms and the nodes that move."""
+        """Put a state into the forms: the displacement, the numbers and the nodes that move."""
         for name, (number, value) in self._settings.items():
             number.value = mu.get(name, value)
         self.u.x.array[: self.size] = u
@@ -303,7 +339,7 @@ class FiniteElementSystem:
         return finite if self.comm.size == 1 else bool(self.comm.allreduce(finite, MPI.LAND))
 
     def step_along(self, v: Vector, fraction: float) -> float:
-        """Return the factor of v whose largest entry is a fraction of the system's length.
+        """Return the factor of v whose largest entry is then a fraction of the system's length.
 
         Collective.
         """
@@ -311,7 +347,17 @@ class FiniteElementSystem:
         return float(fraction * self.length / (largest or 1.0))
 
     def lid_potential(self, mu: Amplitudes, *names: str) -> float:
-        """Return the derivative of p V by one or two amplitudes, V the volume that lids sweep."""
+        """Return the derivative of p V by one or two amplitudes, V the volume that lids sweep.
+
+        Parameters
+        ----------
+        names
+            The one or two amplitudes: of the pressure p or of motions.
+
+        Returns
+        -------
+        The derivative; zero without a live pressure at moving edges.
+        """
         pressure = self.edge_pressure
         if pressure is None:
             return 0.0
@@ -326,7 +372,14 @@ class FiniteElementSystem:
     def _motion_curvature(
         self, moving: PrescribedMotion, mu: Amplitudes, other: str, name: str
     ) -> float:
-        """Return this rank's part of d2Pi/dmu_i dmu_j; `name` is the amplitude of a motion."""
+        """Return this rank's part of d2Pi/dmu_i dmu_j, where one amplitude moves supports.
+
+        Parameters
+        ----------
+        other, name
+            The two amplitudes; `name` moves supports, `other` may do so.
+        """
+        # by the displacement of the moving nodes
         curvature = moving.rate(mu, name) @ self._column(mu, other)
         if other not in moving.names:
             return float(curvature)
@@ -335,17 +388,21 @@ class FiniteElementSystem:
             moving.rate(mu, other) @ self._turning_column(mu, name)
             + moving.bend(mu, name, other) @ residual
         )
-        spins = dict(moving.turning(mu, other))
+        # by the normals of clamped edges that both motions turn
+        other_spins = dict(moving.turning(mu, other))
         for edge, A in moving.turning(mu, name):
-            if edge in spins:
+            if edge in other_spins:
                 spin = moving.spin_displacement(A, u)
-                curvature += spin @ self._turned_column(edge, spins[edge])
+                curvature += spin @ self._turned_column(edge, other_spins[edge])
         for edge, B in moving.turning_twice(mu, (name, other)):
             curvature += moving.spin_displacement(B, u) @ self._gradient({edge: 1.0})
         return float(curvature)
 
     def _column(self, mu: Amplitudes, name: str) -> NDArray[np.float64]:
-        """Return this rank's part of d2Pi/du dmu at all nodes, at the displacement that is set."""
+        """Return this rank's part of d2Pi/du dmu at all nodes, at the displacement in the forms.
+
+        The amplitude `name` moves supports, is a free parameter, or multiplies terms.
+        """
         if self.moving and name in self.moving.names:
             rate = self.moving.rate(mu, name)
             product = self._tangent_product(rate, self._factors(mu))
@@ -358,11 +415,17 @@ class FiniteElementSystem:
         return self._gradient(self._unit_factors(name))
 
     def _unit_factors(self, name: str) -> dict[str, float]:
-        """Return the factor 1 of each term that an amplitude multiplies."""
+        """Return the factor 1 of each term that the amplitude `name` multiplies."""
         return {t.name: 1.0 for t in self.terms if t.amplitude == name}
 
     def _turning_column(self, mu: Amplitudes, name: str) -> NDArray[np.float64]:
-        """Return the part of d2Pi/du dmu from normals of edges, which turn with the motion."""
+        """Return the part of d2Pi/du dmu from clamped edges whose normals turn with the motion.
+
+        Parameters
+        ----------
+        name
+            The amplitude of the motion.
+        """
         assert self.moving
         column: NDArray[np.float64] = np.zeros_like(self.u.x.array)
         for edge, A in self.moving.turning(mu, name):
@@ -370,7 +433,15 @@ class FiniteElementSystem:
         return column
 
     def _turned_column(self, edge: str, A: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the change of an edge's forces where its normal turns, A = Q dQ^T."""
+        """Return the change of a clamped edge's forces as its normal turns, this rank's part.
+
+        Parameters
+        ----------
+        edge
+            Name of the term that holds the normal of the edge.
+        A
+            (3, 3): Q dQ^T of the edge's rotation Q.
+        """
         assert self.moving
         spin = self.moving.spin_displacement(A, self.u.x.array)
         turned_forces = self._tangent_product(spin, {edge: 1.0})
@@ -379,7 +450,15 @@ class FiniteElementSystem:
     def _tangent_product(
         self, v: NDArray[np.float64], factors: Mapping[str, float]
     ) -> NDArray[np.float64]:
-        """Return this rank's part of the tangent without supports times v, both with ghosts."""
+        """Return this rank's part of the tangent without supports times a vector. Collective.
+
+        Parameters
+        ----------
+        v
+            The vector at all local nodes, with ghosts, as is the product.
+        factors
+            Term name -> factor of its tangent.
+        """
         if self._assembler:
             product = self._assembler.times(v, factors)
         else:
@@ -400,7 +479,17 @@ class FiniteElementSystem:
         *,
         inexact: bool = False,
     ) -> PETSc.Mat | CorrectedTangent | SkewedTangent:
-        """Assemble the tangent of the terms with these factors; `stress` has ghosts."""
+        """Assemble the tangent at the displacement in the forms. Collective.
+
+        Parameters
+        ----------
+        factors
+            Term name -> factor of its tangent.
+        stress
+            As in `System.tangent`; the displacements have ghosts.
+        inexact
+            Whether the dense terms may have the tangent of an earlier state.
+        """
         if self._assembler:
             K = self._assembler.tangent(factors, stress)
         else:
@@ -428,13 +517,21 @@ class FiniteElementSystem:
     def _dense_product(
         self, factors: Mapping[str, float], *, inexact: bool
     ) -> Callable[[Vector], Vector]:
-        """Return a function that multiplies the dense terms' tangent at the present u with v.
+        """Return a function: the dense terms' tangent at the present u times a vector.
 
-        It takes differences of forces; if `inexact`, of extrapolated forces.
+        It takes differences of forces and is collective.
+
+        Parameters
+        ----------
+        factors
+            Dense term name -> factor of its tangent.
+        inexact
+            Whether the forces are extrapolated.
         """
         u = np.array(self.u.x.array)
 
         def times(v: Vector) -> Vector:
+            """Return the product with v, zero at supports, by a central difference."""
             step, direction = self.step_along(v, DENSE_DIFFERENCE_STEP), self.with_ghosts(v)
             present, product = np.array(self.u.x.array), np.zeros(self.size)
             for sign in (1.0, -1.0):
@@ -447,7 +544,7 @@ class FiniteElementSystem:
         return times
 
     def _skew(self, factors: Mapping[str, float]) -> PETSc.Mat | None:
-        """Return the skew part of the tangent, of loads without potential; None without."""
+        """Return the skew part of the tangent, of loads without potential; None without such."""
         forms = [t for t in self.terms if isinstance(t, FormTerm)]
         loads = [t for t in forms if not t.has_potential and factors[t.name]]
         if not loads:
@@ -463,7 +560,15 @@ class FiniteElementSystem:
     def _assemble_forms(
         self, K: PETSc.Mat, factors: Mapping[str, float], clamped: list[fem.DirichletBC]
     ) -> PETSc.Mat:
-        """Assemble the tangent from the terms' own forms."""
+        """Assemble the tangent from the terms' own forms into K, and return K. Collective.
+
+        Parameters
+        ----------
+        factors
+            Term name -> factor of its tangent; others are left out.
+        clamped
+            Conditions whose rows and columns become those of the identity.
+        """
         K.zeroEntries()
         for t in self.terms:
             if factor := factors.get(t.name):
@@ -472,6 +577,7 @@ class FiniteElementSystem:
         return K
 
     def _factors(self, mu: Amplitudes) -> dict[str, float]:
+        """Return the factor of each term, by its name: its amplitude, or 1 without one."""
         return {t.name: factor_of(t.amplitude, mu) for t in self.terms}
 
     def _gradient(
@@ -481,12 +587,14 @@ class FiniteElementSystem:
         *,
         inexact: bool = False,
     ) -> NDArray[np.float64]:
-        """Return this rank's part of the gradient of the terms with these factors, by name.
+        """Return this rank's part of the gradient of terms at all local nodes, ghosts included.
 
         Parameters
         ----------
+        factors
+            Term name -> factor of its gradient; others are left out.
         further
-            Terms that are added, with their factors.
+            Derivatives by free parameters that are added, with their factors.
         inexact
             Whether forces of dense terms may be extrapolated.
         """
@@ -503,7 +611,15 @@ class FiniteElementSystem:
             return b
 
     def _summed(self, local: NDArray[np.float64], *, constrained: bool = True) -> Vector:
-        """Return the sum of all ranks' vectors; zero at supports if `constrained`."""
+        """Return the sum of all ranks' parts of a vector, at own nodes. Collective.
+
+        Parameters
+        ----------
+        local
+            Vector at all local nodes, ghosts included.
+        constrained
+            Whether the sum is zero at supports.
+        """
         with self.assembly:
             b = self._b.x.array
             b[:] = local

@@ -34,13 +34,13 @@ DIFFERENCE_WEIGHTS = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
 
 
 class SettableNumber(Protocol):
-    """A number that terms depend on."""
+    """A number in the terms that may be set: a constant of forms, or an amplitude."""
 
     value: Any
 
 
 class Derivative(Protocol):
-    """An energy's derivative by parameters, with the amplitude of its term."""
+    """The derivative of an energy by parameters, with the amplitude of its term."""
 
     @property
     def amplitude(self) -> str | None: ...
@@ -67,8 +67,9 @@ class FreeParameter:
     slopes
         dPi_i/dp as terms with the amplitudes mu_i.
     differentiate_slopes
-        Returns the derivatives of the slopes by another parameter q in the terms, or by p itself.
-        Where q is no constant but has a method `second_derivatives`, this is called instead.
+        Called with another parameter q in the terms, or with p itself. It returns the derivatives
+        of the slopes by it. Where q is no constant but has a method `second_derivatives`, that
+        method is called instead.
     """
 
     constant: SettableNumber
@@ -77,7 +78,13 @@ class FreeParameter:
     _second_derivatives: dict[Any, Sequence[Derivative]] = field(default_factory=dict)
 
     def second_derivatives(self, q: Any) -> Sequence[Derivative]:
-        """Return d2Pi_i/dp dq with the amplitudes mu_i; q may be p."""
+        """Return d2Pi_i/dp dq as terms with the amplitudes mu_i; they are made once.
+
+        Parameters
+        ----------
+        q
+            Another parameter as it stands in the terms, or p itself.
+        """
         if q not in self._second_derivatives:
             if hasattr(q, "second_derivatives"):
                 self._second_derivatives[q] = q.second_derivatives(self.constant)
@@ -89,16 +96,21 @@ class FreeParameter:
 def make_parameters(
     constants: Mapping[str, fem.Constant], terms: Sequence[Term], u: fem.Function, log: KernelLog
 ) -> dict[str, FreeParameter]:
-    """Return the free parameters of a model, by name; collective.
+    """Return the free parameters of a model, by name. Collective.
 
     Parameters
     ----------
     constants
-        The parameters as they stand in the forms of the terms.
+        Name -> the parameter as it stands in the forms of the terms.
+    terms
+        The terms; those without forms do not depend on the parameters.
+    u
+        The displacement in the forms.
     """
     form_terms = [term for term in terms if isinstance(term, FormTerm)]
 
     def derivatives(p: fem.Constant, terms: Sequence[FormTerm], suffix: str) -> list[FormTerm]:
+        """Return the derivatives by p of the terms that have it, named by a suffix."""
         return [
             FormTerm(f"{term.name} {suffix}", derived(term.form, p), u, log, term.amplitude)
             for term in terms
@@ -116,7 +128,7 @@ def make_parameters(
 
 
 def derived(energy: ufl.Form, p: fem.Constant) -> ufl.Form:
-    """Return the derivative of a form by a constant in it."""
+    """Return the derivative of a form by a scalar constant p in it."""
     variable = ufl.variable(p)
     return ufl.diff(ufl.replace(energy, {p: variable}), variable)
 
@@ -127,11 +139,11 @@ class PlacementAmplitudes:
     Parameters
     ----------
     r0
-        The placement, which this changes; at first all amplitudes are zero.
+        The placement, which this object changes; at first all amplitudes are zero.
     shapes
-        Amplitude -> d, in the space of r0.
+        Amplitude -> the shape d, in the space of r0.
     length
-        A small displacement.
+        A small displacement, which scales the steps of differences.
 
     Attributes
     ----------
@@ -144,11 +156,11 @@ class PlacementAmplitudes:
     def __init__(self, r0: fem.Function, shapes: Mapping[str, fem.Function], length: float) -> None:
         self._r0, self.initial_placement = r0, r0.copy()
         self._values = dict.fromkeys(shapes, 0.0)
-        self._shapes = {name: np.array(d.x.array) for name, d in shapes.items()}
+        self._shapes = {name: np.array(shape.x.array) for name, shape in shapes.items()}
         comm = r0.function_space.mesh.comm
         self.steps = {}
-        for name, d in self._shapes.items():
-            largest = comm.allreduce(np.abs(d).max(initial=0.0), MPI.MAX)
+        for name, shape in self._shapes.items():
+            largest = comm.allreduce(np.abs(shape).max(initial=0.0), MPI.MAX)
             self.steps[name] = PLACEMENT_DIFFERENCE_STEP * length / largest if largest else 1.0
 
     def value(self, name: str) -> float:
@@ -156,7 +168,7 @@ class PlacementAmplitudes:
         return self._values[name]
 
     def set_value(self, name: str, value: float) -> None:
-        """Change an amplitude of the placement."""
+        """Set an amplitude, and change the placement accordingly."""
         if value == self._values[name]:
             return
         self._values[name] = value
@@ -166,19 +178,23 @@ class PlacementAmplitudes:
     def differentiate(self, name: str, function: Callable[[float], float]) -> float:
         """Return a derivative by an amplitude, from values at neighbouring placements.
 
+        The placement is as before afterwards.
+
         Parameters
         ----------
+        name
+            The amplitude.
         function
-            Returns a weight times the value at the present placement; it is called once for each
-            placement of the difference.
+            Called with a weight, once at each placement of the difference. It returns the weight
+            times the value there.
         """
         value, step = self._values[name], self.steps[name]
-        total = 0.0
+        derivative = 0.0
         for number, weight in DIFFERENCE_WEIGHTS:
             self.set_value(name, value + number * step)
-            total += function(weight / step)
+            derivative += function(weight / step)
         self.set_value(name, value)
-        return total
+        return derivative
 
     def parameters(
         self,
@@ -186,14 +202,14 @@ class PlacementAmplitudes:
         others: Mapping[str, FreeParameter],
         gradients: ResidualAssembler | None = None,
     ) -> dict[str, FreeParameter]:
-        """Return the amplitudes as free parameters of the terms.
+        """Return the amplitudes as free parameters of the terms, by name.
 
         Parameters
         ----------
         others
-            The other free parameters.
+            The other free parameters, by name.
         gradients
-            Computes residuals of some terms instead of their forms.
+            Computes residuals of some terms instead of their forms; None: forms do.
         """
         amplitudes = {name: PlacementAmplitude(self, name, terms, others) for name in self._values}
         return {
@@ -206,7 +222,19 @@ class PlacementAmplitudes:
 
 @dataclass(eq=False)
 class PlacementAmplitude:
-    """One amplitude of the placement, which takes the place of a constant in a form."""
+    """One amplitude of the placement, which takes the place of a constant in a form.
+
+    Attributes
+    ----------
+    amplitudes
+        All amplitudes of the placement.
+    name
+        The name of this one.
+    terms
+        The terms of the system.
+    others
+        Other free parameters, by name.
+    """
 
     amplitudes: PlacementAmplitudes
     name: str
@@ -223,7 +251,13 @@ class PlacementAmplitude:
         self.amplitudes.set_value(self.name, float(value))
 
     def slopes(self, gradients: ResidualAssembler | None = None) -> list[Derivative]:
-        """Return dPi_i/dmu as terms, one for each amplitude of terms."""
+        """Return dPi_i/dmu as terms, one for each amplitude mu_i of terms.
+
+        Parameters
+        ----------
+        gradients
+            Computes residuals of some terms instead of their forms; None: forms do.
+        """
         by_amplitude = dict[str | None, list[Term]]()
         for term in self.terms:
             by_amplitude.setdefault(term.amplitude, []).append(term)
@@ -233,7 +267,7 @@ class PlacementAmplitude:
         ]
 
     def second_derivatives(self, q: object) -> list[Derivative]:
-        """Return d2Pi_i/dmu dq with the amplitudes mu_i.
+        """Return d2Pi_i/dmu dq as terms with the amplitudes mu_i.
 
         Parameters
         ----------
@@ -243,17 +277,31 @@ class PlacementAmplitude:
         if isinstance(q, PlacementAmplitude):
             slopes: Sequence[Derivative] = q.slopes()
         else:
-            slopes = next(other.slopes for other in self.others.values() if other.constant is q)
+            slopes = next(
+                parameter.slopes for parameter in self.others.values() if parameter.constant is q
+            )
         return [_PlacementDerivative(slope.amplitude, self, [slope], None) for slope in slopes]
 
     def derivative_of(self, energy: Callable[[], float]) -> float:
-        """Return the derivative of an energy by the amplitude."""
+        """Return the derivative by this amplitude of an energy that a function computes."""
         return self.amplitudes.differentiate(self.name, lambda weight: weight * energy())
 
 
 @dataclass(frozen=True)
 class _PlacementDerivative:
-    """The derivative of some energies, which share an amplitude, by one of the placement."""
+    """The derivative of some energies, which share an amplitude, by one of the placement.
+
+    Attributes
+    ----------
+    amplitude
+        The amplitude that multiplies the energies; None: 1.
+    variable
+        The amplitude of the placement by which they are differentiated.
+    terms
+        The energies.
+    gradients
+        Computes residuals of some of them; None: their forms do.
+    """
 
     amplitude: str | None
     variable: PlacementAmplitude
@@ -265,12 +313,13 @@ class _PlacementDerivative:
         return self.variable.derivative_of(lambda: sum(term.energy() for term in self.terms))
 
     def add_residual(self, b: Array, factor: float) -> None:
-        """Add factor times its gradient to the local vector."""
+        """Add factor times the gradient of the derivative to the local vector b."""
         assembled = self.gradients.names if self.gradients else frozenset[str]()
         names = [name for term in self.terms if (name := getattr(term, "name", "")) in assembled]
         others = [term for term in self.terms if getattr(term, "name", "") not in assembled]
 
         def add(weight: float) -> float:
+            """Add the weighted gradients at the present placement to b; return 0 as the value."""
             if self.gradients:
                 self.gradients.add(b, dict.fromkeys(names, weight * factor))
             for term in others:

@@ -17,12 +17,12 @@ from scipy.sparse.csgraph import connected_components
 
 @dataclass(frozen=True)
 class GlobalCells:
-    """The cells of all ranks, on each of them.
+    """The cells of all ranks, on each rank.
 
     Attributes
     ----------
     nodes
-        (cells, k) global numbers of the nodes of each cell.
+        (cells, k): global numbers of the nodes of each cell.
     own_range
         Rows of the cells that this rank owns.
     """
@@ -33,18 +33,18 @@ class GlobalCells:
 
     @classmethod
     def gather(cls, V: fem.FunctionSpace) -> "GlobalCells":
-        """Gather the cells of a space; collective."""
+        """Gather the cells of a space from all ranks, in the order of ranks. Collective."""
         comm, index_map, topology = V.mesh.comm, V.dofmap.index_map, V.mesh.topology
         count = topology.index_map(topology.dim).size_local
         local_nodes = V.dofmap.list[:count]
         flat_nodes = local_nodes.ravel().astype(np.int32)
         nodes = index_map.local_to_global(flat_nodes).reshape(local_nodes.shape)
-        first = sum(comm.allgather(count)[: comm.rank])
+        first_cell = sum(comm.allgather(count)[: comm.rank])
         all_nodes = np.concatenate(comm.allgather(nodes)).astype(np.intp)
-        return cls(all_nodes, range(first, first + count), comm)
+        return cls(all_nodes, range(first_cell, first_cell + count), comm)
 
     def gather_values(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return the values of all cells; collective.
+        """Return the values at all cells, in the order of `nodes`. Collective.
 
         Parameters
         ----------
@@ -60,7 +60,7 @@ def gather_rows(comm: MPI.Comm, values: NDArray[Any]) -> NDArray[Any]:
 
 
 def global_values(f: fem.Function) -> NDArray[np.float64]:
-    """Return the nodal values (nodes, components) of all ranks, by global numbers; collective."""
+    """Return the nodal values (nodes, components) of all ranks, by global numbers. Collective."""
     V = f.function_space
     block_size = V.dofmap.bs
     owned = f.x.array[: block_size * V.dofmap.index_map.size_local]
@@ -73,14 +73,14 @@ def add_to_owners(
     owned_dofs: tuple[int, int],
     comm: MPI.Comm,
 ) -> None:
-    """Sum forces on all nodes over the ranks and add each to its owner's vector; collective.
+    """Sum forces on all nodes over the ranks, and add each to its owner's vector. Collective.
 
     Parameters
     ----------
     b
         Local vector, which is changed.
     forces
-        (nodes, 3) by global numbers, this rank's part.
+        (nodes, 3): this rank's part, by global numbers of nodes.
     owned_dofs
         Global number of this rank's first degree of freedom, and how many it owns.
     """
@@ -90,7 +90,7 @@ def add_to_owners(
 
 
 def component_numbers(V: fem.FunctionSpace) -> NDArray[np.int32]:
-    """Return the connected component of the mesh that each local node belongs to; collective.
+    """Return the connected component of the mesh to which each local node belongs. Collective.
 
     Returns
     -------
@@ -119,7 +119,17 @@ def component_numbers(V: fem.FunctionSpace) -> NDArray[np.int32]:
 def _graph_components(
     starts: NDArray[np.int64], ends: NDArray[np.int64], count: int
 ) -> tuple[int, NDArray[np.int32]]:
-    """Return the number of components of a graph of `count` nodes, and the component of each."""
+    """Find the connected components of a graph of `count` nodes.
+
+    Parameters
+    ----------
+    starts, ends
+        The two nodes of each edge.
+
+    Returns
+    -------
+    The number of components, and the component of each node.
+    """
     graph = coo_array((np.ones(len(starts), dtype=np.int8), (starts, ends)), (count, count))
     number, labels = connected_components(graph, directed=False)
     return int(number), labels

@@ -52,10 +52,12 @@ class _MeshlessForm:
 
     Attributes
     ----------
+    kernels
+        The compiled kernels.
     fields, constants
         Positions of the kernels' fields and constants among those of the form's origin.
     rank
-        Number of its arguments.
+        Number of the form's arguments.
     """
 
     kernels: compat.FormKernels
@@ -69,21 +71,21 @@ _compiled_forms: dict[FormKey, _MeshlessForm] = {}
 
 @dataclass(frozen=True)
 class DerivedForm:
-    """A form that is derived from another one, its origin.
+    """A UFL form that is derived from another one, its origin.
 
     Attributes
     ----------
     origin
-        The other form.
+        The form from which this one is derived.
     derivation
         Says how: with the signature of the origin and the position of `u` it determines the form.
     make
-        Returns the form.
+        Returns the derived form.
     u
-        The field that it is differentiated by, whose space its arguments have; None for the origin
-        itself.
+        The field by which the origin is differentiated, whose space the arguments of the form have;
+        None for the origin itself.
     factor
-        A constant that the origin does not have.
+        A constant that the origin does not have; empty without one.
     """
 
     origin: ufl.Form
@@ -94,9 +96,10 @@ class DerivedForm:
 
     @property
     def key(self) -> FormKey | None:
-        """Key under which the compiled form is kept.
+        """Key under which the compiled form is kept: signature, derivation and position of `u`.
 
-        None if it cannot be: it is empty, has several meshes, or does not depend on `u`.
+        It is None if the form cannot be kept: it is empty, has several meshes, or does not depend
+        on `u`.
         """
         origin = self.origin
         if not isinstance(origin, ufl.Form) or origin.empty() or len(origin.ufl_domains()) != 1:
@@ -112,7 +115,13 @@ class DerivedForm:
         return [*self.origin.constants(), *self.factor]
 
     def bind(self, meshless: _MeshlessForm) -> fem.Form:
-        """Return a compiled form on the mesh, with the fields and constants of this one."""
+        """Return a compiled form on the mesh of this one, with its fields and constants.
+
+        Parameters
+        ----------
+        meshless
+            A compiled form with the same key.
+        """
         fields, constants = self.origin.coefficients(), self.constants
         if self.u is None:
             spaces = [argument.ufl_function_space() for argument in self.origin.arguments()]
@@ -127,10 +136,17 @@ class DerivedForm:
         )
 
     def without_mesh(self, form: ufl.Form, kernels: compat.FormKernels) -> _MeshlessForm | None:
-        """Return the compiled form apart from its mesh.
+        """Return the compiled form apart from its mesh, to serve other forms with the same key.
 
-        None if it has fields or constants that its origin does not have, or labels, which no other
-        form has.
+        Parameters
+        ----------
+        form, kernels
+            The form as `make` returned it, and its compiled kernels.
+
+        Returns
+        -------
+        The form; None if it has fields or constants that its origin does not have, or labels, which
+        no other form has.
         """
         if has_type(self.origin, Label):
             return None
@@ -145,7 +161,7 @@ class DerivedForm:
 
 
 def _position(item: Any, items: Iterable[Any]) -> int | None:
-    """Return the position of an object among others; None if it is not there."""
+    """Return the position of an object among others; None if it is not among them."""
     return next((i for i, candidate in enumerate(items) if candidate is item), None)
 
 
@@ -156,12 +172,24 @@ def _bind(
     fields: Sequence[fem.Function],
     constants: Sequence[fem.Constant],
 ) -> fem.Form:
-    """Return the compiled form of kernels on the mesh and the subdomains of a form."""
+    """Return the compiled form of kernels on the mesh and the subdomains of a form.
+
+    Parameters
+    ----------
+    spaces
+        The spaces of its arguments.
+    fields, constants
+        The data of the kernels, in their order.
+    """
     domain = _domain_of(form)
     subdomain_data = form.subdomain_data()[domain]
     # dolfinx demands that integrals of a kind share their tags.
-    assert all(tags is data[0] for data in subdomain_data.values() for tags in data)
-    tags = {kind: data[0] for kind, data in subdomain_data.items()}
+    assert all(
+        tags is tags_of_integrals[0]
+        for tags_of_integrals in subdomain_data.values()
+        for tags in tags_of_integrals
+    )
+    tags = {kind: tags_of_integrals[0] for kind, tags_of_integrals in subdomain_data.items()}
     return compat.bind_form(kernels, spaces, fields, constants, tags, domain.ufl_cargo())
 
 
@@ -184,8 +212,9 @@ def _tensor_size(form: ufl.Form) -> int:
 
 
 def _print_to_stderr() -> Callable[[str], None]:
-    """Return a function that prints a line on rank 0, unless it has printed one in the last
-    `REPEAT_SECONDS`.
+    """Return a function that prints a line to standard error on rank 0.
+
+    The function drops a line that comes less than `REPEAT_SECONDS` after the last one.
     """
     last = -REPEAT_SECONDS
 
@@ -205,9 +234,9 @@ class Status:
     Attributes
     ----------
     tell
-        Receives messages.
+        Receives messages, as a rule one line each.
     compiled, requested
-        Numbers of libraries.
+        Numbers of libraries in all calls so far.
     """
 
     tell: Callable[[str], None] = field(default_factory=_print_to_stderr)
@@ -215,7 +244,7 @@ class Status:
     requested: int = 0
 
     def compile(self, libraries: Sequence[Library]) -> None:
-        """Compile libraries in parallel, see `compile_libraries`, and tell how many are ready."""
+        """Compile libraries in parallel, and report how many are ready if this takes long."""
         if not libraries:
             return
         begin = time.perf_counter()
@@ -223,6 +252,7 @@ class Status:
         self.requested += len(libraries)
 
         def tell_progress(count: int) -> None:
+            """Report that `count` libraries of this call are ready, if that is new or long ago."""
             nonlocal last_count, last_time
             time_now = time.perf_counter()
             if time_now - begin < SILENT_SECONDS:
@@ -240,7 +270,13 @@ _status = Status()
 
 @contextmanager
 def reporting_progress_to(tell: Callable[[str], None]) -> Iterator[None]:
-    """Tell a function how many kernels are compiled of how many, within `with`."""
+    """Report the progress of compilation to a function, within `with`.
+
+    Parameters
+    ----------
+    tell
+        Receives messages on how many kernels are compiled of how many.
+    """
     global _status
     previous, _status = _status, Status(tell)
     try:
@@ -251,7 +287,13 @@ def reporting_progress_to(tell: Callable[[str], None]) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class _RequestedLibrary:
-    """A library that is requested, and how many numbers its function returns."""
+    """A library that is requested.
+
+    Attributes
+    ----------
+    size
+        How many numbers its function returns: the largest is compiled first.
+    """
 
     library: Library
     size: int
@@ -259,28 +301,46 @@ class _RequestedLibrary:
 
 @dataclass
 class KernelLog:
-    """Names of the kernels of a problem and the seconds spent on compiling or loading them."""
+    """Requests of the kernels of a problem, and the time spent on them.
+
+    Attributes
+    ----------
+    names
+        Names of all requested kernels.
+    seconds
+        Time spent on compiling or loading them.
+    """
 
     names: list[str] = field(default_factory=list)
     seconds: float = 0.0
     _requested: dict[str, _RequestedLibrary] = field(default_factory=dict)
 
     def compile(self, name: str, expression: ufl.Form) -> fem.Form:
-        """Return a compiled form; collective."""
+        """Return a form compiled under a name. Collective."""
         return self.compile_derived(name, underived(expression))
 
     def compile_derived(self, name: str, form: DerivedForm) -> fem.Form:
-        """Return a compiled form that is derived from another one; collective."""
+        """Return a form that is derived from another one, compiled under a name. Collective."""
         (compiled,) = self._compile_together({name: form})
         return compiled
 
     def compile_all(self, groups: Iterable[Mapping[str, ufl.Form]]) -> dict[str, fem.Form]:
-        """Return compiled forms under their names; collective."""
+        """Return compiled forms by name, all compiled in parallel. Collective.
+
+        Parameters
+        ----------
+        groups
+            Mappings from the name of each form to the form.
+        """
         forms = {name: form for group in groups for name, form in group.items()}
         compiled = self._compile_together({name: underived(form) for name, form in forms.items()})
         return dict(zip(forms, compiled, strict=True))
 
     def _compile_together(self, forms: Mapping[str, DerivedForm]) -> list[fem.Form]:
+        """Return compiled forms, in the order of their names, all compiled in parallel.
+
+        Collective over the mesh of the forms.
+        """
         requests = [self.request_form(name, form) for name, form in forms.items()]
         origins = [form.origin for form in forms.values()]
         integrals = [form for form in origins if isinstance(form, ufl.Form) and not form.empty()]
@@ -289,9 +349,12 @@ class KernelLog:
         return [request() for request in requests]
 
     def request_form(self, name: str, form: DerivedForm) -> Callable[[], fem.Form]:
-        """Request a form; return a function that returns it compiled.
+        """Request a compiled form, which comes from this process, the cache or the compiler.
 
-        It comes from this process, from the cache or from the compiler.
+        Returns
+        -------
+        A function that returns the compiled form, which is None for an empty form. Its first call
+        compiles all requested kernels.
         """
         start, key = time.perf_counter(), form.key
         try:
@@ -314,6 +377,7 @@ class KernelLog:
             self._note(name, start)
 
     def _load_form(self, form: DerivedForm, ufl_form: ufl.Form, library: ctypes.CDLL) -> fem.Form:
+        """Return a compiled form from its library; keep it for other forms with the same key."""
         kernels, key = compat.FormKernels.from_library(ufl_form, library), form.key
         if key and (meshless := form.without_mesh(ufl_form, kernels)):
             _compiled_forms[key] = meshless
@@ -324,12 +388,25 @@ class KernelLog:
     def request_library(
         self, name: str, key: str, source: Callable[[], str], options: tuple[str, ...], size: int
     ) -> Callable[[], ctypes.CDLL]:
-        """Request a library, whose function returns `size` numbers; see `Library`.
+        """Request a library with a C function.
+
+        Parameters
+        ----------
+        name
+            Name of the kernel in the log.
+        key
+            Determines the source and the options; see `Library`.
+        source
+            Returns the C source.
+        options
+            Options of the compiler.
+        size
+            How many numbers the function returns.
 
         Returns
         -------
         Callable
-            Returns the library.
+            Returns the library. Its first call compiles all requested kernels.
         """
         start = time.perf_counter()
         library = self._request_library(key, source, options, size)
@@ -339,11 +416,13 @@ class KernelLog:
     def _request_library(
         self, key: str, source: Callable[[], str], options: tuple[str, ...], size: int
     ) -> Callable[[], ctypes.CDLL]:
+        """Request a library without a note in the log; see `request_library`."""
         library = Library(key, source, options)
         request = self._requested.setdefault(library.file, _RequestedLibrary(library, size))
 
         @cache
         def loaded() -> ctypes.CDLL:
+            """Return the library; compile all requested ones if it is among them."""
             if library.file in self._requested:
                 self._compile_requested()
             return ctypes.CDLL(str(request.library.path()))
@@ -351,7 +430,7 @@ class KernelLog:
         return loaded
 
     def compile_requested(self, comm: MPI.Comm) -> None:
-        """Compile all that was requested; collective.
+        """Compile all libraries that were requested. Collective.
 
         Raises
         ------
@@ -363,6 +442,7 @@ class KernelLog:
         raise_on_all_ranks(comm, self._compile_requested)
 
     def _compile_requested(self) -> None:
+        """Compile all libraries that were requested, the largest first; on this rank alone."""
         start = time.perf_counter()
         largest_first = sorted(self._requested.values(), key=lambda request: -request.size)
         libraries = [request.library for request in largest_first]
@@ -371,5 +451,6 @@ class KernelLog:
         self.seconds += time.perf_counter() - start
 
     def _note(self, name: str, start: float) -> None:
+        """Note the name of a kernel, and the seconds since `start`."""
         self.seconds += time.perf_counter() - start
         self.names.append(name)

@@ -19,21 +19,21 @@ Value = TypeVar("Value")
 
 
 class Memo(Generic[Value]):
-    """A value that is a function of other values.
+    """A value that is computed from other values, and again only if these have changed.
 
     Parameters
     ----------
     function
         Computes the value, on each rank alone.
     inputs
-        Returns the arrays and numbers that it depends on.
+        Returns the arrays and numbers on which the value depends.
 
     Attributes
     ----------
     latest
         The value that was computed last.
     version
-        How often it was computed.
+        How often the value was computed.
     """
 
     def __init__(
@@ -43,7 +43,7 @@ class Memo(Generic[Value]):
         self._latest_inputs: tuple[Any, ...] | None = None
 
     def renew(self) -> Value:
-        """Return the value; it is computed again if its inputs have changed."""
+        """Return the value; compute it again if its inputs have changed."""
         inputs = self._inputs()
         if not self._is_current(inputs):
             self.latest = self._function()
@@ -52,6 +52,7 @@ class Memo(Generic[Value]):
         return self.latest
 
     def _is_current(self, inputs: tuple[Any, ...]) -> bool:
+        """Return whether inputs are equal to those of the latest value."""
         previous = self._latest_inputs
         if previous is None or len(previous) != len(inputs):
             return False
@@ -65,15 +66,17 @@ class PointField(fem.Function):  # type: ignore[misc]  # dolfinx has no types
 
     Parameters
     ----------
+    domain
+        The mesh.
     degree
-        Of the quadrature.
+        Degree of the quadrature.
     size
         Number of components.
 
     Attributes
     ----------
     points
-        (q, dimension) on the reference cell.
+        (q, dimension): the quadrature points on the reference cell.
     values
         (local cells, q, size), as they were last renewed.
     """
@@ -89,7 +92,15 @@ class PointField(fem.Function):  # type: ignore[misc]  # dolfinx has no types
     def compute_by(
         self, function: Callable[[], Array], inputs: Callable[[], tuple[Any, ...]]
     ) -> None:
-        """Let all values be a function of others, see `Memo`."""
+        """Let a function compute the values at every `renew` after its inputs have changed.
+
+        Parameters
+        ----------
+        function
+            Returns the values (local cells, q, size).
+        inputs
+            Returns the arrays and numbers on which they depend, see `Memo`.
+        """
         self._memo = Memo(lambda: self._put(function()), inputs)
 
     def renew(self) -> int:
@@ -98,27 +109,40 @@ class PointField(fem.Function):  # type: ignore[misc]  # dolfinx has no types
         return self._memo.version
 
     def at_cells(self, cells: NDArray[np.int32]) -> Array:
-        """Return the values (cells * q, size) at consecutive cells: a view, no copy."""
-        first = cells[0] if len(cells) else 0
-        return self.values[first : first + len(cells)].reshape(-1, self.values.shape[-1])
+        """Return the values (cells * q, size) at consecutive cells: a view, no copy.
+
+        Parameters
+        ----------
+        cells
+            (cells,): local numbers, ascending without gaps.
+        """
+        first_cell = cells[0] if len(cells) else 0
+        return self.values[first_cell : first_cell + len(cells)].reshape(-1, self.values.shape[-1])
 
     def _put(self, values: Array) -> None:
+        """Store values (local cells, q, size) here and in the coefficient."""
         self.values[:] = values
         self.x.array.reshape(-1, values.shape[-1])[self._dofs] = values
 
 
 def memo_input(field: fem.Function) -> Array | int:
-    """Return an input of a `Memo` that changes with a field: its values, or their version."""
+    """Return a field's values, or their version: an input of a `Memo` that changes with them."""
     return field.renew() if isinstance(field, PointField) else field.x.array
 
 
 def at_quadrature(field: fem.Function, points: Array) -> Array:
-    """Return a field at points of the reference cell.
+    """Return a nodal field at points of the reference cell, in all local cells.
+
+    Parameters
+    ----------
+    points
+        (points, dimension) on the reference cell.
 
     Returns
     -------
     Array
-        (cells, points, components); (cells, points, 3) of the plane vectors of a meridian.
+        (cells, points, components); (cells, points, 3) of the plane vectors of a meridian, whose
+        second component is zero.
     """
     components, V = field.function_space.dofmap.bs, field.function_space
     shape = V.element.basix_element.tabulate(0, points)[0, :, :, 0]

@@ -29,13 +29,25 @@ Factors: TypeAlias = Mapping[str, float]  # of terms, by name
 
 
 class AddedTangent(Protocol):
-    """A matrix that is added to the sparse tangent: the tangents of some terms, times factors."""
+    """The tangents of some terms, times factors: a matrix that is added to the sparse tangent."""
 
     def sum(self, K: PETSc.Mat, factors: Factors) -> PETSc.Mat:
-        """Return a sparse matrix plus the tangents of these terms. Collective."""
+        """Return a sparse matrix plus the tangents of the terms. Collective.
+
+        Parameters
+        ----------
+        factors
+            Term name -> factor of its tangent.
+        """
 
     def times(self, v: Array, factors: Factors) -> Array:
-        """Return this rank's part of the tangents' product with v, both with ghosts. Collective."""
+        """Return this rank's part of the tangents' product with v, both with ghosts. Collective.
+
+        Parameters
+        ----------
+        factors
+            Term name -> factor of its tangent.
+        """
 
 
 @runtime_checkable
@@ -48,20 +60,33 @@ class FieldDifferentiable(Protocol):
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
     ) -> tuple[fem.Function, Array] | None:
-        """Return a field and derivatives by its values in own cells. Collective.
+        """Return derivatives by the values of a field in the term. Collective.
 
-        They are those of energy Pi + force v . dPi/du, v the direction. None if the term has no
-        field of that name.
+        Parameters
+        ----------
+        name
+            Name of the field.
+        direction
+            The direction v of the force.
+        energy, force
+            Factors in the number energy Pi + force v . dPi/du that is differentiated.
+
+        Returns
+        -------
+        The field, and the derivatives by its values in own cells; None if the term has no field of
+        that name.
         """
 
 
 def added_tangents(
     V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.DirichletBC]
 ) -> list[AddedTangent]:
-    """Return the added tangents of the nonlocal terms among these; collective.
+    """Return the added tangents of the nonlocal terms in a list of terms. Collective.
 
     Parameters
     ----------
+    V
+        Space of the displacement.
     clamped
         Homogeneous Dirichlet conditions.
     """
@@ -72,7 +97,19 @@ def added_tangents(
 def dense_terms(
     V: fem.FunctionSpace, terms: Sequence[Term], clamped: Sequence[fem.DirichletBC]
 ) -> "DenseTerms | None":
-    """Return the terms among these that couple all unknowns; None without. Collective."""
+    """Return the terms that couple all unknowns, from a list of terms. Collective.
+
+    Parameters
+    ----------
+    V
+        Space of the displacement.
+    clamped
+        Homogeneous Dirichlet conditions.
+
+    Returns
+    -------
+    The terms with their matrix; None if there are no such terms.
+    """
     coupling_all = [t for t in terms if isinstance(t, DenseTerm)]
     return DenseTerms(DenseTangent(V, clamped), coupling_all) if coupling_all else None
 
@@ -87,9 +124,18 @@ class DenseTerms:
     def corrected(
         self, K: PETSc.Mat, factors: Factors, *, inexact: bool
     ) -> PETSc.Mat | CorrectedTangent:
-        """Return a sparse matrix corrected by these terms. Collective.
+        """Return a sparse matrix corrected by the dense terms; K itself if all factors are zero.
 
-        If `inexact`, their tangents may be those of an earlier state.
+        Collective.
+
+        Parameters
+        ----------
+        K
+            The sparse matrix, which is changed.
+        factors
+            Term name -> factor of its tangent.
+        inexact
+            Whether the tangents may be those of an earlier state.
         """
         terms = self._weighted(factors)
         return self.matrix.corrected(K, terms, inexact=inexact) if terms else K
@@ -99,6 +145,7 @@ class DenseTerms:
         return self.matrix.times(self._weighted(factors), v)
 
     def _weighted(self, factors: Factors) -> list[tuple[float, DenseTerm]]:
+        """Return pairs of a factor and its term, without those whose factor is zero."""
         return [(factor, t) for t in self.terms if (factor := factors.get(t.name, 0.0))]
 
 
@@ -109,9 +156,9 @@ class NonlocalTerm(Protocol):
     name: str
 
     def entries(self) -> Entries:
-        """Return this rank's part of d2Pi/du2, in any order. Collective.
+        """Return this rank's part of d2Pi/du2: global rows and columns, and values. Collective.
 
-        Entries at the same place are summed.
+        Entries come in any order; those at the same place are summed.
         """
 
     def coupled_pairs(self) -> tuple[Longs, Longs]:
@@ -127,9 +174,16 @@ class NonlocalTerm(Protocol):
 
 
 class NonlocalEntries:
-    """Tangents of nonlocal terms, whose entries change from state to state.
+    """Sum of the sparse tangent and of nonlocal terms, whose entries change from state to state.
 
-    The constructor is collective.
+    It is an `AddedTangent`. The constructor is collective.
+
+    Parameters
+    ----------
+    V
+        Space of the displacement.
+    clamped
+        Homogeneous Dirichlet conditions.
     """
 
     def __init__(
@@ -138,6 +192,7 @@ class NonlocalEntries:
         terms: Sequence[NonlocalTerm],
         clamped: Sequence[fem.DirichletBC],
     ) -> None:
+        """Gather the ranges of all ranks' unknowns, and which of them are clamped. Collective."""
         self._terms, self._comm = terms, V.mesh.comm
         sizes = self._comm.allgather(V.dofmap.index_map.size_local)
         self._block_size = V.dofmap.index_map_bs
@@ -152,9 +207,15 @@ class NonlocalEntries:
         self._pattern_keys: tuple[tuple[str, float], ...] = ()
 
     def sum(self, K: PETSc.Mat, factors: Factors) -> PETSc.Mat:
-        """Return a sparse matrix plus the tangents of these terms. Collective.
+        """Return a sparse matrix plus the tangents of the nonlocal terms. Collective.
 
-        It is K itself if there are no entries, else mostly the same object.
+        The result is K itself if there are no entries. Else it is mostly the same object, with a
+        pattern that has room for the expected entries.
+
+        Parameters
+        ----------
+        factors
+            Term name -> factor of its tangent.
         """
         entries = self._entries(factors)
         if not entries:
@@ -182,10 +243,11 @@ class NonlocalEntries:
         return product
 
     def _entries(self, factors: Factors) -> list[tuple[float, Entries]]:
+        """Return pairs of a factor and its term's entries, without those whose factor is zero."""
         return [(factor, t.entries()) for t in self._terms if (factor := factors.get(t.name, 0.0))]
 
     def _expected_pattern(self, factors: Factors) -> csr_array:
-        """Return the pattern of entries that are or may come; collective."""
+        """Return the pattern (own unknowns, all) of expected entries of the terms. Collective."""
         pairs = [t.coupled_pairs() for t in self._terms if factors.get(t.name, 0.0)]
         rows, columns = (np.concatenate(nodes) for nodes in zip(*pairs, strict=True))
         count = len(self._fixed) // self._block_size
@@ -194,6 +256,7 @@ class NonlocalEntries:
             self._block_size * nodes[:, None, None] + np.arange(self._block_size)
             for nodes in (rows, columns)
         )
+        # all components of the first node with all of the second, (pairs, 3, 3)
         i, j = np.broadcast_arrays(i.transpose(0, 2, 1), j)
         entries = i.ravel(), j.ravel(), np.ones(i.size, dtype=np.int8)
         return _pattern_of(_owned_rows(self._comm, self._ranges, self._fixed, entries))
@@ -207,12 +270,13 @@ class _MatrixSum:
     sparse
         The sparse matrix, which is always the same object.
     room
-        (own unknowns, all) ones where entries can be.
+        (own unknowns, all): ones where entries can be.
     first
-        Number of the first own unknown.
+        Global number of the first own unknown.
     """
 
     def __init__(self, sparse: PETSc.Mat, room: csr_array, first: int) -> None:
+        """Create the matrix of PETSc with the union of both patterns. Collective."""
         self.sparse, self.room = sparse, room
         starts, columns, _ = sparse.getValuesCSR()
         ones = np.ones(len(columns), dtype=np.int8)
@@ -239,7 +303,13 @@ class _MatrixSum:
             self._matrix.setOption(option, True)
 
     def has_room_for(self, added: csr_array) -> bool:
-        """Return whether the pattern has these entries of this rank."""
+        """Return whether the pattern contains the entries of this rank.
+
+        Parameters
+        ----------
+        added
+            (own unknowns, all): the entries.
+        """
         keys = _entry_keys(added)
         positions = np.searchsorted(self._room_keys, keys)
         if positions.max(initial=0) >= len(self._room_keys):
@@ -247,7 +317,10 @@ class _MatrixSum:
         return bool((self._room_keys[positions] == keys).all())
 
     def update(self, added: csr_array) -> PETSc.Mat:
-        """Return the sum with the present values of both."""
+        """Return the sum of the present sparse matrix and of entries within the room.
+
+        It is always the same object.
+        """
         self._values[:] = 0.0
         self._values[self._at_sparse] = self.sparse.getValuesCSR()[2]
         positions = np.searchsorted(self._room_keys, _entry_keys(added))
@@ -261,9 +334,16 @@ class _MatrixSum:
 
 
 def with_entries(K: PETSc.Mat, entries: Entries, fixed: NDArray[np.bool_]) -> PETSc.Mat:
-    """Return a new matrix with further entries, except those of `fixed` unknowns. Collective.
+    """Return a new matrix: K with further entries, except those of fixed unknowns. Collective.
 
-    It is K itself if there are none.
+    It is K itself if no rank has entries.
+
+    Parameters
+    ----------
+    entries
+        Global rows and columns, and values; entries at one place are summed.
+    fixed
+        (all unknowns,): whether each is fixed.
     """
     ranges = np.asarray(K.getOwnershipRanges())
     added = _owned_rows(K.comm.tompi4py(), ranges, fixed, entries)
@@ -275,20 +355,33 @@ def with_entries(K: PETSc.Mat, entries: Entries, fixed: NDArray[np.bool_]) -> PE
 def _owned_rows(
     comm: MPI.Comm, ranges: Longs, fixed: NDArray[np.bool_], entries: tuple[Longs, Longs, Any]
 ) -> csr_array:
-    """Return the rows of own unknowns of entries that ranks have, summed. Collective.
+    """Send entries to the ranks that own their rows, and sum them there. Collective.
 
-    Entries of fixed unknowns are left out.
+    Parameters
+    ----------
+    ranges
+        (ranks + 1,): the first unknown of each rank, and the number of all.
+    fixed
+        (all unknowns,): whether each is fixed; its entries are left out.
+    entries
+        Global rows and columns, and values.
+
+    Returns
+    -------
+    (own unknowns, all) the matrix of the entries in own rows.
     """
     rows, columns, values = entries
     free = ~(fixed[rows] | fixed[columns])
-    owned = rows[free], columns[free], values[free]
+    selected = rows[free], columns[free], values[free]
     if comm.size > 1:
-        owner = np.searchsorted(ranges, owned[0], side="right") - 1
-        sent = [tuple(array[owner == rank] for array in owned) for rank in range(comm.size)]
+        owner = np.searchsorted(ranges, selected[0], side="right") - 1
+        sent = [tuple(array[owner == rank] for array in selected) for rank in range(comm.size)]
         received = comm.alltoall(sent)
-        owned = tuple(np.concatenate(arrays) for arrays in zip(*received, strict=True))
-    first, last = ranges[comm.rank : comm.rank + 2]
-    return coo_array((owned[2], (owned[0] - first, owned[1])), (last - first, len(fixed))).tocsr()
+        selected = tuple(np.concatenate(arrays) for arrays in zip(*received, strict=True))
+    first_row, end_row = ranges[comm.rank : comm.rank + 2]
+    return coo_array(
+        (selected[2], (selected[0] - first_row, selected[1])), (end_row - first_row, len(fixed))
+    ).tocsr()
 
 
 def times(entries: list[tuple[float, Entries]], v: Array) -> Array:
@@ -297,7 +390,7 @@ def times(entries: list[tuple[float, Entries]], v: Array) -> Array:
     Parameters
     ----------
     entries
-        With a factor each.
+        Pairs of a factor and entries: global rows and columns, and values.
 
     Returns
     -------
@@ -311,19 +404,24 @@ def times(entries: list[tuple[float, Entries]], v: Array) -> Array:
 
 
 def pairs_of(nodes: Longs) -> tuple[Longs, Longs]:
-    """Return all pairs of nodes within each row of (n, k)."""
+    """Return all ordered pairs of the k nodes in each row of an array (n, k).
+
+    Returns
+    -------
+    The first and the second node of each pair, both (n k^2,).
+    """
     i, j = np.broadcast_arrays(nodes[:, :, None], nodes[:, None, :])
     return i.ravel(), j.ravel()
 
 
 def _pattern_of(matrix: csr_array) -> csr_array:
-    """Return a matrix with ones in place of all entries."""
+    """Return a matrix of the same pattern, with ones in place of all entries."""
     ones = np.ones(matrix.nnz, dtype=np.int8)
     return csr_array((ones, matrix.indices, matrix.indptr), matrix.shape)
 
 
 def _entry_keys(matrix: csr_array) -> Longs:
-    """Return a number for the place of each entry, ascending."""
+    """Return a number row * width + column for the place of each entry, ascending."""
     rows = np.repeat(np.arange(matrix.shape[0], dtype=np.int64), np.diff(matrix.indptr))
     return np.asarray(rows * matrix.shape[1] + matrix.indices)
 
@@ -331,7 +429,19 @@ def _entry_keys(matrix: csr_array) -> Longs:
 def _selected_columns(
     matrix: csr_array, mask: NDArray[np.bool_], first: int
 ) -> tuple[Any, Any, Array]:
-    """Return starts, columns counted from `first`, and zeros of the entries in a mask."""
+    """Return the arrays of a matrix of PETSc with some entries of a matrix.
+
+    Parameters
+    ----------
+    mask
+        (entries,): which entries are selected.
+    first
+        Number from which columns are counted.
+
+    Returns
+    -------
+    Starts of the rows, columns, and zeros as values.
+    """
     starts = np.concatenate([[0], np.cumsum(mask)])[matrix.indptr]
     columns = matrix.indices[mask] - first
     return starts.astype(PETSc.IntType), columns.astype(PETSc.IntType), np.zeros(len(columns))

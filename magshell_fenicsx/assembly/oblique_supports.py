@@ -27,7 +27,7 @@ class ObliqueSupport:
     nodes
         Local numbers, ghosts included.
     normal
-        (3,) unit vector.
+        (3,): the direction, a unit vector.
     """
 
     nodes: NDArray[np.int32]
@@ -40,7 +40,19 @@ Constraint: TypeAlias = fem.DirichletBC | ObliqueSupport
 def support_along(
     V: fem.FunctionSpace, dim: int, entities: NDArray[np.int32], normal: Array
 ) -> Constraint:
-    """Return the constraint u . normal = 0 on some edges (`dim` 1) or faces (2)."""
+    """Return the constraint u . normal = 0 on some edges (`dim` 1) or faces (`dim` 2).
+
+    Along a coordinate axis it is a Dirichlet condition, else an oblique support.
+
+    Parameters
+    ----------
+    V
+        Space of the displacement.
+    entities
+        Local numbers of the edges or faces.
+    normal
+        (3,): the direction, a unit vector.
+    """
     axis = int(np.argmax(np.abs(normal)))
     if np.delete(normal, axis).any():
         return ObliqueSupport(fem.locate_dofs_topological(V, dim, entities), normal)
@@ -50,10 +62,12 @@ def support_along(
 
 
 class Projection:
-    """The projection of displacements onto the admissible ones.
+    """The projection of displacements onto the admissible ones, node by node.
 
     Parameters
     ----------
+    V
+        Space of the displacement.
     oblique
         Supports along any direction.
     clamped
@@ -66,11 +80,13 @@ class Projection:
         oblique: Sequence[ObliqueSupport],
         clamped: Sequence[fem.DirichletBC],
     ) -> None:
+        """Compute the projector P of each supported node, from all its directions."""
         index_map = V.dofmap.index_map
         is_clamped = np.zeros((index_map.size_local + index_map.num_ghosts, 3), dtype=bool)
         for bc in clamped:
             is_clamped.ravel()[bc.dof_indices()[0]] = True
         self._nodes = np.unique(np.concatenate([support.nodes for support in oblique]))
+        # clamped components of the node, then the normals of its oblique supports
         directions = [np.eye(3)[is_clamped[node]] for node in self._nodes]
         for support in oblique:
             for i in np.searchsorted(self._nodes, support.nodes):
@@ -84,21 +100,24 @@ class Projection:
         self._unprojected: PETSc.Mat | None = None
 
     def project(self, u: Array) -> None:
-        """Project a vector of owned nodes, with or without ghosts, in place."""
+        """Project a vector of owned nodes, with or without ghosts, in place: replace u by P u."""
         local = self._nodes < len(u) // 3
         nodes, x = self._nodes[local], u.reshape(-1, 3)
         x[nodes] = np.einsum("nij,nj->ni", self._P[local], x[nodes])
 
     def constrained_part(self, u: Array) -> Array:
-        """Return u - P u: rounding, which extrapolation along a path would multiply."""
+        """Return u - P u, the part of u along the supports' directions.
+
+        It is rounding, which extrapolation along a path would multiply.
+        """
         admissible = np.array(u)
         self.project(admissible)
         return np.asarray(u - admissible)
 
     def tangent(self, K: PETSc.Mat) -> PETSc.Mat:
-        """Return P K P + (I - P). Collective.
+        """Return P K P + (I - P) for a tangent K. Collective.
 
-        It is the same object as long as K is the same; contact makes another K.
+        The result is the same object as long as K is the same; contact makes another K.
         """
         if self._P_matrix is None:
             self._P_matrix = self._block_diagonal(self._P, 1.0)
@@ -113,11 +132,11 @@ class Projection:
         return self._projected
 
     def project_both_sides(self, M: PETSc.Mat) -> PETSc.Mat:
-        """Return P M P. Collective."""
+        """Return P M P for a matrix M. Collective."""
         return M.ptap(self._block_diagonal(self._P, 1.0))
 
     def mass(self, M: PETSc.Mat) -> PETSc.Mat:
-        """Return P M P, symmetric. Collective.
+        """Return P M P for a mass matrix M, marked as symmetric. Collective.
 
         Directions of supports then have no finite eigenvalue.
         """
@@ -126,31 +145,34 @@ class Projection:
         return product
 
     def _block_diagonal(self, blocks: Array, elsewhere: float) -> PETSc.Mat:
-        """Return a block-diagonal matrix. Collective.
+        """Return a block-diagonal matrix of own unknowns. Collective.
 
         Parameters
         ----------
         blocks
-            (supported nodes, 3, 3).
+            (supported nodes, 3, 3): the block of each supported node.
         elsewhere
             The number on the diagonal at other nodes.
         """
-        n, first = 3 * self._owned, 3 * self._first
+        n, first_row = 3 * self._owned, 3 * self._first
         matrix = PETSc.Mat().createAIJ(((n, None), (n, None)), nnz=(3, 0), comm=self._comm)
         local = self._nodes < self._owned
         if elsewhere:
             other_nodes = np.setdiff1d(np.arange(self._owned), self._nodes[local])
             for i in (3 * other_nodes[:, None] + np.arange(3)).ravel():
-                matrix.setValue(first + i, first + i, elsewhere)
+                matrix.setValue(first_row + i, first_row + i, elsewhere)
         for node, block in zip(self._nodes[local], blocks[local], strict=True):
-            rows = (first + 3 * node + np.arange(3)).astype(PETSc.IntType)
+            rows = (first_row + 3 * node + np.arange(3)).astype(PETSc.IntType)
             matrix.setValues(rows, rows, block)
         matrix.assemble()
         return matrix
 
 
 def _complement(directions: Array) -> Array:
-    """Return the (3, 3) projector onto the complement of the directions (n, 3)."""
+    """Return the projector (3, 3) onto the complement of some directions (n, 3).
+
+    Nearly equal directions count as one.
+    """
     _, sizes, axes = np.linalg.svd(directions)
     spanned = axes[: len(sizes)][sizes > DIRECTION_TOLERANCE]
     return np.asarray(np.eye(3) - spanned.T @ spanned)

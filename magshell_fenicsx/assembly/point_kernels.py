@@ -39,7 +39,13 @@ PointFunction: TypeAlias = Callable[[int, int, int, int, int], None]
 
 
 class PointStorage:
-    """Storage for fields at a number of points, on this rank."""
+    """Storage for fields at a number of points, on this rank.
+
+    Parameters
+    ----------
+    capacity
+        Largest number of points.
+    """
 
     def __init__(self, capacity: int) -> None:
         self.capacity = capacity
@@ -59,7 +65,7 @@ class PointStorage:
         return copied
 
     def evaluate(self, kernel: "PointKernel", count: int) -> Array:
-        """Return values (count, components) at the first points.
+        """Return the values (count, components) of a kernel at the first points.
 
         The array is reused by the next call.
         """
@@ -75,10 +81,17 @@ class PointStorage:
 class PointKernel:
     """A function of fields and constants at points, compiled when it is first evaluated.
 
+    Parameters
+    ----------
+    library
+        Returns the compiled library.
+    fields, constants
+        The inputs, in the order of the code; their present values are taken at each evaluation.
+
     Attributes
     ----------
     size
-        Number of its components.
+        Number of components of the function.
     """
 
     def __init__(
@@ -97,10 +110,11 @@ class PointKernel:
 
     @cached_property
     def _function(self) -> PointFunction:
+        """The compiled function, see `PointFunction`."""
         return kernel_function(self._library())
 
     def evaluate(self, count: int, values: Array) -> None:
-        """Fill a contiguous array (count, size) for the first points."""
+        """Fill a contiguous array (count, size) with the results at the first points."""
         # With a zero at the end, so that it is never empty.
         constants = np.concatenate([np.ravel(value) for value in (*self._constants, 0.0)])
         arrays = self._addresses, self._sizes, constants, values
@@ -124,16 +138,25 @@ def _kernel(
 
     Parameters
     ----------
+    name
+        Name of the kernel in the log.
+    expressions
+        The expressions of UFL; fields, constants and labels in them are numbered.
     task
-        Says what is made of the expressions.
+        Says what is made of the expressions; a part of the key.
     size
         Number of the results.
+    make_nodes
+        Called with the graph and the nodes of each expression; it returns the nodes of the results.
+    log
+        Requests the compiled library.
     """
     fields, constants, labels = terminals_of(expressions, ufl.Coefficient, ufl.Constant, Label)
     translate = cache(lambda: _graph(expressions, fields, constants))
     structure = (task, *_structures(expressions, fields, constants, labels))
 
     def code() -> str:
+        """Return the C source of the kernel."""
         graph, nodes = translate()
         return point_code(graph, make_nodes(graph, nodes))
 
@@ -146,9 +169,16 @@ _KEYS: dict[tuple[str, ...], str] = {}  # of kernels, by the structure of their 
 
 
 def _cached_key(structure: tuple[str, ...], compute_key: Callable[[], str]) -> str:
-    """Return the key of a kernel, from this process or an earlier one if known.
+    """Return the key of a kernel, from this process or from the cache on disk if it is known.
 
     To translate an expression takes as long as all else of a kernel.
+
+    Parameters
+    ----------
+    structure
+        The task, and signatures of the expressions, which determine the key.
+    compute_key
+        Computes the key of an unknown structure.
     """
     if structure not in _KEYS:
         inputs = repr((_version(), ufl.__version__, structure))
@@ -163,7 +193,13 @@ def _cached_key(structure: tuple[str, ...], compute_key: Callable[[], str]) -> s
 
 
 def _structures(expressions: Sequence[Expr], *inputs: Sequence[Any]) -> list[str]:
-    """Return signatures of expressions that are independent of which inputs they have."""
+    """Return signatures of expressions in which inputs count by their position alone.
+
+    Parameters
+    ----------
+    inputs
+        Fields, constants and labels, each in its order.
+    """
     numbers = {terminal: i for terminals in inputs for i, terminal in enumerate(terminals)}
     numbers |= {domain: 0 for e in expressions for domain in extract_domains(e)}
     return [compute_expression_signature(e, numbers) for e in expressions]
@@ -172,17 +208,31 @@ def _structures(expressions: Sequence[Expr], *inputs: Sequence[Any]) -> list[str
 def _graph(
     expressions: Sequence[Expr], fields: Sequence[fem.Function], constants: Sequence[fem.Constant]
 ) -> tuple[ScalarGraph, list[list[int]]]:
-    """Return the operations, and the nodes of each expression."""
+    """Return the graph of some expressions, and the nodes of each expression.
+
+    Parameters
+    ----------
+    fields, constants
+        All that occur, in their order among the inputs.
+    """
     graph = ScalarGraph()
     return graph, [flat(graph.components(e, fields, constants)) for e in expressions]
 
 
 def _key(task: str, graph: ScalarGraph, nodes: list[list[int]]) -> str:
-    """Return the key of a kernel: a hash of all that its code depends on.
+    """Return the key of a kernel: a hash of everything on which its code depends.
 
     It is independent of the order and number of other operations in the graph.
+
+    Parameters
+    ----------
+    task
+        Says what is made of the expressions.
+    nodes
+        The nodes of each expression.
     """
     all_nodes = [node for nodes_of_one in nodes for node in nodes_of_one]
+    # nodes are numbered anew, in the order in which the code needs them
     number = {node: i for i, node in enumerate(graph.dependencies(all_nodes))}
     operations = list[tuple[Any, ...]]()
     for node in number:
@@ -203,7 +253,7 @@ def _version() -> str:
 
 
 def point_values(name: str, W: Expr, log: KernelLog) -> PointKernel:
-    """Return the kernel of the components of an expression."""
+    """Return the kernel of the components of an expression W."""
     size = int(np.prod(W.ufl_shape))
     return _kernel(name, [W], "values", size, lambda _, nodes: nodes[0], log)
 
@@ -211,15 +261,25 @@ def point_values(name: str, W: Expr, log: KernelLog) -> PointKernel:
 def point_gradient(
     name: str, sums: Sequence[tuple[Expr, fem.Function]], log: KernelLog
 ) -> PointKernel:
-    """Return the kernel of the sum of dW/dz for some W, each with its own z of the same size."""
+    """Return the kernel of a sum of gradients dW/dz at points.
+
+    Parameters
+    ----------
+    sums
+        Pairs of a density W and the field z by which it is differentiated; all z have the same
+        size.
+    """
     size = sums[0][1].ufl_shape[0]
 
     def gradient(graph: ScalarGraph, nodes: list[list[int]]) -> list[int]:
-        total = [graph.zero] * size
+        """Return the nodes of the sum's components."""
+        sum_nodes = [graph.zero] * size
         for (W,), z in zip(nodes[::2], nodes[1::2], strict=True):
-            first, _ = graph.derivatives(W, z, second=False)
-            total = [graph.add(t, first.get(i, graph.zero)) for t, i in zip(total, z, strict=True)]
-        return total
+            slopes, _ = graph.derivatives(W, z, second=False)
+            sum_nodes = [
+                graph.add(t, slopes.get(i, graph.zero)) for t, i in zip(sum_nodes, z, strict=True)
+            ]
+        return sum_nodes
 
     expressions = [expression for pair in sums for expression in pair]
     return _kernel(name, expressions, "gradient", size, gradient, log)
@@ -229,15 +289,15 @@ def point_gradient(
 class BlockPairs:
     """The nonzero blocks (3, 3) of a Hessian: d2W/dz_i dz_j for vectors i, j of z.
 
-    z consists of the vectors of one side or of two. A block and its transpose are stored as
-    symmetric and skew part.
+    z consists of the vectors of one side of an edge, or of two. A block and its transpose are
+    stored as symmetric and skew part.
 
     Attributes
     ----------
     within_side
-        i <= j, on each side.
+        Pairs i <= j, the same on each side.
     cross
-        i on the first side, j on the second; empty for one side.
+        Pairs of i on the first side and j on the second; empty for one side.
     """
 
     within_side: tuple[IndexPair, ...]
@@ -249,6 +309,8 @@ class BlockPairs:
         return tuple((i, j) for i, j in self.within_side if i < j)
 
     def __or__(self, other: "BlockPairs") -> "BlockPairs":
+        """Return the pairs of both, in order, each once."""
+
         def union(a: Sequence[IndexPair], b: Sequence[IndexPair]) -> tuple[IndexPair, ...]:
             return tuple(dict.fromkeys((*a, *b)))
 
@@ -275,32 +337,43 @@ def point_hessian(
 
     Parameters
     ----------
+    W
+        The density.
     z
         Field of `vectors` vectors, or twice as many for two sides.
+    vectors
+        Number of vectors on a side.
+    pairs
+        The blocks that are not zero.
+    at_zero
+        Whether the Hessian is taken at z = 0.
 
     Returns
     -------
     PointKernel
-        For each side the symmetric parts (6, pairs) then the skew parts (3, skew pairs); after
-        them the cross blocks (9, pairs).
+        For each side the symmetric parts (6, pairs) then the skew parts (3, skew pairs); after them
+        the cross blocks (9, pairs).
     """
     sides = z.ufl_shape[0] // (3 * vectors)
 
     def hessian(graph: ScalarGraph, nodes: list[list[int]]) -> list[int]:
+        """Return the nodes of the kernel's results, in their order."""
         (density,), inputs = nodes
         _, second = graph.derivatives(density, inputs, second=True)
 
         def entry(i: int, j: int, c: int, d: int) -> int:
+            """Return the second derivative by component c of vector i and d of vector j."""
             row, column = inputs[3 * i + c], inputs[3 * j + d]
             return second.get((min(row, column), max(row, column)), graph.zero)
 
         def mean(a: int, b: int) -> int:
+            """Return the node of (a + b)/2."""
             return graph.times(graph.number(0.5), graph.add(a, b))
 
         outputs = list[int]()
-        for first in range(0, sides * vectors, vectors):
-            within = [(first + i, first + j) for i, j in pairs.within_side]
-            skew = [(first + i, first + j) for i, j in pairs.skew]
+        for first_vector in range(0, sides * vectors, vectors):
+            within = [(first_vector + i, first_vector + j) for i, j in pairs.within_side]
+            skew = [(first_vector + i, first_vector + j) for i, j in pairs.skew]
             outputs += [
                 mean(entry(i, j, c, d), entry(i, j, d, c)) for c, d in COMPONENTS for i, j in within
             ]
@@ -321,10 +394,11 @@ def point_hessian(
 
 
 def full_hessian(name: str, W: Expr, z: fem.Function, log: KernelLog) -> PointKernel:
-    """Return the kernel of d2W/dz2 at z = 0: the rows of its upper triangle."""
+    """Return the kernel of d2W/dz2 at z = 0: the upper triangle, row by row."""
     size = z.ufl_shape[0]
 
     def hessian(graph: ScalarGraph, nodes: list[list[int]]) -> list[int]:
+        """Return the nodes of the upper triangle's entries, with zeros in place of z."""
         (density,), inputs = nodes
         _, second = graph.derivatives(density, inputs, second=True)
         pairs = [(min(i, j), max(i, j)) for i, j in combinations_with_replacement(inputs, 2)]
@@ -373,23 +447,31 @@ void {name}(const double* const* values, const int32_t* sizes, const double* con
 
 
 def point_code(graph: ScalarGraph, outputs: Sequence[int]) -> str:
-    """Return the C source of a function that computes some nodes at many points."""
+    """Return the C source of a function that computes some nodes at many points.
+
+    Each node becomes a local variable that holds four points at once.
+
+    Parameters
+    ----------
+    outputs
+        The nodes of the results, in order; a node may occur several times.
+    """
     names, helpers = dict[int, str](), dict[str, int]()
     lines = [f"four A[{len(outputs)}];"]
-    positions = dict[int, list[int]]()
+    result_positions = dict[int, list[int]]()
     for k, node in enumerate(outputs):
-        positions.setdefault(node, []).append(k)
+        result_positions.setdefault(node, []).append(k)
     for node in graph.dependencies(outputs):
-        operation, *rest = graph.operations[node]
-        if operation == "number":
-            names[node] = f"({rest[0]!r})"
+        operator, *arguments = graph.operations[node]
+        if operator == "number":
+            names[node] = f"({arguments[0]!r})"
         else:
             names[node] = f"x{node}"
-            kind = "mask" if operation in MASK_OPERATIONS else "four"
+            kind = "mask" if operator in MASK_OPERATIONS else "four"
             lines.append(
-                f"const {kind} x{node} = {_c_expression(operation, rest, names, helpers)};"
+                f"const {kind} x{node} = {_c_expression(operator, arguments, names, helpers)};"
             )
-        lines += [f"A[{k}] = none + {names[node]};" for k in positions.get(node, ())]
+        lines += [f"A[{k}] = none + {names[node]};" for k in result_positions.get(node, ())]
     helper_code = "".join(
         (UNARY_HELPER if count == 1 else BINARY_HELPER).format(f=f) for f, count in helpers.items()
     )
@@ -399,7 +481,7 @@ def point_code(graph: ScalarGraph, outputs: Sequence[int]) -> str:
 
 
 def kernel_function(library: ctypes.CDLL) -> PointFunction:
-    """Return the function of a library, with the types of its arguments, see `PointFunction`."""
+    """Return the C function of a library, with the types of its arguments: a `PointFunction`."""
     function, pointer = library[FUNCTION_NAME], ctypes.c_void_p
     function.argtypes, function.restype = [pointer, pointer, pointer, ctypes.c_int64, pointer], None
     return function
@@ -408,16 +490,18 @@ def kernel_function(library: ctypes.CDLL) -> PointFunction:
 def _c_expression(
     operation: str, rest: list[int], names: dict[int, str], helpers: dict[str, int]
 ) -> str:
-    """Return an operation in C.
+    """Return an operation as a C expression.
 
     Parameters
     ----------
+    operation
+        Name of the operation.
     rest
-        Its operands, or what an input is.
+        The nodes of its operands; of an input its numbers.
     names
-        Of nodes in C.
+        Node -> its name in C.
     helpers
-        Number of arguments of each function that the code needs; may be added to.
+        Function -> number of its arguments, of all functions that the code needs; may be added to.
     """
     if operation == "field":
         number, component = rest

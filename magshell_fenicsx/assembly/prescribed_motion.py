@@ -43,7 +43,7 @@ class EdgeCurve:
     Attributes
     ----------
     nodes
-        (sides, functions): local numbers.
+        (sides, functions): local numbers of the nodes of each side's cell.
     values
         (sides, points, functions): the shape functions at quadrature points.
     slopes
@@ -65,27 +65,35 @@ class EdgeCurve:
         sides: Mapping[int, CellSide],
         pressure_signs: Array | None = None,
     ) -> "EdgeCurve":
-        """Return the curve of those facets that this rank owns.
+        """Return the curve of facets that this rank owns.
 
         Parameters
         ----------
+        V
+            Space of the shape functions.
+        facets
+            Local numbers of boundary facets; those of other ranks are left out.
         sides
-            Sides of the reference cell, by the local numbers of facets.
+            Local number of a facet in its cell -> the side of the reference cell.
         pressure_signs
             (local cells,): -1 beside cells on which the pressure acts from inside, where the
-            surface is on the right of the curve; 1 elsewhere.
+            surface is on the right of the curve; 1 elsewhere. None: 1 everywhere.
         """
         topology, element, dim = V.mesh.topology, V.element.basix_element, V.mesh.topology.dim
         for dims in ((dim - 1, dim), (dim, dim - 1), (dim, 0)):
             topology.create_connectivity(*dims)
         facets = facets[facets < topology.index_map(dim - 1).size_local]
         rule = basix.make_quadrature(basix.CellType.interval, 3 * element.degree)
-        x, weights = (np.asarray(array) for array in rule)
+        points, weights = (np.asarray(array) for array in rule)
         values, slopes = {}, {}
-        for number, (first, last, _) in sides.items():
-            table = element.tabulate(1, first + x * (last - first))[..., 0]
-            values[number] = table[0]
-            slopes[number] = weights[:, None] * np.tensordot(last - first, table[1:], 1)
+        for number, (first_place, last_place, _) in sides.items():
+            tabulated = element.tabulate(1, first_place + points * (last_place - first_place))[
+                ..., 0
+            ]
+            values[number] = tabulated[0]
+            slopes[number] = weights[:, None] * np.tensordot(
+                last_place - first_place, tabulated[1:], 1
+            )
         cells = [int(topology.connectivity(dim - 1, dim).links(facet)[0]) for facet in facets]
         facets_of_cells = topology.connectivity(dim, dim - 1)
         numbers = [
@@ -112,7 +120,7 @@ class EdgeCurve:
         return np.asarray(self.values @ x[self.nodes])
 
     def derivative(self, x: Array) -> Array:
-        """Return the derivatives of nodal vectors along the curve times the weights.
+        """Return the derivatives of nodal vectors x (nodes, 3) along the curve, times the weights.
 
         The shape is (sides, points, 3).
         """
@@ -120,15 +128,20 @@ class EdgeCurve:
 
 
 def triangle_sides() -> dict[int, CellSide]:
-    """Return the sides of the reference triangle, which is on their left."""
+    """Return the sides of the reference triangle by number; the triangle is on their left."""
     corners_of_sides = ((1, 2), (2, 0), (0, 1))
     return {i: (CORNERS[a], CORNERS[b], (a, b)) for i, (a, b) in enumerate(corners_of_sides)}
 
 
 def level_sides(height: float) -> dict[int, CellSide]:
-    """Return lines on the side faces of the reference hexahedron at a height from 0 to 1.
+    """Return lines on the side faces of the reference hexahedron, by number of the face.
 
-    The face above a line is on its left.
+    The part of the face above a line is on its left.
+
+    Parameters
+    ----------
+    height
+        Height of the lines, from 0 to 1.
     """
     corners = np.array(
         [[0.0, 0.0, height], [1.0, 0.0, height], [0.0, 1.0, height], [1.0, 1.0, height]]
@@ -138,7 +151,10 @@ def level_sides(height: float) -> dict[int, CellSide]:
 
 
 def end_corners(curves: Sequence[EdgeCurve], comm: MPI.Comm) -> NDArray[np.int64]:
-    """Return the corners at which curves begin or end, none of closed curves; collective."""
+    """Return the corners at which curves begin or end; closed curves have none. Collective.
+
+    Such a corner belongs to an odd number of sides. The numbers are the same on all ranks.
+    """
     local = np.concatenate([np.empty(0, np.int64), *(curve.corners.ravel() for curve in curves)])
     corners, count = np.unique(np.concatenate(comm.allgather(local)), return_counts=True)
     return np.asarray(corners[count % 2 == 1])
@@ -146,14 +162,14 @@ def end_corners(curves: Sequence[EdgeCurve], comm: MPI.Comm) -> NDArray[np.int64
 
 @dataclass(frozen=True)
 class Lid:
-    """A surface that closes an edge and moves with it.
+    """A surface that closes an edge and moves with it as a rigid body.
 
     Attributes
     ----------
     motions
-        Carried out one after the other.
+        Motions of the lid, carried out one after the other.
     origin
-        (3,): the apex of the cone.
+        (3,): the apex of the cone, over R.
     area
         (3,): the integral of the normal n over the lid.
     moment
@@ -174,13 +190,21 @@ class Lid:
         origin: Array,
         comm: MPI.Comm,
     ) -> "Lid":
-        """Return the cone over curves through nodes at x (nodes, 3); collective."""
+        """Return the cone over curves through nodes, as lid. Collective.
+
+        Parameters
+        ----------
+        x
+            (nodes, 3): places of all local nodes.
+        origin
+            (3,): the apex.
+        """
         area, moment = np.zeros(3), np.zeros((3, 3))
         for curve in curves:
             y = curve.at_points(x) - origin
-            normal = np.cross(y, curve.derivative(x))
-            area -= normal.sum(axis=(0, 1)) / 2
-            moment -= np.einsum("sqi,sqj->ij", y, normal) / 3
+            y_cross_slope = np.cross(y, curve.derivative(x))
+            area -= y_cross_slope.sum(axis=(0, 1)) / 2
+            moment -= np.einsum("sqi,sqj->ij", y, y_cross_slope) / 3
         return cls(motions, origin, comm.allreduce(area), comm.allreduce(moment))
 
     @classmethod
@@ -190,7 +214,9 @@ class Lid:
         Parameters
         ----------
         rho
-            Its radius.
+            Radius of the disc.
+        last
+            Whether it is at the last end; its normal then points the other way.
         """
         area = np.array([0.0, 0.0, np.pi * rho**2])
         return cls(motions, np.zeros(3), -area if last else area, np.zeros((3, 3)))
@@ -200,20 +226,29 @@ class Lid:
     ) -> tuple[float, dict[str, float], dict[AmplitudePair, float]]:
         """Return the volume that the lid sweeps when its points move straight to their places.
 
+        The volume is the integral of u . cof(F) n over the time tau of the motion and the lid, with
+        the displacement u = G y + s and F = 1 + tau G.
+
         Returns
         -------
         tuple
-            The volume, its first and its second derivatives by the amplitudes of the motions.
+            The volume, its first derivatives by amplitude, and its second ones by pair of
+            amplitudes.
         """
         turn = total_rotation(self.motions, mu)
         place = apply_motions(self.motions, mu, self.origin[None])
         # The displacement is u = G y + s; (G, s) here and of each derivative.
         displacement = turn.x.T - np.eye(3), place.x[0] - self.origin
         rates = {name: (turn.slopes[name].T, place.slopes[name][0]) for name in turn.slopes}
-        bends = {
+        second_rates = {
             pair: (turn.curvatures[pair].T, place.curvatures[pair][0]) for pair in turn.curvatures
         }
-        volume, slopes, curvatures = 0.0, dict.fromkeys(rates, 0.0), dict.fromkeys(bends, 0.0)
+        volume, slopes, curvatures = (
+            0.0,
+            dict.fromkeys(rates, 0.0),
+            dict.fromkeys(second_rates, 0.0),
+        )
+        # cof F is quadratic in tau: two Gauss points integrate exactly
         for tau in GAUSS_POINTS:
             F = np.eye(3) + tau * displacement[0]
             flux = self._flux(*displacement)
@@ -221,7 +256,7 @@ class Lid:
             for a, (G, s) in rates.items():
                 stretched = 2 * tau * _cofactor(F, G) * flux
                 slopes[a] += float((stretched + _cofactor(F, F) * self._flux(G, s)).sum()) / 2
-            for (a, b), (G, s) in bends.items():
+            for (a, b), (G, s) in second_rates.items():
                 second = 2 * tau**2 * _cofactor(rates[a][0], rates[b][0])
                 stretched = (second + 2 * tau * _cofactor(F, G)) * flux
                 mixed = [
@@ -238,7 +273,7 @@ class Lid:
 
 
 def _cofactor(X: Array, Y: Array) -> Array:
-    """Return the bilinear symmetric form of which cof F is the value for X = Y = F."""
+    """Return the symmetric bilinear form of X and Y (3, 3) whose value for X = Y = F is cof F."""
     trace = np.trace(X) * np.trace(Y) - np.trace(X @ Y)
     return np.asarray((X @ Y + Y @ X - np.trace(X) * Y - np.trace(Y) * X + trace * np.eye(3)).T / 2)
 
@@ -254,9 +289,9 @@ class EdgePressure:
     unit
         The pressure that the amplitude 1 stands for.
     lids
-        On edges that are closed.
+        Lids on edges that are closed.
     curves
-        The edges.
+        The moving edges.
     """
 
     load: str
@@ -277,11 +312,16 @@ class EdgePressure:
         return sum(lid.swept_volume(mu)[2].get((name, other), 0.0) for lid in self.lids)
 
     def edge_forces(self, x0: Array, u: Array) -> Array:
-        """Return nodal forces (nodes, 3) of p = 1 on the edges.
+        """Return nodal forces (nodes, 3) of the unit pressure on the moving edges.
 
-        Those that the derivative of the swept volume has are left out. An edge that moves straight
-        by u sweeps a ribbon. Where a node moves further by v, the volume between the two ribbons is
-        the integral of v . u x (x0/2 + u/3)' along the edge.
+        The forces that the derivative of the swept volume has are left out. An edge that moves
+        straight by u sweeps a ribbon. Where a node moves further by v, the volume between the two
+        ribbons is the integral of v . u x (x0/2 + u/3)' along the edge.
+
+        Parameters
+        ----------
+        x0, u
+            (nodes, 3): undeformed places and displacements of all local nodes.
         """
         forces = np.zeros_like(x0)
         for curve in self.curves:
@@ -302,7 +342,7 @@ class RigidBody:
     Attributes
     ----------
     motions
-        Carried out one after the other.
+        Motions of the body, carried out one after the other.
     dofs
         Local numbers, with ghosts, of the components that are prescribed.
     edge
@@ -332,8 +372,10 @@ class PrescribedMotion:
     ----------
     r0
         The reference placement.
+    bodies
+        The rigid bodies to which the moving nodes belong.
     edge_pressure
-        What a live pressure does at edges that move.
+        The part of a live pressure at edges that move; None: there is none.
 
     Attributes
     ----------
@@ -353,6 +395,7 @@ class PrescribedMotion:
         self._axes = list(AXES_OF_COMPONENTS[r0.function_space.dofmap.index_map_bs])
         self._r0, self._bodies = r0, bodies
         places = vectors_in_space(r0.x.array, len(self._axes))
+        # the place of the node of each prescribed component
         self._places = [places[body.dofs // len(self._axes)] for body in bodies]
         self.names = frozenset(name for body in bodies for name in body.names)
         V = r0.function_space
@@ -362,20 +405,20 @@ class PrescribedMotion:
         self.cells = node_moves[V.dofmap.list].any(axis=1)
 
     def put(self, u: Array, mu: Amplitudes) -> None:
-        """Write E(mu) into a displacement."""
+        """Write E(mu) into a local displacement, at the nodes that move."""
         for body, places in zip(self._bodies, self._places, strict=True):
             displacement = apply_motions(body.motions, mu, places).x - places
             u[body.dofs] = self._components(body, displacement)
 
     def turn(self, mu: Amplitudes) -> None:
-        """Write the rotations into the terms of the edges; missing amplitudes are zero."""
+        """Write the rotations Q^T into the terms of clamped edges; missing amplitudes are zero."""
         for body in self._bodies:
             if body.turn is not None:
                 amplitudes = dict.fromkeys(body.names, 0.0) | dict(mu)
                 body.turn.value[:] = total_rotation(body.motions, amplitudes).x.T
 
     def rate(self, mu: Amplitudes, name: str) -> Array:
-        """Return dE/dmu."""
+        """Return dE/dmu by the amplitude `name`, zero at nodes that do not move with it."""
         rates = np.zeros(len(self._r0.x.array))
         for body, places in self._bodies_moved_by(name):
             velocity = apply_motions(body.motions, mu, places).slopes[name]
@@ -383,7 +426,7 @@ class PrescribedMotion:
         return rates
 
     def bend(self, mu: Amplitudes, name: str, other: str) -> Array:
-        """Return d2E/dmu_i dmu_j."""
+        """Return d2E/dmu_i dmu_j by two amplitudes, zero at nodes that do not move with both."""
         bends = np.zeros(len(self._r0.x.array))
         for body, places in self._bodies_moved_by(name, other):
             curvature = apply_motions(body.motions, mu, places).curvatures[name, other]
@@ -391,21 +434,31 @@ class PrescribedMotion:
         return bends
 
     def edge_forces(self, u: Array) -> Array:
-        """Return the forces of p = 1 on edges, see `EdgePressure.edge_forces`."""
+        """Return the forces of the unit pressure on moving edges: `EdgePressure.edge_forces`."""
         if not (self.edge_pressure and self.edge_pressure.curves):
             return np.zeros_like(u)
         x0 = self._r0.x.array.reshape(-1, 3)
         return self.edge_pressure.edge_forces(x0, u.reshape(-1, 3)).ravel()
 
     def turning(self, mu: Amplitudes, name: str) -> Iterator[tuple[str, Array]]:
-        """Iterate over edges that the motion turns, each with A = Q dQ^T/dmu (3, 3)."""
+        """Iterate over the clamped edges that a motion turns.
+
+        Yields
+        ------
+        The name of the edge's term, and A = Q dQ^T/dmu (3, 3).
+        """
         for body, _ in self._bodies_moved_by(name):
             if body.turn is not None:
                 rotation = total_rotation(body.motions, mu)
                 yield body.edge, rotation.x.T @ rotation.slopes[name]
 
     def turning_twice(self, mu: Amplitudes, pair: AmplitudePair) -> Iterator[tuple[str, Array]]:
-        """Iterate over edges that both motions turn, each with dA_i/dmu_j (3, 3)."""
+        """Iterate over the clamped edges that both motions of a pair turn.
+
+        Yields
+        ------
+        The name of the edge's term, and dA_i/dmu_j (3, 3).
+        """
         for body, _ in self._bodies_moved_by(*pair):
             if body.turn is not None:
                 rotation = total_rotation(body.motions, mu)
@@ -414,28 +467,46 @@ class PrescribedMotion:
                 yield body.edge, product + rotation.x.T @ rotation.curvatures[pair]
 
     def spin_displacement(self, A: Array, u: Array) -> Array:
-        """Return the displacement A r of all nodes, r = r0 + u."""
+        """Return the displacement A r of all nodes, r = r0 + u, for a matrix A (3, 3)."""
         return self.transform(A, self._r0.x.array + u)
 
     def transform(self, A: Array, v: Array) -> Array:
-        """Return a matrix (3, 3) times the vectors of all nodes."""
+        """Return a matrix A (3, 3) times the vectors of all nodes, as a local vector."""
         vectors = vectors_in_space(v, len(self._axes)) @ A.T
         return np.ascontiguousarray(vectors[:, self._axes]).ravel()
 
     def _bodies_moved_by(self, *names: str) -> Iterator[tuple[RigidBody, Array]]:
-        """Iterate over bodies that all these motions move, with the places of their nodes."""
+        """Iterate over the bodies that all these motions move, with the places of their nodes."""
         for body, places in zip(self._bodies, self._places, strict=True):
             if body.names.issuperset(names):
                 yield body, places
 
     def _components(self, body: RigidBody, vectors: Array) -> Array:
-        """Return that component of each vector which is prescribed."""
+        """Return the prescribed component of each vector.
+
+        Parameters
+        ----------
+        vectors
+            (n, 3): one for each of the body's n prescribed degrees of freedom.
+        """
         axes = np.array(self._axes)[body.dofs % len(self._axes)]
         return np.asarray(vectors[np.arange(len(axes)), axes])
 
 
 def vectors_in_space(v: Array, components: int) -> Array:
-    """Return vectors (n, 3) of nodes, from three components each or two in a meridian's plane."""
+    """Return nodal vectors in space, from those in space or in a meridian's plane.
+
+    Parameters
+    ----------
+    v
+        (n * components,): nodal values.
+    components
+        3 in space, 2 in the plane of e1 and e3.
+
+    Returns
+    -------
+    (n, 3) vectors.
+    """
     vectors = np.zeros((len(v) // components, 3))
     vectors[:, AXES_OF_COMPONENTS[components]] = v.reshape(-1, components)
     return vectors

@@ -42,11 +42,11 @@ class RigidMotion:
 
     @property
     def linear(self) -> "RigidMotion":
-        """The rotation of vectors, without translation and centre."""
+        """The same motion of vectors: the rotation, without translation and centre."""
         return replace(self, shift=np.zeros(3), centre=np.zeros(3))
 
     def rotation(self, mu: float) -> tuple[Array, Array, Array]:
-        """Return Rot(mu turn) (3, 3) and its first two derivatives by mu (Rodrigues)."""
+        """Return Rot(mu turn) (3, 3) and its first two derivatives by mu (Rodrigues' formula)."""
         angle = float(np.linalg.norm(self.turn))
         x, y, z = self.turn / (angle or 1.0)
         N = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
@@ -60,16 +60,16 @@ class RigidMotion:
 
 @dataclass(frozen=True)
 class MovedPoints:
-    """Places after some motions, with their derivatives by the amplitudes.
+    """Places of n points after some motions, with their derivatives by the amplitudes.
 
     Attributes
     ----------
     x
-        (n, 3).
+        (n, 3): the places, over R.
     slopes
         Amplitude -> dx/dmu, (n, 3).
     curvatures
-        Two amplitudes, in each order -> d2x/dmu_i dmu_j, (n, 3).
+        Pair of amplitudes, in each order -> d2x/dmu_i dmu_j, (n, 3).
     """
 
     x: Array
@@ -78,21 +78,35 @@ class MovedPoints:
 
 
 def apply_motions(motions: Sequence[RigidMotion], mu: Mapping[str, float], x: Array) -> MovedPoints:
-    """Return places (n, 3) after motions with different amplitudes, one after the other."""
+    """Return places after motions, carried out one after the other, with all derivatives.
+
+    Parameters
+    ----------
+    motions
+        Motions with different amplitudes.
+    mu
+        Amplitude -> its value; it has all of the motions.
+    x
+        (n, 3): the places before, over R.
+    """
     slopes: dict[str, Array] = {}
     curvatures: dict[AmplitudePair, Array] = {}
     for motion in motions:
-        Q, Q1, Q2 = (q.T for q in motion.rotation(mu[motion.name]))
+        Q, Q1, Q2 = (matrix.T for matrix in motion.rotation(mu[motion.name]))
         name, arm = motion.name, x - motion.centre
-        curvatures = {pair: d @ Q for pair, d in curvatures.items()}
-        for other, d in slopes.items():
-            curvatures[other, name] = curvatures[name, other] = d @ Q1
-        slopes = {other: d @ Q for other, d in slopes.items()}
+        # this motion turns all derivatives by earlier amplitudes; then come those by its own
+        curvatures = {pair: derivative @ Q for pair, derivative in curvatures.items()}
+        for earlier_name, derivative in slopes.items():
+            curvatures[earlier_name, name] = curvatures[name, earlier_name] = derivative @ Q1
+        slopes = {earlier_name: derivative @ Q for earlier_name, derivative in slopes.items()}
         slopes[name], curvatures[name, name] = arm @ Q1 + motion.shift, arm @ Q2
         x = arm @ Q + motion.centre + mu[name] * motion.shift
     return MovedPoints(x, slopes, curvatures)
 
 
 def total_rotation(motions: Sequence[RigidMotion], mu: Mapping[str, float]) -> MovedPoints:
-    """Return the rotation of all motions together: its row `x[i]` of (3, 3) is the image of e_i."""
+    """Return the rotation of all motions together, with its derivatives by their amplitudes.
+
+    Row i of its `x` (3, 3) is the image of e_i, so that `x` is the transposed rotation matrix.
+    """
     return apply_motions([motion.linear for motion in motions], mu, np.eye(3))

@@ -39,14 +39,15 @@ IDENTITY_OPERATIONS = (classes.Variable, classes.Real, classes.Conj)  # all numb
 
 
 class ScalarGraph:
-    """A graph of operations on scalars.
+    """A graph of operations on scalars; a node is the number of an operation.
 
     Attributes
     ----------
     operations
-        By node. Names are those of C, and "number", "field" (its position among the fields,
-        component), "constant" (position among the values of all constants) and "pick" (condition,
-        what is taken if it holds, what else).
+        The operation of each node: its name, then the nodes of its operands. Names are those of C,
+        and "pick" (condition, value if it holds, other value). Without operands are "number"
+        (value), "field" (position among the fields, component) and "constant" (position among the
+        values of all constants).
     """
 
     def __init__(self) -> None:
@@ -55,7 +56,7 @@ class ScalarGraph:
         self.zero, self.one = self.number(0.0), self.number(1.0)
 
     def node(self, *operation: Any) -> int:
-        """Return the node of an operation."""
+        """Return the node of an operation, a new one if the operation is new."""
         node = self._nodes.get(operation)
         if node is None:
             node = self._nodes[operation] = len(self.operations)
@@ -72,7 +73,7 @@ class ScalarGraph:
         return operation[1] if operation[0] == "number" else None
 
     def add(self, a: int, b: int) -> int:
-        """Return the node of a + b, simplified."""
+        """Return the node of a + b, simplified; the smaller node becomes the first operand."""
         if a == self.zero or b == self.zero:
             return b if a == self.zero else a
         if a == b:
@@ -83,7 +84,7 @@ class ScalarGraph:
         return self.node("+", min(a, b), max(a, b))
 
     def times(self, a: int, b: int) -> int:
-        """Return the node of a b, simplified."""
+        """Return the node of a b, simplified; a number becomes the first factor."""
         if self.zero in (a, b):
             return self.zero
         if a == self.one or b == self.one:
@@ -95,8 +96,8 @@ class ScalarGraph:
             a, b, x = b, a, y
         if x is not None:
             name, *factors = self.operations[b]
-            if name == "*" and (other := self.value(factors[0])) is not None:
-                return self.times(self.number(x * other), factors[1])
+            if name == "*" and (number_in_b := self.value(factors[0])) is not None:
+                return self.times(self.number(x * number_in_b), factors[1])
             return self.node("*", a, b)
         return self.node("*", min(a, b), max(a, b))
 
@@ -112,7 +113,10 @@ class ScalarGraph:
         return self.zero if a == self.zero else self.node("/", a, b)
 
     def power(self, a: int, b: int) -> int:
-        """Return the node of a to the power b, simplified."""
+        """Return the node of a to the power b, simplified.
+
+        Small whole and half powers are written as products and square roots.
+        """
         exponent = self.value(b)
         if exponent is None:
             return self.node("pow", a, b)
@@ -135,7 +139,7 @@ class ScalarGraph:
         return total
 
     def dependencies(self, nodes: Iterable[int]) -> list[int]:
-        """Return all nodes on which some depend, and themselves.
+        """Return the given nodes and all nodes on which they depend.
 
         Operands come first, each shortly before it is needed.
         """
@@ -154,25 +158,33 @@ class ScalarGraph:
         return order
 
     def operands(self, node: int) -> tuple[int, ...]:
-        """Return the operands of a node; none of an input or a number."""
-        name, *rest = self.operations[node]
-        return () if name in ("number", "field", "constant") else tuple(rest)
+        """Return the nodes of an operation's operands; none for an input or a number."""
+        name, *operand_nodes = self.operations[node]
+        return () if name in ("number", "field", "constant") else tuple(operand_nodes)
 
     def substitute(self, nodes: Sequence[int], replacements: dict[int, int]) -> list[int]:
-        """Return nodes with others in place of inputs."""
-        new = dict(replacements)
+        """Return nodes of the same expressions with other inputs.
+
+        Parameters
+        ----------
+        replacements
+            Input -> the node that replaces it.
+        """
+        new_nodes = dict(replacements)
         for node in self.dependencies(nodes):
-            if node in new:
+            if node in new_nodes:
                 continue
             operands = self.operands(node)
             if operands:
-                new[node] = self.apply(self.operations[node][0], [new[o] for o in operands])
+                new_nodes[node] = self.apply(
+                    self.operations[node][0], [new_nodes[o] for o in operands]
+                )
             else:
-                new[node] = node
-        return [new[node] for node in nodes]
+                new_nodes[node] = node
+        return [new_nodes[node] for node in nodes]
 
     def apply(self, name: str, operands: Sequence[int]) -> int:
-        """Return the node of an operation by name, simplified."""
+        """Return the node of the operation `name` on some nodes, simplified."""
         simplified: dict[str, Callable[..., int]] = {
             "+": self.add,
             "*": self.times,
@@ -191,13 +203,15 @@ class ScalarGraph:
 
         Parameters
         ----------
+        expression
+            An expression of UFL without free indices.
         fields, constants
-            All that occur, in their order among the inputs.
+            All that occur in it, in their order among the inputs.
 
         Raises
         ------
         NotImplementedError
-            If it has more than arithmetic, conditions and functions of numbers.
+            If the expression has more than arithmetic, conditions and functions of numbers.
         """
         lowered = apply_algebra_lowering(expression)
         if has_type(lowered, classes.Derivative):
@@ -205,23 +219,32 @@ class ScalarGraph:
         inputs: dict[Expr, list[Operation]] = {}
         for number, f in enumerate(fields):
             inputs[f] = [("field", number, k) for k in range(prod(f.ufl_shape))]
-        first = 0
+        constant_start = 0
         for c in constants:
-            inputs[c] = [("constant", first + k) for k in range(prod(c.ufl_shape))]
-            first += prod(c.ufl_shape)
+            inputs[c] = [("constant", constant_start + k) for k in range(prod(c.ufl_shape))]
+            constant_start += prod(c.ufl_shape)
         values: dict[Expr, Nodes] = {}
-        for e in unique_post_traversal(lowered):
-            if e in inputs:
-                nodes = [self.node(*operation) for operation in inputs[e]]
-                values[e] = np.array(nodes).reshape(e.ufl_shape)
-            elif not isinstance(e, classes.MultiIndex | classes.Label):
-                values[e] = self._translate(e, [values.get(o) for o in e.ufl_operands])
+        for subexpression in unique_post_traversal(lowered):
+            if subexpression in inputs:
+                nodes = [self.node(*operation) for operation in inputs[subexpression]]
+                values[subexpression] = np.array(nodes).reshape(subexpression.ufl_shape)
+            elif not isinstance(subexpression, classes.MultiIndex | classes.Label):
+                values[subexpression] = self._translate(
+                    subexpression, [values.get(o) for o in subexpression.ufl_operands]
+                )
         return values[lowered]
 
     def _translate(self, e: Expr, operands: list[Any]) -> Nodes:
-        """Return the nodes of an expression from those of its operands.
+        """Return the nodes of an expression e from those of its operands.
 
-        Their shape is (*shape, *dimensions of the free indices).
+        Parameters
+        ----------
+        operands
+            The nodes of each operand; None for a multi-index or label.
+
+        Returns
+        -------
+        Nodes in the shape (*shape, *dimensions of the free indices) of the expression.
         """
         if isinstance(e, classes.Zero):
             return np.full(e.ufl_shape + e.ufl_index_dimensions, self.zero)
@@ -235,6 +258,7 @@ class ScalarGraph:
             return _indexed(operands[0], e)
         if isinstance(e, classes.ComponentTensor):
             a, labels = e.ufl_operands
+            # free indices that become axes of the shape move to the front
             axes = [len(a.ufl_shape) + a.ufl_free_indices.index(i.count()) for i in labels]
             return np.asarray(np.moveaxis(operands[0], axes, range(len(axes))))
         if isinstance(e, classes.ListTensor):
@@ -249,11 +273,18 @@ class ScalarGraph:
         pairs = zip(operands, e.ufl_operands, strict=True)
         aligned = [_aligned(nodes, operand, e) for nodes, operand in pairs if nodes is not None]
         arrays = np.broadcast_arrays(*aligned)
+        # a row of operands for each component of the result
         rows = np.stack([nodes.ravel() for nodes in arrays], axis=1).tolist()
         return np.array([operation(*row) for row in rows]).reshape(arrays[0].shape)
 
     def _scalar_operation(self, e: Expr) -> Callable[..., int]:
-        """Return the operation that an expression applies to each component."""
+        """Return the function from operand nodes to a node that an expression applies by component.
+
+        Raises
+        ------
+        NotImplementedError
+            If the expression is no operation on numbers.
+        """
         if type(e) in (simple := self._simple_operations()):
             return simple[type(e)]
         if type(e) in COMPARISONS:
@@ -270,7 +301,7 @@ class ScalarGraph:
         )
 
     def _simple_operations(self) -> dict[type, Callable[..., int]]:
-        """Return the operation of each class of expressions that has one alone."""
+        """Return the classes of UFL expressions with one operation, and the operation of each."""
         return {
             classes.Sum: self.add,
             classes.Product: self.times,
@@ -289,11 +320,20 @@ class ScalarGraph:
     def derivatives(
         self, f: int, inputs: Sequence[int], *, second: bool
     ) -> tuple[FirstDerivatives, SecondDerivatives]:
-        """Return the first derivatives of a node by some inputs, and the second ones.
+        """Return the first derivatives of a node f by some inputs, and the second ones.
 
         Missing derivatives are zero. Nodes are eliminated from f down to the inputs, with the
         derivatives of f by those that are left: R. M. Gower and M. P. Mello, *A new framework for
         the computation of Hessians*, Optimization Methods and Software 27 (2012).
+
+        Parameters
+        ----------
+        second
+            Whether second derivatives are computed.
+
+        Returns
+        -------
+        Input -> first derivative, and pair of inputs, the smaller one first -> second derivative.
         """
         ends = set(inputs)
         ascending = sorted(self.dependencies([f]))
@@ -301,9 +341,10 @@ class ScalarGraph:
         for node in ascending:
             if any(operand in active for operand in self.operands(node)):
                 active.add(node)
-        first, pairs = {f: self.one}, dict[int, dict[int, int]]()
+        adjoints, pairs = {f: self.one}, dict[int, dict[int, int]]()
 
         def couple(j: int, k: int, value: int) -> None:
+            """Add a value to the second derivative of f by the nodes j and k."""
             if value != self.zero:
                 total = self.add(pairs.setdefault(j, {}).get(k, self.zero), value)
                 pairs[j][k] = pairs.setdefault(k, {})[j] = total
@@ -311,34 +352,45 @@ class ScalarGraph:
         for node in reversed(ascending):
             if node in ends or node not in active:
                 continue
-            adjoint = first.pop(node, self.zero)
+            adjoint = adjoints.pop(node, self.zero)
             mixed = pairs.pop(node, {})
             squared = mixed.pop(node, self.zero)
             if adjoint == self.zero and squared == self.zero and not mixed:
                 continue
             slopes, curvatures = self._local_derivatives(node, active, ends, second=second)
-            for other, value in mixed.items():
-                pairs[other].pop(node)
+            # second derivatives by the node and another one move to the operands: chain rule
+            for other_node, value in mixed.items():
+                pairs[other_node].pop(node)
                 for j, slope in slopes.items():
-                    multiplicity = self.number(2.0 if j == other else 1.0)
-                    couple(j, other, self.times(multiplicity, self.times(slope, value)))
+                    multiplicity = self.number(2.0 if j == other_node else 1.0)
+                    couple(j, other_node, self.times(multiplicity, self.times(slope, value)))
+            # pairs of operands: from the second derivative by the node, and from its curvature
             for j, k in combinations_with_replacement(slopes, 2) if second else ():
                 curvature = curvatures.get((min(j, k), max(j, k)), self.zero)
-                bent = self.times(adjoint, curvature)
-                product = self.times(slopes[j], self.times(slopes[k], squared))
-                couple(j, k, self.add(product, bent))
+                curvature_part = self.times(adjoint, curvature)
+                slope_part = self.times(slopes[j], self.times(slopes[k], squared))
+                couple(j, k, self.add(slope_part, curvature_part))
             for j, slope in slopes.items():
-                first[j] = self.add(first.get(j, self.zero), self.times(adjoint, slope))
+                adjoints[j] = self.add(adjoints.get(j, self.zero), self.times(adjoint, slope))
         upper = {(j, k): value for j, row in pairs.items() for k, value in row.items() if j <= k}
-        return {node: value for node, value in first.items() if node in ends}, upper
+        return {node: value for node, value in adjoints.items() if node in ends}, upper
 
     def _local_derivatives(
         self, node: int, active: set[int], ends: set[int], *, second: bool
     ) -> tuple[FirstDerivatives, SecondDerivatives]:
-        """Return the derivatives of an operation by its operands.
+        """Return the first and second derivatives of an operation by its operands.
 
-        Those of a choice are by the inputs, for each side on its own: the side that is not picked
-        may have no value, and then it must be multiplied by nothing.
+        A choice ("pick") is differentiated by the inputs instead, each side on its own. The side
+        that is not picked may have no value, so it must not be multiplied by anything.
+
+        Parameters
+        ----------
+        active
+            Nodes that depend on inputs; others count as constant.
+        ends
+            The inputs.
+        second
+            Whether second derivatives are computed.
         """
         name, *operands = self.operations[node]
         if name == "pick":
@@ -368,7 +420,19 @@ class ScalarGraph:
     def _rules(
         self, node: int, name: str, operands: list[int]
     ) -> tuple[list[int], list[list[int]]]:
-        """Return the first and second derivatives of an operation by its operands."""
+        """Return the first and second derivatives of an operation by its operands.
+
+        Parameters
+        ----------
+        node
+            The node of the operation.
+        name, operands
+            Its name and the nodes of its operands.
+
+        Returns
+        -------
+        A list with an entry for each operand, and a matrix as nested lists.
+        """
         zero, one, number = self.zero, self.one, self.number
         times, divide = self.times, self.divide
         a, b = operands[0], operands[-1]
@@ -406,25 +470,50 @@ class ScalarGraph:
         return [slope], [[bend]]
 
     def _bessel(self, name: str, order: int, x: int, shift: int | None) -> int:
-        """Return a Bessel function of an order nearby; the second derivative if shift is None."""
+        """Return a Bessel function of a nearby order, or the second derivative of this one.
+
+        Parameters
+        ----------
+        name
+            "jn" or "yn".
+        order, x
+            Nodes of the order, a number, and of the argument.
+        shift
+            Shift of the order; None for the second derivative.
+        """
         n = int(self.value(order) or 0)
 
         def of_order(m: int) -> int:
+            """Return the function of order m; J_-m = (-1)^m J_m."""
             positive = self.node(name, self.number(abs(m)), x)
             return positive if m >= 0 or m % 2 == 0 else self.minus(positive)
 
         if shift is not None:
             return of_order(n + shift)
+        # J_n'' = (J_(n-2) - 2 J_n + J_(n+2))/4
         outer = self.add(of_order(n - 2), of_order(n + 2))
         quarter = self.number(0.25)
         inner = self.times(self.number(-2.0), of_order(n))
         return self.times(quarter, self.add(outer, inner))
 
     def _function_rules(self, node: int, name: str, x: int) -> tuple[int, int]:
-        """Return the first and second derivative of a function of one number."""
+        """Return the first and second derivative of a function of one number.
+
+        Parameters
+        ----------
+        node
+            The node of the function's value.
+        name, x
+            Name of the function, and the node of its argument.
+
+        Raises
+        ------
+        NotImplementedError
+            If the function is not known.
+        """
         number, times, divide = self.number, self.times, self.divide
         square = times(x, x)
-        rest = self.add(self.one, self.minus(square))
+        one_minus_square = self.add(self.one, self.minus(square))
         match name:
             case "sqrt":
                 slope = divide(number(0.5), node)
@@ -447,8 +536,10 @@ class ScalarGraph:
                 slope = self.add(self.one, self.minus(times(node, node)))
                 return slope, times(number(-2.0), times(node, slope))
             case "asin" | "acos":
-                slope = divide(number(1.0 if name == "asin" else -1.0), self.node("sqrt", rest))
-                return slope, divide(times(x, slope), rest)
+                slope = divide(
+                    number(1.0 if name == "asin" else -1.0), self.node("sqrt", one_minus_square)
+                )
+                return slope, divide(times(x, slope), one_minus_square)
             case "atan":
                 slope = divide(self.one, self.add(self.one, square))
                 return slope, times(number(-2.0), times(x, times(slope, slope)))
@@ -464,12 +555,16 @@ def flat(nodes: Nodes) -> list[int]:
 
 
 def terminals_of(expressions: Iterable[Expr], *kinds: type) -> tuple[list[Any], ...]:
-    """Return the terminals in expressions, each kind in the order in which they were created.
+    """Return the terminals in expressions, such as fields and constants.
 
     Parameters
     ----------
     kinds
-        Such as `ufl.Coefficient`.
+        Classes such as `ufl.Coefficient`.
+
+    Returns
+    -------
+    A list for each kind, in the order in which the terminals were created.
     """
     terminals = {terminal for e in expressions for terminal in traverse_unique_terminals(e)}
     return tuple(
@@ -482,6 +577,13 @@ def _indexed(value: Nodes, e: Expr) -> Nodes:
     """Return the nodes of A[i, 0, ...] from those of A.
 
     An index that is free in A too makes a diagonal.
+
+    Parameters
+    ----------
+    value
+        Nodes (*shape, *free indices) of A.
+    e
+        The indexed expression.
     """
     tensor, indices = e.ufl_operands
     fixed, labels = list[int | slice](), list[int]()
@@ -497,7 +599,15 @@ def _indexed(value: Nodes, e: Expr) -> Nodes:
 
 
 def _aligned(value: Nodes, operand: Expr, e: Expr) -> Nodes:
-    """Return the components of an operand with an axis for each free index of the expression."""
+    """Return the nodes of an operand with an axis for each free index of an expression e.
+
+    Axes that the operand does not have are of length one, so that all operands broadcast.
+
+    Parameters
+    ----------
+    value
+        Nodes (*shape, *free indices) of the operand.
+    """
     labels, shape = operand.ufl_free_indices, operand.ufl_shape
     axes = [
         len(shape) + labels.index(label) if label in labels else None

@@ -1,6 +1,6 @@
-"""The sparse matrix of a vector field, assembled from element matrices.
+"""The sparse matrix of a vector field, assembled from element matrices of cells and edges.
 
-They are those of cells and of interior edges. The sparsity pattern consists of (3, 3) blocks; every
+The sparsity pattern consists of (3, 3) blocks; every
 rank has the rows of its own nodes. Theory: docs/tangent.md.
 """
 
@@ -23,7 +23,7 @@ Longs = NDArray[np.int64]
 
 
 class SparsityPattern:
-    """The blocks of this rank, in an order that suits PETSc and communication.
+    """The pattern of (3, 3) blocks of this rank, in an order that suits PETSc and communication.
 
     First come the blocks that couple this rank's n own nodes, row by row; then those that couple
     own nodes with nodes of other ranks; then those in the rows of ghosts, which are added on the
@@ -43,9 +43,9 @@ class SparsityPattern:
     owned
         n.
     starts
-        (2 n + ghosts + 1,) number of the first block of every row, and of all blocks.
+        (2 n + ghosts + 1,): number of the first block of every row, and of all blocks.
     columns
-        (blocks,) an own node, or n + the position of another in `others`.
+        (blocks,): an own node, or n + the position of another in `others`.
     others
         Global numbers, ascending, of nodes of other ranks.
     """
@@ -53,7 +53,8 @@ class SparsityPattern:
     def __init__(
         self, nodes: IndexMap, coupled: Iterable[tuple[Ints, Ints]], comm: MPI.Comm
     ) -> None:
-        n, ghosts, first = nodes.size_local, nodes.num_ghosts, nodes.local_range[0]
+        """Collect the blocks of this rank, and exchange those in the rows of ghosts. Collective."""
+        n, ghosts, first_node = nodes.size_local, nodes.num_ghosts, nodes.local_range[0]
         self.owned, self._comm = n, comm
         own_nodes = np.arange(n, dtype=np.int32)
         numbers = nodes.local_to_global(np.arange(n + ghosts, dtype=np.int32))
@@ -67,20 +68,22 @@ class SparsityPattern:
         self._sent_counts = np.bincount(ranks, minlength=comm.size)
         self._received_counts = np.array(comm.alltoall(list(self._sent_counts)))
         received = tuple(self._exchange(numbers[local], 1) for local in sent)
-        is_foreign = (received[1] < first) | (received[1] >= first + n)
+        is_foreign = (received[1] < first_node) | (received[1] >= first_node + n)
+        # all nodes of other ranks in own columns; columns are numbered by their position here
         self.others = np.unique(np.concatenate([numbers[n:], received[1][is_foreign]]))
         received_columns = np.where(
-            is_foreign, n + np.searchsorted(self.others, received[1]), received[1] - first
+            is_foreign, n + np.searchsorted(self.others, received[1]), received[1] - first_node
         )
         ghost_columns = n + np.searchsorted(self.others, numbers[n:])
         self._columns_of_nodes = np.concatenate([own_nodes, ghost_columns]).astype(np.int32)
         self._width = n + len(self.others)
-        received_blocks = self._row(received[0] - first, received_columns), received_columns
-        both = zip(self._position(i, j), received_blocks, strict=True)
-        rows, columns = (np.concatenate(arrays, dtype=np.int32) for arrays in both)
+        received_blocks = self._row(received[0] - first_node, received_columns), received_columns
+        all_positions = zip(self._position(i, j), received_blocks, strict=True)
+        rows, columns = (np.concatenate(arrays, dtype=np.int32) for arrays in all_positions)
         del i, j
         blocks = _unique_positions(rows, columns, (2 * n + ghosts, self._width))
         self.starts, self.columns = blocks.indptr, blocks.indices
+        # keys row * width + column ascend, so that a search finds each block
         block_rows = np.repeat(np.arange(2 * n + ghosts), np.diff(self.starts))
         self._keys = block_rows * self._width + self.columns
         self._sent_entries = self._entries(*self._position(*sent)).ravel()
@@ -91,23 +94,29 @@ class SparsityPattern:
         return self._find(*self._position(i, j))
 
     def entries(self, i: Ints, j: Ints) -> Longs:
-        """Return the indices in the array of values of the blocks of pairs of local nodes.
+        """Return where the values of blocks that couple pairs of local nodes are stored.
 
-        The shape is (pairs, 3, 3).
+        The indices in the array of values have the shape (pairs, 3, 3).
         """
         return self._entries(*self._position(i, j))
 
     def add_ghosts(self, values: NDArray[np.float64]) -> None:
-        """Add the rows of ghosts to the rows of their owners. Collective."""
+        """Add values in the rows of ghosts to those in the rows of their owners. Collective.
+
+        Parameters
+        ----------
+        values
+            (9 blocks,): the values in the order of the pattern, which are changed.
+        """
         np.add.at(values, self._received_entries, self._exchange(values[self._sent_entries], 9))
 
     def csr(self, first: int, last: int) -> tuple[Ints, Ints]:
-        """Return rows of blocks, from `first` up to `last`, in compressed sparse rows.
+        """Return rows of blocks, from `first` up to `last`, as scalar compressed sparse rows.
 
         Returns
         -------
         tuple
-            The start of each row, and the columns.
+            The start of each scalar row, and the columns.
         """
         starts = self.starts[first : last + 1]
         columns = self.columns[starts[0] : starts[-1]]
@@ -117,30 +126,51 @@ class SparsityPattern:
         return rows.indptr, rows.indices
 
     def _position(self, i: Ints, j: Ints) -> tuple[Any, Any]:
-        """Return row and column of the block of two local nodes."""
+        """Return the row and the column in the pattern of the blocks of pairs of local nodes."""
         columns = self._columns_of_nodes[j]
         return self._row(i, columns), columns
 
     def _row(self, i: Any, columns: Any) -> Any:
-        """Return the row of blocks: that of a node, n further down beside nodes of other ranks."""
+        """Return the row of blocks of local nodes: n further down beside nodes of other ranks.
+
+        Parameters
+        ----------
+        columns
+            Columns of the blocks in the pattern.
+        """
         return i + self.owned * ((i >= self.owned) | (columns >= self.owned))
 
     def _find(self, rows: Any, columns: Any) -> Ints:
-        """Return the numbers of blocks; -1 for a missing block."""
+        """Return the numbers of the blocks at rows and columns; -1 for a missing block."""
         keys = rows * np.int64(self._width) + columns
         positions = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
         return np.where(self._keys[positions] == keys, positions, -1).astype(np.int32)
 
     def _entries(self, rows: Any, columns: Any) -> Longs:
-        """Return the indices (pairs, 3, 3) of blocks in the array of values."""
-        start = self.starts[rows].astype(np.int64)
+        """Return where the values of the blocks at rows and columns are stored, (pairs, 3, 3).
+
+        A row of b blocks has three scalar rows of 3 b values each.
+        """
+        row_start = self.starts[rows].astype(np.int64)
         width = 3 * (self.starts[rows + 1] - self.starts[rows])
-        c = np.arange(3)
-        first = 6 * start + 3 * self._find(rows, columns)
-        return np.asarray(first[:, None, None] + c[:, None] * width[:, None, None] + c)
+        components = np.arange(3)
+        first_entry = 6 * row_start + 3 * self._find(rows, columns)
+        return np.asarray(
+            first_entry[:, None, None] + components[:, None] * width[:, None, None] + components
+        )
 
     def _exchange(self, values: NDArray[Any], size: int) -> NDArray[Any]:
-        """Send values, `size` for each block, to the owners of the rows. Collective."""
+        """Send values of blocks in the rows of ghosts to the owners of the rows. Collective.
+
+        Parameters
+        ----------
+        values
+            `size` values for each block that is sent, in the order of ranks.
+
+        Returns
+        -------
+        The values that other ranks have sent, in the order of ranks.
+        """
         values = np.ascontiguousarray(values)
         received = np.empty(size * int(self._received_counts.sum()), dtype=values.dtype)
         self._comm.Alltoallv(
@@ -152,7 +182,13 @@ class SparsityPattern:
 def _unique_positions(
     rows: Ints, columns: Ints, shape: tuple[int, int]
 ) -> "scipy.sparse.csr_array":
-    """Return a matrix with each position once, sorted; its values have no meaning."""
+    """Return a matrix with each position once, sorted by rows; its values have no meaning.
+
+    Parameters
+    ----------
+    rows, columns
+        Positions, which may occur several times.
+    """
     values = np.zeros(len(rows), dtype=np.int8)
     positions = scipy.sparse.coo_array((values, (rows, columns)), shape=shape).tocsr()
     positions.sum_duplicates()
@@ -176,6 +212,8 @@ class BlockMatrix:
 
     Parameters
     ----------
+    V
+        Space of the vector field.
     coupled
         Batches of pairs of local cells, (n,) on one side and on the other, with blocks that couple
         them.
@@ -189,6 +227,7 @@ class BlockMatrix:
         coupled: Sequence[tuple[Ints, ...]],
         clamped: list[fem.DirichletBC],
     ) -> None:
+        """Set up the pattern, the places of element matrices in it, and the matrix. Collective."""
         comm, nodes = V.mesh.comm, V.dofmap.index_map
         source = Path(__file__).with_name("scatter.c")
         self._ffi, self._lib = load_native(source, C_DECLARATIONS, comm)
@@ -199,6 +238,7 @@ class BlockMatrix:
             is_clamped.ravel()[bc.dof_indices()[0]] = True
         self._fully_clamped = np.array(is_clamped.all(axis=1))
         self._pattern = pattern = SparsityPattern(nodes, self._free_pairs(), comm)
+        # numbers of the blocks of each cell, and of each pair of coupled cells in both orders
         self._blocks = pattern.blocks(*_pairs(self._cells, self._cells))
         self._coupling_blocks = [
             np.stack(
@@ -212,16 +252,17 @@ class BlockMatrix:
         self._K = self._create_matrix(comm)
 
     def _create_matrix(self, comm: MPI.Comm) -> PETSc.Mat:
-        """Return the matrix that shares the array of values. Collective."""
+        """Return a matrix of PETSc that shares the array of values. Collective."""
         n = self._pattern.owned
         starts, columns = self._pattern.csr(0, n)
         arrays = [(starts, columns, self._values[: len(columns)])]
         if comm.size > 1:
-            first = len(columns)
+            value_start = len(columns)
             starts, columns = self._pattern.csr(n, 2 * n)
+            # columns of other ranks' nodes are stored by their position in `others`
             columns -= 3 * n
             numbers = 3 * self._pattern.others[columns // 3] + columns % 3
-            values = self._values[first : first + len(columns)]
+            values = self._values[value_start : value_start + len(columns)]
             arrays.append((starts, numbers.astype(PETSc.IntType), values))
         size = ((3 * n, None), (3 * n, None))
         K = PETSc.Mat().createAIJWithArrays(
@@ -236,7 +277,7 @@ class BlockMatrix:
         self._values[:] = 0
 
     def add_cells(self, K: Array) -> None:
-        """Add the matrices of all local cells.
+        """Add the element matrices of all local cells.
 
         Parameters
         ----------
@@ -252,8 +293,11 @@ class BlockMatrix:
 
         Parameters
         ----------
+        batch
+            Number of the batch in `coupled`.
         K
-            (pairs, 9, functions^2).
+            (pairs, 9, functions^2): components (3, 3), row by row, of functions a on the first cell
+            and b on the second.
         """
         self._scatter("cross", *self._coupled[batch], self._coupling_blocks[batch], K)
 
@@ -266,6 +310,14 @@ class BlockMatrix:
         return self._K
 
     def _scatter(self, kind: str, *arrays: NDArray[np.float64] | Ints) -> None:
+        """Add element matrices by the C function `scatter_` + kind.
+
+        Parameters
+        ----------
+        arrays
+            Its arrays: nodes of cells, numbers of blocks, and values.
+        """
+
         def pointer(x: NDArray[np.float64] | Ints) -> object:
             assert x.flags.c_contiguous
             return self._ffi.from_buffer("double[]" if x.dtype == np.float64 else "int32_t[]", x)
@@ -276,29 +328,40 @@ class BlockMatrix:
         add(values, starts, self._pattern.owned, entities, functions, *map(pointer, arrays))
 
     def _free_pairs(self) -> Iterator[tuple[Ints, Ints]]:
-        """Iterate over pairs of nodes with a block; a clamped node has only its diagonal block."""
+        """Iterate over the pairs of nodes with a block.
+
+        A fully clamped node has only its diagonal block, which does not occur here.
+        """
         for rows, columns in self._coupled_cells():
             i, j = _pairs(rows, columns)
             has_block = ~(self._fully_clamped[i] | self._fully_clamped[j])
             yield i[has_block], j[has_block]
 
     def _coupled_cells(self) -> Iterable[tuple[Ints, Ints]]:
-        """Iterate over nodes (pairs, functions) of cells that are coupled, in both orders."""
+        """Iterate over the nodes (pairs, functions) of coupled cells, in both orders.
+
+        Every cell is coupled to itself.
+        """
         yield self._cells, self._cells
         for rows, columns in self._coupled:
             yield rows, columns
             yield columns, rows
 
     def _clamped_entries(self, is_clamped: NDArray[np.bool_]) -> tuple[Longs, Longs]:
-        """Return this rank's entries in clamped rows and columns, and the diagonal ones of these.
+        """Return where this rank stores entries that clamped unknowns fix.
 
         Parameters
         ----------
         is_clamped
             (local nodes, 3).
+
+        Returns
+        -------
+        Indices of all entries in clamped rows and columns, and of the own diagonal ones of these.
         """
         count, owned = len(is_clamped), self._pattern.owned
         partly, own_nodes = np.array(is_clamped.any(axis=1)), np.arange(owned, dtype=np.int32)
+        # a pair i, j of nodes as the number i * count + j
         keys = [own_nodes[partly[own_nodes]] * (count + np.int64(1))]
         for i, j in self._free_pairs():
             has_clamped = partly[i] | partly[j]
@@ -311,6 +374,16 @@ class BlockMatrix:
 
 
 def _pairs(rows: Ints, columns: Ints) -> tuple[Ints, Ints]:
-    """Return all pairs of an entity's nodes, (entities, functions, functions)."""
+    """Return all pairs of the nodes of two cells.
+
+    Parameters
+    ----------
+    rows, columns
+        (entities, functions): nodes of the first and of the second cell.
+
+    Returns
+    -------
+    The first and the second node of each pair, both (entities, functions, functions).
+    """
     i, j = np.broadcast_arrays(rows[:, :, None], columns[:, None, :])
     return i, j

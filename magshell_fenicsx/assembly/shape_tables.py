@@ -41,24 +41,35 @@ class ShapeTable:
 
     @cached_property
     def triangle(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Pairs a <= b of functions."""
+        """The pairs a <= b of functions, as two arrays of indices."""
         return np.triu_indices(self.values.shape[2])
 
     def jets(self, nodal: Array) -> Array:
-        """Return jets (entities, points, 6, 3) of nodal vectors (entities, functions, 3)."""
+        """Return the values and derivatives of vector fields at the points: their jets.
+
+        Parameters
+        ----------
+        nodal
+            (entities, functions, 3): nodal vectors of cells or edges.
+
+        Returns
+        -------
+        Array
+            (entities, points, 6, 3).
+        """
         points, derivatives, functions = self.values.shape
         jets = np.matmul(self.values.reshape(-1, functions), nodal)
         return np.asarray(jets.reshape(len(nodal), points, derivatives, 3))
 
     def symmetric(self, w: Array, pairs: tuple[IndexPair, ...]) -> Array:
-        """Return w (D_i D_j + D_j D_i) of functions a <= b; w D_i D_i if i = j.
+        """Return w (D_i[a] D_j[b] + D_j[a] D_i[b]) of functions a <= b; half as much if i = j.
 
         Parameters
         ----------
         w
-            (points,) weights.
+            (points,): weights.
         pairs
-            i, j.
+            The pairs i <= j of derivatives, by their numbers in the table.
 
         Returns
         -------
@@ -71,13 +82,22 @@ class ShapeTable:
         return _flat(w, products)
 
     def skew(self, w: Array, pairs: tuple[IndexPair, ...]) -> Array:
-        """Return w (D_i D_j - D_j D_i) of functions a <= b; see `symmetric`."""
+        """Return w (D_i[a] D_j[b] - D_j[a] D_i[b]) of functions a <= b; see `symmetric`."""
         a, b = self.triangle
         D = self.values
         return _flat(w, [D[:, i, a] * D[:, j, b] - D[:, j, a] * D[:, i, b] for i, j in pairs])
 
     def cross(self, w: Array, other: "ShapeTable", pairs: tuple[IndexPair, ...]) -> Array:
-        """Return w D_i D'_j of all functions a of this side and b of the other.
+        """Return w D_i D'_j of all functions a of this side and b of the other one.
+
+        Parameters
+        ----------
+        w
+            (points,): weights.
+        other
+            The table of the other side of an edge, at the same points.
+        pairs
+            The pairs i, j of derivatives: on this side, and on the other one.
 
         Returns
         -------
@@ -85,11 +105,19 @@ class ShapeTable:
             (points * pairs, functions^2).
         """
         products = [self.values[:, i, :, None] * other.values[:, j, None, :] for i, j in pairs]
-        return _flat(w, [p.reshape(len(p), -1) for p in products])
+        return _flat(w, [product.reshape(len(product), -1) for product in products])
 
 
 def _flat(w: Array, products: list[Array]) -> Array:
-    """Return weighted products (points * pairs, ...) of (points, ...) for each pair."""
+    """Return weighted products as (points * pairs, ...).
+
+    Parameters
+    ----------
+    w
+        (points,): weights.
+    products
+        For each pair of derivatives an array (points, ...).
+    """
     stacked = w[:, None, None] * np.stack(products, axis=1)
     return np.ascontiguousarray(stacked.reshape(-1, stacked.shape[2]))
 
@@ -101,9 +129,18 @@ def cell_rule(degree: int) -> tuple[Array, Array]:
 
 
 def edge_rule(degree: int, edge: int, is_reversed: bool) -> tuple[Array, Array]:
-    """Return points (q, 2) on an edge, and weights (q,) that sum to one.
+    """Return a quadrature rule on an edge of the reference triangle.
 
-    Points run from its first corner to its last, or back if `is_reversed`.
+    Parameters
+    ----------
+    edge
+        Number of the edge, 0 to 2.
+    is_reversed
+        Whether points run from the last corner of the edge to its first.
+
+    Returns
+    -------
+    Points (q, 2), and weights (q,) that sum to one.
     """
     x, weights = basix.make_quadrature(basix.CellType.interval, degree)
     start, end = CORNERS[list(EDGES[edge][:: -1 if is_reversed else 1])]
@@ -111,11 +148,17 @@ def edge_rule(degree: int, edge: int, is_reversed: bool) -> tuple[Array, Array]:
 
 
 def edge_covector(edge: int) -> Array:
-    """Return a covector (2,): zero along an edge, positive outward and as long as the edge."""
+    """Return a covector (2,): zero along an edge, positive outward and as long as the edge.
+
+    Parameters
+    ----------
+    edge
+        Number of an edge of the reference triangle, 0 to 2.
+    """
     start, end = CORNERS[list(EDGES[edge])]
     tangent = end - start
-    m = np.array([tangent[1], -tangent[0]])
-    return m if m @ (CORNERS.mean(axis=0) - start) < 0 else -m
+    covector = np.array([tangent[1], -tangent[0]])
+    return covector if covector @ (CORNERS.mean(axis=0) - start) < 0 else -covector
 
 
 def cell_frames(domain: mesh.Mesh) -> Array:
@@ -130,12 +173,14 @@ def cell_frames(domain: mesh.Mesh) -> Array:
         (local cells, 4): p, q, s and the Jacobian determinant.
     """
     corners = domain.geometry.x[compat.geometry_dofs(domain)]
-    first, second = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
-    length = np.linalg.norm(first, axis=1)
-    direction = first / length[:, None]
-    shift = np.einsum("ci,ci->c", second, direction)
-    height = np.linalg.norm(second - shift[:, None] * direction, axis=1)
-    return np.column_stack([1 / length, -shift / (length * height), 1 / height, length * height])
+    first_edge, second_edge = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    length = np.linalg.norm(first_edge, axis=1)
+    direction = first_edge / length[:, None]
+    second_along_first = np.einsum("ci,ci->c", second_edge, direction)
+    height = np.linalg.norm(second_edge - second_along_first[:, None] * direction, axis=1)
+    return np.column_stack(
+        [1 / length, -second_along_first / (length * height), 1 / height, length * height]
+    )
 
 
 class PointSampling:
@@ -146,15 +191,18 @@ class PointSampling:
 
     Parameters
     ----------
+    table
+        Shape functions at the points.
     weights
         (points,) of the quadrature.
     derivatives
-        Numbers of the derivatives in a `ShapeTable` that are sampled.
+        Numbers of the derivatives in the table that are sampled.
     """
 
     def __init__(self, table: ShapeTable, weights: Array, derivatives: Sequence[int]) -> None:
         D, identity = table.values[:, list(derivatives)], np.eye(3)
         size = 3 * D.shape[2]
+        # q point, p derivative, f function; c and d components, of node and of value
         self._to_points = np.einsum("qpf,cd->fcqpd", D, identity).reshape(size, -1)
         self._to_nodes = np.einsum("q,qpf,cd->qpdfc", weights, D, identity).reshape(-1, size)
 
@@ -165,9 +213,11 @@ class PointSampling:
     def at_nodes(self, gradients: Array) -> Array:
         """Return nodal vectors (cells, functions * 3): the weighted sum of gradients at points.
 
+        It is the transpose of `at_points`, with the weights of the quadrature.
+
         Parameters
         ----------
         gradients
-            By the values at points, in any shape.
+            Derivatives by the values at points, in their order and in any shape.
         """
         return np.asarray(gradients.reshape(-1, len(self._to_nodes)) @ self._to_nodes)

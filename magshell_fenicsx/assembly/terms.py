@@ -18,18 +18,21 @@ Density = TypeVar("Density")  # the type of a form's density
 
 
 class Term(Protocol):
-    """A summand mu Pi(u) of the potential; mu = 1 where `amplitude` is None."""
+    """A summand mu Pi(u) of the potential; mu = 1 where `amplitude` is None.
+
+    Its methods see the displacement u in the forms of the system.
+    """
 
     @property
     def name(self) -> str: ...
 
     @property
     def amplitude(self) -> str | None:
-        """Name of mu."""
+        """Name of the amplitude mu; None: the term has the factor 1."""
 
     @property
     def group(self) -> str:
-        """Name under which its energy is reported, with that of all terms of one group."""
+        """Name of the group of terms whose energies are reported as one sum."""
 
     @property
     def column(self) -> str:
@@ -48,11 +51,11 @@ class Term(Protocol):
         """Compile the form of `add_tangent`."""
 
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
-        """Add factor d2Pi/du2."""
+        """Add factor d2Pi/du2 to K, without rows and columns of clamped unknowns."""
 
 
 def factor_of(amplitude: str | None, mu: Mapping[str, float]) -> float:
-    """Return the factor of the energy of a term or slope with this amplitude."""
+    """Return the factor of the energy of a term or slope: the value of its amplitude, or 1."""
     return 1.0 if amplitude is None else mu[amplitude]
 
 
@@ -64,12 +67,22 @@ class FormTerm:
 
     Parameters
     ----------
+    name
+        Name of the term.
+    energy
+        The form of Pi(u).
+    u
+        The displacement in the form.
+    log
+        Requests and counts the compiled kernels.
+    amplitude
+        Name of the factor mu; None: 1.
     linear
         Whether the energy is linear in u, so that it has no tangent.
     work
-        The virtual work of a load without potential.
+        The virtual work of a load without potential; None: the load has a potential.
     over
-        An integral that a linear energy has been divided by.
+        An integral that a linear energy has been divided by; None: it has not been divided.
 
     Attributes
     ----------
@@ -102,6 +115,7 @@ class FormTerm:
 
     @cached_property
     def _gradient(self) -> ufl.Form:
+        """The gradient of the energy as a linear form, or the virtual work in its place."""
         if self._work is not None:
             return self._work
         return ufl.derivative(self.form, self._u, ufl.TestFunction(self._u.function_space))
@@ -134,6 +148,7 @@ class FormTerm:
 
     @cached_property
     def skew_form(self) -> fem.Form | None:
+        """The compiled skew part of the derivative of the work; None for a potential."""
         if self.has_potential:
             return None
 
@@ -144,7 +159,19 @@ class FormTerm:
         return self._request("skew tangent", skew)()
 
     def _request(self, kind: str, make: Callable[[], ufl.Form]) -> Callable[[], fem.Form]:
-        """Request a form that is made of the energy, or of the work of a load without potential."""
+        """Request a form that is made of the energy, or of the work of a load without potential.
+
+        Parameters
+        ----------
+        kind
+            Name of the form, which tells it from others with the same origin.
+        make
+            Returns the form.
+
+        Returns
+        -------
+        A function that returns the compiled form.
+        """
         origin = self.form if self._work is None else self._work
         description = kind if self._work is None else f"{kind} of work"
         derived = DerivedForm(origin, description, make, self._u, (self._factor,))
@@ -152,6 +179,7 @@ class FormTerm:
 
     @property
     def _symmetric_hessian(self) -> ufl.Form:
+        """The second derivative of the energy; for a work the symmetric part of its derivative."""
         hessian = self._hessian
         return hessian if self.has_potential else 0.5 * (hessian + ufl.adjoint(hessian))
 
@@ -165,7 +193,7 @@ class FormTerm:
         return [field for field in self.form.coefficients() if isinstance(field, PointField)]
 
     def renew(self) -> None:
-        """Renew the coefficients of the forms, which assembly takes as they are."""
+        """Renew the coefficients of the forms that are functions of u; assembly does not do so."""
         for field in self._point_fields:
             field.renew()
 
@@ -203,7 +231,7 @@ class FormTerm:
 
 
 class AngleTerm(FormTerm):
-    """The potential of a moment at an edge: -Pi = intensity times its angle, integrated.
+    """The potential of a moment at an edge: -Pi = intensity times the edge's angle, integrated.
 
     The angle goes on beyond half a turn, while forms know no turns. So the energy is that of the
     angle nearest to `value`, a reference angle that stands in the state: it is a function of the
@@ -211,12 +239,13 @@ class AngleTerm(FormTerm):
     """
 
     def set_reference_turn(self, cosine_and_sine: fem.Constant, moment: float) -> None:
-        """Set the reference angle to zero; to be called once.
+        """Set the reference angle to zero, and the numbers that the energy needs; call it once.
 
         Parameters
         ----------
         cosine_and_sine
-            Of the reference angle, a constant in the form; see `edges.turning`.
+            (2,): cosine and sine of the reference angle, a constant in the form; see
+            `edges.turning`.
         moment
             Intensity times the edge's length: -Pi of one radian.
         """
@@ -251,7 +280,13 @@ class AngleTerm(FormTerm):
 
 
 class DensityTerm(FormTerm, Generic[Density]):
-    """A form that keeps its density."""
+    """A form term that keeps its density, from which point kernels are made.
+
+    Parameters
+    ----------
+    density
+        The density that the form integrates.
+    """
 
     def __init__(
         self,
@@ -270,14 +305,20 @@ class DensityTerm(FormTerm, Generic[Density]):
 
 
 class LinearTerm:
-    """A dead load, Pi(u) = -l . u.
+    """A dead load, Pi(u) = -l . u; a `Term` without a tangent.
 
     Parameters
     ----------
+    name
+        Name of the term.
     dofs
         Local, owned degrees of freedom.
     entries
         The load vector l there.
+    u
+        The displacement.
+    amplitude
+        Name of the amplitude of the load.
     forms
         Those parts of the load that depend on the placement, as terms.
     """
@@ -314,15 +355,17 @@ class LinearTerm:
 
 
 class TangentAssembler(Protocol):
-    """Computes the tangent without the terms' forms."""
+    """Computes the tangent without the terms' forms. All methods are collective."""
 
     def tangent(
         self, factors: Mapping[str, float], stress: Sequence[tuple[float, NDArray[np.float64]]] = ()
     ) -> PETSc.Mat:
-        """Return the tangent of the terms with these factors, by name, at the present u.
+        """Return the tangent of some terms at the present u, with the system's supports.
 
         Parameters
         ----------
+        factors
+            Term name -> factor of its tangent; others are left out.
         stress
             As in `System.tangent`, of displacements with ghosts.
         """
@@ -331,6 +374,11 @@ class TangentAssembler(Protocol):
         """Return this rank's part of the tangent without supports times a vector with ghosts.
 
         It is exact where nodes move.
+
+        Parameters
+        ----------
+        factors
+            Term name -> factor of its tangent.
         """
 
 
@@ -346,4 +394,10 @@ class ResidualAssembler(Protocol):
     names: frozenset[str]
 
     def add(self, b: NDArray[np.float64], factors: Mapping[str, float]) -> None:
-        """Add the gradients of the terms with these factors, by name, at the present u."""
+        """Add the gradients of terms at the present u to a local vector with ghosts.
+
+        Parameters
+        ----------
+        factors
+            Term name -> factor of its gradient.
+        """

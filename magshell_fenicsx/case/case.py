@@ -157,12 +157,15 @@ class Case(WithParts):
         return self._several
 
     def with_shells(self, parts: Sequence[MemberCase]) -> Self:
-        """Return the case with other imperfections of its several shells."""
+        """Return a copy of a case of several shells, whose imperfections have changed.
+
+        `parts` are in the order of the file; joints and pairs remain.
+        """
         assert self.several
         several = SeveralShells(parts, self.several.joints, self.several.pairs)
         shell = self.shell.model_copy(update={"file": several.file})
         assert isinstance(shell, MeshSurface)
-        sections = {part.name: part.section for part in parts}
+        sections = {member.name: member.section for member in parts}
         copied = self.model_copy(update={"shell": shell, "shells": sections})
         copied._several = several
         shell.files.given[shell.path] = several.assembly
@@ -170,6 +173,7 @@ class Case(WithParts):
 
     @model_serializer(mode="wrap")
     def _plain_data(self, handler: SerializerFunctionWrapHandler) -> dict[str, Any]:
+        """Return the plain data of the case, without keys that were made from its `shells`."""
         return without_merged_keys(handler(self), self.shells)
 
     @model_validator(mode="wrap")
@@ -177,6 +181,10 @@ class Case(WithParts):
     def _units_go_with_those_of_the_shell(
         cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
     ) -> Self:
+        """Merge several shells into one mesh, validate, and check that lengths agree in units.
+
+        Raises ValueError for the first length with a unit if the shell's lengths have none.
+        """
         data, several = merge_shells(data, info.context, cls)
         section = handler(data)
         if several and isinstance(section.shell, MeshSurface):
@@ -191,7 +199,10 @@ class Case(WithParts):
         return section
 
     def _with_units(self, data: Mapping[str, Any]) -> Iterator[str]:
-        """Yield the keys of plain data that have units as lengths of the shell have."""
+        """Yield the keys in plain data of the case whose lengths have units.
+
+        Only the sections that must agree with the shell's lengths are searched.
+        """
         for key in SECTIONS_WITH_SHELL_UNITS:
             yield from numbers_with_units(getattr(self, key), data.get(key), key)
         shell = data.get("shell")
@@ -203,6 +214,7 @@ class Case(WithParts):
 
     @model_validator(mode="after")
     def _abilities_fit(self) -> Self:
+        """Check that abilities and load steps have what they need, and that patches are known."""
         for ability in self.context.abilities:
             ability.refuse_unfit(self.context)
         for key, patches in self.patches.items():
@@ -211,7 +223,7 @@ class Case(WithParts):
         return self
 
     def problem(self, smooth: Collection[str] = ()) -> "Problem":
-        """Return the problem of the case.
+        """Return the problem of the case: mesh, loads and supports, not yet built.
 
         Parameters
         ----------
@@ -229,7 +241,7 @@ class Case(WithParts):
 
     @property
     def patches(self) -> dict[str, Iterable[str]]:
-        """Names of patches by key, of all keys that have values by patch."""
+        """Key of the case -> names of its patches, for all keys that have values by patch."""
         patches = dict[str, Iterable[str]]()
         for ability in self.context.abilities:
             patches |= ability.patches()
@@ -237,6 +249,7 @@ class Case(WithParts):
 
     @model_validator(mode="after")
     def _model_fits(self) -> Self:
+        """Check that shell or solid, mesh and symmetry go together."""
         is_mesh_file = isinstance(self.shell, MeshSurface)
         size_keys = sorted(self.mesh.model_fields_set & {"size", "refinement", "tolerance"})
         if size_keys and is_mesh_file and not self.several:
@@ -262,7 +275,7 @@ class Case(WithParts):
 
     @cached_property
     def context(self) -> Context:
-        """Sections, units and steps of the case, as its parts need them."""
+        """Sections, units and steps of the case, in the form that its parts read."""
         sections = {key: getattr(self, key) for key in type(self).model_fields}
         sections["imperfections"] = self.imperfections
         is_programme, is_solid = isinstance(self.loading, list), self.model == "solid"
@@ -273,23 +286,26 @@ class Case(WithParts):
 
     @property
     def programme(self) -> tuple[ProgrammeStep, ...]:
-        """Steps of the case; before a single load the natural shape grows, then the field."""
+        """Load steps of the case in their order.
+
+        Before a single load the natural shape grows, then the field.
+        """
         return tuple(self.context.steps)
 
     @property
     def approaches(self) -> dict[str, str]:
-        """Body -> name of its approach, the amplitude."""
+        """Name of a body -> name of the amplitude by which it approaches the shell."""
         return approaches(self.bodies, list(loads_by_key(self.loading).values()))
 
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return a copy with some sections changed, whose parts know the copy alone."""
+        """Return a copy with some sections changed; its parts read the copy, not the original."""
         copied = super().model_copy(update=update, deep=deep)
         copied.__dict__.pop("context", None)
         return copied
 
     @property
     def imperfections(self) -> dict[str, ImperfectionSection]:
-        """Key of each imperfection below `shell` -> its section; `defect` is one of them."""
+        """Key below `shell` -> section of each imperfection; `defect` is one of them."""
         shell = self.shell
         if isinstance(shell, ShellSection | CapSurface | RevolutionSurface) and shell.defect:
             return {"defect": shell.defect}
@@ -301,13 +317,13 @@ class Case(WithParts):
 
     @property
     def dimples(self) -> dict[str, str]:
-        """Names of the patches within the rims of dimples -> keys of `imperfections`."""
+        """Name of the patch within each dimple's rim -> key of the dimple in `imperfections`."""
         keys = [key for key, section in self.imperfections.items() if section.patch]
         return {"dimple" if i == 0 else f"dimple_{i + 1}": key for i, key in enumerate(keys)}
 
     @property
     def thickness_factor(self) -> str | dict[str, float] | UserField | None:
-        """Factor of h: a formula, numbers of patches, or a function of a program."""
+        """Factor of the thickness: a formula, patch -> number, or a user function; None for 1."""
         return self.shell.thickness_factor
 
     @property
@@ -337,9 +353,9 @@ class Case(WithParts):
 
     @property
     def outside(self) -> dict[str, str | None]:
-        """Hashes of what is solved besides the case's own keys.
+        """Key -> hash of what a result depends on besides the case's own keys.
 
-        They are of the mesh file, other files, and user-defined energies.
+        That is the mesh file, other files, and user-defined energies.
         """
         mesh = {"mesh_file": self.shell.digest} if isinstance(self.shell, MeshSurface) else {}
         readers = {key: s for key, s in self.readers.items() if s is not self.shell}
@@ -347,7 +363,10 @@ class Case(WithParts):
 
     @property
     def readers(self) -> dict[str, FileKeys]:
-        """Sections that read a file, by key; keys below `shell` are without that."""
+        """Key -> section, of all sections that read a file.
+
+        Keys of imperfections are those below `shell`.
+        """
         sections: dict[str, object] = {
             "shell": self.shell,
             "magnetic.remanent": self.remanent,
@@ -359,7 +378,7 @@ class Case(WithParts):
         return {key: s for key, s in sections.items() if isinstance(s, FileKeys) and s.file}
 
     def with_place(self, message: str) -> str:
-        """Return a message with the place of its key in the file."""
+        """Return a message with file and line of the key that it begins with."""
         return super().with_place(in_words_of_shells(message, self.origin.data))
 
     @classmethod
@@ -375,13 +394,12 @@ class Case(WithParts):
 
     @classmethod
     def from_source(cls, source: Source | Mapping[str, Any]) -> "Case":
-        """Return the case of a mapping like a case file, or of a `Source`, which knows its places
-        in a file.
+        """Return the validated case of a mapping, or of a `Source`, which knows places in a file.
 
         Raises
         ------
         CaseError
-            See `load`; of a mapping the message begins with the key.
+            See `load`; for a mapping the message begins with the key.
         """
         if not isinstance(source, Source):
             source = Source("case", dict(source))

@@ -1,6 +1,7 @@
-"""A case as programs give it, the same case with other values, and the perfect shell of a case.
+"""A case as programs give it, the same case with other values, and the case of its perfect shell.
 
-On several ranks a file is as rank 0 reads it. A run writes down what its case says.
+On several ranks, all ranks have the files as rank 0 reads them. The data of a changed case are
+changed too, so that a run writes down the case that it solves.
 """
 
 from collections.abc import Mapping, Sequence
@@ -28,15 +29,20 @@ KEYS_OF_SHELLS = ("shells", "shell", "boundary", "points")  # made of the data o
 def open_case(
     case: Case | Mapping[str, Any] | str | Path, comm: "MPI.Comm", settings: Sequence[str] = ()
 ) -> Case:
-    """Return the case itself, or that of a mapping or of a file; collective.
+    """Return a validated case from a case, a mapping or the path of a file; collective.
 
     Its files are the same on all ranks.
+
+    Parameters
+    ----------
+    settings
+        `key.path=value` texts that replace values of a file.
 
     Raises
     ------
     CaseError
-        On every rank, if it is neither, the file is no valid case, or the ranks have different
-        cases.
+        On every rank, if `case` is of another kind, the file is no valid case, or the ranks have
+        different cases.
     """
     if isinstance(case, str | Path):
         case = Case.from_source(read_together(case, comm, settings))
@@ -51,12 +57,12 @@ def open_case(
 
 
 def read_together(file: str | Path, comm: "MPI.Comm", settings: Sequence[str] = ()) -> Source:
-    """Return the case file as rank 0 reads it; collective. See `read_source`."""
+    """Return the case file as rank 0 reads it, on every rank; collective. See `read_source`."""
     return on_first_rank(comm, lambda: read_source(Path(file), settings))
 
 
 def with_same_files(case: Case, comm: "MPI.Comm") -> Case:
-    """Return the case, whose files rank 0 reads for all ranks; collective.
+    """Return the case with all its files as rank 0 reads them; collective.
 
     Raises
     ------
@@ -90,14 +96,20 @@ def _content(reader: FileKeys) -> bytes | OSError:
 
 
 def case_with_values(case: Case, values: Mapping[str, Any]) -> Case:
-    """Return the case whose file has other values, by keys such as "mesh.degree".
+    """Return a copy of a case with other values of some keys.
 
     The values are not validated again.
+
+    Parameters
+    ----------
+    values
+        Key path such as "mesh.degree" -> value, as a validated case has it: a length in metres, not
+        a text with a unit.
 
     Raises
     ------
     CaseError
-        If one is a number of the shell that is not allowed.
+        If a new value of the shell is not allowed.
     """
     for key, value in values.items():
         case = _case_with_value(case, key, value)
@@ -105,7 +117,11 @@ def case_with_values(case: Case, values: Mapping[str, Any]) -> Case:
 
 
 def _case_with_value(case: Case, key: str, value: Any) -> Case:
-    """Return a case with another value."""
+    """Return a copy of a case with another value at a key path, also in its plain data.
+
+    A key of the shell changes numbers that other keys are relative to, so the loading is made
+    again.
+    """
     case_data = case.origin.data
     if case.several and key.split(".")[0] in ("shells", "mesh"):  # all shells are meshed anew
         return _remade_case(case, key, value)
@@ -114,13 +130,17 @@ def _case_with_value(case: Case, key: str, value: Any) -> Case:
         return replaced
     data = _data_with_value(case, case_data, key, value)  # which the next change builds on
     if key.startswith("shell."):  # no other number is one that others are given over
-        other = _validated(data, case, key)
-        replaced = replaced.model_copy(update={"shell": other.shell, "loading": other.loading})
+        remade = _validated(data, case, key)
+        replaced = replaced.model_copy(update={"shell": remade.shell, "loading": remade.loading})
     return replaced.written_as(replace(case.origin, data=data))
 
 
 def _remade_case(case: Case, key: str, value: Any) -> Case:
-    """Return a case of several shells with another value, made again from its data."""
+    """Return a case of several shells with another value, made again from its plain data.
+
+    Sections that the value does not concern are taken from `case`, with what programs have changed
+    in them.
+    """
     if case.origin.data is None:
         raise CaseError(
             f"{key}: needs a case that was read from a file or a mapping: see Case.from_source"
@@ -128,55 +148,63 @@ def _remade_case(case: Case, key: str, value: Any) -> Case:
     data = _data_with_value(case, case.origin.data, key, value)
     tolerance = case.mesh.tolerance
     # a mesh that the tolerance has chosen is no mistake
-    checked = _data_with_value(case, data, "mesh.tolerance", None) if tolerance else data
-    remade = _validated(checked, case, key).with_terms(case.own_terms)
-    names = [name for name in type(case).model_fields if name not in KEYS_OF_SHELLS]
-    sections = {name: getattr(case, name) for name in names}
-    sections["mesh"] = remade.mesh.model_copy(update={"tolerance": tolerance})
+    data_to_validate = _data_with_value(case, data, "mesh.tolerance", None) if tolerance else data
+    remade = _validated(data_to_validate, case, key).with_terms(case.own_terms)
+    kept_names = [name for name in type(case).model_fields if name not in KEYS_OF_SHELLS]
+    kept_sections = {name: getattr(case, name) for name in kept_names}
+    kept_sections["mesh"] = remade.mesh.model_copy(update={"tolerance": tolerance})
     if key.startswith("shells."):  # targets are over its numbers
-        sections["loading"] = remade.loading
+        kept_sections["loading"] = remade.loading
     if any(section.remanent for section in (remade.shells or {}).values()):
-        sections["magnetic"] = remade.magnetic
-    return remade.model_copy(update=sections).written_as(replace(case.origin, data=data))
+        kept_sections["magnetic"] = remade.magnetic
+    return remade.model_copy(update=kept_sections).written_as(replace(case.origin, data=data))
 
 
 def _data_with_value(case: Case, data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
-    """Return plain data of a case with another value, in the unit that the one before had."""
+    """Return plain data with another value at a key path, in the unit of the previous value.
+
+    `value` is in the size of the validated case, such as SI units.
+    """
     new_data = deepcopy(dict(data))
-    *path, last = key.split(".")
+    *path, last_key = key.split(".")
     section: Any = new_data
     for name in path:
         is_list = isinstance(section, list)
         section = section[int(name)] if is_list else section.setdefault(name, {})
-    index: Any = int(last) if isinstance(section, list) else last
+    index: Any = int(last_key) if isinstance(section, list) else last_key
     previous = section[index] if isinstance(section, list) else section.get(index)
     number, unit = number_and_unit(previous) if isinstance(previous, str) else ("", "")
     if not unit or value is None:
         section[index] = value
         return new_data
-    size, present = si_size(unit), _number_at(case, key)
-    if present and float(number):  # over h or a width, an imperfection is no number in SI units
-        size = present / float(number)
-    elif present is not None:
+    size_of_unit, current = si_size(unit), _number_at(case, key)
+    if current and float(number):  # over h or a width, an imperfection is no number in SI units
+        size_of_unit = current / float(number)
+    elif current is not None:
         section[index] = f"1 {unit}"
-        size = _number_at(_validated(new_data, case, key), key) or size
-    section[index] = f"{value / size!r} {unit}"
+        size_of_unit = _number_at(_validated(new_data, case, key), key) or size_of_unit
+    section[index] = f"{value / size_of_unit!r} {unit}"
     return new_data
 
 
 def _number_at(case: Case, key: str) -> float | None:
-    """Return the number of a case at a key, in the size that it has there; None if it has none."""
-    part: Any = case
+    """Return the number of a validated case at a key path; None if there is none."""
+    section: Any = case
     for name in key.split("."):
-        if isinstance(part, list):
-            part = part[int(name)]
+        if isinstance(section, list):
+            section = section[int(name)]
         else:
-            part = part.get(name) if isinstance(part, Mapping) else getattr(part, name, None)
-    return part if isinstance(part, float) else None
+            section = (
+                section.get(name) if isinstance(section, Mapping) else getattr(section, name, None)
+            )
+    return section if isinstance(section, float) else None
 
 
 def _validated(data: Mapping[str, Any], case: Case, key: str) -> Case:
-    """Return the case of data; CaseError with the key of the new value if they are not valid."""
+    """Return the case of plain data, validated in the context of `case`.
+
+    Raises CaseError with `key`, whose value has changed, if the data are not valid.
+    """
     try:
         return Case.model_validate(data, context=case.origin.context)
     except ValidationError as e:
@@ -184,28 +212,31 @@ def _validated(data: Mapping[str, Any], case: Case, key: str) -> Case:
 
 
 def _with_value(part: Any, key: str, value: Any) -> Any:
-    """Return a part of a case with another value; it is not validated again."""
+    """Return a part of a case with another value at a key path below it, without validation.
+
+    An empty key path stands for the part itself.
+    """
     if not key:
         return value
-    first, _, rest = key.partition(".")
+    first_key, _, further_keys = key.partition(".")
     if isinstance(part, list):
         return [
-            _with_value(item, rest, value) if i == int(first) else item
+            _with_value(item, further_keys, value) if i == int(first_key) else item
             for i, item in enumerate(part)
         ]
     if isinstance(part, dict):
         return {
-            name: _with_value(item, rest, value) if name == first else item
+            name: _with_value(item, further_keys, value) if name == first_key else item
             for name, item in part.items()
         }
-    inner = getattr(part, first)
-    if inner is None and rest:  # a section that the case leaves out
-        inner = get_args(type(part).model_fields[first].annotation)[0]()
-    return part.model_copy(update={first: _with_value(inner, rest, value)})
+    inner_section = getattr(part, first_key)
+    if inner_section is None and further_keys:  # a section that the case leaves out
+        inner_section = get_args(type(part).model_fields[first_key].annotation)[0]()
+    return part.model_copy(update={first_key: _with_value(inner_section, further_keys, value)})
 
 
 def perfect_case(case: Case) -> Case:
-    """Return the case without imperfections, as a shell on the smallest model and the default mesh.
+    """Return the case without imperfections, as a shell on the smallest model and a default mesh.
 
     Several shells keep their meshes, whose vertices meet at joints. A pressure at its end goes on
     to the first instability.
@@ -213,7 +244,7 @@ def perfect_case(case: Case) -> Case:
     Raises
     ------
     CaseError
-        If the case has values for the patch of a dimple.
+        If the case has values for the patch of a dimple, which the perfect shell lacks.
     """
     if case.dimples and case.patches:
         raise CaseError(
@@ -234,26 +265,29 @@ def perfect_case(case: Case) -> Case:
     )
     if not case.several:
         return perfect
-    parts = []
-    for part in case.several.parts:
-        section_shell = _without_imperfections(part.section.shell)
-        case_shell = _without_imperfections(part.case.shell)
-        section = part.section.model_copy(update={"shell": section_shell})
-        own_case = part.case.model_copy(update={"shell": case_shell})
-        parts.append(MemberCase(part.name, section, own_case))
-    return perfect.with_shells(parts)
+    perfect_shells = []
+    for member in case.several.parts:
+        section_shell = _without_imperfections(member.section.shell)
+        case_shell = _without_imperfections(member.case.shell)
+        section = member.section.model_copy(update={"shell": section_shell})
+        own_case = member.case.model_copy(update={"shell": case_shell})
+        perfect_shells.append(MemberCase(member.name, section, own_case))
+    return perfect.with_shells(perfect_shells)
 
 
 def _without_imperfections(shell: Surface | ShellSection) -> Surface | ShellSection:
-    """Return the section of a shell without its imperfections."""
-    without: dict[str, Any] = {"imperfections": []}
+    """Return the section of a shell without imperfections and defect."""
+    changes: dict[str, Any] = {"imperfections": []}
     if "defect" in type(shell).model_fields:
-        without["defect"] = None
-    return shell.model_copy(update=without)
+        changes["defect"] = None
+    return shell.model_copy(update=changes)
 
 
 def _to_the_limit(case: Case) -> Any:
-    """Return the loading of the perfect shell, to the first instability."""
+    """Return the loading of the perfect shell, which ends at its first instability.
+
+    None if no load of the case remains.
+    """
     loading = case.loading
     if not isinstance(loading, list):
         return loading and loading.on_perfect(last=True)

@@ -39,7 +39,10 @@ def describe(case: Case, problem: Problem | None = None) -> str:
 
 
 def _description(case: Case, problem: Problem) -> str:
-    """Return the text of `describe`."""
+    """Return the text of `magshell check`: numbers, mesh, contents of the model, warnings.
+
+    Raises CaseError if nothing holds the shell or the memory is too small.
+    """
     memory_warning = None if case.mesh.tolerance else refuse_beyond_memory(problem)
     _refuse_unsupported(problem)
     lines = _number_lines(case, problem)
@@ -76,7 +79,7 @@ def _description(case: Case, problem: Problem) -> str:
 
 
 def _refuse_unsupported(problem: Problem) -> None:
-    """Refuse a shell that nothing holds."""
+    """Raise CaseError for a shell that nothing holds."""
     unsupported = all(
         condition in ("free", "symmetry") for condition in problem.conditions.values()
     )
@@ -89,7 +92,7 @@ def _refuse_unsupported(problem: Problem) -> None:
 
 
 def _number_lines(case: Case, problem: Problem) -> list[str]:
-    """Return the dimensionless numbers and the sizes of a case, and the numbers of its parts."""
+    """Return lines with dimensionless numbers, sizes in units, and numbers of the case's parts."""
     material = problem.material
     numbers = {
         "R/h": 1 / material.h,
@@ -106,13 +109,16 @@ def _number_lines(case: Case, problem: Problem) -> list[str]:
     lines += _in_units(case, without="p_c" if is_flat else "")
     if case.several:
         lines += case.several.scale_lines
-    for part in case.context.abilities:
-        lines += part.numbers(case.context)
+    for ability in case.context.abilities:
+        lines += ability.numbers(case.context)
     return lines
 
 
 def _mesh_lines(problem: Problem, patch: PatchMesh | None) -> list[str]:
-    """Return the size of a mesh, a warning on slivers, and what a mesh file holds."""
+    """Return lines on the size of a mesh, on slivers, and on what a mesh file contains.
+
+    `patch` is the triangulation; None for a meridian.
+    """
     cells, unknowns = _count(problem, patch)
     refuse_overlap(problem, cells)
     lines = [f"mesh: {cells} cells of degree {degree_of(problem.context)}, {unknowns} unknowns"]
@@ -127,7 +133,10 @@ def _mesh_lines(problem: Problem, patch: PatchMesh | None) -> list[str]:
 
 
 def _in_units(case: Case, without: str) -> list[str]:
-    """Return the sizes of a case with units, without one scale."""
+    """Return lines with the scales of a case in units, but for the scale `without`.
+
+    There are none for a case without units.
+    """
     sizes = sizes_of(case.context)
     words_and_units = {
         "h": ("h", "mm"),
@@ -148,7 +157,10 @@ def _in_units(case: Case, without: str) -> list[str]:
 
 
 def _edges_without_potential(problem: Problem, patch: PatchMesh | None) -> tuple[str, ...]:
-    """Return the edges at which a live pressure has no potential."""
+    """Return the names of the edges at which a live pressure has no potential.
+
+    `patch` is the triangulation, if it is made already.
+    """
     span = problem.meridian
     if span is None:
         return open_edges(
@@ -158,14 +170,14 @@ def _edges_without_potential(problem: Problem, patch: PatchMesh | None) -> tuple
 
 
 def _surface_lines(patch: PatchMesh) -> list[str]:
-    """Return what a mesh file holds, so that its author sees that it was read as meant."""
+    """Return lines on what a mesh file contains, so that its author can see how it was read."""
     places = patch.embedding(patch.nodes)
     a, b, c = places[patch.cells[0, :3]]
     normal = np.cross(b - a, c - a)
     extent, place = np.ptp(places, axis=0), (a + b + c) / 3
     unit_normal = normal / np.linalg.norm(normal)
     return [
-        f"extent over the radius: {' x '.join(f'{size:.4g}' for size in extent)}",
+        f"extent over the radius: {' x '.join(f'{side:.4g}' for side in extent)}",
         f"edges: {', '.join(patch.edges) or 'none'}; patches: {', '.join(patch.patches) or 'none'}",
         f"outside: the normal at {_vector_text(place)}, over the radius, "
         f"is {_vector_text(unit_normal)}",
@@ -173,16 +185,20 @@ def _surface_lines(patch: PatchMesh) -> list[str]:
 
 
 def _vector_text(vector: NDArray[np.float64]) -> str:
-    """Return a vector as text."""
+    """Return a vector (3,) as text with four digits, without negative zeros."""
     return f"({', '.join(f'{x + 0.0:.4g}' for x in np.round(vector, 9))})"
 
 
 def _count(problem: Problem, patch: PatchMesh | None) -> tuple[int, int]:
-    """Return the numbers of cells and of unknowns of the mesh, or of the meridian."""
+    """Return (number of cells, number of unknowns) of the mesh.
+
+    `patch` is the triangulation; None for a meridian, whose cells are intervals.
+    """
     degree = degree_of(problem.context)
     if patch is None:
         assert problem.meridian
         chart = problem.meridian
+        # joined meridians share a vertex, and count as one piece
         joined_count = sum(first == second for first, second in chart.joints)
         piece_count = max(len(chart.shell_meridians) - joined_count, 1)
         count = len(meridian_vertices(problem)) - piece_count
@@ -192,5 +208,6 @@ def _count(problem: Problem, patch: PatchMesh | None) -> tuple[int, int]:
     if problem.body:  # three hexahedra a layer above each triangle
         count = len(problem.body.layer_bounds) - 1
         return 3 * len(cells) * count, 3 * (2 * count + 1) * (corners + 3 * sides + 7 * len(cells))
+    # three components at corners, within sides and within cells
     inner_nodes = (degree - 1) * (degree - 2) // 2
     return len(cells), 3 * (corners + (degree - 1) * sides + inner_nodes * len(cells))

@@ -1,5 +1,7 @@
-"""Meridians of several shells of revolution with one axis, one after the other along one
-parameter.
+"""Meridians of several shells of revolution with one axis, along one common parameter.
+
+The common parameter runs through the shells one after the other, over the R of the first shell. The
+axis is e3.
 """
 
 from collections.abc import Mapping, Sequence
@@ -27,16 +29,24 @@ NO_MERIDIAN = "symmetry: axisymmetric: "  # begin of a message that says why the
 
 @dataclass(frozen=True)
 class CoaxialShell:
-    """Shell of revolution whose axis is that of all.
+    """Shell of revolution whose axis is the common axis of all shells.
+
+    "The common frame" is that of the case; lengths in it are over the R of the first shell.
 
     Attributes
     ----------
+    name
+        Name of the shell.
     start
-        Begin of the shell's parameter along all meridians, over the R of the first shell.
+        Beginning of the shell in the common parameter.
     problem
         The problem of the shell alone.
-    chart, place, outline
-        The shell's own meridian over its own length, its place, and its outline.
+    chart
+        The shell's own meridian, over its own length.
+    place
+        Position, orientation and scale of the shell in the common frame.
+    outline
+        Its perfect surface, in its own frame.
     """
 
     name: str
@@ -48,14 +58,15 @@ class CoaxialShell:
 
     @property
     def end(self) -> float:
-        """End of the shell's parameter along all meridians."""
+        """End of the shell in the common parameter."""
         return self.start + self.place.scale * self.chart.length
 
     @property
     def upright(self) -> bool:
-        """Whether the shell's own e3 is that of all.
+        """Whether the shell's own e3 points along the common e3.
 
-        Otherwise its meridian is taken from its end, so that its normal stays outside.
+        Otherwise its meridian runs backwards in the common parameter, so that its normal stays
+        outside.
         """
         return bool(self.place.Q[2, 2] > 0)
 
@@ -66,28 +77,28 @@ class CoaxialShell:
         return reach * float(np.sqrt(self.chart.curvature / self.problem.material.h))
 
     def own_parameter(self, s: Array) -> Array:
-        """Return the parameter of the shell alone from that of all meridians."""
+        """Return the shell's own parameters, clipped to its meridian, from common ones (n,)."""
         t = (s - self.start) / self.place.scale
         return np.clip(t if self.upright else self.chart.length - t, 0.0, self.chart.length)
 
     def parameter(self, own_parameter: Array) -> Array:
-        """Return the parameter of all meridians from that of the shell alone."""
+        """Return the common parameter from the shell's own parameters (n,)."""
         from_start = own_parameter if self.upright else self.chart.length - own_parameter
         return self.start + self.place.scale * from_start
 
     def places_at(self, s: Array) -> Array:
-        """Return places (n, 3) in the plane of e1 and e3 at parameters (n,)."""
+        """Return places (n, 3) in the plane of e1 and e3, at common parameters (n,)."""
         own_s = self.own_parameter(s)
         places = self.chart.embedding(np.column_stack([own_s, 0 * own_s]))
         return self._in_common_frame(self.place.scale * places) + self._translation
 
     def normal(self, s: Array) -> Array:
-        """Return outward normals (n, 3) at parameters (n,)."""
+        """Return outward unit normals (n, 3) in the common frame, at common parameters (n,)."""
         own_s = self.own_parameter(s)
         return self._in_common_frame(self.chart.normal(np.column_stack([own_s, 0 * own_s])))
 
     def deviation(self, s: Array) -> Array:
-        """Return w0 (n, 1) of the imperfect shell at parameters (n,), over R."""
+        """Return the deviation w0 (n, 1) of the imperfect shell, at common parameters (n,)."""
         own_s, embedding = self.own_parameter(s), self.chart.embedding
         w0 = 0 * own_s
         if isinstance(embedding, DeviatedEmbedding):
@@ -95,15 +106,15 @@ class CoaxialShell:
         return np.asarray(self.place.scale * w0[:, None])
 
     def foot(self, x: Array) -> tuple[float, float]:
-        """Return parameter and azimuth (rad) of the nearest place to a place x in space."""
+        """Return common parameter and azimuth (rad) of the shell's place nearest to x (3,)."""
         in_shell_frame = self.place.to_shell_frame(np.asarray(x)[:3])
         own_s, _ = self.chart.locate(self.outline.inverse(in_shell_frame))
         return float(self.parameter(np.array(own_s))), float(np.arctan2(x[1], x[0]))
 
     def vertices(self, body_contacts: Sequence[tuple[float, float]]) -> Array:
-        """Return the parameters of the vertices, see `ShellMeridian`.
+        """Return the common parameters (n,) of the mesh vertices on this shell, ascending.
 
-        `body_contacts` are element size and reach where bodies press, over the first shell's R.
+        `body_contacts` are pairs of element size and reach where bodies press.
         """
         scale = self.place.scale
         own_contacts = tuple((size / scale, reach / scale) for size, reach in body_contacts)
@@ -114,13 +125,13 @@ class CoaxialShell:
 
     @property
     def names(self) -> list[str | None]:
-        """Names of the shell's first and last end; None for a pole."""
+        """Names of the shell's first and last end in the common parameter; None for a pole."""
         names = [name and f"{self.name}_{name}" for name in self.chart.names]
         return names if self.upright else names[::-1]
 
     @property
     def places(self) -> list[tuple[str | None, Array]]:
-        """Names and places of the shell's ends."""
+        """Name and place (3,) of the shell's first and last end in the common parameter."""
         return [
             (name, self.places_at(np.array([s]))[0])
             for name, s in zip(self.names, (self.start, self.end), strict=True)
@@ -132,24 +143,27 @@ class CoaxialShell:
         return ShellMeridian(self.name, (self.start, self.end), self.foot, self.vertices)
 
     def _in_common_frame(self, x: Array) -> Array:
-        """Return vectors (n, 3) of the shell's frame in that of all."""
+        """Return vectors (n, 3) of the shell's own meridian plane in the common frame."""
         return np.asarray(x if self.upright else x * [1.0, 1.0, -1.0])
 
     @property
     def _translation(self) -> Array:
+        """Vector (3,) from the origin of the shell to its place on the common axis, over R."""
         return self.place.position * [0.0, 0.0, 1.0]
 
 
 @dataclass(frozen=True)
 class CoaxialEmbedding:
-    """Map from charts (n, 2) of all meridians to places (n, 3).
+    """Map from charts (n, 2) on all meridians to places (n, 3) in space.
+
+    The first chart coordinate is the common parameter of all shells.
 
     Attributes
     ----------
     shells
-        The shells, ascending along the parameter.
+        The shells, ascending along the common parameter.
     begins
-        Begin of the parameters that belong to each shell.
+        Beginning of the parameters that belong to each shell.
     """
 
     shells: Sequence[CoaxialShell]
@@ -167,8 +181,9 @@ class CoaxialEmbedding:
         return self._values(chart, "deviation", 1)[:, 0]
 
     def _values(self, chart: Array, name: str, size: int) -> Array:
-        """Return values (n, size) of a method of the shells."""
+        """Return the values (n, size) of method `name` of the shell to which each chart belongs."""
         s, values = chart[:, 0], np.empty((len(chart), size))
+        # the last shell that begins before the parameter, up to rounding
         shell_numbers = np.searchsorted(self.begins, s + ROUNDING, side="right") - 1
         for i, shell in enumerate(self.shells):
             values[shell_numbers == i] = getattr(shell, name)(s[shell_numbers == i])
@@ -176,48 +191,58 @@ class CoaxialEmbedding:
 
 
 def meridians(several: "SeveralShells") -> MeridianChart | str:
-    """Return the meridians of all shells, over the R of the first one; or why there are none.
+    """Return the joined meridians of all shells, or the reason why there are none.
+
+    Lengths are over the R of the first shell.
+
+    Returns
+    -------
+    The chart of the meridians along their common parameter; or a reason in words.
 
     Raises
     ------
     CaseError, MeshError
-        If a shell alone cannot be built; the message begins with its key.
+        If a shell alone cannot be planned; the message begins with its key.
     """
     joined_shells = [{several.shell_of(name) for name in names} for names in several.joints]
     if any(set(pair) in joined_shells for pair in several.pairs):
         return "contact: shells that are joined to each other are modelled with their circumference"
     shells = list[CoaxialShell]()
-    for part in several.parts:
-        place, outline = several.place(part), reference_shell_of(part.case.shell).perfect
-        key = part.refused("place")
+    for member in several.parts:
+        place, outline = several.place(member), reference_shell_of(member.case.shell).perfect
+        key = member.refused("place")
         if max(np.hypot(*place.position[:2]), np.hypot(*place.Q[:2, 2])) > ROUNDING:
             return f"{key}: its axis is not e3 through the origin"
-        problem = _problem_of(part)
+        problem = _problem_of(member)
         if isinstance(problem, str):
-            return part.refused(problem)
+            return member.refused(problem)
         assert problem.meridian
-        shells.append(CoaxialShell(part.name, 0.0, problem, problem.meridian, place, outline))
+        shells.append(CoaxialShell(member.name, 0.0, problem, problem.meridian, place, outline))
     successors = _successors(shells, several.joints)
     if isinstance(successors, str):
         return successors
     places = dict(name_and_place for shell in shells for name_and_place in shell.places)
     with_feet = []
     for shell in shells:
-        feet = [places[edge] for edge, other in several.joints if other == shell.name]
+        # T-junctions: edges of other shells that stand on this one
+        feet = [
+            places[edge] for edge, name_of_other in several.joints if name_of_other == shell.name
+        ]
         with_feet.append(_with_feet(shell, feet))
-    ordered = _in_chains(with_feet, successors)
-    if len(ordered) < len(shells):
+    ordered_shells = _in_chains(with_feet, successors)
+    if len(ordered_shells) < len(shells):
         return "joints: shells are joined in a ring"
-    return _joined_chart(ordered, several)
+    return _joined_chart(ordered_shells, several)
 
 
 def _successors(
     shells: Sequence[CoaxialShell], joints: Sequence[tuple[str, str]]
 ) -> dict[str, str] | str:
-    """Return shell -> the shell that goes on where it ends, joined to it.
+    """Return name -> name of the shell that is joined to its end and goes on along the parameter.
 
-    If two shells cannot be joined so, the result is the reason.
+    The result is a reason in words if two shells cannot be joined end to beginning.
     """
+    # name of an end -> 0 for the first or 1 for the last one, its place, its shell
     ends = {
         name: (end, begin_place, shell)
         for shell in shells
@@ -244,7 +269,10 @@ def _successors(
 
 
 def _with_feet(shell: CoaxialShell, feet: Sequence[Array]) -> CoaxialShell:
-    """Return a shell with cells that end where other shells stand, at places (3,)."""
+    """Return a shell whose mesh has vertices where edges of other shells stand on it.
+
+    `feet` are the places (3,) of these edges.
+    """
     parameters = [float(shell.own_parameter(np.array(shell.foot(foot)[0]))) for foot in feet]
     new_jumps = [s for s in parameters if np.abs(shell.chart.knots - s).min() > ROUNDING]
     chart = replace(shell.chart, curvature_jumps=(*shell.chart.curvature_jumps, *new_jumps))
@@ -252,11 +280,17 @@ def _with_feet(shell: CoaxialShell, feet: Sequence[Array]) -> CoaxialShell:
 
 
 def _in_chains(shells: Sequence[CoaxialShell], successors: Mapping[str, str]) -> list[CoaxialShell]:
-    """Return the shells in the order of the parameter.
+    """Return the shells in the order of the common parameter, with their `start` set.
 
-    Each is followed by the shell that is joined to its end, without a gap.
+    A shell is followed without a gap by the one that is joined to its end. Shells in a closed ring
+    are left out.
+
+    Parameters
+    ----------
+    successors
+        Name of a shell -> name of the shell that follows it.
     """
-    by_name, ordered, end = (
+    by_name, ordered_shells, end = (
         {shell.name: shell for shell in shells},
         list[CoaxialShell](),
         -PARAMETER_GAP,
@@ -264,13 +298,17 @@ def _in_chains(shells: Sequence[CoaxialShell], successors: Mapping[str, str]) ->
     for name in (shell.name for shell in shells if shell.name not in successors.values()):
         end, next_name = end + PARAMETER_GAP, name or None
         while next_name:
-            ordered.append(replace(by_name[next_name], start=end))
-            end, next_name = ordered[-1].end, successors.get(next_name)
-    return ordered
+            ordered_shells.append(replace(by_name[next_name], start=end))
+            end, next_name = ordered_shells[-1].end, successors.get(next_name)
+    return ordered_shells
 
 
 def _problem_of(part: "MemberCase") -> Problem | str:
-    """Return the problem of a shell alone, on its meridian; or why there is none."""
+    """Return the problem of a shell alone, reduced to its meridian.
+
+    The result is a reason in words if the shell is not axisymmetric. Other errors are raised with
+    the key of the shell.
+    """
     # the planner finds the outlines of several shells
     from magshell_fenicsx.case.planner import make_problem
 
@@ -283,8 +321,16 @@ def _problem_of(part: "MemberCase") -> Problem | str:
 
 
 def _joined_chart(shells: Sequence[CoaxialShell], several: "SeveralShells") -> MeridianChart:
-    """Return the chart of all meridians, in the order of the parameter."""
-    joints, names = several.joints, [part.name for part in several.parts]
+    """Return the chart of all meridians.
+
+    Parameters
+    ----------
+    shells
+        The shells, in the order of the common parameter.
+    several
+        The shells of the case, with their joints.
+    """
+    joints, names = several.joints, [member.name for member in several.parts]
     by_name = {shell.name: shell for shell in shells}
     joined_ends = {name for joint in joints if joint[1] not in by_name for name in joint}
     begins = []
@@ -294,7 +340,10 @@ def _joined_chart(shells: Sequence[CoaxialShell], several: "SeveralShells") -> M
     embedding = CoaxialEmbedding(shells, np.array(begins))
 
     def locate(x: Array) -> tuple[float, float]:
-        """Return parameter and azimuth of a place (3,), or of a node with its shell's number."""
+        """Return common parameter and azimuth (rad) of a place, or of a node of a known shell.
+
+        A place is (3,); a node is (4,), with the number of its shell last.
+        """
         if len(x) > len("xyz"):
             return by_name[names[round(float(x[-1]))]].foot(x)
         in_plane = np.array([np.hypot(x[0], x[1]), 0.0, x[2]])
@@ -316,6 +365,7 @@ def _joined_chart(shells: Sequence[CoaxialShell], several: "SeveralShells") -> M
         end_names += [None if name in joined_ends else name for name in shell.names]
 
     def parameter_of(edge: str, foot: str) -> float:
+        """Return the common parameter of an edge, or of the place of `foot` on a shell."""
         if edge in parameters:
             return parameters[edge]
         return by_name[edge].foot(places[foot])[0]

@@ -1,6 +1,6 @@
-"""Mesh sizes at contact: elements are smaller where shells that may touch are nearest.
+"""Mesh sizes at contact: elements are small where shells that may touch are nearest.
 
-Distances are between the undeformed shells.
+Distances are those of the undeformed shells.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -28,12 +28,15 @@ FACE_CANDIDATES = 50  # places of a mid-surface among which that of the nearest 
 
 @dataclass(frozen=True)
 class ContactPlace:
-    """Place in the chart where another shell is nearest."""
+    """Place (2,) in the chart where another shell is nearest and elements must be small."""
 
     place: Array
 
     def features(self, outline: Outline, sizing: SizingContext, growth: float) -> list[Feature]:
-        """Return the element sizes that resolve the ring of a contact."""
+        """Return the element sizes that resolve the ring of a contact around the place.
+
+        `growth` is the increase of the element size per distance from it.
+        """
         x, y = map(float, self.place)
         length = sqrt(sizing.h)
         size = CONTACT_CELL_SIZE * length / sizing.refinement
@@ -47,21 +50,28 @@ def contact_places(
     one_place_distance: Mapping[str, float],
     charted: "Mapping[str, ChartedShell]",
 ) -> dict[str, list[Array]]:
-    """Return places (3,) where other shells are nearest, by name of a shell.
+    """Return the places where other shells are nearest and the mesh is to be refined.
 
-    There are places only where the nearest places are one place and no area.
+    A shell gets a place only where its nearest places to another shell are close together, and no
+    extended area.
 
     Parameters
     ----------
     pairs
-        Names of shells that may come into contact, or `shell` and itself for all.
+        Names of shells that may touch; WHOLE_SHELL with itself stands for all pairs.
     places
         Name -> places (n, 3) all over the shell.
-    thickness, one_place_distance
-        Name -> its thickness, at all places or everywhere, and up to which distance places are one;
-        of all in the same length.
+    thickness
+        Name -> thickness at all places (n,), or everywhere.
+    one_place_distance
+        Name -> distance up to which places count as one. All lengths are in one unit.
     charted
-        Name -> its chart; without one its places are those that are given.
+        Name -> the shell with its chart, which makes its place exact; other shells have the given
+        places alone.
+
+    Returns
+    -------
+    Name of a shell -> places (3,).
     """
     names = list(places)
     all_pairs = [(a, b) for i, a in enumerate(names) for b in names[i + 1 :]]
@@ -69,8 +79,8 @@ def contact_places(
     half_thickness = {
         name: np.broadcast_to(np.asarray(thickness[name]) / 2, len(places[name])) for name in names
     }
-    are_all = [WHOLE_SHELL, WHOLE_SHELL] in [[*pair] for pair in pairs]
-    for a, b in all_pairs if are_all else pairs:
+    all_may_touch = [WHOLE_SHELL, WHOLE_SHELL] in [[*pair] for pair in pairs]
+    for a, b in all_pairs if all_may_touch else pairs:
         if a == b or a not in places or b not in places:
             continue
         gaps_between = {
@@ -79,28 +89,56 @@ def contact_places(
             )
             for first, second in ((a, b), (b, a))
         }
-        gaps, number = gaps_between[a]
+        gaps, nearest_numbers = gaps_between[a]
         nearest = int(np.argmin(gaps))
-        ends, with_one_place = {a: places[a][nearest], b: places[b][number[nearest]]}, list[str]()
-        h = {name: 2 * float(half_thickness[name].mean()) for name in (a, b)}
+        nearest_places, with_one_place = (
+            {a: places[a][nearest], b: places[b][nearest_numbers[nearest]]},
+            list[str](),
+        )
+        mean_thickness = {name: 2 * float(half_thickness[name].mean()) for name in (a, b)}
         for name in (a, b):
-            similar = places[name][gaps_between[name][0] < gaps.min() + GAP_TOLERANCE * h[name]]
-            if np.linalg.norm(similar - ends[name], axis=1).max() < one_place_distance[name]:
+            # places whose gap is nearly the least
+            similar_places = places[name][
+                gaps_between[name][0] < gaps.min() + GAP_TOLERANCE * mean_thickness[name]
+            ]
+            if (
+                np.linalg.norm(similar_places - nearest_places[name], axis=1).max()
+                < one_place_distance[name]
+            ):
                 with_one_place.append(name)
         if with_one_place and a in charted and b in charted:
-            ends = dict(
-                zip((a, b), _nearest(ends[a], ends[b], charted[a], charted[b]), strict=True)
+            nearest_places = dict(
+                zip(
+                    (a, b),
+                    _nearest(nearest_places[a], nearest_places[b], charted[a], charted[b]),
+                    strict=True,
+                )
             )
         for name in with_one_place:
-            if np.linalg.norm(ends[a] - ends[b]) < MAX_GAP * h[name]:
-                places_of_contact[name].append(ends[name])
+            if (
+                np.linalg.norm(nearest_places[a] - nearest_places[b])
+                < MAX_GAP * mean_thickness[name]
+            ):
+                places_of_contact[name].append(nearest_places[name])
     return places_of_contact
 
 
 def _gaps(x: Array, y: Array, half_x: Array, half_y: Array) -> tuple[Array, NDArray[np.int64]]:
-    """Return the gaps between faces of places x (n, 3) and the nearest faces of places y (m, 3).
+    """Return the gaps between the faces of one shell and the nearest faces of another.
 
-    The second result has the numbers of the latter; `half_x`, `half_y` are half the thicknesses.
+    Parameters
+    ----------
+    x, y
+        Places (n, 3) and (m, 3) of the two mid-surfaces.
+    half_x, half_y
+        Half the thicknesses there.
+
+    Returns
+    -------
+    gaps
+        (n,) between the faces at x and the nearest faces.
+    numbers
+        (n,) of the places y with these nearest faces.
     """
     distances, candidates = scipy.spatial.KDTree(y).query(
         x, k=range(1, 1 + min(FACE_CANDIDATES if np.ptp(half_y) else 1, len(y)))
@@ -112,17 +150,16 @@ def _gaps(x: Array, y: Array, half_x: Array, half_y: Array) -> tuple[Array, NDAr
 
 @dataclass(frozen=True)
 class ChartedShell:
-    """A shell in the frame of all, with the map between charts (2,) and places (3,).
+    """A shell in a common frame, with the map between its charts (2,) and places (3,).
 
     Attributes
     ----------
     outline
-        Its outline, in its own frame.
+        Outline of the shell, in its own frame.
     place, to_own_frame
-        Maps from its own frame to that of all, and back.
+        Maps of places from its own frame to the common frame, and back.
     half
-        Half the thickness at its own places (n, 3), over the length of all; None where it is the
-        same everywhere.
+        Half the thickness at its own places (n, 3), over the common length; None if uniform.
     """
 
     outline: Outline
@@ -131,25 +168,38 @@ class ChartedShell:
     half: Callable[[Array], Array] | None = None
 
     def chart(self, x: Array) -> Array:
-        """Return the chart of a place."""
+        """Return the chart (2,) of a place (3,) in the common frame."""
         return self.outline.inverse(self.to_own_frame(x))
 
     def place_of(self, chart: Array) -> Array:
-        """Return the place of a chart, or of the nearest one that the shell has."""
+        """Return the place (3,) of a chart (2,), or of the nearest chart that the shell has."""
         return self.place(self.outline.embedding(self.outline.clip_to_chart(chart)[None])[0])
 
     def depth(self, x: Array) -> float:
-        """Return the depth of a place below the face, less the uniform one."""
+        """Return half the thickness at a place (3,) in the common frame; 0 if it is uniform.
+
+        A uniform thickness changes no comparison of gaps.
+        """
         return float(self.half(self.to_own_frame(x)[None])[0]) if self.half else 0.0
 
 
 def _nearest(x: Array, y: Array, of_x: ChartedShell, of_y: ChartedShell) -> tuple[Array, Array]:
-    """Return the places of two surfaces, near x and y, whose faces are nearest to each other."""
+    """Return the places (3,) of two shells whose faces are nearest to each other, near x and y.
+
+    Parameters
+    ----------
+    x, y
+        Places (3,) in the common frame at which the search begins.
+    of_x, of_y
+        The shells of these places.
+    """
 
     def difference(charts: Array) -> Array:
+        """Return the vector (3,) between the places of two charts (4,)."""
         return of_x.place_of(charts[:2]) - of_y.place_of(charts[2:])
 
     def gap(charts: Array) -> float:
+        """Return the gap between the faces at two charts (4,), up to uniform thicknesses."""
         ends = of_x.place_of(charts[:2]), of_y.place_of(charts[2:])
         return float(np.linalg.norm(ends[0] - ends[1])) - of_x.depth(ends[0]) - of_y.depth(ends[1])
 

@@ -15,50 +15,64 @@ EDITOR_LINE = "# yaml-language-server:"
 
 
 def examples() -> dict[str, Path]:
-    """Return name -> file, the benchmarks last."""
+    """Return name -> case file of all examples, the benchmarks last."""
     files = [*sorted(CASES.glob("*.yaml")), *sorted(CASES.glob("benchmarks/*.yaml"))]
     return {file.stem: file for file in files}
 
 
 def title(file: Path) -> str:
-    """Return the title of a case: the first line of its comment, up to a colon."""
+    """Return the title of a case file: the first line of its comment, up to a colon."""
     comment = _text(file).partition("\n")[0].removeprefix("# ")
     return (comment + " ").partition(": ")[0].strip().removesuffix(".")
 
 
 def write_example(name: str, file: Path | None = None) -> list[Path]:
-    """Write an example to a file, by default NAME.yaml, with the files that it names beside it.
+    """Write an example case to a file, with the files that it names beside it.
+
+    Parameters
+    ----------
+    name
+        Name of the example, see `examples`.
+    file
+        File to write; by default NAME.yaml in the working folder.
 
     Returns
     -------
-    The files.
+    The files that were written.
 
     Raises
     ------
     CaseError
         If there is no such example, or a file cannot be written or would be overwritten.
     """
-    of_package = examples()
-    if name not in of_package:
-        raise CaseError(f"example {name}: there is no such case, only {', '.join(of_package)}")
+    example_files = examples()
+    if name not in example_files:
+        raise CaseError(f"example {name}: there is no such case, only {', '.join(example_files)}")
     target = file or Path(f"{name}.yaml")
     try:
-        return _write_files(_contents(of_package[name], target), target)
+        return _write_files(_contents(example_files[name], target), target)
     except OSError as e:
         raise CaseError(f"{e.filename or target}: cannot be written: {e.strerror}") from None
 
 
 def _text(file: Path) -> str:
-    """Return the text of a case without its line for editors."""
+    """Return the text of a case file without its line for editors."""
     lines = file.read_text(encoding="utf-8").splitlines(keepends=True)
     return "".join(line for line in lines if not line.startswith(EDITOR_LINE))
 
 
 def _contents(source: Path, target: Path) -> dict[Path, bytes]:
-    """Return the contents of the files of an example.
+    """Return path -> content of the files of an example.
 
-    They are the case, and beside it the mesh file that it names or the data of its name. So are the
-    cases and data that it predicts.
+    They are the case, and its mesh file or data file. For an example of `identify`, the cases and
+    data that it predicts come too.
+
+    Parameters
+    ----------
+    source
+        The example's case file.
+    target
+        Path of the case to be written; other files are beside it.
     """
     text, case_data = _text(source), read_source(source).data
     mesh, data_file = (case_data.get("shell") or {}).get("file"), source.with_suffix(".csv")
@@ -83,9 +97,10 @@ def _contents(source: Path, target: Path) -> dict[Path, bytes]:
 
 
 def _write_files(contents: dict[Path, bytes], target: Path) -> list[Path]:
-    """Write the files if none is in the way, and return them.
+    """Write files if none is in the way, and return their paths.
 
-    The mesh of another copy of the case serves this one too.
+    A file with the same content may be there already, such as the mesh of another copy of the case.
+    Raises CaseError before anything is written.
     """
     for path, content in contents.items():
         if path.exists() and (path == target or path.read_bytes() != content):

@@ -1,4 +1,4 @@
-"""The programme of a case: its steps, what all of them must have in common, and patches."""
+"""The programme of a case: its load steps, rules that all of them share, and names of patches."""
 
 from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, Union
@@ -25,14 +25,28 @@ Loading: TypeAlias = Annotated[
 
 
 def loads_by_key(loading: Any) -> dict[str, Any]:
-    """Return key -> load, or its plain data: of the one load of a case or of a list of steps."""
+    """Return key -> load of the section `loading`, which is one load or a list of steps.
+
+    Keys are "loading", or "loading.0" and so on. Plain data of loads are accepted too.
+    """
     if isinstance(loading, Sequence):
         return {f"loading.{i}": load for i, load in enumerate(loading)}
     return {"loading": loading} if loading else {}
 
 
 def programme(loading: Step | Sequence[Step] | None, context: Context) -> tuple[ProgrammeStep, ...]:
-    """Return the steps of a case: those of a list, or what comes before one load, and then that."""
+    """Return the load steps of a case.
+
+    They are those of a list. Before a single load come the steps that it implies, such as the
+    field.
+
+    Parameters
+    ----------
+    loading
+        The load or the list of the case; None without.
+    context
+        The rest of the case.
+    """
     implied_steps: list[tuple[str, Step]] = []
     if not isinstance(loading, Sequence):
         implied_steps = [
@@ -40,13 +54,14 @@ def programme(loading: Step | Sequence[Step] | None, context: Context) -> tuple[
             for kind in KINDS_BEFORE_LOAD
             for pair in STEPS[kind].steps_before_load(context, loading)
         ]
-    keyed = [*implied_steps, *loads_by_key(loading).items()]
-    loads, places_of = [load for _, load in keyed], dict[str, list[Any]]()
+    keyed_loads = [*implied_steps, *loads_by_key(loading).items()]
+    loads, places_of_amplitude = [load for _, load in keyed_loads], dict[str, list[Any]]()
     steps = []
-    for number, (key, load) in enumerate(keyed, 1):
+    for number, (key, load) in enumerate(keyed_loads, 1):
         name = load.name_in(context, loads)
+        # loads of one kind at different places have amplitudes with numbers
         if name is None:
-            places = places_of.setdefault(load.amplitude, [])
+            places = places_of_amplitude.setdefault(load.amplitude, [])
             if load.place not in places:
                 places.append(load.place)
             number_of_place = places.index(load.place) + 1
@@ -56,7 +71,7 @@ def programme(loading: Step | Sequence[Step] | None, context: Context) -> tuple[
 
 
 def refuse_unfit_steps(context: Context) -> None:
-    """Check that each step has what it needs, a way to go, and known amplitudes to hold.
+    """Check that each load step has what it needs, a way to go, and known amplitudes to hold.
 
     Raises
     ------
@@ -83,30 +98,33 @@ def refuse_unfit_steps(context: Context) -> None:
 
 
 def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> None:
-    """Refuse amplitudes that a step cannot hold."""
-    loads: dict[str, Step | None] = {"pressure": None}
-    loads |= {other.name: other.load for other in steps if other.load.holdable}
+    """Raise ValueError if a step asks to hold an amplitude, or its conjugate, that it cannot hold.
+
+    `steps` are all steps of the programme, whose amplitudes a step may hold.
+    """
+    holdable_loads: dict[str, Step | None] = {"pressure": None}
+    holdable_loads |= {any_step.name: any_step.load for any_step in steps if any_step.load.holdable}
     if step.load.in_time:
-        loads.pop(step.name)
+        holdable_loads.pop(step.name)
     to_limit = step.until == "limit"
-    names = sorted(set(loads) - (set() if to_limit else {step.name}))
+    names = sorted(set(holdable_loads) - (set() if to_limit else {step.name}))
     allowed = ", ".join(names) or "none"
-    for name, how in step.load.hold.items():
+    for name, manner in step.load.hold.items():
         key = f"{step.key}.hold.{name}"
-        holds_conjugate = how == "conjugate"
+        holds_conjugate = manner == "conjugate"
         if name == step.name and not (to_limit and holds_conjugate):
             raise ValueError(f"{key}: this step drives {name}; allowed: {allowed}")
         if name == step.name and step.load.limit_target:
             raise ValueError(
                 f"{key}: conjugate: the way to the instability has no end: leave out the target"
             )
-        if name not in loads:
+        if name not in holdable_loads:
             raise ValueError(f"{key}: the programme has no such amplitude; allowed: {allowed}")
-        if isinstance(how, Gas) and name != "pressure":
+        if isinstance(manner, Gas) and name != "pressure":
             raise ValueError(
                 f"{key}: a gas holds the pressure, not {name}; allowed: load, conjugate"
             )
-        load = loads[name]
+        load = holdable_loads[name]
         if not holds_conjugate or load is None:
             continue
         if not load.held_conjugate:
@@ -120,7 +138,9 @@ def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> N
 def refuse_unknown_patches(
     key: str, patches: Iterable[str], shell: ShellSection | Surface, dimples: Collection[str]
 ) -> None:
-    """Check that a shell has the patches of a key; a mesh file knows its own later.
+    """Check that a shell has the patches that a key of the case names.
+
+    A mesh file is not checked here: its patches are known when it is read.
 
     Parameters
     ----------

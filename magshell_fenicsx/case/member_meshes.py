@@ -1,7 +1,4 @@
-"""The meshes of several shells, whole or halved by a plane.
-
-In the plane each of them is its own mirror image.
-"""
+"""The meshes of several shells, whole or halved by a plane in which each shell is its own image."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -35,26 +32,32 @@ Array = NDArray[np.float64]
 
 
 class MemberMeshes:
-    """Meshes and mirror planes of several shells, as a `MultiShellMesh` needs them."""
+    """Meshes and mirror planes of several shells, for a `MultiShellMesh`.
+
+    The frame of all shells is that of the case; lengths in it are over the R of the first shell.
+    """
 
     def __init__(self, several: "SeveralShells") -> None:
         self._several = several
 
     def whole_shells(self) -> list[MemberShell]:
-        """Return all shells as they are; a message of one begins with its key."""
+        """Return all shells, each meshed as a whole.
+
+        Raises CaseError or MeshError, beginning with the key of the shell.
+        """
         return [self._member(part, None) for part in self._several.parts]
 
     def halved(self, plane: Mirror) -> MultiShellMesh:
-        """Return the halves of all shells on the one side of a plane, or their sectors.
+        """Return the mesh of the halves of all shells on one side of a plane, or of their sectors.
 
-        The plane is one of `mirrors`.
+        The plane is one of `mirrors`; the shells are meshed at first use.
         """
-        assembly, parts = self._several.assembly, self._several.parts
+        assembly, members = self._several.assembly, self._several.parts
 
         def member_shells() -> list[MemberShell]:
             if isinstance(plane, Sector):
-                return [self._sector(part, plane) for part in parts]
-            return [self._member(part, self._plane_of_shell(part, plane)) for part in parts]
+                return [self._sector(member, plane) for member in members]
+            return [self._member(member, self._plane_of_shell(member, plane)) for member in members]
 
         waves = f" {plane.waves}" if isinstance(plane, Sector) else ""
         return replace(
@@ -65,8 +68,9 @@ class MemberMeshes:
         )
 
     def mirrors(self, vectors: Vectors, loosely: bool) -> list[Mirror]:
-        """Return the planes in which each shell is its own image, as those of the halves on both
-        sides.
+        """Return the planes in which each shell is its own image, each for both of its halves.
+
+        There are none if a shell is not held, because halves do not see motions across their plane.
 
         Parameters
         ----------
@@ -76,27 +80,28 @@ class MemberMeshes:
         mirrors = list[Mirror]()
         if not self._all_are_held:
             return mirrors
-        parts = self._several.parts
+        members = self._several.parts
         for plane in self._candidates(vectors, loosely):
             for side in (plane, plane.reversed):
-                own_mirrors = [self._mirror_of_shell(part, side, loosely) for part in parts]
-                is_known = any(side.is_plane_of(other) for other in mirrors)
+                own_mirrors = [self._mirror_of_shell(member, side, loosely) for member in members]
+                is_known = any(side.is_plane_of(known_plane) for known_plane in mirrors)
                 if is_known or not all(own_mirrors):
                     continue
                 removed_edges = dict[str, str]()
-                for part, mirror in zip(parts, own_mirrors, strict=True):
+                for member, mirror in zip(members, own_mirrors, strict=True):
                     for a, b in mirror.removed_edges.items() if mirror else ():
-                        removed_edges[f"{part.name}_{a}"] = f"{part.name}_{b}"
+                        removed_edges[f"{member.name}_{a}"] = f"{member.name}_{b}"
                 mirrors.append(replace(side, removed_edges=removed_edges))
         return mirrors
 
     def normal(self, x: Array) -> Array:
-        """Return the outward unit normal (3,) at the place of the perfect shells nearest to x
-        (3,).
-        """
+        """Return the outward unit normal (3,) of the perfect shell nearest to a place x (3,)."""
         distances_and_normals = list[tuple[float, Array]]()
-        for part in self._several.parts:
-            place, perfect = self._several.place(part), reference_shell_of(part.case.shell).perfect
+        for member in self._several.parts:
+            place, perfect = (
+                self._several.place(member),
+                reference_shell_of(member.case.shell).perfect,
+            )
             in_shell_frame, nodes = place.to_shell_frame(x), perfect.nodes
             chart = perfect.inverse(in_shell_frame)
             feet = perfect.embedding(chart[None]) if nodes is None else nodes[:, :3]
@@ -105,9 +110,9 @@ class MemberMeshes:
         return min(distances_and_normals, key=lambda entry: entry[0])[1]
 
     def _member(self, part: "MemberCase", plane: Mirror | None) -> MemberShell:
-        """Return a shell, or its half at a plane in the frame of the shell.
+        """Return the mesh of a shell, or of its half or sector at a plane in the shell's frame.
 
-        The frame of its mesh is turned about e3.
+        The pose of the result includes the angle about e3 by which the frame of its mesh is turned.
         """
         from magshell_fenicsx.case.planner import make_problem  # the solver takes long to import
 
@@ -121,14 +126,17 @@ class MemberMeshes:
         return MemberShell(part.name, patch, pose, tuple(part.section.points), problem.outward)
 
     def _sector(self, part: "MemberCase", sector: Sector) -> MemberShell:
-        """Return the sector of a shell.
+        """Return the mesh of the sector of a shell between two planes through e3 of the case.
 
-        A shell that is upside down has the two planes the other way round.
+        A shell that is upside down has the two planes in the other order. Raises CaseError for a
+        shell that is not closed around e3.
         """
-        first, second = (self._plane_of_shell(part, side) for side in sector.planes.values())
+        first_plane, second_plane = (
+            self._plane_of_shell(part, side) for side in sector.planes.values()
+        )
         is_round = reference_shell_of(part.case.shell).perfect.round
         is_closed = is_round or isinstance(part.case.shell, MeshSurface)
-        for begin, end in ((first, second), (second, first)):
+        for begin, end in ((first_plane, second_plane), (second_plane, first_plane)):
             own_sector = Sector.from_azimuth(begin.azimuth, sector.waves)
             has_planes = own_sector.is_plane_of(begin) and own_sector.second_plane.is_plane_of(end)
             if is_closed and begin.through_e3 and has_planes:
@@ -140,14 +148,17 @@ class MemberMeshes:
                 )
             )
         member = self._member(part, own_sector)
-        if begin is first:
+        if begin is first_plane:
             return member
         other_edge = {SYMMETRY_EDGE: SECOND_SYMMETRY_EDGE, SECOND_SYMMETRY_EDGE: SYMMETRY_EDGE}
         edges = {other_edge.get(name, name): pairs for name, pairs in member.patch.edges.items()}
         return replace(member, patch=replace(member.patch, edges=edges))
 
     def _plane_of_shell(self, part: "MemberCase", plane: Mirror) -> Mirror:
-        """Return a plane in the frame and over the length of a shell, with its removed edges."""
+        """Return a plane of all shells in the frame and over the length of one of them.
+
+        The edges that the half loses have the shell's own names.
+        """
         place, start = self._several.place(part), f"{part.name}_"
         offset = float(plane.offset - plane.normal @ place.position) / place.scale
         own_plane = Mirror.with_normal(place.Q.T @ plane.normal, offset)
@@ -159,7 +170,7 @@ class MemberMeshes:
         return replace(own_plane, offset=_rounded(own_plane.offset), removed_edges=removed_edges)
 
     def _mirror_of_shell(self, part: "MemberCase", plane: Mirror, loosely: bool) -> Mirror | None:
-        """Return the plane in the frame of a shell that is its own image in it; else None."""
+        """Return a plane in a shell's frame if the shell is its own image in it, else None."""
         from magshell_fenicsx.case.modelled_part import (
             own_mirror,
         )  # the solver takes long to import
@@ -168,11 +179,16 @@ class MemberMeshes:
             return own_mirror(part.case, self._plane_of_shell(part, plane), loosely=loosely)
 
     def _candidates(self, vectors: Vectors, loosely: bool) -> Iterator[Mirror]:
-        """Yield planes that some shell has.
+        """Yield planes that may be symmetry planes of all shells.
 
-        They are upright ones through axes of revolution, and those of its outline.
+        They are planes through axes of revolution and planes of each shell's outline.
+
+        Parameters
+        ----------
+        vectors, loosely
+            See `Outline.mirrors`.
         """
-        places = [self._several.place(part) for part in self._several.parts]
+        places = [self._several.place(member) for member in self._several.parts]
         shells_at_places = zip(places, self._reference_shells, strict=True)
         axes = [
             (place.position, place.Q[:, 2])
@@ -180,7 +196,8 @@ class MemberMeshes:
             if reference_shell.perfect.round
         ]
         for point, axis in axes:
-            distances = [other - point for other, _ in axes]
+            distances = [other_point - point for other_point, _ in axes]
+            # planes through the axis and another axis or a coordinate direction
             for direction in (*vectors, *distances, np.eye(3)[0], np.eye(3)[1], np.eye(3)[2]):
                 normal = np.cross(axis, direction)
                 if np.linalg.norm(normal) > ROUNDING:
@@ -203,52 +220,58 @@ class MemberMeshes:
 
     @cached_property
     def _contact_places_of_shells(self) -> Mapping[str, Sequence[Array]]:
-        """Name of a shell -> places (3,) in its own frame where others are nearest."""
+        """Name of a shell -> places (3,), in its own frame, where other shells are nearest."""
         several, places, charted = self._several, dict[str, Array](), dict[str, ChartedShell]()
         thickness, one_place_distance = dict[str, Array | float](), dict[str, float]()
         if not several.pairs:
-            return {part.name: [] for part in several.parts}
-        for part, reference_shell in zip(several.parts, self._reference_shells, strict=True):
-            h, place = 1 / part.case.shell.R_over_h, several.place(part)
+            return {member.name: [] for member in several.parts}
+        for member, reference_shell in zip(several.parts, self._reference_shells, strict=True):
+            h, place = 1 / member.case.shell.R_over_h, several.place(member)
             sample, scale = reference_shell.perfect.sample(), place.scale
 
             def half(
                 x: Array, reference_shell: ReferenceShell = reference_shell, scale: float = scale
             ) -> Array:
+                """Return half the thickness (n,) over the common length, at own places (n, 3)."""
                 return np.asarray(scale * reference_shell.half_thickness(x))
 
             varies = half if reference_shell.thickness_factor else None
-            places[part.name], one_place_distance[part.name] = (
+            places[member.name], one_place_distance[member.name] = (
                 place(sample),
                 ONE_PLACE_DISTANCE * sqrt(h) * scale,
             )
-            thickness[part.name] = 2 * varies(sample) if varies else h * scale
+            thickness[member.name] = 2 * varies(sample) if varies else h * scale
             if reference_shell.perfect.chart_samples() is not None:
-                charted[part.name] = ChartedShell(
+                charted[member.name] = ChartedShell(
                     reference_shell.perfect, place, place.to_shell_frame, varies
                 )
         places_of_contact = contact_places(
             several.pairs, places, thickness, one_place_distance, charted
         )
         return {
-            part.name: [several.place(part).to_shell_frame(x) for x in places_of_contact[part.name]]
-            for part in several.parts
+            member.name: [
+                several.place(member).to_shell_frame(x) for x in places_of_contact[member.name]
+            ]
+            for member in several.parts
         }
 
     @property
     def _all_are_held(self) -> bool:
-        """Whether each shell, or one that is joined to it, is held.
+        """Whether each shell is held, or joined to a shell that is held.
 
         Halves do not see motions across their plane.
         """
-        is_held = {part.name: part.section.boundary.fixes for part in self._several.parts}
+        is_held = {member.name: member.section.boundary.fixes for member in self._several.parts}
         pairs = [
             tuple(self._several.shell_of(name) for name in edges) for edges in self._several.joints
         ]
+        # as often as there are joints: a chain of shells passes it on
         for _ in pairs:
-            for first, second in pairs:
-                if first in is_held and second in is_held:
-                    is_held[first] = is_held[second] = is_held[first] or is_held[second]
+            for first_name, second_name in pairs:
+                if first_name in is_held and second_name in is_held:
+                    is_held[first_name] = is_held[second_name] = (
+                        is_held[first_name] or is_held[second_name]
+                    )
         return all(is_held.values())
 
 

@@ -35,14 +35,15 @@ from magshell_fenicsx.shape.symmetry_constraint import (
 
 @dataclass(frozen=True)
 class ModelledPart:
-    """Part of a shell that is modelled, and the frame of its model.
+    """The part of a shell that is modelled, and the frame of its model.
 
     Attributes
     ----------
     axisymmetric
         Whether the meridian is modelled.
     plane
-        Symmetry plane of a half, or the sector, in the frame of the case; None for all.
+        Symmetry plane of a half, or the sector, in the frame of the case; None for all of the shell
+        or its meridian.
     turn
         Angle about e3 (rad) by which the model's frame is turned from that of the case.
     mirror
@@ -65,11 +66,14 @@ class ModelledPart:
         return self.mirror if isinstance(self.mirror, Sector) else None
 
     def name(self, model: str) -> str:
-        """Return the name of the part in words, such as "half shell"; `model` is that of a case."""
+        """Return the part in words, such as "half shell"; `model` is "shell" or "solid"."""
         return "meridian" if self.axisymmetric else f"{_fraction(self.plane)} {model}"
 
     def conditions(self, conditions: dict[str, Condition]) -> dict[str, Condition]:
-        """Return the conditions at edges of the part, its planes of symmetry among them."""
+        """Return name -> condition of the edges of the part, its planes of symmetry among them.
+
+        Edges of the other half are left out.
+        """
         if self.mirror is None:
             return conditions
         removed_edges = self.mirror.removed_edges
@@ -80,7 +84,7 @@ class ModelledPart:
 def modelled_part(
     case: Case, outline: Outline, constraints: list[SymmetryConstraint], plane: Mirror | None
 ) -> ModelledPart:
-    """Return the part of a shell that a case models.
+    """Return the smallest part of a shell that the case allows, or the one that it asks for.
 
     Parameters
     ----------
@@ -89,7 +93,7 @@ def modelled_part(
     constraints
         Symmetry that each part of the case preserves.
     plane
-        Symmetry plane of a half that is chosen already; None to look for one.
+        Symmetry plane of a half that is already chosen; None to look for one.
 
     Raises
     ------
@@ -110,7 +114,10 @@ def modelled_part(
 def symmetry_constraints(
     case: Case, outline: Outline, energies: Sequence[OwnTerm]
 ) -> list[SymmetryConstraint]:
-    """Return the symmetry that the shell, its abilities, steps, points and `energies` preserve."""
+    """Return the symmetry that each part of a case preserves, imperfections and bodies left out.
+
+    The parts are the shape, abilities, load steps, named points and `energies`.
+    """
     context = case.context
     constraints = [shape_constraint(case.shell, outline)]
     for section in context.abilities:
@@ -123,13 +130,15 @@ def symmetry_constraints(
 
 
 def own_mirror(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | None:
-    """Return a plane in which the mid-surface is its own image, with the edges that are lost.
+    """Return a plane in which the shell is its own image, with the edges that the half loses.
 
-    Its thickness, plies and imperfections are their own images too. None if there is no such plane
-    that is the given one.
+    The mid-surface, its thickness, plies and imperfections must all be their own images. None if
+    the shell has no such plane equal to `plane`.
 
     Parameters
     ----------
+    plane
+        The plane to look for, in the frame of the case.
     loosely
         See `mesh_mirrors`.
     """
@@ -160,7 +169,7 @@ def own_mirror(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | 
 
 
 def edge_conditions(boundary: BoundarySection, turn: float) -> dict[str, Condition]:
-    """Return the conditions of a case in the model's terms, in a frame turned about e3 (rad)."""
+    """Return edge -> condition in the model's terms, in a frame turned about e3 (rad)."""
     terms: dict[EdgeCondition, Condition] = {
         "hinged": "simply supported",
         "symmetry": "plane",
@@ -177,7 +186,10 @@ def edge_conditions(boundary: BoundarySection, turn: float) -> dict[str, Conditi
 
 
 def _turned_components(components: tuple[int, ...], turn: float) -> list[int]:
-    """Return the components in a frame into which they turn as a whole."""
+    """Return the components (0, 1, 2 for e1, e2, e3) that are held in a turned frame.
+
+    The frame is turned about e3 by `turn` (rad), into which the components turn as a whole.
+    """
     axes = np.eye(3)[list(components)] @ rotation(turn).T
     return [i for i in range(3) if axes[:, i] @ axes[:, i] > 0.5]
 
@@ -192,9 +204,10 @@ def _fraction(plane: Mirror | None) -> str:
 def _symmetry(
     case: Case, outline: Outline, constraints: list[SymmetryConstraint]
 ) -> tuple[bool, Mirror | None]:
-    """Return whether to model the meridian, and else the plane of a half or the sector.
+    """Return whether to model the meridian, and the plane of a half or the sector otherwise.
 
-    The plane is None for a full model.
+    The plane is None for a meridian and for a full model. Raises CaseError if the symmetry that the
+    case asks for is not there; the message says why.
     """
     reason = why_not_axisymmetric(constraints)
     if reason and case.symmetry == "axisymmetric":
@@ -226,7 +239,10 @@ def _symmetry(
 def _sector(
     case: Case, outline: Outline, constraints: list[SymmetryConstraint], waves: int
 ) -> Sector:
-    """Return the sector between two planes of symmetry of a number of waves."""
+    """Return the sector of 180/`waves` degrees between two planes of symmetry.
+
+    Raises CaseError if there are no such planes.
+    """
     places = [np.array(x) for x in case.points.values()]
     if sector := common_sector(constraints, outline, waves, places):
         return sector

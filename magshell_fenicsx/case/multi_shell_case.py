@@ -1,6 +1,6 @@
-"""A case with several shells as a case of one mesh file.
+"""A case with several shells, rewritten as a case of one mesh file.
 
-Edges, points and patches have the names that they have in the mesh of all.
+Edges, points and patches get the names that they have in the common mesh.
 """
 
 import re
@@ -42,9 +42,16 @@ class _ShellsAlone(Section):
 def merge_shells(
     data: Any, context: Mapping[str, Any] | None, case: "type[Case]"
 ) -> "tuple[Any, SeveralShells | None]":
-    """Return the data of a case with its shells as one mesh file, and the shells.
+    """Return the data of a case with its shells merged into one mesh file, and the shells.
 
-    Without `shells` the data are returned as they are, and None.
+    Parameters
+    ----------
+    data
+        Plain data of a case; anything without `shells` is returned as it is, with None.
+    context
+        Folder and files of the case, for pydantic; None without.
+    case
+        The class `Case`.
 
     Raises
     ------
@@ -65,13 +72,13 @@ def merge_shells(
     for name in sections:
         _refuse_name(name, sections)
     # in the order of the file
-    parts = [
+    member_shells = [
         MemberCase(name, section, _case(name, section, data, {**context_keys}, case))
         for name, section in sections.items()
     ]
     joined_edges = _joined_edges(_with_mesh_names(data.get("joints"), sections))
-    several = SeveralShells(parts, joined_edges, _pairs(data.get("contact")))
-    common_keys = _common_shell(parts)
+    several = SeveralShells(member_shells, joined_edges, _pairs(data.get("contact")))
+    common_keys = _common_shell(member_shells)
     merged_data = {
         key: _with_mesh_names(value, sections) if key in SECTIONS_WITH_NAMES else value
         for key, value in data.items()
@@ -80,9 +87,9 @@ def merge_shells(
         "shells": sections,
         "shell": {"geometry": "mesh", "file": several.file, **common_keys},
         "boundary": {
-            f"{part.name}_{name}": condition
-            for part in parts
-            for name, condition in part.section.boundary.conditions().items()
+            f"{member.name}_{name}": condition
+            for member in member_shells
+            for name, condition in member.section.boundary.conditions().items()
         },
         "points": _points(several),
     }
@@ -92,7 +99,11 @@ def merge_shells(
 
 
 def without_merged_keys(data: Keys, shells: Mapping[str, OneOfShells] | None) -> Keys:
-    """Return the plain data of a case, without what its shells make."""
+    """Return the plain data of a case without the keys that `merge_shells` has made.
+
+    `shells` are the sections of several shells; None for one shell, whose data are returned
+    unchanged.
+    """
     if shells is None:
         return data
     magnetic = data.get("magnetic")
@@ -103,21 +114,41 @@ def without_merged_keys(data: Keys, shells: Mapping[str, OneOfShells] | None) ->
 
 
 def _refuse_name(name: str, names: Mapping[str, OneOfShells]) -> None:
-    """Refuse a name of a shell that cannot be told from others."""
+    """Raise ValueError for a name of a shell from which names of edges would be ambiguous.
+
+    `names` has the names of all shells as keys.
+    """
     if not NAME.fullmatch(name) or name == "shell":
         raise ValueError(
             f"shells: {name!r}: a name is a word of letters, digits and _, and not shell, which is "
             "all"
         )
-    if other := next((other for other in names if other.startswith(f"{name}_")), None):
+    if longer := next((longer for longer in names if longer.startswith(f"{name}_")), None):
         raise ValueError(
-            f"shells: {other}: begins as {name}_ does, by which edges of {name} are named: rename "
+            f"shells: {longer}: begins as {name}_ does, by which edges of {name} are named: rename "
             "one"
         )
 
 
 def _case(name: str, section: OneOfShells, data: Keys, context: Keys, case: "type[Case]") -> "Case":
-    """Return the case of one shell alone."""
+    """Return the case of one shell alone, with the loads that its mesh sizes follow.
+
+    Parameters
+    ----------
+    name, section
+        Name of the shell, and its section.
+    data
+        Plain data of the whole case.
+    context
+        Folder and files of the case, for pydantic.
+    case
+        The class `Case`.
+
+    Raises
+    ------
+    ValueError
+        With the key in the whole case.
+    """
     shell_data = data["shells"][name]
     if isinstance(shell_data, BaseModel):
         shell_data = shell_data.model_dump(exclude_unset=True)
@@ -127,9 +158,9 @@ def _case(name: str, section: OneOfShells, data: Keys, context: Keys, case: "typ
         "points": shell_data.get("points") or {},
     }
     mesh = data.get("mesh") or {}
-    sizes = {key: mesh[key] for key in ("degree", "size", "refinement") if key in mesh}
+    mesh_data = {key: mesh[key] for key in ("degree", "size", "refinement") if key in mesh}
     for key, value in (shell_data.get("mesh") or {}).items():
-        sizes[key] = value * sizes.get(key, 1.0) if key == "refinement" else value
+        mesh_data[key] = value * mesh_data.get(key, 1.0) if key == "refinement" else value
     # loads that mesh sizes follow
     points = own_data["points"] if isinstance(own_data["points"], dict) else {}
     loads = [load for load in _forces_on(name, data) if load["at"]["point"] in points]
@@ -139,14 +170,14 @@ def _case(name: str, section: OneOfShells, data: Keys, context: Keys, case: "typ
         own_data["loading"] = loads
     try:
         shell_case = case.model_validate(
-            {**own_data, "mesh": sizes, "symmetry": "none"}, context=context
+            {**own_data, "mesh": mesh_data, "symmetry": "none"}, context=context
         )
     except ValidationError as e:
         error = e.errors()[0]
         message, key = error["msg"].removeprefix("Value error, "), ".".join(map(str, error["loc"]))
         raise ValueError(f"shells.{name}.{f'{key}: ' if key else ''}{message}") from None
-    has_units = [*numbers_with_units(section.place, shell_data.get("place"), "place")]
-    if has_units and not shell_case.shell.with_units:
+    keys_with_units = [*numbers_with_units(section.place, shell_data.get("place"), "place")]
+    if keys_with_units and not shell_case.shell.with_units:
         raise ValueError(
             f"shells.{name}.place: has a unit, but the shell's lengths have none: give all one, or "
             "none"
@@ -155,7 +186,10 @@ def _case(name: str, section: OneOfShells, data: Keys, context: Keys, case: "typ
 
 
 def _forces_on(name: str, data: Keys) -> list[Keys]:
-    """Return the indentations of points of a shell as loads of its own case."""
+    """Return the indentations of points of shell `name` as loads of that shell's own case.
+
+    `data` is the plain data of the whole case.
+    """
     loading = data.get("loading")
     forces = list[Keys]()
     for load in loading if isinstance(loading, list) else [loading]:
@@ -175,7 +209,7 @@ def _forces_on(name: str, data: Keys) -> list[Keys]:
 
 
 def _joined_edges(joints: Any) -> list[tuple[str, str]]:
-    """Return the edges of joints, as far as these are such."""
+    """Return the pairs of edge names in `joints`; entries that are no pair are refused later."""
     if not isinstance(joints, list):
         return []
     edges = [joint.get("edges") for joint in joints if isinstance(joint, dict)]
@@ -183,7 +217,7 @@ def _joined_edges(joints: Any) -> list[tuple[str, str]]:
 
 
 def _presses(loading: Any, name: str) -> bool:
-    """Whether a step presses on a shell."""
+    """Whether a step of `loading` presses on shell `name`; without `on` it presses on all."""
     steps = loading if isinstance(loading, list) else [loading]
     pressures = [
         load for load in steps if isinstance(load, dict) and load.get("kind") == "pressure"
@@ -192,13 +226,13 @@ def _presses(loading: Any, name: str) -> bool:
 
 
 def _common_shell(parts: Sequence[MemberCase]) -> Keys:
-    """Return the keys of the shell that replaces all of them.
+    """Return the keys of the shell section that stands for all shells.
 
-    Lengths and material are those of the first shell, which results are over.
+    Lengths and material are those of the first shell, over which results are.
     """
-    first, shell = parts[0], parts[0].case.shell
-    for part in parts:
-        _refuse_unfit_shell(part, first)
+    first_member, shell = parts[0], parts[0].case.shell
+    for member in parts:
+        _refuse_unfit_shell(member, first_member)
     unit = _unit if shell.with_units else (lambda value, unit: value)
     keys: Keys = {
         "radius": unit(shell.reference, "m"),
@@ -216,25 +250,25 @@ def _common_shell(parts: Sequence[MemberCase]) -> Keys:
 
 
 def _refuse_unfit_shell(part: MemberCase, first: MemberCase) -> None:
-    """Refuse a shell that cannot be in one mesh with the first one."""
-    shell, other = first.case.shell, part.case.shell
-    if other.with_units != shell.with_units:
-        names = (first.name, part.name) if shell.with_units else (part.name, first.name)
+    """Raise ValueError for a shell that cannot be in one mesh with the first one."""
+    first_shell, shell = first.case.shell, part.case.shell
+    if shell.with_units != first_shell.with_units:
+        names = (first.name, part.name) if first_shell.with_units else (part.name, first.name)
         raise ValueError(
             part.refused(
                 f"shell: lengths of {names[0]} have units and those of {names[1]} none: "
                 "give all of them one, or none"
             )
         )
-    if isinstance(other.thickness_factor, UserField):
+    if isinstance(shell.thickness_factor, UserField):
         raise ValueError(part.refused("shell.thickness_factor: of several shells a formula"))
-    without_units = isinstance(other, ShellSection) and not other.with_units
-    if without_units and other.youngs_modulus is not None:
+    without_units = isinstance(shell, ShellSection) and not shell.with_units
+    if without_units and shell.youngs_modulus is not None:
         raise ValueError(
             part.refused("shell.youngs_modulus: has a unit: give radius and thickness theirs")
         )
     for key in COMMON_KEYS:
-        if getattr(other, key) != getattr(shell, key):
+        if getattr(shell, key) != getattr(first_shell, key):
             raise ValueError(
                 part.refused(
                     f"shell.{key}: is another than that of {first.name}: several shells have it in "
@@ -242,10 +276,12 @@ def _refuse_unfit_shell(part: MemberCase, first: MemberCase) -> None:
                 )
             )
     for key, name in (("modulus", "youngs_modulus"), ("density", "density")):
-        value_of_first, value = getattr(shell, key), getattr(other, key)
+        value_of_first, value = getattr(first_shell, key), getattr(shell, key)
         if (value_of_first is None) != (value is None):
-            without, has = (part, first) if value is None else (first, part)
-            raise ValueError(without.refused(f"shell.{name}: is missing; {has.name} has one"))
+            part_without, part_with = (part, first) if value is None else (first, part)
+            raise ValueError(
+                part_without.refused(f"shell.{name}: is missing; {part_with.name} has one")
+            )
         if value_of_first is None:
             continue
         ratio = value / value_of_first
@@ -259,23 +295,27 @@ def _refuse_unfit_shell(part: MemberCase, first: MemberCase) -> None:
 
 
 def _unit(value: float, unit: str) -> Any:
-    """Return a number with its unit, as a case has it."""
+    """Return a number with its unit as text, in the form of a case file."""
     return f"{value!r} {unit}"
 
 
 def _points(several: SeveralShells) -> dict[str, list[float]]:
-    """Return name -> place in the frame of the case."""
+    """Return name -> place (3,) of all shells' points, in the frame and the length of the case."""
     places = {}
-    for part in several.parts:
-        place = part.section.place
-        for name, own_place in part.section.points.items():
+    for member in several.parts:
+        place = member.section.place
+        for name, own_place in member.section.points.items():
             in_case = place.Q @ np.array(own_place) + np.array(place.position)
-            places[f"{part.name}_{name}"] = [float(coordinate) for coordinate in in_case]
+            places[f"{member.name}_{name}"] = [float(coordinate) for coordinate in in_case]
     return places
 
 
 def _with_remanences(magnetic: Any, several: SeveralShells) -> Any:
-    """Return the magnetic section with the remanence of each shell as one by patches."""
+    """Return the magnetic section with the remanences of the shells as one remanence by patches.
+
+    All are over the flux density of the first shell that has one. Raises ValueError if some shells
+    lack a flux density, or `magnetic` has a remanence of its own.
+    """
     if magnetic is not None and not isinstance(magnetic, dict):
         return magnetic
     section = magnetic or {}
@@ -283,33 +323,42 @@ def _with_remanences(magnetic: Any, several: SeveralShells) -> Any:
         raise ValueError(
             "magnetic.remanent: shells have a remanence of their own: give it here, or there"
         )
-    sizes = {
-        part.name: part.section.remanent.flux_density
-        for part in several.parts
-        if part.section.remanent
+    flux_densities = {
+        member.name: member.section.remanent.flux_density
+        for member in several.parts
+        if member.section.remanent
     }
-    if len({size is None for size in sizes.values()}) > 1:
-        without = next(name for name, size in sizes.items() if size is None)
+    if len({flux_density is None for flux_density in flux_densities.values()}) > 1:
+        without = next(
+            name for name, flux_density in flux_densities.items() if flux_density is None
+        )
         raise ValueError(
             f"shells.{without}.remanent.flux_density: is missing; other shells have one"
         )
-    size = next(iter(sizes.values()))
-    if 0 in sizes.values():
+    flux_density = next(iter(flux_densities.values()))
+    if 0 in flux_densities.values():
         raise ValueError(
             "shells: a remanence of length zero is no magnetisation: leave remanent out"
         )
     patches: dict[str, Any] = {}
-    for part in several.parts:
-        patches |= _remanences_of(part, several, size)
-    density = {} if size is None else {"flux_density": f"{size!r} T"}
+    for member in several.parts:
+        patches |= _remanences_of(member, several, flux_density)
+    density_key = {} if flux_density is None else {"flux_density": f"{flux_density!r} T"}
     # whole shells before their parts, which take their place
-    shells = {part.name for part in several.parts}
+    shells = {member.name for member in several.parts}
+    # whole shells come before their patches
     ordered = dict(sorted(patches.items(), key=lambda item: item[0] not in shells))
-    return {**section, "remanent": {"kind": "patches", "patches": ordered, **density}}
+    return {**section, "remanent": {"kind": "patches", "patches": ordered, **density_key}}
 
 
 def _remanences_of(part: MemberCase, several: SeveralShells, size: float | None) -> dict[str, Any]:
-    """Return the remanence of a shell by patch, over the size of that of the first one."""
+    """Return patch -> remanence of one shell, over a common flux density.
+
+    Parameters
+    ----------
+    size
+        Flux density (T) of the first remanence of all shells; None if they have none.
+    """
     remanent = part.section.remanent
     if remanent is None:
         return {}
@@ -333,10 +382,7 @@ def _remanences_of(part: MemberCase, several: SeveralShells, size: float | None)
 
 
 def _pairs(contact: Any) -> list[list[str]]:
-    """Return the pairs of names in `contact`.
-
-    What else it has is refused later.
-    """
+    """Return the pairs of names in the section `contact`; other entries are refused later."""
     entries_of_contact = contact if isinstance(contact, list | tuple) else []
     entries = [
         entry.get("between") if isinstance(entry, dict) else entry for entry in entries_of_contact
@@ -348,14 +394,20 @@ def _pairs(contact: Any) -> list[list[str]]:
 
 
 def _with_mesh_names(data: Any, shells: Mapping[str, Any]) -> Any:
-    """Return data with upper_rim in place of upper.rim."""
+    """Return plain data with the names of the common mesh: `upper_rim` in place of `upper.rim`.
+
+    Keys and values are renamed, except the values of keys that name files. `shells` has the names
+    of all shells as keys.
+    """
     pattern = re.compile(rf"({'|'.join(map(re.escape, shells))})\.(\w+)")
 
     def name(text: Any) -> Any:
+        """Return the name of an edge, point or patch in the common mesh; other values unchanged."""
         is_name = isinstance(text, str) and pattern.fullmatch(text)
         return pattern.sub(r"\1_\2", text) if is_name else text
 
     def walk(part: Any) -> Any:
+        """Return a part of the data with all names in it replaced."""
         if isinstance(part, dict):
             return {
                 name(key): value if key in FILE_KEYS else walk(value) for key, value in part.items()

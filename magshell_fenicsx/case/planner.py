@@ -1,9 +1,9 @@
-"""Planner: makes the `Problem` of a case, without building anything.
+"""Planner: make the `Problem` of a case, without building a mesh or a model.
 
-A case has sections, units and a programme. Here the symmetry that its parts preserve chooses the
-part of the shell that is modelled; loads, bodies, imperfections and formulas choose the sizes of
-elements; and what the parts of the case bring is added up to the loads of one model. docs/theory.md
-has the sizes and the symmetry.
+A case has sections, units and a programme of load steps. The symmetry that all parts of the case
+preserve chooses which part of the shell is modelled. Loads, bodies, imperfections and formulas
+choose the element sizes. The contributions of all parts are added up to the loads of one model.
+docs/theory.md has the sizes and the symmetry.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -92,26 +92,28 @@ def make_problem(
     smooth: Collection[str] = (),
     contact_places: Sequence[Array] = (),
 ) -> Problem:
-    """Return the problem of a case.
+    """Return the problem of a case: mesh, loads, supports and output, nothing of it built yet.
 
     Parameters
     ----------
+    case
+        The validated case.
     terms
-        User-defined energies besides those of the case.
+        User-defined energies to add to those of the case.
     plane
-        Mirror plane of the half to be modelled, see `modelled_part.own_mirror`; None lets the case
-        choose.
+        Mirror plane of the half to be modelled, see `modelled_part.own_mirror`; None to find the
+        smallest part that the symmetry of the case allows.
     smooth
-        Keys whose formulas are known to have no details between samples.
+        Keys of the case whose formulas are known to have no details between samples.
     contact_places
-        Places (3,) over R where other shells touch it.
+        Places (3,) over R where other shells touch this one; the mesh is refined there.
 
     Raises
     ------
     CaseError
-        If the symmetry that is asked for is not there, or what is asked for cannot be built.
+        If the requested symmetry is not there, or the case asks for something that cannot be built.
     MeshError
-        If the meridian has no such edge or point.
+        If a support or a load names an edge or a point that the meridian does not have.
     """
     if terms:
         case = case.with_terms([*case.own_terms, *terms])
@@ -147,7 +149,11 @@ def _modelled(
     mesh: "_MeshPlan",
     points: "_VertexPoints",
 ) -> Modelled:
-    """Return the modelled part as abilities and steps know it, with fields in its frame."""
+    """Return the modelled part in the form that abilities and load steps read.
+
+    Its deviations and patch rims are functions of places in the frame of the model, which is turned
+    about e3 from that of the case.
+    """
     imperfections, turn = shell.imperfections, part.turn
     return Modelled(
         outline=mesh.outline,
@@ -175,7 +181,26 @@ def _problem(
     loads: Loads,
     constraints: list[SymmetryConstraint],
 ) -> Problem:
-    """Return the problem of a case from its part, its mesh and its loads."""
+    """Assemble the `Problem` from the results of the other functions of this module.
+
+    Parameters
+    ----------
+    part
+        Which part of the shell is modelled.
+    mesh
+        Shape to be meshed and element sizes.
+    modelled
+        The same part in the form that abilities read; its rims are those of patches of dimples.
+    loads
+        All loads of the model.
+    constraints
+        Symmetry of each part of the case; says whether the whole case is axisymmetric.
+
+    Raises
+    ------
+    MeshError
+        If supports or loads of a meridian name an edge or a point that it does not have.
+    """
     context, outline = case.context, mesh.outline
     conditions = edge_conditions(case.boundary, part.turn)
     supports = tuple(name for name, condition in conditions.items() if condition != "free")
@@ -235,7 +260,7 @@ def _problem(
 
 
 def document_of(case: Case) -> Document:
-    """Return the document of a case, which a run writes."""
+    """Return what a run writes down about its case: data, file name and the files that it names."""
     return Document(
         data=case.model_dump(mode="json", exclude_none=True),
         name=case.file_name,
@@ -245,13 +270,18 @@ def document_of(case: Case) -> Document:
 
 
 def _pending_modes(case: Case) -> PendingModes | None:
-    """Return the modes of the perfect shell that are still to be computed; None without.
+    """Return the buckling modes that imperfections take and that are not yet computed.
 
-    Of several shells they are those of the perfect ones together.
+    They belong to the perfect shell, or to all perfect shells of a case together.
+
+    Returns
+    -------
+    Their number, and functions that make the problem of the perfect shell and the problem with the
+    modes. None if no imperfection waits for modes.
     """
     several = case.several
-    parts = list(several.parts) if several else []
-    shell_cases = [part.case for part in parts] or [case]
+    member_shells = list(several.parts) if several else []
+    shell_cases = [member.case for member in member_shells] or [case]
     pending_sections = [
         (i, key, section)
         for i, shell_case in enumerate(shell_cases)
@@ -262,21 +292,33 @@ def _pending_modes(case: Case) -> PendingModes | None:
         return None
 
     def with_modes(modes: tuple[Mode, ...]) -> Problem:
+        """Put the modes into the imperfection sections, and return the problem with them.
+
+        Raises CaseError if no mode with an amplitude moves one of several shells.
+        """
         for i, key, section in pending_sections:
-            name_and_place = (parts[i].name, several.place(parts[i])) if several else ()
+            name_and_place = (
+                (member_shells[i].name, several.place(member_shells[i])) if several else ()
+            )
             try:
                 section.become(modes, *name_and_place)
             except ValueError as e:
-                raise CaseError(parts[i].refused(f"shell.{key}.{e}")) from None
+                raise CaseError(member_shells[i].refused(f"shell.{key}.{e}")) from None
         problem = make_problem(case.with_shells(several.parts) if several else case)
 
         def remade(values: Mapping[str, Any]) -> Problem:
-            other = problem.with_values(values)
-            return other.pending_modes.with_modes(modes) if other.pending_modes else other
+            """Return the problem with other values of keys, and with the same modes."""
+            changed_problem = problem.with_values(values)
+            return (
+                changed_problem.pending_modes.with_modes(modes)
+                if changed_problem.pending_modes
+                else changed_problem
+            )
 
         return replace(problem, remade=remade)
 
     count = max(len(section.amplitudes) for _, _, section in pending_sections)
+    # the sections ask for no mode at all
     if not count:
         return None
     return PendingModes(count, lambda: make_problem(perfect_case(case)), with_modes)
@@ -286,19 +328,21 @@ def _pending_modes(case: Case) -> PendingModes | None:
 class _ImperfectShell:
     """The undeformed shell of a case with its imperfections, in the frame of the case.
 
+    An imperfection grows if a load step multiplies its deviation; the others are constant.
+
     Attributes
     ----------
     reference
-        The shell that imperfections and bodies are placed on; its `imperfect` outline has the
-        imperfections that do not grow.
+        The shell on which imperfections and bodies are placed. Its `imperfect` outline has the
+        constant imperfections.
     imperfections
         Key of each imperfection below `shell` -> its geometry.
     constant
-        Keys of those that do not grow.
+        Keys of the constant imperfections.
     material
-        Its material, that of several shells by patch; without plies.
+        Material of the shell, or of several shells by patch; without plies.
     sample
-        Places (n, 3) all over it; none of a mesh file, which is read later.
+        Places (n, 3) over R all over the shell; n = 0 for a mesh file, which is read later.
     """
 
     reference: ReferenceShell
@@ -309,7 +353,7 @@ class _ImperfectShell:
 
     @classmethod
     def of_case(cls, case: Case) -> "_ImperfectShell":
-        """Return the shell of a case."""
+        """Return the shell of a case, with imperfections sorted into growing and constant ones."""
         material, reference = _material(case), reference_shell_of(case.shell)
         imperfections = imperfection_geometries(case.imperfections, reference)
         last_steps = {step.name: step for step in case.programme}
@@ -333,17 +377,20 @@ class _ImperfectShell:
         return self.reference.imperfect
 
     def turned_outline(self, turn: float) -> Outline:
-        """Return the outline in a frame turned about e3 (rad)."""
+        """Return the outline with constant imperfections, in a frame turned about e3 (rad)."""
         return _imperfect_outline(self.perfect, self.imperfections, self.constant, turn)
 
     @property
     def without_centre(self) -> list[ImperfectionGeometry]:
-        """Imperfections that are everywhere."""
+        """Imperfections that are spread over the whole surface."""
         return [geometry for geometry in self.imperfections.values() if geometry.centre is None]
 
 
 def _material(case: Case) -> Material:
-    """Return the material of a case, that of several shells by patch; without plies."""
+    """Return Poisson's ratio, thickness over R and rubber law of a case, without plies.
+
+    Several shells have one material each, by patch.
+    """
     material = Material(case.shell.poisson_ratio, 1 / case.shell.R_over_h, case.shell.rubber)
     if several := case.several:
         return replace(
@@ -358,9 +405,10 @@ def _imperfect_outline(
     constant: Collection[str],
     turn: float,
 ) -> Outline:
-    """Return the outline with the imperfections that do not grow, in a frame turned about e3 (rad).
+    """Return an outline with the constant imperfections, in a frame turned about e3 (rad).
 
-    All imperfections have their cells, those that grow too.
+    The chart's division into cells follows all `imperfections`, the growing ones too. The deviation
+    has those with keys in `constant` alone.
     """
     if not imperfections:
         return perfect
@@ -377,7 +425,10 @@ def _imperfect_outline(
 
 
 def _load_places(case: Case, outline: Outline) -> StepsAtPlaces:
-    """Return the steps whose load is at one place, with the place; the last one of each name."""
+    """Return name -> (step, place) of the steps that load a single place.
+
+    Places (3,) are over R. Of several steps with one name the last one counts.
+    """
     places: StepsAtPlaces = {}
     for name, step in {step.name: step for step in case.programme}.items():
         place = step.load.place_on(step, case.context, outline)
@@ -388,12 +439,15 @@ def _load_places(case: Case, outline: Outline) -> StepsAtPlaces:
 
 @dataclass(frozen=True)
 class _ResolvedFormulas:
-    """Formulas of a case, with cells so small that samples in them show what each formula does.
+    """Formulas of a case, each with cells so small that samples in them show its narrow details.
 
     Attributes
     ----------
+    formulas
+        The keys of the case that have formulas of the undeformed place.
     cells
-        For each formula the division of the surface, see `adaptive_cells`; None of a smooth one.
+        For each element of `formulas` the division of the surface, see `adaptive_cells`; None for a
+        smooth formula.
     """
 
     formulas: Sequence[PlacedFormulas]
@@ -401,7 +455,7 @@ class _ResolvedFormulas:
 
     @classmethod
     def of_case(cls, case: Case, outline: Outline, smooth: Collection[str]) -> "_ResolvedFormulas":
-        """Return the formulas of a case; those of the keys in `smooth` have no narrow details."""
+        """Return the formulas of a case; those whose keys are in `smooth` get no cells."""
         formulas = case_formulas(case.context)
         cells = [
             None if placed.spec.key in smooth else adaptive_cells(placed.formulas, outline)
@@ -410,7 +464,7 @@ class _ResolvedFormulas:
         return cls(formulas, cells)
 
     def sampled(self, outline: Outline) -> Outline:
-        """Return an outline among whose samples are places with narrow details of the formulas."""
+        """Return the outline with further samples, at places where formulas have narrow details."""
         if not self.formulas:
             return outline
         return outline.with_samples(narrow_places([cells for cells in self.cells if cells]))
@@ -419,7 +473,10 @@ class _ResolvedFormulas:
 def _constraints(
     case: Case, shell: _ImperfectShell, outline: Outline, energies: Sequence[OwnTerm]
 ) -> list[SymmetryConstraint]:
-    """Return the symmetry that each part of a case preserves, imperfections and bodies included."""
+    """Return the symmetry that each part of a case preserves.
+
+    The parts are shape, abilities, load steps, named points, `energies`, imperfections and bodies.
+    """
     one_by_one = bool(case.patches)
     constraints = symmetry_constraints(case, outline, energies)
     constraints += imperfection_constraints(
@@ -430,21 +487,24 @@ def _constraints(
 
 
 def _body_contacts(case: Case, reference: ReferenceShell) -> tuple[ContactBody, ...]:
-    """Return the contacts of a case with rigid bodies, in the frame of a reference shell."""
+    """Return the contacts of a case with rigid bodies, in the frame of a reference shell.
+
+    A body whose amplitude has the name of a load step is moved by that step.
+    """
     driven_names = {step.name for step in case.programme}
     return contact_bodies(case.bodies, case.approaches, driven_names, reference)
 
 
 @dataclass(frozen=True)
 class _VertexPoints:
-    """Points of a case at which its mesh has vertices.
+    """Points of a case at which its mesh must have vertices.
 
     Attributes
     ----------
     charts
-        Name -> chart (2 | 3,).
+        Name of a point -> its place (2 | 3,) in the chart.
     of_steps
-        Name of a step whose load is at one place -> name of the point there.
+        Name of a step that loads a single place -> name of the point in `charts` at that place.
     """
 
     charts: dict[str, Array]
@@ -454,7 +514,14 @@ class _VertexPoints:
     def of_case(
         cls, case: Case, load_places: StepsAtPlaces, outline: Outline, part: ModelledPart
     ) -> "_VertexPoints":
-        """Return the named points of a case, and those of loads at one place.
+        """Return the named points of a case, and a point for each load at a single place.
+
+        Parameters
+        ----------
+        load_places
+            Name of a step -> the step and the place of its load.
+        outline, part
+            The shell in the frame of the case, and the part that is modelled.
 
         Raises
         ------
@@ -466,6 +533,7 @@ class _VertexPoints:
         for name, (step, place) in load_places.items():
             chart = step.load.chart_of(place, outline, part.turn, half=part.is_symmetric)
             chart = on_features(chart, outline, charts)
+            # a load at the pole or at the place of an earlier load shares that point
             candidates = (point for point in ("pole", *of_steps.values()) if point in charts)
             at_same_place = (point for point in candidates if np.array_equal(charts[point], chart))
             of_steps[name] = next(at_same_place, name.replace("force", "load"))
@@ -477,7 +545,7 @@ class _VertexPoints:
         return cls(charts, of_steps)
 
     def concentrated_loads(self, case: Case) -> list[Loaded]:
-        """Return the charts of concentrated loads, each with the loads there."""
+        """Return (chart, loads there) for each point with a concentrated load."""
         loads: list[Loaded] = [
             (self.charts[point], [step.load])
             for step in case.programme
@@ -493,24 +561,24 @@ class _VertexPoints:
 
 @dataclass(frozen=True)
 class _MeshPlan:
-    """Shape that is meshed and element sizes, in the model's frame.
+    """Shape to be meshed and element sizes, in the frame of the model; lengths are over R.
 
     Attributes
     ----------
     outline
-        The shell with the imperfections that do not grow.
+        The shell with the constant imperfections.
     shape
-        What is triangulated.
+        The chart, or the grid with rims in it, that is triangulated.
     size
         Element sizes over the chart.
     points
-        Name -> chart (2 | 3,) of a vertex.
+        Name of a point -> chart (2 | 3,) of the vertex there.
     bodies
         Contacts with rigid bodies.
     contact_regions
-        Where these press.
+        Zones in which the bodies press.
     rim_count
-        Number of different rims besides the pole's.
+        Number of different rims of imperfections, besides a rim around the pole.
     """
 
     outline: Outline
@@ -531,14 +599,25 @@ def _mesh_plan(
     formulas: _ResolvedFormulas,
     contact_places: Sequence[Array],
 ) -> _MeshPlan:
-    """Return what is meshed for a part of a shell.
+    """Return the shape to be meshed and the element sizes, for the modelled part of a shell.
 
     Parameters
     ----------
     outline
-        The shell in the frame of the case, whose samples show the formulas.
+        The shell in the frame of the case, with samples that show details of the formulas.
+    part
+        The part that is modelled, and the angle of its frame about e3.
+    points
+        Points at which there must be vertices.
+    formulas
+        Formulas of the case, with the cells that resolve them.
     contact_places
-        Places (3,) over R where other shells touch it.
+        Places (3,) over R, in the frame of the case, where other shells touch this one.
+
+    Raises
+    ------
+    CaseError
+        If a sector has T-junctions or rims beside the axis, or two vertices would be too close.
     """
     local: list[LocalImperfection] = []
     if not isinstance(case.shell, MeshSurface):
@@ -573,6 +652,7 @@ def _mesh_plan(
     shape, size = _shape(turned_outline, part, size, points.charts.values())
     rims = distinct_rims(local)
     _refuse_unfit_sector(case, part, rims)
+    # with too many rims the mesh has no edges along them
     shape = _with_rims(shape, local, rims if len(rims) <= MAX_RIMS else (), size)
     if not part.axisymmetric:
         vertices = Vertices.of_case(case, points.charts, turned_outline, size, part.turn)
@@ -587,9 +667,15 @@ def _size_limits(
     part: ModelledPart,
     formulas: _ResolvedFormulas,
 ) -> tuple[list[SquaresFeature], float]:
-    """Return where formulas and imperfections without a centre need small elements.
+    """Return where formulas and spread imperfections need small elements, and a global limit.
 
-    The second result is the largest size that resolves these imperfections everywhere.
+    Returns
+    -------
+    squares
+        Places where elements must be small; empty if the element size is given or a meridian is
+        modelled.
+    largest
+        The element size, over R, that resolves the spread imperfections everywhere.
     """
     if part.axisymmetric or case.mesh.size:
         return [], min((geometry.size for geometry in shell.without_centre), default=inf)
@@ -602,7 +688,17 @@ def _size_limits(
 def _shape(
     outline: Outline, part: ModelledPart, size: Grading, points: Collection[Array]
 ) -> tuple[Chart, Grading]:
-    """Return what is triangulated of an outline, and the element sizes there."""
+    """Return the shape to be triangulated, and the element sizes on it.
+
+    Parameters
+    ----------
+    outline, part
+        The shell in the frame of the model, and the part of it that is modelled.
+    size
+        Element sizes before those at the tip of a sector are added.
+    points
+        Charts (2 | 3,) of the points that are vertices; a grid has movable lines through them.
+    """
     shape = outline.chart(part.mirror, size)
     is_grid = isinstance(shape, Grid)
     if part.sector and not is_grid:  # a ring has no tip
@@ -614,13 +710,15 @@ def _shape(
         for chart in points:
             place = outline.embedding(chart[None])[0]
             images.append(outline.inverse(part.mirror.image(place)))
-        x, y = ((*shape.movable_lines[i], *(float(image[i]) for image in images)) for i in range(2))
-        shape = replace(shape, movable_lines=(x, y))
+        x_lines, y_lines = (
+            (*shape.movable_lines[i], *(float(image[i]) for image in images)) for i in range(2)
+        )
+        shape = replace(shape, movable_lines=(x_lines, y_lines))
     return shape, size
 
 
 def _refuse_unfit_sector(case: Case, part: ModelledPart, rims: Sequence[Array]) -> None:
-    """Refuse a sector of a shell with a T-junction, or with rims beside the axis."""
+    """Raise CaseError for a sector of a shell with a T-junction, or with rims beside the axis."""
     if part.sector is None:
         return
     if any(joint.edges[1] in (case.shells or ()) for joint in case.joints):
@@ -633,9 +731,9 @@ def _refuse_unfit_sector(case: Case, part: ModelledPart, rims: Sequence[Array]) 
 
 
 def towards_tip(size: Grading, sector: Sector) -> Grading:
-    """Return sizes at most as large as a sector is wide.
+    """Return element sizes that are at most the sector's width near its tip.
 
-    Triangles are then not thin beside the axis of a disc.
+    Without that, triangles beside the axis of a disc would be thin.
     """
     tip = DiscFeature((0.0, 0.0), 0.0, MIN_SIZE_AT_TIP * size.largest, sector.angle)
     return replace(size, features=[*size.features, tip])
@@ -644,7 +742,17 @@ def towards_tip(size: Grading, sector: Sector) -> Grading:
 def _with_rims(
     shape: Chart, local: Sequence[LocalImperfection], rims: tuple[Array, ...], size: Grading
 ) -> Chart | RimmedGrid:
-    """Return the shape with element edges along the rims."""
+    """Return the shape with element edges along the rims of imperfections.
+
+    Parameters
+    ----------
+    local
+        The local imperfections in the chart; rims around the chart's origin are taken from here.
+    rims
+        Points (n, 2) of each closed rim beside the axis.
+    size
+        Element sizes; on a disc they choose which circles are drawn.
+    """
     circles = tuple(
         dict.fromkeys(
             local_imperfection.radius
@@ -663,7 +771,10 @@ def _with_rims(
 
 
 def _cells(shape: Chart | RimmedGrid, size: Grading, plane: Mirror | None) -> float:
-    """Return about how many triangles there will be."""
+    """Estimate the number of triangles of the modelled part.
+
+    `plane` is the symmetry plane of the part, in the frame of the case; None for a whole shell.
+    """
     if isinstance(shape, MeshFile):
         halved = isinstance(shape.in_memory, MultiShellMesh)  # it has the cells of its half
         return cell_count(shape) / (plane.copies if plane and not halved else 1)
@@ -671,7 +782,11 @@ def _cells(shape: Chart | RimmedGrid, size: Grading, plane: Mirror | None) -> fl
 
 
 def _loads(case: Case, modelled: Modelled) -> Loads:
-    """Return the loads of a model: what the abilities and the last step of each name add."""
+    """Return the loads of the model: the sum of what abilities and load steps contribute.
+
+    Of several steps with one name the last one contributes. In the sum, dictionaries and tuples are
+    joined; of other values the first one that is set counts.
+    """
     context, last_steps = case.context, {step.name: step for step in case.programme}
     amplitudes = set(last_steps)
     for step in case.programme:
@@ -684,18 +799,18 @@ def _loads(case: Case, modelled: Modelled) -> Loads:
     fields: dict[str, Any] = {}
     for addition in additions:
         for name, value in addition.items():
-            present = fields.get(name)
+            earlier_value = fields.get(name)
             if isinstance(value, dict):
-                fields[name] = {**(present or {}), **value}
+                fields[name] = {**(earlier_value or {}), **value}
             elif isinstance(value, tuple):
-                fields[name] = (*(present or ()), *value)
+                fields[name] = (*(earlier_value or ()), *value)
             else:
-                fields[name] = present or value
+                fields[name] = earlier_value or value
     return Loads(**fields)
 
 
 def _thickness(case: Case, turn: float) -> Thickness | None:
-    """Return the factor of the thickness in a frame turned about e3 (rad); None for 1."""
+    """Return the thickness factor in a frame turned about e3 by `turn` (rad); None if it is 1."""
     if case.several:
         return case.several.thickness
     factor = case.thickness_factor
@@ -708,6 +823,7 @@ def _thickness(case: Case, turn: float) -> Thickness | None:
     in_case_frame, Q = formula(factor), rotation(turn)
 
     def in_model_frame(x: Array, y: Array, z: Array) -> Array:
+        """Return the factor at places of the model, which are turned back into the case's frame."""
         if not turn:
             return in_case_frame(x, y, z)
         return in_case_frame(*np.tensordot(Q.T, np.stack([x, y, z]), 1))
@@ -716,12 +832,17 @@ def _thickness(case: Case, turn: float) -> Thickness | None:
 
 
 def _warnings(case: Case, places: Array, outline: Outline) -> tuple[str, ...]:
-    """Return warnings of what is unphysical, or often meant in another way.
+    """Return warnings about input that is unphysical, or that is often meant in another way.
 
-    `places` (n, 3) are all over the undeformed shell, whose perfect outline is given.
+    Parameters
+    ----------
+    places
+        Places (n, 3) over R, all over the undeformed shell.
+    outline
+        The perfect shell.
     """
     context = case.context
-    warnings = [part.warning(context, places) for part in context.abilities]
+    warnings = [ability.warning(context, places) for ability in context.abilities]
     R = case.shell.reference
     warnings += [step.load.warning(step, outline, R) for step in case.programme]
     warnings.append(_unit_warning(case, places))
@@ -729,7 +850,10 @@ def _warnings(case: Case, places: Array, outline: Outline) -> tuple[str, ...]:
 
 
 def _unit_warning(case: Case, places: Array) -> str | None:
-    """Return a hint at another unit of a mesh file's coordinates; None without."""
+    """Return a warning that the coordinates of a mesh file may be in another unit; None if not.
+
+    The hint is an extent of `places` (n, 3) that is far from the radius, which is their unit.
+    """
     extent = float(np.ptp(places, axis=0).max())
     is_usual = 1 / MAX_EXTENT_OVER_RADIUS <= extent <= MAX_EXTENT_OVER_RADIUS
     if not isinstance(case.shell, MeshSurface) or is_usual:

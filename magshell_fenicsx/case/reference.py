@@ -1,6 +1,6 @@
 """The JSON Schema of the case file, for editors, and its reference in Markdown.
 
-They are docs/case.schema.json and docs/case.md.
+The results are docs/case.schema.json and docs/case.md.
 """
 
 import json
@@ -69,9 +69,10 @@ The column `amplitude` names the amplitude that varied:
 
 
 class _WithMeanings(GenerateJsonSchema):
-    """Generator of a schema whose keys have their docstrings, and sections their class names."""
+    """Generator of a schema, with keys described by docstrings and sections titled by class."""
 
     def model_schema(self, schema: core_schema.ModelSchema) -> dict[str, Any]:
+        """Return the schema of a section, titled by its class, with a description of each key."""
         schema_of_model = super().model_schema(schema)
         schema_of_model["title"] = f"{schema['cls'].__module__}.{schema['cls'].__qualname__}"
         for key, value in schema_of_model.get("properties", {}).items():
@@ -80,22 +81,26 @@ class _WithMeanings(GenerateJsonSchema):
         return schema_of_model
 
     def encode_default(self, dft: Any) -> Any:
+        """Return a default as JSON data, also where the default is a whole section."""
         return super().encode_default(
             dft.model_dump(mode="json") if isinstance(dft, BaseModel) else dft
         )
 
 
 def schema() -> dict[str, Any]:
-    """Return the schema of a case file, key by key; rules between keys are `Case`'s alone."""
+    """Return the JSON Schema of a case file, key by key.
+
+    Rules between several keys are checked by `Case` alone.
+    """
     head = {"$schema": GenerateJsonSchema.schema_dialect, "title": "magshell_fenicsx case"}
-    of_case = _without_noise(
+    case_schema = _without_noise(
         _with_definitions(Case.model_json_schema(schema_generator=_WithMeanings))
     )
     # parts come last
-    properties = sorted(of_case["properties"].items(), key=lambda item: item[0] in PART_CLASSES)
-    of_case["properties"] = dict(properties)
-    of_case["anyOf"] = [{"required": of_case.pop("required")}, {"required": ["shells"]}]
-    return {**head, **of_case}
+    properties = sorted(case_schema["properties"].items(), key=lambda item: item[0] in PART_CLASSES)
+    case_schema["properties"] = dict(properties)
+    case_schema["anyOf"] = [{"required": case_schema.pop("required")}, {"required": ["shells"]}]
+    return {**head, **case_schema}
 
 
 def schema_text() -> str:
@@ -104,9 +109,9 @@ def schema_text() -> str:
 
 
 def _with_definitions(schema_of_case: Schema) -> Schema:
-    """Return a schema with every section as a definition.
+    """Return a schema with every section as a definition, and a reference wherever it is used.
 
-    pydantic 2.14 writes some in full where they are used.
+    pydantic 2.14 writes some sections in full where they are used.
     """
     titles = {
         f"#/$defs/{name}": section["title"]
@@ -116,59 +121,73 @@ def _with_definitions(schema_of_case: Schema) -> Schema:
     sections: dict[str, Schema] = {}
 
     def referring(part: Any) -> Any:
+        """Return a part of the schema with each section replaced by a reference to its title.
+
+        The sections themselves are collected in `sections`.
+        """
         if isinstance(part, list):
             return [referring(item) for item in part]
         if not isinstance(part, dict):
             return part
-        inner = {
+        rewritten_part = {
             key: value if key in ("default", "$defs") else referring(value)
             for key, value in part.items()
         }
         if "$ref" in part:
-            inner["$ref"] = titles.get(part["$ref"], part["$ref"])
+            rewritten_part["$ref"] = titles.get(part["$ref"], part["$ref"])
         if (
             "properties" not in part
             or part is schema_of_case
             or not isinstance(part.get("title"), str)
         ):
-            return inner
-        sections[part["title"]] = inner
+            return rewritten_part
+        sections[part["title"]] = rewritten_part
         return {"$ref": part["title"]}
 
     with_names = referring(schema_of_case)
     definitions_of_case = {
         name: referring(section) for name, section in schema_of_case["$defs"].items()
     }
-    others = {
+    other_definitions = {
         name: section
         for name, section in definitions_of_case.items()
         if f"#/$defs/{name}" not in titles
     }
-    counts = Counter(title.rsplit(".", 1)[-1] for title in sections)
-    names = {}
+    class_counts = Counter(title.rsplit(".", 1)[-1] for title in sections)
+    definition_names = {}
     for title in sections:
         class_name = title.rsplit(".", 1)[-1]
-        is_unique = counts[class_name] == 1
-        names[title] = class_name if is_unique else title.replace(".", "__")
+        is_unique = class_counts[class_name] == 1
+        definition_names[title] = class_name if is_unique else title.replace(".", "__")
 
     def shortened(part: Any) -> Any:
+        """Return a part of the schema with references to definition names in place of titles."""
         if isinstance(part, list):
             return [shortened(item) for item in part]
         if not isinstance(part, dict):
             return part
         return {
-            key: f"#/$defs/{names[value]}" if key == "$ref" and value in names else shortened(value)
+            key: f"#/$defs/{definition_names[value]}"
+            if key == "$ref" and value in definition_names
+            else shortened(value)
             for key, value in part.items()
         }
 
-    definitions = {names[title]: section for title, section in sections.items()} | others
+    definitions = {
+        definition_names[title]: section for title, section in sections.items()
+    } | other_definitions
     return dict(shortened({**with_names, "$defs": dict(sorted(definitions.items()))}))
 
 
 def _without_noise(part: Any, *, names: bool = False) -> Any:
-    """Return a schema without what pydantic adds and JSON Schema does not know.
+    """Return a schema without keywords that pydantic adds and JSON Schema does not know.
 
-    `names` is whether the keys are those of the case, and none of the schema.
+    Parameters
+    ----------
+    part
+        Any part of a schema: a dictionary, a list or a value.
+    names
+        Whether the keys of `part` are names from the case, such as "title", and so all are kept.
     """
     if isinstance(part, list):
         return [_without_noise(item) for item in part]
@@ -184,7 +203,7 @@ def _without_noise(part: Any, *, names: bool = False) -> Any:
 
 @dataclass(frozen=True)
 class KeyText:
-    """What is said of a key of a section: its meaning, what is allowed, and its default."""
+    """Words on one key of a section: its meaning, the values that it allows, and its default."""
 
     key: str
     meaning: str
@@ -192,7 +211,10 @@ class KeyText:
     default: str
 
     def item(self, kinds: str = "") -> str:
-        """Return the key as an item of a list, with words for the kinds that have it."""
+        """Return the key as an item of a list in Markdown.
+
+        `kinds` are words for the kinds of section that have the key; empty if all have it.
+        """
         default = self.default and (
             self.default if self.default == REQUIRED else f"default {self.default}"
         )
@@ -204,39 +226,43 @@ class KeyText:
 def reference() -> str:
     """Return the content of docs/case.md.
 
-    Sections that a tag such as `kind` tells apart have many keys in common, which one list has
-    before them.
+    Sections that a tag such as `kind` tells apart form a family. Their common keys are listed once,
+    before the sections.
     """
-    of_case = schema()
-    sections, places = of_case["$defs"], _places(of_case, of_case["$defs"])
+    case_schema = schema()
+    sections, places = case_schema["$defs"], _places(case_schema, case_schema["$defs"])
     titles = {name: _title(paths, sections[name]) for name, paths in places.items()}
     families = defaultdict[str, list[Schema]](list)
     for name, title in titles.items():
         if _tag_key(sections[name]):
             families[_family(title)].append(sections[name])
-    parts = [HEAD, _section(TITLE_OF_CASE, of_case, titles)]
+    texts = [HEAD, _section(TITLE_OF_CASE, case_schema, titles)]
     common_of_family = dict[str, set[KeyText]]()
     for name, title in titles.items():
         family = _family(title)
         if family in families and family not in common_of_family:
             text, common_of_family[family] = _common_keys(family, families[family], titles)
-            parts += [text] if text else []
+            texts += [text] if text else []
         common = common_of_family[family] if _tag_key(sections[name]) else set()
-        parts.append(_section(title, sections[name], titles, common))
-    return "\n".join([*parts, columns_page()])
+        texts.append(_section(title, sections[name], titles, common))
+    return "\n".join([*texts, columns_page()])
 
 
 def _family(title: str) -> str:
-    """Return the keys under which sections are that a tag tells apart, from a title of one."""
+    """Return the key path that all sections of a family share, from the title of one of them.
+
+    A family is a set of sections under one key that a tag such as `kind` tells apart.
+    """
     return title.split(", ")[0]
 
 
 def _tag_key(section: Schema) -> str | None:
-    """Return the key that tells a section from others under the same keys; None without one."""
+    """Return the key whose value tells a section from others in its family; None without one."""
     return next((key for key in TAG_KEYS if key in section.get("required", [])), None)
 
 
 def _tags(section: Schema) -> list[str]:
+    """Return the values of its tag, such as "field", by which a section is chosen."""
     tag = section["properties"][_tag_key(section)]
     return list(tag.get("enum", [tag.get("const")]))
 
@@ -244,15 +270,29 @@ def _tags(section: Schema) -> list[str]:
 def _common_keys(
     family: str, sections: Sequence[Schema], titles: dict[str, str]
 ) -> tuple[str, set[KeyText]]:
-    """Return the list of the keys that several sections have alike, and what is said of them.
+    """Return the Markdown list of the keys that several sections of a family share, and these keys.
 
     Keys that differ in their default alone are one item of the list.
+
+    Parameters
+    ----------
+    family
+        Key path of the family, for the heading.
+    sections
+        The schemas of its sections.
+    titles
+        Name of each section -> its title, for links.
+
+    Returns
+    -------
+    The text, empty if no key is shared; and what the list says of each key.
     """
     kinds_of_text = defaultdict[KeyText, list[str]](list)
     counts = Counter[KeyText]()
     for section in sections:
         for text in _key_texts(section, titles):
             kinds_of_text[text] += _tags(section)
+            # a key counts as shared if all but its default is alike
             counts[replace(text, default="")] += 1
     items, common = list[str](), set[KeyText]()
     all_kinds = [kind for section in sections for kind in _tags(section)]
@@ -276,20 +316,24 @@ def _common_keys(
 
 
 def _kinds_in_words(kinds: Sequence[str], all_kinds: Sequence[str]) -> str:
-    """Return which kinds have a key; empty if all have it."""
-    others = [kind for kind in all_kinds if kind not in kinds]
-    if not others:
+    """Return words for the kinds of section that have a key; empty if all have it."""
+    kinds_without = [kind for kind in all_kinds if kind not in kinds]
+    if not kinds_without:
         return ""
-    if len(others) < len(kinds):
-        return f"all but {', '.join(others)}"
+    if len(kinds_without) < len(kinds):
+        return f"all but {', '.join(kinds_without)}"
     return f"of {', '.join(kinds)}"
 
 
 def _places(of_case: Schema, sections: dict[str, Schema]) -> dict[str, list[str]]:
-    """Return section -> the keys under which it is, in the order of the file."""
+    """Return section -> the key paths under which a case has it, in the order of the file.
+
+    A key of any name is NAME in a path.
+    """
     places: dict[str, list[str]] = {}
 
     def visit(part: Schema, path: str) -> None:
+        """Add the sections below `part`, whose keys are after `path`, and go on into new ones."""
         any_name = (
             {"NAME": part["additionalProperties"]} if part.get("additionalProperties") else {}
         )
@@ -319,7 +363,7 @@ def _references(part: Any) -> Iterator[str]:
 
 
 def _title(paths: list[str], section: Schema) -> str:
-    """Return the keys of a section, and the tag that tells it from others under these keys."""
+    """Return the title of a section: its key paths, or the first one with the values of its tag."""
     key = _tag_key(section)
     return f"{paths[0]}, {key}: {', '.join(_tags(section))}" if key else ", ".join(paths)
 
@@ -327,7 +371,19 @@ def _title(paths: list[str], section: Schema) -> str:
 def _section(
     title: str, section: Schema, titles: dict[str, str], common: Collection[KeyText] = ()
 ) -> str:
-    """Return the text of a section, with the keys that are not among the common ones."""
+    """Return the Markdown text of a section, with the keys that are not among the common ones.
+
+    Parameters
+    ----------
+    title
+        Heading of the section.
+    section
+        Schema of the section.
+    titles
+        Name of each section -> its title, for links.
+    common
+        Keys that the list of common keys of its family describes.
+    """
     lines = ["", f"## {title}", "", section["description"], ""]
     if not section["properties"]:
         return "\n".join([*lines, f"Allowed: {_allowed(section, titles)}."]) + "\n"
@@ -344,7 +400,10 @@ def _section(
 
 
 def _key_texts(section: Schema, titles: dict[str, str]) -> list[KeyText]:
-    """Return what is said of the keys of a section, but for a tag that its title says all of."""
+    """Return the words on each key of a section.
+
+    The tag is left out where the title already says all of it.
+    """
     required = section.get("required", section.get("anyOf", [{}])[0].get("required", []))
     return [
         _key_text(key, value, key in required, titles)
@@ -354,6 +413,17 @@ def _key_texts(section: Schema, titles: dict[str, str]) -> list[KeyText]:
 
 
 def _key_text(key: str, part: Schema, required: bool, titles: dict[str, str]) -> KeyText:
+    """Return the words on one key.
+
+    Parameters
+    ----------
+    part
+        Schema of the key's value. Its description ends with the unit in brackets, if there is one.
+    required
+        Whether the key must be given.
+    titles
+        Name of each section -> its title, for links.
+    """
     meaning_and_unit = re.fullmatch(
         r"(.*?)(?: \[(.*)\])?", " ".join(part.get("description", "").split())
     )
@@ -374,7 +444,10 @@ def _line(cells: Sequence[str]) -> str:
 
 
 def _allowed(part: Schema, titles: dict[str, str]) -> str:
-    """Return words for what a value may be."""
+    """Return words, in Markdown, for the values that a part of the schema allows.
+
+    `titles` maps the name of each section to its title, for links.
+    """
     if "$ref" in part:
         title = titles[part["$ref"].rsplit("/", 1)[-1]]
         words = title.split(": ")[-1] if ": " in title else title.split(", ")[0]
@@ -410,7 +483,10 @@ def _allowed(part: Schema, titles: dict[str, str]) -> str:
 
 
 def _bounded(part: Schema, kind: str) -> str:
-    """Return words for a kind of number with its bounds."""
+    """Return words for a number with its bounds, such as "number, from 0 to 1".
+
+    `kind` is "number" or "whole number".
+    """
     smallest = part.get("minimum", part.get("exclusiveMinimum"))
     lower_word, largest = ("from" if "minimum" in part else "above"), part.get("maximum")
     lower = "" if smallest is None else f", {lower_word} {smallest:g}"
@@ -421,23 +497,23 @@ def _bounded(part: Schema, kind: str) -> str:
 
 
 def _value_text(value: Any) -> str:
-    """Return a value as a case has it."""
+    """Return a value as a case file would write it."""
     if isinstance(value, float):
         return f"{value:g}"
     return value if isinstance(value, str) else json.dumps(value)
 
 
 def anchor(title: str) -> str:
-    """Return the anchor of a heading, as GitHub makes it."""
+    """Return the anchor that GitHub gives to a heading."""
     return re.sub(r"[^\w\- ]", "", title.lower()).replace(" ", "-")
 
 
 def columns_page() -> str:
-    """Return the tables of columns and of amplitudes in Markdown.
+    """Return the tables of the columns of path.csv and of the amplitudes, in Markdown.
 
-    The order of the parts' columns does not depend on what is imported first.
+    Columns of parts are sorted by name, so that their order does not depend on imports.
     """
-    of_parts = [q for q in QUANTITIES.values() if q not in (*OF_EVERY_RUN, *IN_TIME)]
+    part_quantities = [q for q in QUANTITIES.values() if q not in (*OF_EVERY_RUN, *IN_TIME)]
     columns = [
         (
             f"`{q.name}`",
@@ -447,7 +523,7 @@ def columns_page() -> str:
             _in_units(q),
             q.meaning,
         )
-        for q in (*OF_EVERY_RUN, *IN_TIME, *sorted(of_parts, key=lambda q: q.name))
+        for q in (*OF_EVERY_RUN, *IN_TIME, *sorted(part_quantities, key=lambda q: q.name))
     ]
     amplitudes = [
         (f"`{a.name}`", f"`{a.column}`", f"`{a.conjugate}`") for _, a in sorted(AMPLITUDES.items())
@@ -464,7 +540,7 @@ def columns_page() -> str:
 
 
 def _in_units(q: Quantity) -> str:
-    """Return the columns of a quantity in units."""
+    """Return the names of the columns that show a quantity in units, joined by "or"."""
     return "" if q.kind == "text" else " or ".join(f"`{in_unit.name}`" for in_unit in q.in_units)
 
 

@@ -71,7 +71,7 @@ class PlaceSection(Section):
 
     @property
     def Q(self) -> Array:
-        """(3, 3) whose columns are its axes."""
+        """Rotation (3, 3) whose columns are the shell's axes in the frame of the case."""
         turn, polar, azimuth = np.radians([self.turn, self.axis.polar, self.axis.azimuth])
         Q = _about_e3(azimuth) @ _about_e2(polar) @ _about_e3(turn)
         return np.asarray(np.where(np.abs(Q) < 1e-15, 0.0, Q))
@@ -114,9 +114,10 @@ def in_words_of_shells(message: str, data: Any) -> str:
 
     Parameters
     ----------
+    message
+        Text with names of edges and points of the common mesh.
     data
-        Plain data of a case. Edges and points that it names, and edges of all geometries, are
-        known.
+        Plain data of a case. Edges and points that it names are known, and edges of all geometries.
 
     Examples
     --------
@@ -134,14 +135,14 @@ def in_words_of_shells(message: str, data: Any) -> str:
             for text in texts
             if re.fullmatch(rf"{re.escape(name)}\.\w+", text)
         }
-        members = "|".join(
+        known_names = "|".join(
             sorted({*EDGE_NAMES, *names_in_text, *filter(str.isidentifier, _texts(shells[name]))})
         )
         shell = re.escape(name)
         message = re.sub(
-            rf"\b(boundary|points)\.({shell})_({members})\b", r"shells.\2.\1.\3", message
+            rf"\b(boundary|points)\.({shell})_({known_names})\b", r"shells.\2.\1.\3", message
         )
-        message = re.sub(rf"(?<![\w./])({shell})_({members})\b(?!\.\w)", r"\1.\2", message)
+        message = re.sub(rf"(?<![\w./])({shell})_({known_names})\b(?!\.\w)", r"\1.\2", message)
     return message
 
 
@@ -158,16 +159,16 @@ def _texts(data: Any) -> Iterator[str]:
 
 @dataclass(frozen=True)
 class MemberCase:
-    """One of several shells.
+    """One of several shells, with a case of its own.
 
     Attributes
     ----------
     name
-        Its name in the case.
+        Name of the shell in the whole case.
     section
-        Its section in the case.
+        Section of the shell in the whole case.
     case
-        The case of the shell alone.
+        The case of this shell alone.
     """
 
     name: str
@@ -175,12 +176,12 @@ class MemberCase:
     case: "Case"
 
     def refused(self, message: str) -> str:
-        """Return a message of the shell's own case, with the key in the whole case."""
+        """Return a message about the shell's own case, beginning with its key in the whole case."""
         return f"shells.{self.name}.{message}"
 
     @contextmanager
     def naming(self) -> Iterator[None]:
-        """Let an error of the shell's own case within begin with its key."""
+        """Return a context in which errors of the shell's own case get a key in the whole case."""
         try:
             yield
         except (CaseError, MeshError) as e:
@@ -188,7 +189,17 @@ class MemberCase:
 
 
 class SeveralShells:
-    """The shells of a case; a `MultiShellMesh` is made of them where a mesh is needed."""
+    """The shells of a case that has several, and what they have in common.
+
+    Parameters
+    ----------
+    parts
+        The shells, in the order of the file. Results are over the sizes of the first one.
+    joints
+        Pairs of names of edges that are joined, such as ("a_top", "b_bottom").
+    pairs
+        Pairs of names of shells that may touch.
+    """
 
     def __init__(
         self,
@@ -203,16 +214,16 @@ class SeveralShells:
 
     @cached_property
     def digest(self) -> str:
-        """Hash of all from which the shells are made."""
+        """Hash of all data from which the shells are made."""
         contents = [
             [
-                part.name,
-                part.case.model_dump_json(),
-                part.section.place.model_dump_json(),
-                part.case.outside,
+                member.name,
+                member.case.model_dump_json(),
+                member.section.place.model_dump_json(),
+                member.case.outside,
             ]
-            + [section.pending_modes for section in part.case.imperfections.values()]
-            for part in self.parts
+            + [section.pending_modes for section in member.case.imperfections.values()]
+            for member in self.parts
         ]
         return hashlib.sha256(
             json.dumps([contents, self.joints, self.pairs], sort_keys=True).encode()
@@ -220,56 +231,65 @@ class SeveralShells:
 
     @property
     def file(self) -> str:
-        """Name of the mesh file that they replace."""
+        """Name of the mesh file that the shells replace, made from `digest`."""
         return f"shells {self.digest[:16]}"
 
     def place(self, part: MemberCase) -> ShellPose:
-        """Return the place of a shell, over the R of the first one."""
+        """Return position, orientation and scale of a shell, over the R of the first shell."""
         R, place = self.parts[0].case.shell.reference, part.section.place
         return ShellPose(place.Q, np.array(place.position) / R, part.case.shell.reference / R)
 
     @cached_property
     def assembly(self) -> MultiShellMesh:
-        """All shells as one mesh."""
+        """All shells as one mesh, which is triangulated at its first use."""
         from magshell_fenicsx.case.coaxial import meridians  # the solver takes long to import
         from magshell_fenicsx.case.member_meshes import MemberMeshes
 
         materials = self.materials or {}
         moduli = {
-            part.name: materials[part.name].modulus if materials else 1.0 for part in self.parts
+            member.name: materials[member.name].modulus if materials else 1.0
+            for member in self.parts
         }
         laws = {
-            part.name: "laminate" if part.case.shell.laminate else part.case.shell.law
-            for part in self.parts
+            member.name: "laminate" if member.case.shell.laminate else member.case.shell.law
+            for member in self.parts
         }
         members = MemberMeshes(self)
-        of_members = members.mirrors, partial(meridians, self), members.normal, members.halved
+        functions_of_members = (
+            members.mirrors,
+            partial(meridians, self),
+            members.normal,
+            members.halved,
+        )
         return MultiShellMesh(
-            self.digest, members.whole_shells, self.joints, moduli, laws, *of_members
+            self.digest, members.whole_shells, self.joints, moduli, laws, *functions_of_members
         )
 
     def shell_of(self, name: str) -> str:
-        """Return the name of the shell of an edge, or of a shell itself."""
+        """Return the name of the shell that has an edge; a shell's name is returned as it is."""
         return next(
             (part.name for part in self.parts if f"{name}_".startswith(f"{part.name}_")), name
         )
 
     @cached_property
     def thickness(self) -> "Thickness | None":
-        """Factor of the thickness of the first shell; None for 1."""
+        """Thickness of all shells over that of the first, by patch; None if all are 1.
+
+        Raises CaseError or MeshError if a shell's own case cannot be planned.
+        """
         from magshell_fenicsx.models.shell.thickness import PlacedFactor, Thickness
 
         factors: dict[str, Any] = {}
-        for part in self.parts:
-            with part.naming():
-                own_thickness = part.case.problem().thickness
-            ratio = self.ratio(part)
-            factors[part.name] = ratio
+        for member in self.parts:
+            with member.naming():
+                own_thickness = member.case.problem().thickness
+            ratio = self.ratio(member)
+            factors[member.name] = ratio
             if own_thickness and own_thickness.of_position:
-                factors[part.name] = PlacedFactor(own_thickness, self.place(part), ratio)
+                factors[member.name] = PlacedFactor(own_thickness, self.place(member), ratio)
             for name, factor in ((own_thickness and own_thickness.patches) or {}).items():
                 assert isinstance(factor, float)  # a shell of its own has no shells in it
-                factors[f"{part.name}_{name}"] = ratio * factor
+                factors[f"{member.name}_{name}"] = ratio * factor
         return (
             None
             if all(factor == 1.0 for factor in factors.values())
@@ -278,86 +298,91 @@ class SeveralShells:
 
     @cached_property
     def materials(self) -> "dict[str, ShellMaterial] | None":
-        """Name of a shell -> its material over that of the first; None where all are alike."""
+        """Name of a shell -> its material over that of the first shell; None if all are alike."""
         from magshell_fenicsx.models.shell.parameters import ShellMaterial
 
-        first, materials = self.parts[0].case.shell, dict[str, ShellMaterial]()
+        first_shell, materials = self.parts[0].case.shell, dict[str, ShellMaterial]()
         laws = list(self.laws)
-        for part in self.parts:
-            shell, keys = part.case.shell, ("modulus", "density")
+        for member in self.parts:
+            shell, keys = member.case.shell, ("modulus", "density")
             modulus_ratio, density_ratio = (
-                (getattr(shell, key) or 1.0) / (getattr(first, key) or 1.0) for key in keys
+                (getattr(shell, key) or 1.0) / (getattr(first_shell, key) or 1.0) for key in keys
             )
-            materials[part.name] = ShellMaterial(
-                modulus_ratio, shell.poisson_ratio, density_ratio, laws.index(self._law(part))
+            materials[member.name] = ShellMaterial(
+                modulus_ratio, shell.poisson_ratio, density_ratio, laws.index(self._law(member))
             )
         return None if len({*materials.values()}) == 1 else materials
 
     @cached_property
     def laws(self) -> "tuple[Law, ...]":
-        """Different laws of elasticity, that of the first shell at first."""
-        return tuple(dict.fromkeys(self._law(part) for part in self.parts))
+        """The different laws of elasticity, that of the first shell at the beginning."""
+        return tuple(dict.fromkeys(self._law(member) for member in self.parts))
 
     def _law(self, part: MemberCase) -> "Law":
-        """Return the law of a shell, with Poisson's ratio of the first one.
+        """Return the law of elasticity of a shell, with Poisson's ratio of the first shell.
 
-        `materials` replace Poisson's ratio.
+        So laws that differ in Poisson's ratio alone are equal; `materials` has each shell's own
+        ratio.
         """
         from magshell_fenicsx.models.shell.parameters import Material
 
-        first = self.parts[0].case.shell
+        first_shell = self.parts[0].case.shell
         laminate = self.laminates.get(part.name)
         return Material(
-            first.poisson_ratio, 1 / first.R_over_h, part.case.shell.rubber, laminate
+            first_shell.poisson_ratio, 1 / first_shell.R_over_h, part.case.shell.rubber, laminate
         ).law
 
     @cached_property
     def laminates(self) -> "dict[str, Laminate]":
-        """Name of a shell -> its plies, where it has some."""
+        """Name of each shell with plies -> its plies, placed in the frame of the case."""
         laminates: dict[str, Laminate] = {}
-        for part in self.parts:
-            if laminate := laminate_of(part.case.shell, 0.0):
-                place = self.place(part)
-                laminates[part.name] = replace(laminate, axes=place.Q, origin=place.position)
+        for member in self.parts:
+            if laminate := laminate_of(member.case.shell, 0.0):
+                place = self.place(member)
+                laminates[member.name] = replace(laminate, axes=place.Q, origin=place.position)
         return laminates
 
     @property
     def scale_lines(self) -> list[str]:
-        """Lines of `magshell check` on the scales."""
+        """Lines of `magshell check` on the sizes of each shell over those of the first."""
         has_density = self.parts[0].case.shell.density is not None
         scales = "R, h, E, nu and the density" if has_density else "R, h, E and nu"
         lines = [f"scales: {scales} are those of the shell {self.parts[0].name}"]
-        words = self.assembly.laws
-        for part in self.parts[1:]:
-            line = f"h {self.ratio(part):.4g} times" + (
-                "" if part.case.thickness_factor is None else " its factor"
+        law_words = self.assembly.laws
+        for member in self.parts[1:]:
+            line = f"h {self.ratio(member):.4g} times" + (
+                "" if member.case.thickness_factor is None else " its factor"
             )
-            if material := (self.materials or {}).get(part.name):
+            if material := (self.materials or {}).get(member.name):
                 line += f", E {material.modulus:.4g} times, nu = {material.nu:.4g}"
                 line += f", density {material.density:.4g} times" if has_density else ""
-            line += f", law: {words[part.name]}" if len({*words.values()}) > 1 else ""
-            lines.append(f"  {part.name}: {line}")
+            line += f", law: {law_words[member.name]}" if len({*law_words.values()}) > 1 else ""
+            lines.append(f"  {member.name}: {line}")
         return lines
 
     def ratio(self, part: MemberCase) -> float:
-        """Return the thickness of a shell over that of the first one."""
-        first, shell = self.parts[0].case.shell, part.case.shell
+        """Return the thickness of a shell over that of the first shell."""
+        first_shell, shell = self.parts[0].case.shell, part.case.shell
         thickness = shell.reference / shell.R_over_h
-        return 1.0 if part is self.parts[0] else thickness / (first.reference / first.R_over_h)
+        return (
+            1.0
+            if part is self.parts[0]
+            else thickness / (first_shell.reference / first_shell.R_over_h)
+        )
 
     @property
     def readers(self) -> dict[str, FileKeys]:
-        """Sections of the shells that read a file, by key."""
+        """Key in the whole case -> section, of all sections of the shells that read a file."""
         by_key = dict[str, FileKeys]()
-        for part in self.parts:
-            by_key |= {part.refused(key): section for key, section in part.case.readers.items()}
-            if part.section.remanent and part.section.remanent.file:
-                by_key[part.refused("remanent")] = part.section.remanent
+        for member in self.parts:
+            by_key |= {member.refused(key): section for key, section in member.case.readers.items()}
+            if member.section.remanent and member.section.remanent.file:
+                by_key[member.refused("remanent")] = member.section.remanent
         return by_key
 
 
 def _rotation_about(i: int, j: int) -> Callable[[float], Array]:
-    """Return the rotation (3, 3) from axis i to axis j, as a function of an angle in rad."""
+    """Return the rotation (3, 3) from axis i towards axis j, as a function of its angle (rad)."""
 
     def rotation(angle: float) -> Array:
         Q, c, s = np.eye(3), np.cos(angle), np.sin(angle)

@@ -1,7 +1,7 @@
 """Places of a case that are vertices of its mesh.
 
-Places that are nearly on edges and planes are moved onto them; distinct places must be far enough
-from each other.
+Places that are nearly on edges or planes of symmetry are moved onto them. Distinct places must be
+far enough from each other.
 """
 
 from collections.abc import Collection, Mapping
@@ -36,19 +36,21 @@ GRID_FACTOR = 0.7  # lines of a grid are nearer than places by up to this factor
 
 
 def named_points(case: "Case", outline: Outline, turn: float, plane: Mirror | None) -> Points:
-    """Return the named vertices in the chart, "pole" among them.
+    """Return name -> chart (2 | 3,) of the named points of a case, and of "pole".
+
+    "pole" is the first named point; without one it is the highest point of the surface.
 
     Parameters
     ----------
     turn
-        The model's frame is turned about e3 by it (rad).
+        Angle about e3 (rad) of the model's frame.
     plane
-        The mirror plane or the sector of what is modelled, in the model's frame.
+        Mirror plane or sector of the modelled part, in the model's frame; None for a whole shell.
 
     Raises
     ------
     CaseError
-        If one is not on the surface.
+        If a point is not on the surface.
     """
     Q, R = rotation(turn), case.shell.reference
     points: Points = {}
@@ -65,34 +67,38 @@ def named_points(case: "Case", outline: Outline, turn: float, plane: Mirror | No
 
 
 def chart_of(x: Array, outline: Outline, *, half: bool) -> Array:
-    """Return the chart of a place (3,), of its image where the other half is modelled."""
+    """Return the chart of a place (3,) over R of the model.
+
+    With `half`, a place on the half that is not modelled is replaced by its mirror image.
+    """
     places = outline.inverse(x)
     return outline.on_half(places) if half else places
 
 
 def _on_planes(x: Array, plane: Mirror | None) -> Array:
-    """Return a place (3,), moved onto planes of symmetry that it is nearly on."""
+    """Return a place (3,), moved onto each plane of symmetry that it is nearly on."""
     for side in plane.planes.values() if plane else ():
-        off = float(side.signed_distance(x))
-        x = x - off * side.normal if abs(off) <= SAME_PLACE_TOLERANCE else x
+        distance = float(side.signed_distance(x))
+        x = x - distance * side.normal if abs(distance) <= SAME_PLACE_TOLERANCE else x
     return x
 
 
 def on_features(chart: Array, outline: Outline, points: Mapping[str, Array]) -> Array:
-    """Return the chart (2 | 3,) of a place, moved onto what it is nearly on.
+    """Return a chart, moved onto a point, a pole or an edge that it is nearly on.
 
-    That is a point, a pole or an edge.
+    The chart (3,) of a mesh file is not moved.
 
     Parameters
     ----------
     points
-        Points that are known before; they come first.
+        Name -> chart of points that are known already; they come before poles and edges.
     """
     if len(chart) != CHART:
         return chart
     (place,) = outline.embedding(chart[None])
 
     def is_at(other: Array) -> bool:
+        """Whether the place of another chart is the place to be moved, up to rounding."""
         return bool(
             np.linalg.norm(outline.embedding(other[None])[0] - place) <= SAME_PLACE_TOLERANCE
         )
@@ -109,20 +115,23 @@ def on_features(chart: Array, outline: Outline, points: Mapping[str, Array]) -> 
 
 
 def edges_near(chart: Array, outline: Outline) -> dict[str, Array]:
-    """Return the nearest places (2,) on edges by name, the nearest of opposite edges."""
+    """Return name -> nearest place (2,) on each edge; of opposite edges the nearer one.
+
+    Glued sides of a grid are no edges.
+    """
     shape = outline.chart(None, Grading([], 1.0))
     if isinstance(shape, DiscShape):
         distance = float(np.hypot(*chart))
         return {shape.edge: chart * (shape.radius / distance)} if distance else {}
     if isinstance(shape, StripShape):
-        low, high = np.array([0.0, -shape.width / 2]), np.array([1.0, shape.width / 2])
+        lowest, highest = np.array([0.0, -shape.width / 2]), np.array([1.0, shape.width / 2])
         names, glued = ("root", "tip", "sides", "sides"), (False, False)
     else:
         assert isinstance(shape, Grid)
-        low, high = np.array(shape.low), np.array(shape.high)
+        lowest, highest = np.array(shape.low), np.array(shape.high)
         names, glued = shape.sides, shape.glued
-    is_high = chart - low >= high - chart
-    nearest = np.where(is_high, high, low)
+    is_high = chart - lowest >= highest - chart
+    nearest = np.where(is_high, highest, lowest)
     return {
         names[2 * axis + is_high[axis]]: np.where(np.arange(CHART) == axis, nearest, chart)
         for axis in range(CHART)
@@ -132,7 +141,7 @@ def edges_near(chart: Array, outline: Outline) -> dict[str, Array]:
 
 @dataclass(frozen=True)
 class Vertices:
-    """Points that a mesh has vertices at, and how messages name them.
+    """Points at which a mesh has vertices, and how messages name them.
 
     Attributes
     ----------
@@ -143,11 +152,11 @@ class Vertices:
     size
         Element sizes over the chart.
     turn
-        Angle of the model's frame about e3, rad.
+        Angle about e3 (rad) of the model's frame.
     R, unit
-        The reference length in messages, and their unit of lengths, empty without.
+        Reference length in the unit of messages; that unit, such as " mm", empty without units.
     names_in_case
-        The names that are in `points` of the case.
+        Names that are keys of `points` in the case.
     """
 
     points: Mapping[str, Array]
@@ -162,7 +171,7 @@ class Vertices:
     def of_case(
         cls, case: "Case", points: Mapping[str, Array], outline: Outline, size: Grading, turn: float
     ) -> "Vertices":
-        """Return the vertices of a case."""
+        """Return the vertices of a case at charts `points`, those named in the case first."""
         R, unit = case.shell.reference, ""
         if case.shell.with_units:
             R, unit = 1e3 * R, " mm"
@@ -174,10 +183,13 @@ class Vertices:
     def refuse_near(self, shape: Chart | RimmedGrid, plane: Mirror | None) -> None:
         """Check that points are far enough from each other, from edges and from planes of symmetry.
 
+        `plane` is the mirror plane or sector of the modelled part. The nodes of a mesh file are not
+        checked.
+
         Raises
         ------
         CaseError
-            With both places.
+            If two places are too near; the message has both.
         """
         if not isinstance(shape, Grid | DiscShape | StripShape | RimmedGrid):
             return  # vertices of a file stay where they are
@@ -185,7 +197,7 @@ class Vertices:
             self._refuse_beside_edges(name, shape, plane)
         places = list(self.points.values())
         vertices = shape.vertices_of(places) if isinstance(shape, Grid) else None
-        for (i, name), (j, other) in combinations(enumerate(self.points), 2):
+        for (i, name), (j, other_name) in combinations(enumerate(self.points), 2):
             if vertices is not None:
                 is_near = (vertices[i] == vertices[j]).all()
             else:
@@ -196,7 +208,7 @@ class Vertices:
                 self._refuse(
                     name,
                     self._place(places[j]),
-                    f"{self._key(other)}: [{{}}]",
+                    f"{self._key(other_name)}: [{{}}]",
                     "give one of them",
                     MIN_VERTEX_DISTANCE,
                 )
@@ -204,7 +216,7 @@ class Vertices:
     def _refuse_beside_edges(
         self, name: str, shape: Grid | PlaneShape, plane: Mirror | None
     ) -> None:
-        """Refuse a point beside an edge or a plane of symmetry, neither on it nor away from it."""
+        """Raise CaseError for a point beside an edge or a plane of symmetry, but not on it."""
         chart = self.points[name]
         factor = MIN_VERTEX_DISTANCE if isinstance(shape, Grid) else EDGE_DISTANCE
         size = self._size_of_elements(chart, shape)
@@ -221,7 +233,7 @@ class Vertices:
                 self._refuse(name, place_on_edge, words, "put it there", factor)
 
     def _size_of_elements(self, chart: Array, shape: Grid | PlaneShape) -> float:
-        """Return the size of the elements at a place (2,): none is wider than the shape."""
+        """Return the size of the elements at a chart (2,); no element is wider than the shape."""
         if isinstance(shape, Grid):
             return min(
                 self.size(chart),
@@ -230,7 +242,19 @@ class Vertices:
         return min(self.size(chart), float(shape.area / shape.reach))
 
     def _refuse(self, name: str, other_place: Array, what: str, hint: str, factor: float) -> None:
-        """Refuse a point beside a place (3,) of the case, which is in the words `what`."""
+        """Raise CaseError for point `name`, which is too near to another place for its elements.
+
+        Parameters
+        ----------
+        other_place
+            Place (3,) in the case's frame and length.
+        what
+            Words for that place, with {} for its coordinates.
+        hint
+            What to do.
+        factor
+            Least distance of the two places over the element size.
+        """
         chart, unit = self.points[name], self.unit
         place = self._place(chart)
         text, other_text = (

@@ -49,7 +49,10 @@ class TimeSteps:
     fastest: float = -np.inf
 
     def refined(self, factor: float) -> "TimeSteps":
-        """Return steps that are shorter by a factor; `MIN_TOLERANCE` bounds the tolerance."""
+        """Return options for steps that are shorter by a factor below 1.
+
+        The tolerance falls with its third power, as errors do, but not below `MIN_TOLERANCE`.
+        """
         return replace(
             self,
             tolerance=max(factor**3 * self.tolerance, MIN_TOLERANCE),
@@ -57,7 +60,7 @@ class TimeSteps:
         )
 
     def allowed_leak(self, motion: Motion) -> float:
-        """Return what the last step may have added to the imbalance."""
+        """Return the largest change of the imbalance of energy in the last step of a motion."""
         return MAX_LEAK_OF_STEP * self.balance * motion.turnover
 
 
@@ -81,15 +84,25 @@ def advance(
 
     Parameters
     ----------
+    motion
+        The motion at the begin.
+    end
+        The later time.
+    steps
+        Options of the step lengths.
     dt
         The first step.
     before_step
         Called before every step; may raise an exception to stop.
 
+    Returns
+    -------
+    The motion, whose time is exactly `end`, and the length of the next step.
+
     Raises
     ------
     TimeStopped
-        If even a tiny step fails.
+        If even a tiny step fails, or loses its balance of energy.
     """
     begin, failed = motion.t, False
     if np.isnan(motion.imbalance):
@@ -100,6 +113,7 @@ def advance(
         remaining = end - motion.t
         longest = steps.longest if motion.t < steps.fastest else dt
         dt = min(dt, steps.fixed or dt, longest)
+        # steps of equal length up to the end, none of them tiny
         length = remaining / np.ceil(remaining / dt * (1 - 1e-9))
         trial = integrator.step(motion, length)
         if isinstance(trial, str):
@@ -108,9 +122,10 @@ def advance(
                 raise TimeStopped(f"the time step has become too small: {trial}", motion)
             continue
         if steps.fixed is None:
-            change = 0.9 * (steps.tolerance / max(trial.error, 1e-300)) ** (1 / 3)
+            # the error of a step grows with the third power of its length
+            length_ratio = 0.9 * (steps.tolerance / max(trial.error, 1e-300)) ** (1 / 3)
             if trial.error > steps.tolerance and length > smallest:
-                dt = max(0.3, change) * length
+                dt = max(0.3, length_ratio) * length
                 continue
             # nan where the balance is not checked
             leak = abs(trial.imbalance - motion.imbalance) / steps.allowed_leak(trial)
@@ -119,9 +134,9 @@ def advance(
                     raise TimeStopped(leak_message(motion, trial), motion)
                 dt = max(0.3, 0.8 / leak**0.5) * length
                 continue
-            change = min(change, 1.0) if leak > MAX_LEAK_FOR_GROWTH else change
-            unchanged = max(length, dt if change > 1 else 0.0)
-            dt = length * min(change, 2.0) if change > 1.3 else unchanged
+            length_ratio = min(length_ratio, 1.0) if leak > MAX_LEAK_FOR_GROWTH else length_ratio
+            unchanged = max(length, dt if length_ratio > 1 else 0.0)
+            dt = length * min(length_ratio, 2.0) if length_ratio > 1.3 else unchanged
         elif not failed:
             dt = max(dt, 2 * length)
         failed = False
@@ -130,7 +145,7 @@ def advance(
 
 
 def leak_message(begin: Motion, end: Motion) -> str:
-    """Return a message on how much energy a step gains or loses."""
+    """Return a message on how much energy a step from `begin` to `end` gains or loses."""
     leak = end.imbalance - begin.imbalance
     return (
         f"the balance of energy {'gains' if leak > 0 else 'loses'} "

@@ -30,7 +30,10 @@ POWER_ITERATIONS = 25  # for a second eigenvalue near zero
 
 
 class SystemFamily(Protocol):
-    """Systems that differ by a parameter p, with the same unknowns."""
+    """Systems that differ by a parameter p, with the same unknowns.
+
+    All methods are collective.
+    """
 
     @property
     def costly(self) -> bool:
@@ -40,22 +43,32 @@ class SystemFamily(Protocol):
         """
 
     def solver_at(self, p: float) -> BorderedNewton:
-        """Return the solver of the system at p; it may raise `NoSystem`."""
+        """Return the solver of the system at p.
+
+        Raises
+        ------
+        NoSystem
+            If there is no system at p.
+        """
 
     def amplitudes(self, p: float) -> dict[str, float]:
-        """Return the amplitudes that are given, all but the unknown one."""
+        """Return the amplitudes that are given at p: all but the unknown one."""
 
     def difference_weights(
         self, p: float, *, low_order: bool = False
     ) -> Sequence[tuple[float, float]]:
-        """Return weights and values of p of a difference.
+        """Return weights and values of p of a difference formula.
 
-        The derivative by p is the weighted sum of what the systems at these values have.
+        The derivative by p is the weighted sum of a quantity of the systems at these values.
 
         Parameters
         ----------
         low_order
-            Whether the difference is of first order, from p itself and one more value.
+            Whether the formula is of first order, from p itself and one more value.
+
+        Returns
+        -------
+        Pairs of a weight and its value of p.
         """
 
 
@@ -74,21 +87,16 @@ class CurveVector:
 
 @dataclass(frozen=True)
 class BoundaryPoint:
-    """A point of a boundary.
+    """A point of a boundary of stability: an instability at one value of p.
 
     Attributes
     ----------
+    p, state
+        The second parameter, and displacement and amplitudes there.
     phi
         Null vector of K, of length one, with the same orientation along the whole boundary.
     unstable
         Number of unstable directions other than `phi`.
-    counts
-        The same for each family: the model's own modes, then each family that it excludes, where
-        these are counted.
-    met
-        At a crossing: index in `counts` of the family of the other bifurcation.
-    habit
-        `Factorisation.habit` after its solve, where one system serves all p.
     way
         Tangent of the boundary, of length one.
     cubic, pull
@@ -97,6 +105,15 @@ class BoundaryPoint:
         The eigenvalue nearest to zero other than that of `phi`, if requested; else NaN.
     load_error
         Estimated error of the amplitude.
+    factorisations
+        Iterations of its solve, of one factorisation each.
+    counts
+        Number of unstable directions other than `phi` for each family: the model's own modes, then
+        each family that it excludes, where these are counted.
+    met
+        At a crossing: index in `counts` of the family of the other bifurcation.
+    habit
+        `Factorisation.habit` after its solve, where one system serves all p.
     """
 
     p: float
@@ -120,14 +137,14 @@ class BoundaryPoint:
 
 @dataclass(frozen=True)
 class CurveRow:
-    """The scalar equation that says where on the curve a point is.
+    """The scalar equation that says where on a boundary a point is.
 
     Attributes
     ----------
     du, dmu, dp
-        Its gradient; du is None where it is zero.
+        Its gradient by u, mu and p; du is None where it is zero.
     value
-        Its value at (u, mu, p).
+        Called with u, mu and p; it returns the value of the equation, zero at the point.
     """
 
     du: Vector | None
@@ -143,7 +160,7 @@ class DifferenceSystem:
     Attributes
     ----------
     weight
-        Of its residual in the difference.
+        Weight of its residual in the difference.
     system, mu
         The system, and all its amplitudes.
     is_same_p
@@ -157,12 +174,16 @@ class DifferenceSystem:
 
 
 class AugmentedRows:
-    """The rows of Newton's step at a state of a boundary.
+    """The rows of Newton's step at a state of a boundary, in the unknowns dmu, dp and alpha.
 
-    The step is du = alpha v - w_R - dmu w_mu - dp w_p.
+    The step is du = alpha v - w_R - dmu w_mu - dp w_p. The constructor is collective.
 
     Parameters
     ----------
+    kind
+        Whether the boundary is of folds or of bifurcations.
+    name
+        The unknown amplitude mu.
     tangent
         The augmented tangent at the state.
     difference
@@ -195,34 +216,44 @@ class AugmentedRows:
         self._difference = difference
         v, u, mu = tangent.v, state.u, state.mu
         self._R = system.residual(u, mu)
+        # responses to the residual and to the load, orthogonal to b
         self.w_R, self.t_R = tangent.solve(self._R)
         self.w_mu, self.t_mu = tangent.solve(system.load(u, mu, name))
-        d = difference_step(system, v)
-        forward, backward = (system.residual(u + sign * d * v, mu) for sign in (1, -1))
-        self.cubic = np.asarray((backward - 2 * self._R + forward) / d**2)
+        step_factor = difference_step(system, v)
+        forward, backward = (system.residual(u + sign * step_factor * v, mu) for sign in (1, -1))
+        # Pi'''(v, v, .) by a second difference of the residual
+        self.cubic = np.asarray((backward - 2 * self._R + forward) / step_factor**2)
         self.v, self.unstable = v, tangent.unstable
         self.bend, self.pull = dot(system.comm, self.cubic, v), self.t_mu
         self.K_mu_v = first_difference(lambda x: system.load(x, mu, name), system, u, v)
-        R_p, self.K_p_v = self._derivatives_by_p(d, forward, backward)
+        R_p, self.K_p_v = self._derivatives_by_p(step_factor, forward, backward)
         self.w_p, self.t_p = tangent.solve(R_p)
 
     def _derivatives_by_p(
         self, d: float, forward: Vector, backward: Vector
     ) -> tuple[Vector, Vector]:
-        """Return R_p and K_p v from the residuals ahead, at u + d v, and back, at u - d v."""
+        """Return R_p and K_p v, by the difference by p.
+
+        Parameters
+        ----------
+        d
+            Factor of v in the difference along it.
+        forward, backward
+            Residuals at u + d v and at u - d v, at the p of the state.
+        """
         u, v, R_p, K_p_v = self._state.u, self._tangent.v, 0.0 * self._R, 0.0 * self._R
-        for each in self._difference:
-            if each.is_same_p:
+        for neighbour in self._difference:
+            if neighbour.is_same_p:
                 R, K_v = self._R, (forward - backward) / (2 * d)
             else:
-                R = each.system.residual(u, each.mu)
-                K_v = times_tangent(each.system, State(u, each.mu), v)
-            R_p += each.weight * R
-            K_p_v += each.weight * K_v
+                R = neighbour.system.residual(u, neighbour.mu)
+                K_v = times_tangent(neighbour.system, State(u, neighbour.mu), v)
+            R_p += neighbour.weight * R
+            K_p_v += neighbour.weight * K_v
         return R_p, K_p_v
 
     def set_residual(self, residual: Vector) -> None:
-        """Use the residual at a nearby state, with the same factors."""
+        """Replace the residual by that of a nearby state, with the same factors."""
         self.w_R, self.t_R = self._tangent.solve(residual)
 
     def eigenvalue(self, family: int, p: float, state: State) -> float:
@@ -233,10 +264,15 @@ class AugmentedRows:
         return second_eigenvalue(self._tangent, self._system)
 
     def step(self, row: CurveRow, value: float | None, *, settled: bool = False) -> CurveVector:
-        """Return Newton's step to the point on which a row has the value zero.
+        """Return Newton's step to the point on which a row has the value zero. Collective.
+
+        Three rows, scaled to order one, determine dmu, dp and alpha: g = 0, the condition of the
+        kind, and the given row.
 
         Parameters
         ----------
+        row
+            The equation that says where on the boundary the point is.
         value
             The value of the row at the state; None for the tangent of the curve instead of a step.
         settled
@@ -248,7 +284,7 @@ class AugmentedRows:
         g, pull = (0.0, 0.0) if is_tangent or settled else (tangent.g, self.t_mu)
 
         def coefficients(c: Vector) -> list[float]:
-            """Return the coefficients of dmu, dp and alpha in c . du, and its constant term."""
+            """Return c . du as a row: coefficients of dmu, dp and alpha, and the constant term."""
             return [
                 -dot(comm, c, self.w_mu),
                 -dot(comm, c, self.w_p),
@@ -273,10 +309,11 @@ class AugmentedRows:
         rows = np.array([singular_row, kind_row, place_row])
         columns = np.array([*self._scales, self._system.length / max_abs(comm, v)])
         rows[:, :3] *= columns
-        size = np.abs(rows[:, :3]).max(axis=1)
+        row_sizes = np.abs(rows[:, :3]).max(axis=1)
         if kind == "bifurcation":
-            size[1] = max(size[1], self._mixed_size * columns[2])
-        rows /= np.where(size, size, 1.0)[:, None]
+            row_sizes[1] = max(row_sizes[1], self._mixed_size * columns[2])
+        rows /= np.where(row_sizes, row_sizes, 1.0)[:, None]
+        # where bifurcations meet by symmetry the rows are dependent: the least step is taken
         rank_tolerance = SYMMETRY_TOLERANCE if kind != "fold" else None
         solution = np.linalg.lstsq(rows[:, :3], -rows[:, 3], rank_tolerance)[0]
         dmu, dp, alpha = columns * solution
@@ -286,29 +323,43 @@ class AugmentedRows:
     def _row_without_work(
         self, coefficients: Callable[[Vector], list[float]], pull: float
     ) -> list[float]:
-        """Return the row v . R_mu = 0, with v' = -K^-1 K' v."""
+        """Return the row v . R_mu = 0: coefficients of dmu, dp and alpha, and the constant term.
+
+        The null vector changes as v' = -K^-1 K' v.
+
+        Parameters
+        ----------
+        coefficients
+            Returns the row of the product c . du with a vector c.
+        pull
+            The value of v . R_mu at the state.
+        """
         system, state, name, comm = self._system, self._state, self._name, self._system.comm
-        v, w = self._tangent.v, self.w_mu
-        mixed = mixed_third_derivative(system, state, v, w, self._R) - self.K_mu_v
+        v, w_mu = self._tangent.v, self.w_mu
+        mixed = mixed_third_derivative(system, state, v, w_mu, self._R) - self.K_mu_v
         self._mixed_size = dot(comm, np.abs(mixed), np.abs(v))
-        mu, d = state.mu[name], RELATIVE_DIFFERENCE_STEP * (abs(state.mu[name]) or 1.0)
+        mu, mu_step = state.mu[name], RELATIVE_DIFFERENCE_STEP * (abs(state.mu[name]) or 1.0)
         forward, backward = (
-            system.load(state.u, {**state.mu, name: mu + step}, name) for step in (d, -d)
+            system.load(state.u, {**state.mu, name: mu + step}, name)
+            for step in (mu_step, -mu_step)
         )
-        by_mu = dot(comm, v, np.asarray((forward - backward) / (2 * d))) - dot(comm, w, self.K_mu_v)
+        by_mu = dot(comm, v, np.asarray((forward - backward) / (2 * mu_step))) - dot(
+            comm, w_mu, self.K_mu_v
+        )
         loads = [
-            each.weight * each.system.load(state.u, each.mu, name) for each in self._difference
+            neighbour.weight * neighbour.system.load(state.u, neighbour.mu, name)
+            for neighbour in self._difference
         ]
         load_p = np.asarray(np.sum(loads, axis=0))
-        by_p = dot(comm, v, load_p) - dot(comm, w, self.K_p_v)
-        c = coefficients(mixed)
-        return [by_mu - c[0], by_p - c[1], -c[2], pull - c[3]]
+        by_p = dot(comm, v, load_p) - dot(comm, w_mu, self.K_p_v)
+        mixed_row = coefficients(mixed)
+        return [by_mu - mixed_row[0], by_p - mixed_row[1], -mixed_row[2], pull - mixed_row[3]]
 
 
 def second_eigenvalue(tangent: AugmentedTangent, system: System) -> float:
     """Return the eigenvalue of K nearest to zero in the space orthogonal to b. Collective.
 
-    A power iteration of the bordered inverse finds it.
+    A power iteration of the bordered inverse finds it, in a fixed number of steps.
     """
     x = np.sin(1.0 + np.arange(system.size) + system.comm.rank)
     value = np.nan

@@ -66,6 +66,8 @@ class Bifurcation:
 
     Attributes
     ----------
+    state
+        The state there, an equilibrium up to the small force along `phi`.
     phi
         Null vector of K, of length one.
     response
@@ -103,14 +105,14 @@ def find_bifurcation(
     Parameters
     ----------
     phi
-        A vector near its null vector.
+        A vector near the null vector of the tangent.
     stress
         The stress of the guess, see `System.tangent`.
 
     Raises
     ------
     BifurcationLost
-        If Newton's method diverges or takes too long.
+        If Newton's method diverges or takes too long, or the tangent is singular in two directions.
     """
     try:
         start = _equilibrate(newton, guess, phi, stress)[0]
@@ -122,6 +124,18 @@ def find_bifurcation(
 def _find_from_equilibrium(
     newton: BorderedNewton, guess: State, phi: Vector, name: str
 ) -> Bifurcation:
+    """Locate the bifurcation near a guess that is in equilibrium up to a force along phi.
+
+    Newton's method solves the regular system; after a long step the state is brought back into
+    equilibrium, except for the force along the null vector.
+
+    Raises
+    ------
+    BifurcationLost
+        If Newton's method diverges or takes too long.
+    LinAlgError
+        If the tangent is singular in two directions.
+    """
     system, state, count = newton.system, guess, newton.factorisation.count
     b, sizes, load_changes = phi, list[float](), list[float]()
     # of a position the tangent is not linear in the amplitude
@@ -159,7 +173,13 @@ def _find_from_equilibrium(
 def _equilibrate(
     newton: BorderedNewton, state: State, v: Vector, stress: Sequence[WeightedDisplacement] = ()
 ) -> tuple[State, float]:
-    """Return the equilibrium near a state up to a force along v, and its error."""
+    """Return the equilibrium near a state up to a force along v, and its error in lengths.
+
+    Raises
+    ------
+    BifurcationLost
+        If Newton's method fails.
+    """
     equilibrium = held_along(newton, state, v, stress)
     if equilibrium is None:
         raise BifurcationLost
@@ -169,9 +189,15 @@ def _equilibrate(
 def _newton_step(
     system: System, state: State, name: str, tangent: AugmentedTangent
 ) -> tuple[Vector, float, Vector]:
-    """Return Newton's step (du, dmu), and w_mu.
+    """Return Newton's step (du, dmu) for the regular system of a bifurcation, and w_mu.
 
-    du = alpha v - w_R - dmu w_mu; alpha and dmu are from the rows g and v . R_mu.
+    du = alpha v - w_R - dmu w_mu; alpha and dmu are from the rows g and v . R_mu. w_mu is the
+    response to the load, without v.
+
+    Parameters
+    ----------
+    tangent
+        The augmented tangent at the state.
     """
     comm, u, v = system.comm, state.u, tangent.v
     w_R, _ = tangent.solve(system.residual(u, state.mu))
@@ -200,12 +226,12 @@ def _load_rate(system: System, state: State, name: str) -> Vector:
 def mixed_third_derivative(
     system: System, state: State, v: Vector, w: Vector, residual: Vector | None = None
 ) -> Vector:
-    """Return Pi'''(v, w, .), by polarisation. Collective.
+    """Return Pi'''(v, w, .) at a state, by polarisation of `third_derivative`. Collective.
 
     Parameters
     ----------
     residual
-        The residual at the state, if it is known.
+        The residual at the state; None: it is computed.
     """
     comm = system.comm
     size = max_abs(comm, w) / max_abs(comm, v)
@@ -219,13 +245,27 @@ def mixed_third_derivative(
 
 
 def _has_converged(sizes: Sequence[float]) -> bool:
-    """Return whether the last step is below the tolerance, or as small as rounding allows."""
+    """Return whether the last step is below the tolerance, or as small as rounding allows.
+
+    Parameters
+    ----------
+    sizes
+        Sizes of the steps so far, in lengths of the system.
+    """
     stalled = len(sizes) > 1 and sizes[-1] > sizes[-2] / 2 and sizes[-1] <= ROUNDING_STEP
     return stalled or (bool(sizes) and sizes[-1] <= TOLERANCE)
 
 
 def _load_has_converged(changes: Sequence[float], mu: float) -> bool:
-    """Return whether the last change of the amplitude mu is converged, or as small as rounding."""
+    """Return whether the last change of the amplitude is converged, or as small as rounding.
+
+    Parameters
+    ----------
+    changes
+        Magnitudes of the changes so far, one for each step.
+    mu
+        The amplitude itself, relative to which a change is small.
+    """
     stalled = len(changes) > 1 and changes[-1] > changes[-2] / 2
     is_rounding = stalled and changes[-1] <= ROUNDING_STEP * abs(mu)
     return is_rounding or changes[-1] <= TOLERANCE * abs(mu)
@@ -259,12 +299,12 @@ def switch_branch(
     path
         The path, controlled by arc length.
     refused
-        Whether the straight segment from the bifurcation to a first point must not be passed; a
-        nearer point is tried then.
+        Called with the bifurcation and a first point of the branch. It returns whether the straight
+        segment between them must not be passed; a nearer point is tried then.
 
     Returns
     -------
-    None if the null vector or the first points are not found.
+    The branch in both directions; None if the null vector or the first points are not found.
     """
     name, state = path.name, bifurcation.state
     try:
@@ -293,16 +333,32 @@ def switch_branch(
 
 
 def largest_entry(comm: MPI.Comm, v: Vector) -> float:
-    """Return the entry of largest magnitude with its sign; the same on any number of ranks."""
+    """Return the entry of largest magnitude with its sign; the same on any number of ranks.
+
+    Collective.
+    """
     largest_here = float(v[np.argmax(np.abs(v))]) if v.size else 0.0
     return float(max(comm.allgather(largest_here), key=abs))
 
 
 def _step_off(path: Path, state: State, mode: Vector, size: float) -> Point | None:
-    """Return the point of the branch at a distance along the null vector; None if not found.
+    """Return the first point of the branch at a distance along the null vector. Collective.
 
-    Its tangent leads away. First a force along the null vector pushes the system there at the same
-    amplitude. Then the force is removed and the amplitude is unknown.
+    Its tangent leads away from the bifurcation. First a force along the null vector pushes the
+    system there at the same amplitude. Then the force is removed and the amplitude is unknown.
+
+    Parameters
+    ----------
+    state
+        The state at the bifurcation.
+    mode
+        The null vector, whose largest entry is one length of the system.
+    size
+        The distance in units of the mode, with the sign of the direction.
+
+    Returns
+    -------
+    The point, with arc length zero; None if it is not found.
     """
     metric, name, newton = path.metric, path.name, path.newton
     distance = size * metric.inner((mode, 0.0), (mode, 0.0))
@@ -313,7 +369,7 @@ def _step_off(path: Path, state: State, mode: Vector, size: float) -> Point | No
         return None
     if pushed is None:
         return None
-    first = path.solve(row, 0.0, pushed[0])
-    if isinstance(first, str):
+    point = path.solve(row, 0.0, pushed[0])
+    if isinstance(point, str):
         return None
-    return first.with_tangent_per(copysign(metric.norm(first.du, first.dmu), size))
+    return point.with_tangent_per(copysign(metric.norm(point.du, point.dmu), size))

@@ -70,16 +70,22 @@ class BoundaryLost(RuntimeError):
 
 
 class Boundary:
-    """A boundary of stability in the plane of an amplitude and of p.
+    """A boundary of stability in the plane of an amplitude mu and of a second parameter p.
+
+    Each `BoundaryPoint` on it is an instability at its p. All methods that solve are collective.
 
     Parameters
     ----------
+    family
+        The systems at all p; for m > 0 with the tangents of symmetry-breaking modes.
     name
-        The amplitude that is unknown.
+        The amplitude mu, which is unknown.
+    kind
+        Whether the instability is a fold or a bifurcation.
     scales
         Changes of the amplitude and of p that count as of order one in the arc length.
     recorded
-        Gets each solve, and gives its result or that of an interrupted boundary at this place.
+        Called with each solve. It returns its result, or that of an interrupted run at this place.
     m
         The family of symmetry-breaking modes in which the bifurcation is; 0: it is one of the model
         itself.
@@ -106,23 +112,28 @@ class Boundary:
         self._solved_at = list[float]()  # values of p
 
     def inner(self, a: CurveVector, b: CurveVector) -> float:
-        """Return <a, b>: root mean square of u over the length, mu and p over their scales."""
-        mu, p = self.scales
+        """Return <a, b>: root mean square of u over the length, mu and p over their scales.
+
+        Collective.
+        """
+        mu_scale, p_scale = self.scales
         displacement = self._weight * dot(self._comm, a.du, b.du)
-        return displacement + a.dmu * b.dmu / mu**2 + a.dp * b.dp / p**2
+        return displacement + a.dmu * b.dmu / mu_scale**2 + a.dp * b.dp / p_scale**2
 
     def start(self, p: float, state: State, phi: Vector) -> BoundaryPoint:
         """Return the point at p near an instability that a path has located. Collective.
 
         Parameters
         ----------
+        state
+            The state at the instability.
         phi
             A vector near the null vector.
 
         Raises
         ------
         BoundaryLost
-            If none is found.
+            If no point is found, or a load has no potential.
         """
         solver = self.family.solver_at(p)
         system = solver.system
@@ -141,27 +152,35 @@ class Boundary:
     def follow(
         self, start: BoundaryPoint, sense: float, ends: tuple[float, float], steps: int
     ) -> Iterator[tuple[Label, BoundaryPoint]]:
-        """Yield labels and points from a start until p leaves its range.
+        """Yield pairs of a label and a point, from a start until p leaves its range.
+
+        The start itself is not yielded. Cusps, turns, meetings and crossings come between the
+        points. Collective.
 
         Parameters
         ----------
+        start
+            A point of the boundary.
         sense
             Sign of dp at the start.
         ends
-            The range of p.
+            The range of p: its least and largest value.
         steps
             No step changes p by more than its scale over this number.
 
         Raises
         ------
         BoundaryLost
-            If the smallest step fails.
+            If the smallest step fails, or the points are too many.
         """
         current = start if start.way.dp * sense >= 0 else _reversed(start)
         previous: tuple[BoundaryPoint, float] | None = None  # the previous point, and its step
         max_dp = self.scales[1] / steps
-        first = min(max_dp / max(abs(current.way.dp), 1e-3 * self.scales[1]), 2.0 / steps * 5)
-        length = first
+        # the length that changes p by `max_dp`, but at most 10/steps in the metric
+        first_length = min(
+            max_dp / max(abs(current.way.dp), 1e-3 * self.scales[1]), 2.0 / steps * 5
+        )
+        length = first_length
         for _ in range(MAX_POINTS):
             guess = self._predict(previous, current, length)
             if not ends[0] < guess.dp < ends[1]:
@@ -175,7 +194,7 @@ class Boundary:
                 point = self._correct(current, guess, length)
             if isinstance(point, str):
                 length /= 2
-                if length < MIN_STEP_RATIO * first:
+                if length < MIN_STEP_RATIO * first_length:
                     raise BoundaryLost(
                         f"at {current.p:.6g}, load {current.state.mu[self.name]:.6g}: {point}"
                     )
@@ -193,14 +212,24 @@ class Boundary:
             elif point.factorisations > 2 * EASY_ITERATIONS:
                 length = 0.7 * length
             length = min(
-                length, 1.2 * max_dp / max(abs(current.way.dp), 1e-300), 3 * first, 2 * step
+                length, 1.2 * max_dp / max(abs(current.way.dp), 1e-300), 3 * first_length, 2 * step
             )
         raise BoundaryLost(f"{MAX_POINTS} points have not reached the end of the range")
 
     def _events_between(
         self, low: BoundaryPoint, high: BoundaryPoint, length: float
     ) -> Iterator[tuple[Label, BoundaryPoint]]:
-        """Yield cusps, turns, meetings and crossings between two successive points."""
+        """Yield cusps, turns, meetings and crossings between two successive points.
+
+        A turn is where p turns back, and a cusp is one where v . Pi'''(v, v) changes its sign too.
+        At a meeting or crossing a second mode becomes neutral: of the same family, or of another
+        one.
+
+        Parameters
+        ----------
+        length
+            Distance of the points along the tangent of the first.
+        """
         if low.way.dp * high.way.dp < 0:
             turn = self._locate_turn(low, high, length)
             is_cusp = self.kind == "fold" and low.cubic * high.cubic < 0
@@ -221,6 +250,7 @@ class Boundary:
         }
 
         def distance(item: tuple[int, BoundaryPoint | None]) -> float:
+            """Return how far an entry's point is from the first point in p; 0 if none was found."""
             return abs(item[1].p - low.p) if item[1] else 0.0
 
         counts = [low.unstable_of(i) for i in families]
@@ -238,7 +268,14 @@ class Boundary:
     def _predict(
         self, previous: tuple[BoundaryPoint, float] | None, current: BoundaryPoint, length: float
     ) -> CurveVector:
-        """Predict the point after a step by the cubic through the last two points and tangents."""
+        """Predict the point (u, mu, p) after a step of a length along the tangent.
+
+        Parameters
+        ----------
+        previous
+            The point before the current one, and its distance from it. With both, the cubic through
+            points and tangents predicts; without, the tangent.
+        """
         if previous is None:
             mu, tangent = current.state.mu[self.name], current.way
             return CurveVector(
@@ -253,7 +290,16 @@ class Boundary:
     def _hermite(
         self, low: BoundaryPoint, high: BoundaryPoint, step: float, t: float
     ) -> CurveVector:
-        """Return the cubic at t in units of the step, which is measured along the low tangent."""
+        """Return the place (u, mu, p) on the cubic through two points and their tangents.
+
+        Parameters
+        ----------
+        step
+            Distance of both points, measured along the tangent of the first.
+        t
+            The place in units of the step: 0 at the first point, 1 at the second.
+        """
+        # the second tangent has length one too: per unit of the first it is longer
         faster = 1 / self.inner(low.way, high.way)
         (h00, h10), (h01, h11) = hermite(t, (0.0, 1.0))
         a, b, name = step * h10, step * faster * h11, self.name
@@ -270,20 +316,35 @@ class Boundary:
     def _correct(
         self, current: BoundaryPoint, guess: CurveVector, length: float
     ) -> BoundaryPoint | str:
-        """Return the next point: at the predicted p if systems are costly, else at a distance."""
+        """Return the point near a guess, or the reason why there is none.
+
+        It lies at the predicted p if systems at other p are costly, else at a distance along the
+        tangent.
+
+        Parameters
+        ----------
+        length
+            That distance from the current point.
+        """
         if not self._is_taken_at_given_p(current):
             return self._correct_at_distance(current, guess, length)
         return self._correct_on_row(current, guess, length, _row_at(guess.dp), low_order=True)
 
     def _is_taken_at_given_p(self, current: BoundaryPoint) -> bool:
-        """Return whether the next point is solved at a given p."""
+        """Return whether the point after the current one is solved at a given p.
+
+        This is so if systems are costly and p changes enough along the boundary.
+        """
         slope = abs(current.way.dp) / self.scales[1]
         return self.family.costly and slope > MIN_SLOPE_FOR_GIVEN_P
 
     def _distance(self, current: BoundaryPoint, next_point: BoundaryPoint, length: float) -> float:
-        """Return the distance along the tangent of the first point.
+        """Return the distance between two successive points along the tangent of the first.
 
-        Where the second was solved at a distance, it is that `length`.
+        Parameters
+        ----------
+        length
+            The distance at which the second point was solved, if it was not solved at a given p.
         """
         if not self._is_taken_at_given_p(current):
             return length
@@ -303,22 +364,34 @@ class Boundary:
         *,
         eigenvalue_family: int | None = None,
     ) -> BoundaryPoint | str:
-        """Return the point at a distance along the tangent of another one, or why there is none."""
-        tangent, (mu, p), name = base.way, self.scales, self.name
+        """Return the point at a distance along the tangent of a base, or why there is none.
+
+        Parameters
+        ----------
+        length
+            The distance from the base.
+        eigenvalue_family
+            The family whose second eigenvalue the point gets; None: none.
+        """
+        tangent, (mu_scale, p_scale), name = base.way, self.scales, self.name
 
         def value(u: Vector, m: float, q: float) -> float:
+            """Return <tangent, (u, m, q) - base> - length, which is zero at the point."""
             chord = CurveVector(u - base.state.u, m - base.state.mu[name], q - base.p)
             return self.inner(tangent, chord) - length
 
-        row = CurveRow(self._weight * tangent.du, tangent.dmu / mu**2, tangent.dp / p**2, value)
+        row = CurveRow(
+            self._weight * tangent.du, tangent.dmu / mu_scale**2, tangent.dp / p_scale**2, value
+        )
         return self._correct_on_row(base, guess, length, row, eigenvalue_family=eigenvalue_family)
 
     def _correct_with_eigenvalue(
         self, base: BoundaryPoint, guess: CurveVector, s: float, family: int
     ) -> BoundaryPoint | str:
-        """Return a point with the second eigenvalue of a family, or why there is none.
+        """Return a point with the second eigenvalue of a family, or the reason why there is none.
 
-        Where families do not couple it is at a given p if that is cheaper.
+        The point is at the distance `s` from a base. Where families do not couple and it is
+        cheaper, it is at the p of the guess instead.
         """
         if not (self.m and self._is_taken_at_given_p(base)):
             return self._correct_at_distance(base, guess, s, eigenvalue_family=family)
@@ -336,7 +409,20 @@ class Boundary:
         eigenvalue_family: int | None = None,
         low_order: bool = False,
     ) -> BoundaryPoint | str:
-        """Return the point near a guess on which a row holds, or why it is not accepted."""
+        """Return the point near a guess on which a row holds, or the reason why it is not accepted.
+
+        A point is refused if it is far from the guess, or if the boundary turns sharply between the
+        base and the point.
+
+        Parameters
+        ----------
+        length
+            Length of the step from the base, in which the correction of the guess is measured.
+        eigenvalue_family
+            The family whose second eigenvalue the point gets; None: none.
+        low_order
+            Whether a difference by p of low order is enough.
+        """
         name = self.name
         point = self._solve(
             guess.dp,
@@ -365,9 +451,22 @@ class Boundary:
         length: float,
         ends: tuple[float, float],
     ) -> tuple[BoundaryPoint, float] | None:
-        """Return the point at the end of the range, and its distance.
+        """Return the point at the end of the range of p, and its distance from the current point.
 
-        None if the boundary does not go there at once.
+        Bisection finds where the prediction leaves the range.
+
+        Parameters
+        ----------
+        previous
+            As in `_predict`.
+        length
+            A step whose prediction is outside the range.
+        ends
+            The range of p.
+
+        Returns
+        -------
+        The point and its distance; None if the boundary does not reach the end in this step.
         """
         low, high = 0.0, length
         for _ in range(END_BISECTIONS):  # where the prediction leaves the range
@@ -398,7 +497,13 @@ class Boundary:
     def _locate_turn(self, low: BoundaryPoint, high: BoundaryPoint, length: float) -> BoundaryPoint:
         """Return the point between two others where p turns.
 
-        It is the stationary point of the cubic through both, repeated.
+        It is the stationary point of the cubic through both, repeated with the solved point in
+        place of one end. Collective.
+
+        Parameters
+        ----------
+        length
+            Distance of the points along the tangent of the first.
         """
         base, a, b = low, 0.0, length  # distances along the tangent of the base
         best = min(low, high, key=lambda point: abs(point.way.dp))
@@ -414,8 +519,9 @@ class Boundary:
                 return replace(best, p=float(guess.dp), state=state)
             best = middle if abs(middle.way.dp) < abs(best.way.dp) else best
             is_before = middle.way.dp * low.way.dp > 0
-            other, gap = (high, b - s) if is_before else (low, s - a)
-            curvature = abs(other.way.dp - middle.way.dp) / gap
+            opposite_end, distance_to_end = (high, b - s) if is_before else (low, s - a)
+            curvature = abs(opposite_end.way.dp - middle.way.dp) / distance_to_end
+            # near the turn p is a parabola in the arc length
             error = middle.way.dp**2 / (2 * curvature) if curvature else 0.0
             if error <= TURN_TOLERANCE * self.scales[1] or min(s - a, b - s) < MIN_BRACKET * length:
                 break
@@ -433,17 +539,21 @@ class Boundary:
         """Locate the point between two others where a second eigenvalue of a family is zero.
 
         Inverse interpolation finds it. The bordered tangent may be singular there, so the point
-        itself is interpolated between others close by; where families do not couple it is not, and
-        these may be closer.
+        itself is interpolated between others close by. Where families do not couple, the tangent is
+        regular, and these may be closer. Collective.
 
         Parameters
         ----------
+        length
+            Distance of the points along the tangent of the first.
         count
-            Number of unstable directions of the family at a point.
+            Returns the number of unstable directions of the family at a point.
+        family
+            The family: 0 for the model itself.
 
         Returns
         -------
-        None if no point is found between the two.
+        The point; None if no point is found between the two.
         """
         coupled = family in (0, self.m)
         tolerance = MEETING_TOLERANCE if coupled else MEETING_TOLERANCE**2
@@ -477,17 +587,23 @@ class Boundary:
     def _interpolated_point(
         self, solved: Sequence[tuple[float, float, BoundaryPoint]], s: float
     ) -> BoundaryPoint:
-        """Return the nearest of solved points with interpolated p and amplitude."""
+        """Return the nearest solved point, with p and amplitude interpolated at the distance `s`.
+
+        Parameters
+        ----------
+        solved
+            Distances, second eigenvalues and points; the one nearest to a zero eigenvalue first.
+        """
         places, nearest = [entry[0] for entry in solved], solved[0][2]
         loads = [point.state.mu[self.name] for _, _, point in solved]
         p = interpolated(places, [point.p for _, _, point in solved], s)
         load = interpolated(places, loads, s)
-        change = abs(load - interpolated(places[:-1], loads[:-1], s))
+        load_change = abs(load - interpolated(places[:-1], loads[:-1], s))
         return replace(
             nearest,
             p=p,
             state=nearest.state.with_(nearest.state.u, self.name, load),
-            load_error=change + nearest.load_error,
+            load_error=load_change + nearest.load_error,
         )
 
     def _rows(
@@ -498,7 +614,17 @@ class Boundary:
         p: float,
         difference: Sequence[tuple[float, float]],
     ) -> AugmentedRows | SymmetryBreakingRows:
-        """Return the rows of Newton's step at a state, with a tangent bordered by b."""
+        """Return the rows of Newton's step at a state, with a tangent bordered by b.
+
+        Parameters
+        ----------
+        newton
+            The solver of the system at p.
+        b
+            A vector near the null vector.
+        difference
+            Weights and values of p of a difference by p.
+        """
         if self.m:
             family = cast(SymmetryBreakingSystems, self.family)
             return SymmetryBreakingRows(newton, state, self.name, b, self.m, family, p, difference)
@@ -519,7 +645,7 @@ class Boundary:
     def _counts(
         self, rows: AugmentedRows | SymmetryBreakingRows, p: float, state: State
     ) -> Sequence[int]:
-        """Return `BoundaryPoint.counts`."""
+        """Return `BoundaryPoint.counts`: the unstable directions of each family, without phi."""
         if isinstance(rows, SymmetryBreakingRows):
             return rows.counts()
         if not self._counts_families:
@@ -529,7 +655,13 @@ class Boundary:
     def _second_eigenvalue(
         self, rows: AugmentedRows | SymmetryBreakingRows, family: int, p: float, state: State
     ) -> float:
-        """Return the eigenvalue of a family nearest to zero, other than that of the boundary."""
+        """Return the eigenvalue of a family nearest to zero, other than that of the null vector.
+
+        Parameters
+        ----------
+        rows
+            Rows of the last step of Newton's method, at the state.
+        """
         if family and not self.m:
             systems = cast(SymmetryBreakingSystems, self.family)
             return nearest_eigenvalue(systems.factored_tangent(p, state, family), self._comm)
@@ -546,9 +678,27 @@ class Boundary:
         eigenvalue_family: int | None = None,
         low_order: bool = False,
     ) -> BoundaryPoint | str:
-        """Return the point near a guess on which a row holds, or the reason why there is none."""
+        """Return the point near a guess on which a row holds, or the reason why there is none.
+
+        The result passes through `recorded`. Collective.
+
+        Parameters
+        ----------
+        p, state, b
+            The guess, and a vector near the null vector.
+        row
+            The equation that says where on the boundary the point is.
+        neighbour
+            A nearby point, whose null vector and tangent orient those of the result; None: any
+            sign.
+        eigenvalue_family
+            The family whose second eigenvalue the point gets; None: none.
+        low_order
+            Whether a difference by p of low order is enough.
+        """
 
         def solve() -> BoundaryPoint | str:
+            """Run Newton's method; the result also has the choice of the factorisation."""
             try:
                 point = self._iterate(
                     float(p),
@@ -573,9 +723,17 @@ class Boundary:
         return point
 
     def _difference(self, p: float, *, low_order: bool) -> Sequence[tuple[float, float]]:
-        """Return weights and values of p of a difference by p.
+        """Return weights and values of p of a difference formula for the derivative by p.
 
-        One of low order may be from the last points, which have their systems.
+        Parameters
+        ----------
+        low_order
+            Whether a formula of low order is enough. It may use the last solved p, whose systems
+            exist.
+
+        Returns
+        -------
+        Pairs of a weight and its p.
         """
         places = [p]
         min_distance = MIN_SLOPE_DISTANCE * self.scales[1]
@@ -600,16 +758,31 @@ class Boundary:
     ) -> BoundaryPoint | str:
         """Run Newton's method for the point on which a row holds.
 
+        After convergence, a last step with the same matrix reduces the residual, and the rows give
+        the tangent of the boundary.
+
         Parameters
         ----------
+        p, state
+            The guess.
         b
             A vector near the null vector.
         neighbour
-            A nearby point, whose null vector and tangent orient those of the result.
+            A nearby point, whose null vector and tangent orient those of the result; None: any
+            sign.
         eigenvalue_family
             The family whose second eigenvalue is computed; None: none.
         low_order
             Whether a difference by p of low order is enough.
+
+        Returns
+        -------
+        The point, or the reason why there is none.
+
+        Raises
+        ------
+        NoSystem
+            If there is no system at a p on the way.
         """
         u, mu, name = state.u, float(state.mu[self.name]), self.name
         difference = self._difference(p, low_order=low_order)
@@ -640,14 +813,17 @@ class Boundary:
         u, mu, p = u + last_step.du, float(mu + last_step.dmu), float(p + last_step.dp)
         v = b / np.sqrt(dot(system.comm, b, b))
         if neighbour is not None:
+            # the null vector keeps its orientation along the boundary
             cosine = dot(system.comm, v, neighbour.phi)
             if abs(cosine) < MIN_NULL_VECTOR_COSINE:
                 return "the null vector is another one"
             v = v * np.sign(cosine)
+        # the tangent of the boundary, oriented and of length one
         direction = rows.step(row, None)
         norm = np.sqrt(self.inner(direction, direction))
         if neighbour is not None and self.inner(direction, neighbour.way) < 0:
             norm = -norm
+        # b . v = 1 scales the vector of the rows, v has length one
         scale = dot(system.comm, rows.v, v)
         state = State(u, {**self.family.amplitudes(p), name: mu})
         counts = self._counts(rows, p, state)
@@ -671,19 +847,31 @@ class Boundary:
     def _has_converged(self, sizes: Sequence[float], load_changes: Sequence[float]) -> bool:
         """Return whether the remaining errors of u and of the load are small.
 
-        Sizes that shrink slowly below the tolerance are rounding.
+        They are extrapolated from geometric decay. Sizes that shrink slowly below the tolerance are
+        rounding.
+
+        Parameters
+        ----------
+        sizes
+            Sizes of the steps so far, in lengths of the system.
+        load_changes
+            Magnitudes of their changes of the amplitude.
         """
-        ratio, slow = 0.5, False
+        ratio, shrinks_slowly = 0.5, False
         if len(sizes) > 1:
             ratio = min(sizes[-1] / sizes[-2], 0.5) if sizes[-2] else 0.5
-            slow = sizes[-1] > sizes[-2] / 2
+            shrinks_slowly = sizes[-1] > sizes[-2] / 2
         remaining = ratio / (1 - ratio)
-        settled = sizes[-1] * remaining <= TOLERANCE or (slow and sizes[-1] <= TOLERANCE)
-        return settled and (slow or load_changes[-1] * remaining <= LOAD_TOLERANCE * self.scales[0])
+        u_has_converged = sizes[-1] * remaining <= TOLERANCE or (
+            shrinks_slowly and sizes[-1] <= TOLERANCE
+        )
+        return u_has_converged and (
+            shrinks_slowly or load_changes[-1] * remaining <= LOAD_TOLERANCE * self.scales[0]
+        )
 
 
 def _row_at(p: float) -> CurveRow:
-    """Return the row of a point at a given p."""
+    """Return the row q - p = 0 of a point (u, mu, q) at a given p."""
     return CurveRow(None, 0.0, 1.0, lambda u, mu, q: q - p)
 
 

@@ -58,12 +58,14 @@ SAME_FOLD_DISTANCE = 1e-2
 
 @dataclass(frozen=True)
 class Instability:
-    """A point at which the tangent is singular.
+    """A point of a path at which the tangent matrix is singular.
 
     Attributes
     ----------
+    point
+        The located point, with the estimated error of its amplitude in `load_error`.
     kind
-        "fold": the amplitude is stationary; "bifurcation": it is not.
+        "fold": the amplitude is stationary along the path; "bifurcation": it is not.
     """
 
     point: Point
@@ -76,7 +78,7 @@ class UnseparatedInstabilities(PathStopped):
     Attributes
     ----------
     point, high
-        Points before and behind them.
+        The last point before the instabilities, and the first point behind them.
     """
 
     def __init__(self, point: Point, high: Point) -> None:
@@ -86,18 +88,18 @@ class UnseparatedInstabilities(PathStopped):
 
 @dataclass
 class LocationBudget:
-    """The work on the next instability, over all searches in shorter and shorter steps.
+    """Count of the work on one instability, over all searches in shorter and shorter steps.
 
     Attributes
     ----------
     solves
-        Number of solves that were tried.
+        Number of solves that were tried; at most `MAX_SOLVES` are allowed.
     repeated
         Number of searches that ended between instabilities which they could not separate.
     end
-        End of the step in which the last search failed.
+        End of the step in which the last search failed; None if no search has failed.
     clustered
-        Whether that search failed between instabilities.
+        Whether the last search failed between several instabilities.
     """
 
     solves: int = 0
@@ -111,7 +113,7 @@ class LocationBudget:
         return self.solves >= MAX_SOLVES
 
     def renew(self) -> None:
-        """Begin with the next instability."""
+        """Reset all counts, for the search of the next instability."""
         self.solves, self.repeated, self.end, self.clustered = 0, 0, None, False
 
 
@@ -122,14 +124,17 @@ def instabilities(
     tolerance: float = LOAD_TOLERANCE,
     budget: LocationBudget | None = None,
 ) -> Iterator[Instability]:
-    """Yield the singular points between two successive points, in order.
+    """Yield the singular points between two successive points of a path, in their order.
 
-    They are those that inertia and tangents reveal.
+    Inertia and the sign of dmu/ds reveal the instabilities: two that cancel in both are missed.
+    Collective.
 
     Parameters
     ----------
+    low, high
+        Successive accepted points; arc length is measured from `low`.
     tolerance
-        Relative error of the amplitude.
+        Relative error of the amplitude at an instability.
     budget
         Work on this search and earlier ones for the same instability; None: there were none.
 
@@ -146,12 +151,16 @@ def instabilities(
 
 @dataclass
 class _InstabilityLocator:
-    """Locates the instabilities between two points.
+    """Locator of the instabilities between two points of a path.
 
     Attributes
     ----------
     base
         The first point, from which arc length is measured.
+    tolerance
+        Relative error of the amplitude at an instability.
+    budget
+        Solves so far in the search for the next instability, and their limit.
     iterations, factorisations
         Work since the last located instability.
     """
@@ -164,16 +173,32 @@ class _InstabilityLocator:
     factorisations: int = 0
 
     def locate(self, low: Point, high: Point, halvings: int) -> Iterator[Instability]:
-        """Yield the instabilities between two points, after at most so many halvings."""
-        change = abs(high.negative_pivots - low.negative_pivots)
+        """Yield the instabilities between two points, in the order of the path.
+
+        A bracket with several instabilities is halved until each half has one. Then interpolation
+        locates a fold, and a regular system or bisection a bifurcation. Collective.
+
+        Parameters
+        ----------
+        halvings
+            Number of halvings that are left; without any, several instabilities count as one.
+
+        Raises
+        ------
+        PathStopped
+            If a solve fails, or the step has left the branch.
+        UnseparatedInstabilities
+            If no point is found between several instabilities.
+        """
+        changed_pivots = abs(high.negative_pivots - low.negative_pivots)
         turns_back = low.dmu * high.dmu < 0
-        if change == 0 and not turns_back:
+        if changed_pivots == 0 and not turns_back:
             return
         self.path.progress.doing("locating an instability")
-        single = change == 1 or not halvings
+        single = changed_pivots == 1 or not halvings
         if single and turns_back:
             fold = self.locate_fold(low, high)
-            point = self.with_work(fold) if change == 1 else self.with_own_inertia(fold)
+            point = self.with_work(fold) if changed_pivots == 1 else self.with_own_inertia(fold)
             # rounding decides what its own matrix counts
             point = replace(
                 point,
@@ -195,7 +220,7 @@ class _InstabilityLocator:
             yield from self.locate(middle, high, halvings - 1)
 
     def solve(self, s: float, low: Point, high: Point) -> Point:
-        """Return the point at s, whose number of unstable directions is not needed.
+        """Return the point at s on the branch between two points, without valid inertia.
 
         Raises
         ------
@@ -210,7 +235,13 @@ class _InstabilityLocator:
     def try_solve(
         self, s: float, low: Point, high: Point, *, needs_inertia: bool = True
     ) -> Point | str:
-        """Return the point at s on the branch between two points, or why there is none."""
+        """Return the point at s on the branch between two points, or the reason why there is none.
+
+        Parameters
+        ----------
+        needs_inertia
+            Whether the numbers of unstable directions of the result must be valid.
+        """
         point = self.path.correct_between(s, low, high, self.base, needs_inertia=needs_inertia)
         if isinstance(point, str):
             return point
@@ -221,7 +252,7 @@ class _InstabilityLocator:
         return point
 
     def is_on_another_branch(self, point: Point, low: Point, high: Point) -> bool:
-        """Return whether a point is far from the cubic between two points."""
+        """Return whether a point lies far from the cubic through two points and their tangents."""
         if self.base.across:  # no cubic goes around a kink
             return False
         system, cubic = self.path.system, self.path.interpolated_state(point.s, low, high)
@@ -230,9 +261,10 @@ class _InstabilityLocator:
         return deviation > max(MAX_DEVIATION_FROM_CUBIC * chord, ZERO_DISPLACEMENT * system.length)
 
     def middle(self, low: Point, high: Point) -> Point | None:
-        """Return a point somewhere between two others, with its own inertia; None if none is found.
+        """Return a point between two others with its own inertia; None if no solve succeeds.
 
-        Several places are tried: rounding may hide some.
+        Several fractions of the bracket are tried: rounding near a singular tangent may hide some.
+        Each trial counts in the budget.
         """
         for fraction in MIDDLE_FRACTIONS:
             if self.budget.exhausted:
@@ -246,7 +278,12 @@ class _InstabilityLocator:
     def solve_bifurcation(self, low: Point, high: Point) -> Point | None:
         """Return the bifurcation between two points as a solution of a regular system.
 
-        None if there is no solution.
+        The critical modes of both ends are tried as first null vectors. A solution counts if it
+        lies between the ends in s and its inertia fits theirs.
+
+        Returns
+        -------
+        The point; None if there is no such solution.
         """
         path = self.path
         if path.newton.factorisation.skewed:
@@ -281,6 +318,21 @@ class _InstabilityLocator:
         low: Point,
         high: Point,
     ) -> Point | str:
+        """Solve the regular system of a bifurcation, and give the result the tangent of this path.
+
+        Parameters
+        ----------
+        guess, stress
+            A state near the bifurcation, and its stress as in `System.tangent`.
+        phi
+            A vector near the null vector.
+        low, high
+            Points on both sides, whose tangents tell this path from the one that crosses it.
+
+        Returns
+        -------
+        The point with its error estimates, or the reason why there is none.
+        """
         path = self.path
         try:
             bifurcation = find_bifurcation(path.newton, guess, phi, path.name, stress)
@@ -298,16 +350,25 @@ class _InstabilityLocator:
         return replace(point, error=bifurcation.error, load_error=bifurcation.load_error)
 
     def _interpolated_tangent(self, state: State, low: Point, high: Point) -> Direction:
-        """Return the path's tangent near a state between two points, interpolated in mu."""
+        """Return the tangent (du, dmu) of the path near a state between two points.
+
+        It is linear in mu between the tangents of both points.
+        """
         name = self.path.name
         t = (state.mu[name] - low.state.mu[name]) / (high.state.mu[name] - low.state.mu[name])
         t = min(max(t, 0.0), 1.0)
         return (1 - t) * low.du + t * high.du, (1 - t) * low.dmu + t * high.dmu
 
     def bisect_bifurcation(self, low: Point, high: Point) -> Point:
-        """Return the last point before an instability, by bisection.
+        """Return the last point before an instability, by bisection with the inertia.
 
-        It ends where rounding spoils the inertia.
+        Bisection ends at the tolerance, or where no point is found between both ends. The width of
+        the last bracket in the amplitude is the point's `load_error`.
+
+        Raises
+        ------
+        PathStopped
+            If both ends prove to lie on different paths.
         """
         name = self.path.name
         for _ in range(MAX_TRIALS):
@@ -326,42 +387,52 @@ class _InstabilityLocator:
         return replace(self.with_work(low), load_error=width)
 
     def refuse_apart(self, low: Point, high: Point) -> None:
-        """Refuse two points that are not on one path.
+        """Raise if two points are too far apart to lie on one path.
 
-        An imperfect bifurcation has two paths close to each other, of different inertia: a bracket
+        An imperfect bifurcation has two paths close to each other, of different inertia. A bracket
         with an end on each shrinks to nothing in s and contains no instability.
 
         Raises
         ------
         PathStopped
-            If they are not.
+            If the points lie on different paths.
         """
         if self.path.are_apart(low, high, ROUNDING_NEAR_NEUTRAL_MODE):
             raise PathStopped("the step jumped to another branch", low)
 
     def with_work(self, point: Point) -> Point:
-        """Return the point with the work since the last located one, and reset the counts."""
+        """Return a located point with the work that it took, and reset all counts of work."""
         located = replace(point, iterations=self.iterations, factorisations=self.factorisations)
         self.iterations = self.factorisations = 0
         self.budget.renew()
         return located
 
     def with_own_inertia(self, point: Point) -> Point:
-        """Return the point with its own tangent and inertia, and with the work."""
+        """Return a located point with its own tangent and inertia, and the work that it took."""
         self.factorisations += 1
         located = self.with_work(self.path.with_own_inertia(point, self.base))
         return replace(located, load_error=point.load_error)
 
     def locate_fold(self, low: Point, high: Point) -> Point:
-        """Return the zero of dmu/ds, by repeated interpolation with the cubic of both ends."""
+        """Return the point between two others where dmu/ds is zero.
+
+        The stationary place of the cubic through both ends is solved at, and replaces one end,
+        until the estimated error of the amplitude is below the tolerance.
+
+        Raises
+        ------
+        PathStopped
+            If a solve fails.
+        """
         name = self.path.name
         for _ in range(MAX_TRIALS):
             s = _stationary_place(low, high, name, kink if self.base.across else stationary)
             point = self.solve(s, low, high)
             mu = point.state.mu[name]
             is_before = point.dmu * low.dmu > 0
-            other = high if is_before else low
-            curvature = (other.dmu - point.dmu) / (other.s - point.s)
+            opposite_end = high if is_before else low
+            curvature = (opposite_end.dmu - point.dmu) / (opposite_end.s - point.s)
+            # near its extremum mu(s) is a parabola, with this curvature
             load_error = abs(point.dmu**2 / (2 * curvature))
             if load_error <= self.tolerance * abs(mu):
                 return replace(point, load_error=load_error)
@@ -371,14 +442,17 @@ class _InstabilityLocator:
     def distance_to_zero(
         self, point: Point, stability: Stability, slope: float, upper_bound: float
     ) -> float:
-        """Return how far the load is from the zero of the eigenvalue, with the tangent's rounding.
+        """Estimate how far the load of a point is from the zero of its critical eigenvalue.
+
+        The estimate includes the rounding of the tangent: the scatter of the eigenvalue when u is
+        rounded differently.
 
         Parameters
         ----------
         slope
             Derivative of the eigenvalue by the load; zero if it is unknown.
         upper_bound
-            Upper bound, which is returned if the slope is unknown.
+            Upper bound of the distance, which is returned if the slope is unknown.
         """
         u = point.state.u
         random = np.random.default_rng(self.path.system.comm.rank)
@@ -392,15 +466,29 @@ class _InstabilityLocator:
         return float(error / abs(slope))
 
     def locate_zero_eigenvalue(self, low: Point, high: Point, stability: Stability) -> Point:
-        """Return the zero of the eigenvalue that changes sign, by Illinois' regula falsi.
+        """Return the point between two others where an eigenvalue of `stability` is zero.
 
-        It ends when two successive guesses agree to tolerance^(3/4). If the eigenvalue shows a
-        larger error, it goes on until that is no longer halved. The method's order is 1.44, and
-        close to zero the eigenvalue is only rounding.
+        Illinois' regula falsi, of order 1.44, ends when two successive guesses agree to
+        tolerance^(3/4). While the eigenvalue shows a larger error, it goes on as long as the error
+        is halved: close to zero the eigenvalue is only rounding.
+
+        Parameters
+        ----------
+        stability
+            The tangent whose eigenvalue changes sign; it may differ from the tangent of the path.
+
+        Returns
+        -------
+        The point with its `load_error`, which is valid even if the tolerance is not reached.
+
+        Raises
+        ------
+        NoEigenpair
+            If the eigenpair nearest to zero is not found at a point.
         """
         name, last_side, last_s, best = self.path.name, 0, np.inf, None
-        first = critical_mode(stability, low.state)
-        a, b = first.eigenvalue, critical_mode(stability, high.state).eigenvalue
+        low_mode = critical_mode(stability, low.state)
+        a, b = low_mode.eigenvalue, critical_mode(stability, high.state).eigenvalue
         ends = (low.state.mu[name], a), (high.state.mu[name], b)  # loads and eigenvalues
         for _ in range(MAX_TRIALS):
             # the eigenvalue nearest to zero need not be the one that changes sign
@@ -410,9 +498,9 @@ class _InstabilityLocator:
             if point is None:  # the path's own tangent is singular there as well
                 break
             mu = point.state.mu[name]
-            change = abs(point.s - last_s) * abs(point.dmu)
+            load_change = abs(point.s - last_s) * abs(point.dmu)
             width = abs(high.s - low.s) * abs(point.dmu)
-            if change <= self.tolerance**0.75 * abs(mu) and a * b < 0:
+            if load_change <= self.tolerance**0.75 * abs(mu) and a * b < 0:
                 load_error = self.distance_to_zero(point, stability, _slope(*ends), width)
                 zero = replace(point, load_error=load_error)
                 stalled = best and load_error > best.load_error / 2
@@ -423,7 +511,8 @@ class _InstabilityLocator:
                 load_error = self.distance_to_zero(point, stability, _slope(*ends), width)
                 return replace(point, load_error=max(width, load_error))
             last_s, mode = point.s, critical_mode(stability, point.state)
-            if mode.negative_pivots != first.negative_pivots:
+            # Illinois: the value at an end that stays twice in turn is halved
+            if mode.negative_pivots != low_mode.negative_pivots:
                 high, b = point, mode.eigenvalue
                 ends = ends[0], (mu, b)
                 a = a / 2 if last_side == 1 else a
@@ -437,20 +526,28 @@ class _InstabilityLocator:
 
 
 def _slope(low: tuple[float, float], high: tuple[float, float]) -> float:
-    """Return the slope between two loads with their eigenvalues.
+    """Return the slope d(eigenvalue)/d(load) between two pairs of a load and its eigenvalue.
 
-    Zero if the eigenvalues have one sign: then they do not belong to one mode.
+    It is zero if both eigenvalues have one sign: then they do not belong to one mode.
     """
-    (a, first), (b, last) = low, high
-    return (last - first) / (b - a) if first * last < 0 and a != b else 0.0
+    (low_load, low_eigenvalue), (high_load, high_eigenvalue) = low, high
+    return (
+        (high_eigenvalue - low_eigenvalue) / (high_load - low_load)
+        if low_eigenvalue * high_eigenvalue < 0 and low_load != high_load
+        else 0.0
+    )
 
 
 def _stationary_place(
     low: Point, high: Point, name: str, find: Callable[[float, float, float], float]
 ) -> float:
-    """Return s between two points where `find` places the stationary value of mu(s).
+    """Return the s between two points where mu(s) of the amplitude `name` is stationary.
 
-    `find` gets the mean slope and the slopes at both ends.
+    Parameters
+    ----------
+    find
+        Called with the mean slope of mu and its slopes at both ends. It returns the fraction of the
+        interval at which mu is stationary, 0 to 1: `stationary` or `kink`.
     """
     L = high.s - low.s
     return low.s + L * find((high.state.mu[name] - low.state.mu[name]) / L, low.dmu, high.dmu)
@@ -465,12 +562,20 @@ def locate_bifurcation(
 ) -> Point:
     """Locate where another tangent than the path's own is singular, between two successive points.
 
+    Collective.
+
     Parameters
     ----------
+    stable, unstable
+        The points; the arc length of both is measured from the first.
     stability
-        The tangent of symmetry-breaking modes.
+        The tangent of symmetry-breaking modes, which has other inertia at both points.
     tolerance
         Relative error of the amplitude.
+
+    Returns
+    -------
+    The point with its own inertia, and with the estimated error of the amplitude.
 
     Raises
     ------
@@ -514,8 +619,13 @@ class ContinuationGoal:
 class ContinuationRun:
     """A run along a path to its goal; iterate over it once.
 
+    Between each two points of the path it locates the instabilities, and on a path by arc length it
+    solves at the targets.
+
     Parameters
     ----------
+    start
+        The first point of the path.
     renew
         Called with two successive points. It returns the state of the first with other values of
         the amplitudes that the path does not vary, from which the run continues in place of the
@@ -523,8 +633,9 @@ class ContinuationRun:
         accepted. Where no solution is found with the other values it is called again, and may
         accept the second point then.
     refuse
-        Return why no instability or target may be at a point; "" if one may. The step that has
-        passed it is repeated in shorter ones, at whose ends `renew` is called.
+        Called with each located instability or target. It returns why the run must not end at that
+        point, or "" if it may. The step that has passed the point is repeated in shorter ones, at
+        whose ends `renew` is called.
 
     Attributes
     ----------
@@ -533,9 +644,9 @@ class ContinuationRun:
     done
         Whether the last point ends the run.
     clusters
-        The first points before, and behind, instabilities that were not separated. Such a cluster
-        counts as one instability, at the first of both points; its width is the error of the
-        amplitude.
+        Pairs of the last point before and the first point behind instabilities that were not
+        separated. Such a cluster counts as one instability, at the first of both points; its width
+        is the error of the amplitude.
     """
 
     def __init__(
@@ -554,7 +665,10 @@ class ContinuationRun:
         self._budget = LocationBudget()
 
     def __iter__(self) -> Iterator[tuple[Label, Point]]:
-        """Yield labels and points, in the order of the path.
+        """Yield pairs of a label and a point, in the order of the path.
+
+        The start is not yielded. Where `renew` or `refuse` rejects the end of a step, the path
+        continues from the last point in shorter steps. Collective.
 
         Raises
         ------
@@ -604,12 +718,12 @@ class ContinuationRun:
             )
 
     def _renewed_step(self, low: Point, point: Point) -> tuple[float, str] | None:
-        """Renew the amplitudes between two points, if `renew` asks for it.
+        """Replace the first of two points, if `renew` changes amplitudes there.
 
         Returns
         -------
-        The length of the next step from the first point, and the reason if the second was refused;
-        None if the second is accepted.
+        The length in s of the next step from the first point, and the reason if the second was
+        refused, else ""; None if the second is accepted.
         """
         length = abs(point.s - low.s)
         try:
@@ -629,9 +743,15 @@ class ContinuationRun:
         return length, ""
 
     def _steps(self) -> Iterator[tuple[Point, bool]]:
-        """Yield the next points, as `Path.continue_to` does.
+        """Yield the next points of the path, each with whether it is a target.
 
-        Where none is found before a cluster, the end of an earlier step is tried.
+        Where no point is found before a cluster of instabilities, the end of the earlier step that
+        passed the cluster is yielded instead, once.
+
+        Raises
+        ------
+        PathStopped
+            If no point is found, as in `Path.continue_to`.
         """
         try:
             targets = self._remaining_targets()
@@ -646,14 +766,14 @@ class ContinuationRun:
             yield from self._steps()
 
     def _refuse_loop(self, fold: Point) -> None:
-        """Stop at a fold that was passed before.
+        """Remember a fold, and raise if the path has passed it before.
 
         Two successive folds may be close, so the last one is not compared.
 
         Raises
         ------
         PathStopped
-            If it was passed before.
+            If the path has come back to an earlier fold: it is a closed loop.
         """
         name, u = self.path.name, fold.state.u
         mu = fold.state.mu[name]
@@ -671,7 +791,10 @@ class ContinuationRun:
         return self.path.control == "arc"
 
     def _remaining_targets(self) -> list[float]:
-        """Return the values of s that are still to be reached."""
+        """Return the values of s that the path has yet to reach, in order; infinite without an end.
+
+        On a path by arc length the targets are located between its points, so s has no end.
+        """
         goal, s = self.goal, self.points[-1].s
         if self._by_arc:
             return [np.inf]
@@ -681,7 +804,15 @@ class ContinuationRun:
         return [t for t in goal.targets if (t - s) * sense > 0]
 
     def _step_end(self, s: float, predictors: Sequence[Point]) -> float:
-        """Return the end of a step; by arc length it is close behind the last target."""
+        """Return the s at which a planned step to `s` ends; hook of `Path.continue_to`.
+
+        A path by arc length ends its step close behind the last target.
+
+        Parameters
+        ----------
+        predictors
+            The points from which the end of the step is extrapolated.
+        """
         goal = self.goal
         if self._by_arc and goal.targets and goal.until in ("target", "limit"):
             return end_near_last_target(self.path, goal.quantity, goal.targets[-1], s, predictors)
@@ -690,7 +821,12 @@ class ContinuationRun:
     def _accepted_events(
         self, low: Point, high: Point
     ) -> tuple[list[tuple[Label, Point, bool]], str]:
-        """Return the events between two points, and why the step must be shorter; "" if not."""
+        """Return the events between two points, and why the step must be repeated in shorter ones.
+
+        Returns
+        -------
+        The events as in `_events_between`, and the reason; "" if the step is accepted.
+        """
         try:
             events = self._events_between(low, high)
         except PathStopped as e:  # the step had left the branch
@@ -699,9 +835,13 @@ class ContinuationRun:
         return events, next(filter(None, refusals), "")
 
     def _events_between(self, low: Point, high: Point) -> list[tuple[Label, Point, bool]]:
-        """Return the instabilities and, with arc length, targets between two points.
+        """Return the instabilities and the targets between two points, in the order of the path.
 
-        The flag marks the end of the run.
+        Targets are solved for only on a path by arc length; elsewhere steps end at them.
+
+        Returns
+        -------
+        For each event its label, its point, and whether it ends the run.
         """
         events: list[tuple[Label, Point, bool]] = []
         for event in self._located(low, high):
@@ -723,9 +863,17 @@ class ContinuationRun:
         return sorted(events, key=lambda event: abs(event[1].s - low.s))
 
     def _located(self, low: Point, high: Point) -> Iterator[Instability]:
-        """Yield the instabilities between two points.
+        """Yield the instabilities between two successive points, in the order of the path.
 
-        Several that shorter steps do not separate count as one.
+        A search that ends between several instabilities is repeated in shorter steps. If shorter
+        steps do not separate them either, the instabilities count as one cluster.
+
+        Raises
+        ------
+        UnseparatedInstabilities
+            If the step must be repeated in shorter ones.
+        PathStopped
+            If a solve between the points fails.
         """
         budget, step = self._budget, high.s - low.s
         is_beyond = budget.end is not None and (high.s - budget.end.s) * step > 0
@@ -749,9 +897,10 @@ class ContinuationRun:
             raise
 
     def _cluster(self, low: Point, high: Point) -> Instability:
-        """Return the instabilities between two points as one.
+        """Record the instabilities between two points as a cluster; return them as one instability.
 
-        It is a fold if the amplitude turns back between them.
+        It is a fold if the amplitude turns back between the points. Its error is the distance of
+        both points in the amplitude.
         """
         name = self.path.name
         point = replace(low, load_error=abs(high.state.mu[name] - low.state.mu[name]))

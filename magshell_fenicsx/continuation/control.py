@@ -43,24 +43,30 @@ Gradient = tuple[Vector | None, float]  # dg/du, None where it is zero, and dg/d
 
 
 class ConstraintRow(Protocol):
-    """The scalar equation g(u, mu) = 0 that is solved together with equilibrium."""
+    """The scalar equation g(u, mu) = 0 that is solved together with equilibrium.
+
+    Both methods are collective.
+    """
 
     def residual(self, state: State) -> float:
-        """Return g."""
+        """Return g at a state."""
 
     def gradient(self, state: State) -> Gradient:
         """Return dg/du (None where it is zero) and dg/dmu."""
 
 
 def derivative_along(comm: MPI.Comm, gradient: Gradient, direction: Direction) -> float:
-    """Return the derivative of g along a direction, from the gradient of its row."""
+    """Return the derivative of g along a direction (du, dmu), from the gradient of its row.
+
+    Collective.
+    """
     (c, d), (du, dmu) = gradient, direction
     return d * dmu + (dot(comm, c, du) if c is not None else 0.0)
 
 
 @dataclass(frozen=True)
 class PrescribedLoad:
-    """Load control: mu = target."""
+    """Load control: the row mu = target of the amplitude `name`."""
 
     name: str
     target: float
@@ -74,7 +80,7 @@ class PrescribedLoad:
 
 @dataclass(frozen=True)
 class PrescribedConjugate:
-    """Displacement or volume control: -dPi/dmu = target."""
+    """Displacement or volume control: the row -dPi/dmu = target of the amplitude `name`."""
 
     system: System
     name: str
@@ -114,16 +120,53 @@ class Metric:
 
 
 def nearest_combination(metric: Metric, a: Direction, span: Sequence[Direction]) -> Direction:
-    """Return the linear combination of the directions `span` that is nearest to `a`. Collective."""
-    gram = [[metric.inner(p, q) for q in span] for p in span]
-    coefficients = np.linalg.solve(gram, [metric.inner(p, a) for p in span])
-    du = np.sum([c * p[0] for c, p in zip(coefficients, span, strict=True)], axis=0)
-    return du, float(sum(c * p[1] for c, p in zip(coefficients, span, strict=True)))
+    """Return the linear combination of some directions that is nearest to a direction `a`.
+
+    Collective.
+
+    Parameters
+    ----------
+    metric
+        The metric in which it is nearest.
+    span
+        The linearly independent directions that are combined.
+    """
+    gram = [
+        [metric.inner(direction, other_direction) for other_direction in span] for direction in span
+    ]
+    coefficients = np.linalg.solve(gram, [metric.inner(direction, a) for direction in span])
+    du = np.sum(
+        [
+            coefficient * direction[0]
+            for coefficient, direction in zip(coefficients, span, strict=True)
+        ],
+        axis=0,
+    )
+    return du, float(
+        sum(
+            coefficient * direction[1]
+            for coefficient, direction in zip(coefficients, span, strict=True)
+        )
+    )
 
 
 @dataclass(frozen=True)
 class Hyperplane:
-    """Arc-length control: <normal, (u, mu) - base> = distance."""
+    """Arc-length control: the row <normal, (u, mu) - base> = distance.
+
+    Attributes
+    ----------
+    metric
+        The metric of the inner product.
+    name
+        The amplitude mu.
+    base
+        The state from which arc length is measured.
+    normal
+        The direction (du, dmu) along which it is measured.
+    distance
+        Arc length of the solution.
+    """
 
     metric: Metric
     name: str
@@ -146,6 +189,8 @@ def add_scaled(a: Direction, factor: float, b: Direction) -> Direction:
 
 class BorderedMatrix:
     """The matrix [K R_mu; c d] at a state, inverted by block elimination.
+
+    The constructor and all methods are collective.
 
     Parameters
     ----------
@@ -184,7 +229,7 @@ class BorderedMatrix:
         self._weight = dot(self._comm, self._x2, self._x2)
 
     def size(self, step: Direction) -> float:
-        """Return the size of a step: the larger of du, in lengths of the system, and dmu.
+        """Return the size of a step (du, dmu), in lengths: that of the larger part.
 
         dmu counts relative to mu or as the displacement that it causes, whichever is smaller.
         """
@@ -193,17 +238,21 @@ class BorderedMatrix:
         return max(max_abs(self._comm, step[0]) / self._length, abs(step[1]) * scale)
 
     def solve(self, f: Vector, g: float, *, low_accuracy: bool = False) -> Direction:
-        """Return (du, dmu) with K du + R_mu dmu = f and c.du + d dmu = g.
+        """Return the solution (du, dmu) of K du + R_mu dmu = f and c . du + d dmu = g. Collective.
 
-        `low_accuracy` is that of `Factorisation.solve`.
+        Parameters
+        ----------
+        low_accuracy
+            Whether a rough solution is enough, see `Factorisation.solve`.
         """
         x1 = self._factors.solve(f, low_accuracy=low_accuracy)
+        # block elimination: the row without dmu, over the Schur complement
         dmu = (g - derivative_along(self._comm, self._gradient, (x1, 0.0))) / self._schur
         return x1 - dmu * self._x2, dmu
 
     @property
     def tangent(self) -> Direction:
-        """The solution for f = 0 and g = 1."""
+        """The solution (du, dmu) for f = 0 and g = 1: the path's tangent per unit of the row."""
         return np.asarray(-self._x2 / self._schur), 1 / self._schur
 
     def inner(self, a: Direction, b: Direction) -> float:
@@ -220,14 +269,16 @@ class Chord(Generic[V]):
     """The chord method: one matrix for several iterates, with Broyden's update after each step.
 
     C. T. Kelley, Iterative Methods for Linear and Nonlinear Equations, SIAM 1995, algorithm brsol.
-    Steps are subtracted from the iterate.
+    Steps are subtracted from the iterate. V is the type of a step.
 
     Parameters
     ----------
     solve
         Returns the inverse of the matrix times a right side.
-    inner, add_scaled
-        Inner product in which the update is the smallest, and a + factor b.
+    inner
+        The inner product in which the update is the smallest.
+    add_scaled
+        Returns a + factor b, from a, the factor and b.
     """
 
     def __init__(
@@ -244,21 +295,32 @@ class Chord(Generic[V]):
         self._steps.append(step)
 
     def step(self, f: V) -> V:
-        """Return the next step at the present iterate, whose residual is `f`."""
+        """Return the next step at the present iterate, whose residual is `f`.
+
+        If Broyden's update cannot be trusted, all earlier updates are dropped.
+        """
         step, inner = self._updated_solution(f, self._steps), self._inner
         if self._steps:
-            last = self._steps[-1]
-            divisor = 1 - inner(last, step) / inner(last, last)
+            last_step = self._steps[-1]
+            # Sherman and Morrison's formula for the update by the last step
+            divisor = 1 - inner(last_step, step) / inner(last_step, last_step)
             if divisor > MIN_BROYDEN_DIVISOR:
                 return self._add_scaled(step, 1 / divisor - 1, step)
             self._steps.clear()
         return step
 
     def solve(self, f: V, step: V) -> V:
-        """Return the solution for a right side at the iterate whose next step is `step`."""
+        """Return the solution for a right side `f` with the updated matrix of the present iterate.
+
+        Parameters
+        ----------
+        step
+            The next step at the iterate, which `step` has returned.
+        """
         return self._updated_solution(f, [*self._steps, step])
 
     def _updated_solution(self, f: V, steps: Sequence[V]) -> V:
+        """Return the solution for a right side with the updates by successive steps."""
         solution, inner = self._solve(f), self._inner
         for earlier, later in pairwise(steps):
             factor = inner(earlier, solution) / inner(earlier, earlier)
@@ -283,10 +345,16 @@ def refined_tangent(
 
     Parameters
     ----------
+    matrix
+        The bordered matrix of the nearby state, which preconditions.
     t
-        The tangent of the matrix.
+        The tangent (du, dmu) of that matrix.
+    state
+        The solution at which the tangent is wanted.
     load
         R_mu at the state.
+    row
+        The last row, along which the tangent has length one.
     extrapolating
         Whether forces of dense terms may be extrapolated. They are then computed along the tangent.
 
@@ -314,7 +382,16 @@ def refined_tangent(
 class _TangentRefinement:
     """Generalised conjugate residuals for the tangent at a state.
 
-    The matrix of a nearby state is the preconditioner.
+    The equations are K du + R_mu dmu = 0 and c . du + d dmu = 1.
+
+    Attributes
+    ----------
+    matrix
+        The bordered matrix of a nearby state: the preconditioner.
+    load
+        R_mu at the state.
+    row
+        The last row, whose gradient is (c, d).
     """
 
     system: System
@@ -324,11 +401,24 @@ class _TangentRefinement:
     row: ConstraintRow
 
     def refined(self, residual: Residual, t: Direction) -> Direction | None:
-        """Return the tangent for a residual function; None if the approximation t is too poor."""
+        """Return the tangent for a residual function, by refinement of an approximation.
+
+        Parameters
+        ----------
+        residual
+            Returns R at a displacement and amplitudes; its differences replace K.
+        t
+            The approximation (du, dmu).
+
+        Returns
+        -------
+        The tangent; None if the approximation is too poor.
+        """
         comm, gradient = self.system.comm, self.row.gradient(self.state)
         R = residual(self.state.u, self.state.mu)
 
         def preconditioned_product(t: Direction, g: float = 0.0) -> Direction:
+            """Return the preconditioner times the left sides at t, less g in the row."""
             force = self.stiffness(residual, t[0], R) + t[1] * self.load
             row_value = derivative_along(comm, gradient, t) - g
             return self.matrix.solve(force, row_value, low_accuracy=self.matrix.lagged)
@@ -352,7 +442,13 @@ class _TangentRefinement:
         return None
 
     def stiffness(self, residual: Residual, du: Vector, R: Vector) -> Vector:
-        """Return K du by a difference of the residual, which is R at the state."""
+        """Return K du by a forward difference of the residual.
+
+        Parameters
+        ----------
+        R
+            The residual at the state.
+        """
         size = max_abs(self.system.comm, du)
         if size == 0.0:
             return du

@@ -18,7 +18,8 @@ MAX_HALVINGS = 7  # of that distance, until the mode is found there, and is the 
 # relative difference of two loads at a start, below which a path may confuse the modes
 LOAD_TOLERANCE = 1e-3
 
-BoundaryOfFamily = Callable[[int, BoundaryPoint], Boundary]
+BoundaryOfFamily = Callable[[int, BoundaryPoint], Boundary]  # (family, first point) -> boundary
+# (crossing, family, family of the previous boundary) -> mode that becomes critical there
 NullVector = Callable[[BoundaryPoint, int, int], Vector]
 LabelledPoints = Iterator[tuple[Label, BoundaryPoint, Boundary]]
 
@@ -34,15 +35,16 @@ def critical_boundary(
 ) -> LabelledPoints:
     """Yield labels, points and their boundaries from a start until p leaves its range.
 
-    Where another mode becomes critical before that of the boundary, its boundary is followed.
+    The boundary of the first critical mode is followed: where another mode becomes critical first,
+    its boundary takes over. Collective.
 
     Parameters
     ----------
     curve
         Returns the boundary of a family (0: of the model's own modes) that begins at a crossing.
     null_vector
-        Returns the mode that becomes critical at a crossing, from the crossing, the family, and
-        the family of the previous boundary.
+        Returns the mode that becomes critical at a crossing, from the crossing, the family, and the
+        family of the previous boundary.
     mode, start, sense, ends, steps
         The first boundary, and the arguments of `Boundary.follow`.
 
@@ -56,22 +58,22 @@ def critical_boundary(
     # the family of the previous boundary, where this one begins at their crossing
     begun_by: int | None = None
     while True:
-        last, successor = start, None
+        last_point, successor = start, None
         for label, point in mode.follow(start, sense, ends, steps):
-            if last is start and label == "crossing" and point.met == begun_by:
+            if last_point is start and label == "crossing" and point.met == begun_by:
                 continue
             is_point = label in ("point", "end")
-            if not last.unstable and is_point and _unstable_families(mode, point):
-                successor, sense = search.overtaking_mode(mode, point), point.p - last.p
+            if not last_point.unstable and is_point and _unstable_families(mode, point):
+                successor, sense = search.overtaking_mode(mode, point), point.p - last_point.p
                 yield label, successor.start, successor.mode
                 if label == "end":
                     return
                 break
-            if label != "crossing" or last.unstable:
+            if label != "crossing" or last_point.unstable:
                 yield label, point, mode
-                last = point
+                last_point = point
                 continue
-            sense = point.p - last.p
+            sense = point.p - last_point.p
             try:
                 successor = search.mode_beyond(mode, point, sense)
             except BoundaryLost:
@@ -89,11 +91,18 @@ def critical_boundary(
 def first_mode(
     curve: BoundaryOfFamily, null_vector: NullVector, mode: Boundary, start: BoundaryPoint
 ) -> tuple[Boundary, BoundaryPoint]:
-    """Return the boundary that a start belongs to, and its point on it.
+    """Return the boundary to which an instability belongs, and its point on that boundary.
 
-    It is that of another mode if that becomes critical just before: a path with two modes at nearly
-    one load may have named the second. Where others become critical long before, the start is an
-    instability beyond the first, and stays. The parameters are those of `critical_boundary`.
+    A path with two modes at nearly one load may have named the second: if another mode becomes
+    critical just before, its boundary is returned. Where others become critical long before, the
+    start is an instability beyond the first, and stays. Collective.
+
+    Parameters
+    ----------
+    curve, null_vector
+        As in `critical_boundary`.
+    mode, start
+        The boundary that the path has named, and the point on it.
     """
     if not _unstable_families(mode, start):
         return mode, start
@@ -127,9 +136,12 @@ class _Successor:
 
 @dataclass(frozen=True)
 class _FirstModeSearch:
-    """The search for the first mode, among those that are unstable where another one is neutral.
+    """The search for the mode that becomes critical first, where others are unstable too.
 
-    The attributes are the arguments of `critical_boundary`.
+    Attributes
+    ----------
+    curve, null_vector, ends
+        As in `critical_boundary`.
     """
 
     curve: BoundaryOfFamily
@@ -141,43 +153,58 @@ class _FirstModeSearch:
 
         It may be that of a third mode that becomes critical there too.
 
+        Parameters
+        ----------
+        mode
+            The boundary on which the crossing lies.
+        sense
+            Sign of the change of p along the boundary.
+
         Raises
         ------
         BoundaryLost
-            If none of them is the first beyond it.
+            If none of the modes is the first beyond the crossing.
         """
 
         def starts_of(family: int) -> Iterator[_Successor]:
-            other, phi = self._boundary_of(family, crossing, mode.m)
+            """Yield where a family's boundary may be taken up: at the crossing, or beyond."""
+            boundary, phi = self._boundary_of(family, crossing, mode.m)
             if mode.m and family not in (0, mode.m):  # the two equations do not couple
-                start = other.start(crossing.p, crossing.state, phi)
+                start = boundary.start(crossing.p, crossing.state, phi)
                 unstable = start.unstable - start.unstable_of(mode.m)
-                yield _Successor(other, replace(start, unstable=unstable), mode.m)
-            yield _Successor(other, _point_beyond(other, crossing, phi, sense, self.ends))
+                yield _Successor(boundary, replace(start, unstable=unstable), mode.m)
+            yield _Successor(boundary, _point_beyond(boundary, crossing, phi, sense, self.ends))
 
         return self._first_of([crossing.met], starts_of, mode, crossing)
 
     def overtaking_mode(self, mode: Boundary, point: BoundaryPoint) -> _Successor:
-        """Return the mode that is the first where that of a boundary is not any more.
+        """Return the first mode at a point of a boundary at which other modes are unstable.
 
-        It starts at the same p.
+        Its boundary starts at the same p.
 
         Raises
         ------
         BoundaryLost
-            If none is found.
+            If no such mode is found.
         """
 
         def starts_of(family: int) -> Iterator[_Successor]:
-            other, phi = self._boundary_of(family, point, mode.m)
-            yield _Successor(other, other.start(point.p, point.state, phi))
+            """Yield the point of a family's boundary at the same p."""
+            boundary, phi = self._boundary_of(family, point, mode.m)
+            yield _Successor(boundary, boundary.start(point.p, point.state, phi))
 
         return self._first_of(_unstable_families(mode, point), starts_of, mode, point)
 
     def _boundary_of(
         self, family: int, point: BoundaryPoint, previous_family: int
     ) -> tuple[Boundary, Vector]:
-        """Return the boundary of a family that follows another one, and its null vector there."""
+        """Return the boundary of a family that follows another one at a point, and its null vector.
+
+        Parameters
+        ----------
+        previous_family
+            The family of the boundary that ends there.
+        """
         return self.curve(family, point), self.null_vector(point, family, previous_family)
 
     def _first_of(
@@ -187,19 +214,21 @@ class _FirstModeSearch:
         mode: Boundary,
         point: BoundaryPoint,
     ) -> _Successor:
-        """Return the first mode of some families, and of those that prove to be unstable before.
+        """Return the first mode of some families, which no other mode precedes.
+
+        Families that prove to be unstable before join the candidates.
 
         Parameters
         ----------
         starts_of
-            Family -> where it may be taken up, one after the other.
+            Called with a family. It yields the places where its boundary may be taken up.
         mode, point
             The boundary that ends, and its last point, for the message.
 
         Raises
         ------
         BoundaryLost
-            If none is found.
+            If no mode is the first.
         """
         candidates, reason = [*families], "none that comes before it is the first there"
         for family in candidates:  # which grows
@@ -207,9 +236,9 @@ class _FirstModeSearch:
                 for successor in starts_of(family):
                     if not successor.start.unstable:
                         return successor
-                    for other in _unstable_families(successor.mode, successor.start):
-                        if other not in candidates and other != mode.m:
-                            candidates.append(other)
+                    for other_family in _unstable_families(successor.mode, successor.start):
+                        if other_family not in candidates and other_family != mode.m:
+                            candidates.append(other_family)
             except (BoundaryLost, NoSystem) as e:
                 reason = str(e)
         load = point.state.mu[mode.name]
@@ -222,7 +251,7 @@ class _FirstModeSearch:
 def _unstable_families(mode: Boundary, point: BoundaryPoint) -> list[int]:
     """Return the families with modes that are unstable at a point of a boundary.
 
-    The model's own family does not count along its own boundary: such a place is a `meeting`.
+    The model's own family, 0, does not count along its own boundary: such a place is a `meeting`.
     """
     return [i for i, count in enumerate(point.counts) if count and not i == mode.m == 0]
 
@@ -230,9 +259,21 @@ def _unstable_families(mode: Boundary, point: BoundaryPoint) -> list[int]:
 def _point_beyond(
     mode: Boundary, crossing: BoundaryPoint, phi: Vector, sense: float, ends: tuple[float, float]
 ) -> BoundaryPoint:
-    """Return a point of a boundary near a crossing, where its equations are singular.
+    """Return a point of a boundary near a crossing, at which its equations are singular.
 
-    If possible it is the first instability there.
+    The distance is halved until no mode is unstable at the point; if this never happens, it is the
+    farthest point.
+
+    Parameters
+    ----------
+    mode
+        The boundary that the crossing begins.
+    phi
+        A vector near its null vector.
+    sense
+        Sign of the change of p from the crossing.
+    ends
+        The range of p.
 
     Raises
     ------

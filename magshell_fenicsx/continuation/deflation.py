@@ -30,7 +30,14 @@ LEAP_LENGTH, MAX_LEAPS = 1.0, 4  # in lengths of the system: a step over a singu
 class Deflation:
     """The deflation operator M of known solutions.
 
-    Its norm |.| is the root mean square over the system's length.
+    Its norm |.| is the root mean square of a displacement over the system's length.
+
+    Attributes
+    ----------
+    metric
+        The metric whose norm of a displacement that is.
+    known_solutions
+        The displacements u_i.
     """
 
     metric: Metric
@@ -42,19 +49,22 @@ class Deflation:
         return float(np.prod([r**-POWER + SHIFT if r else np.inf for r in distances]))
 
     def slope(self, u: Vector, d: Vector) -> float:
-        """Return d . grad M/M at u. Collective."""
-        total = 0.0
+        """Return d . grad M/M at u, for a step d; -inf at a known solution. Collective."""
+        slope = 0.0
         for v in self.known_solutions:
             difference = (u - v, 0.0)
-            r = self.metric.norm(*difference)
-            if not r:
+            distance = self.metric.norm(*difference)
+            if not distance:
                 return -np.inf
             component = self.metric.inner(difference, (d, 0.0))
-            total -= POWER * component / (r**2 * (1 + SHIFT * r**POWER))
-        return total
+            slope -= POWER * component / (distance**2 * (1 + SHIFT * distance**POWER))
+        return slope
 
     def factor(self, u: Vector, d: Vector) -> float:
-        """Return tau for Newton's step d at u; zero at a known solution. Collective."""
+        """Return the factor tau of Newton's step d at u, with M; zero at a known solution.
+
+        Collective.
+        """
         divisor = 1 - self.slope(u, d)
         return 1 / divisor if divisor else np.inf
 
@@ -68,31 +78,40 @@ def find_deflated(
 ) -> State | None:
     """Find a state near an unknown solution on which a row holds. Collective.
 
-    Steps are shortened until the residual changes as the tangent says. Newton's method must confirm
-    the result.
+    Steps are shortened until the residual changes as the tangent says. Where that needs tiny steps,
+    a long one leaps over the singular tangent, a few times. Newton's method must confirm the
+    result.
 
     Parameters
     ----------
+    guess
+        The state from which the iteration starts.
     name
         The amplitude that the row determines.
+    row
+        The scalar equation that is solved together with equilibrium.
     known_solutions
         The displacements of the known solutions.
 
     Returns
     -------
-    None if no such state is found.
+    The state; None if none is found.
     """
     system, state, fraction, leaps = newton.system, guess, 1.0, 0
     deflation = Deflation(Metric(system, 1.0), known_solutions)
     residual = system.residual(state.u, state.mu), row.residual(state)
     for _ in range(MAX_ITERATIONS):
         matrix = BorderedMatrix(system, newton.factor_at(state), state, name, row)
-        d = matrix.solve(-residual[0], -residual[1])
-        tau, size, M = deflation.factor(state.u, d[0]), matrix.size(d), deflation.value(state.u)
+        newton_step = matrix.solve(-residual[0], -residual[1])
+        tau, size, M = (
+            deflation.factor(state.u, newton_step[0]),
+            matrix.size(newton_step),
+            deflation.value(state.u),
+        )
         if not np.isfinite(size) or not np.isfinite(tau) or tau == 0.0:
             return None
         if size <= FINAL_STEP and 1 / MAX_DEFLATION_FACTOR < tau < MAX_DEFLATION_FACTOR:
-            return state.with_(state.u + d[0], name, state.mu[name] + d[1])
+            return state.with_(state.u + newton_step[0], name, state.mu[name] + newton_step[1])
         fraction, nonlinearity = min(1.0, 4 * fraction), np.inf
         while not nonlinearity <= MAX_NONLINEARITY:
             leaps += (leap := fraction < MIN_STEP_FRACTION)
@@ -101,17 +120,24 @@ def find_deflated(
             if leap:
                 fraction = LEAP_LENGTH / (abs(tau) * size)
             factor = fraction * tau
-            trial = state.with_(state.u + factor * d[0], name, state.mu[name] + factor * d[1])
+            trial = state.with_(
+                state.u + factor * newton_step[0], name, state.mu[name] + factor * newton_step[1]
+            )
             residual = system.residual(trial.u, trial.mu), row.residual(trial)
             next_step = matrix.solve(-residual[0], -residual[1])
             # the next step with the same matrix, over M
-            next_step = add_scaled(next_step, tau * deflation.slope(state.u, next_step[0]), d)
-            ratio = deflation.value(trial.u) / M
-            unexplained = (
-                ratio * next_step[0] + (fraction - 1) * tau * d[0],
-                ratio * next_step[1] + (fraction - 1) * tau * d[1],
+            next_step = add_scaled(
+                next_step, tau * deflation.slope(state.u, next_step[0]), newton_step
             )
-            relative_square = matrix.inner(unexplained, unexplained) / matrix.inner(d, d)
+            ratio = deflation.value(trial.u) / M
+            # what the linear model of M R leaves of the step, as displacement and amplitude
+            unexplained = (
+                ratio * next_step[0] + (fraction - 1) * tau * newton_step[0],
+                ratio * next_step[1] + (fraction - 1) * tau * newton_step[1],
+            )
+            relative_square = matrix.inner(unexplained, unexplained) / matrix.inner(
+                newton_step, newton_step
+            )
             nonlinearity = np.sqrt(relative_square) / abs(factor)
             if leap:
                 break

@@ -40,10 +40,14 @@ FORCE = "holding force"
 
 
 class Device:
-    """A system under a loading device.
+    """A system under a loading device, which is a `System` again.
+
+    Its unknowns are u, and on the last rank y_f = mu_f length/scale_f of the free amplitudes mu_f.
 
     Parameters
     ----------
+    system
+        The inner system, without the device.
     held_conjugates_of_step
         Amplitude that becomes unknown -> its conjugate: a value of -dPi/dmu, a function q(mu) that
         does not rise, or the name of a further amplitude of the device, whose value it is.
@@ -65,8 +69,8 @@ class Device:
         self.comm, self.length, self.coordinates = system.comm, system.length, system.coordinates
         self._system, self.names = system, list(held_conjugates_of_step)
         self._conjugates = [
-            q if callable(q) or isinstance(q, str) else constant(q)
-            for q in held_conjugates_of_step.values()
+            conjugate if callable(conjugate) or isinstance(conjugate, str) else constant(conjugate)
+            for conjugate in held_conjugates_of_step.values()
         ]
         self._units = np.array([scale[name] / system.length for name in held_conjugates_of_step])
         self.size = system.size + len(held_conjugates_of_step) * (
@@ -75,10 +79,10 @@ class Device:
 
     def for_system(self, system: System) -> "Device":
         """Return the same device on another system."""
-        other = copy(self)
-        other._system = system
-        other.size = system.size + self.size - self._system.size
-        return other
+        device = copy(self)
+        device._system = system
+        device.size = system.size + self.size - self._system.size
+        return device
 
     def padded(self, u: Vector) -> Vector:
         """Return a vector of the inner system with zeros appended for the amplitudes."""
@@ -90,39 +94,53 @@ class Device:
         return State(join(state.u, self.unknowns(state.mu), self.comm), fixed)
 
     def leave(self, state: State) -> State:
-        """Return a state of the device as a state of the inner system."""
+        """Return a state of the device as a state of the inner system, with all its amplitudes."""
         u, mu = self._split(state.u, state.mu)
         return State(u, {name: value for name, value in mu.items() if name not in self._conjugates})
 
     def displacement(self, x: Vector) -> Vector:
-        """Return u of a vector (u, y)."""
+        """Return the part u of a vector (u, y) of the device's unknowns."""
         return split(x, len(self.names), self.comm)[0]
 
     def rates(self, x: Vector) -> dict[str, float]:
-        """Return the changes of the amplitudes along a vector (u, y)."""
+        """Return the changes of the unknown amplitudes by name along a vector (u, y)."""
         y = split(x, len(self.names), self.comm)[1]
         return dict(zip(self.names, (float(v) for v in y * self._units), strict=True))
 
     def gradient(self, by_u: Vector, by_amplitude: Amplitudes) -> Vector:
-        """Return a gradient by (u, y), from those by u and by the amplitudes."""
+        """Return a gradient by the unknowns (u, y).
+
+        Parameters
+        ----------
+        by_u
+            The gradient by u.
+        by_amplitude
+            Amplitude -> the derivative by it; it has all unknown ones.
+        """
         by_y = np.array([by_amplitude[name] for name in self.names]) * self._units
         return join(by_u, by_y, self.comm)
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
+        """Return R of the inner system, followed by `rows`."""
         v, amplitudes = self._split(u, mu)
         rows = self.rows(v, amplitudes)
         return join(self._system.residual(v, amplitudes), rows, self.comm)
 
     def rows(self, u: Vector, mu: Amplitudes) -> Array:
-        """Return dPi/dmu + q at a state of the inner system, zero where the conjugates are held.
+        """Return dPi/dmu + q of the unknown amplitudes, zero where the conjugates are held.
+
+        Parameters
+        ----------
+        u, mu
+            A state of the inner system.
 
         Returns
         -------
-        (k,) numbers in units of y.
+        (k,) numbers, as derivatives by y.
         """
         held_conjugates_of_step = [
-            mu[q] if isinstance(q, str) else q(mu[name])[0]
-            for name, q in zip(self.names, self._conjugates, strict=True)
+            mu[conjugate] if isinstance(conjugate, str) else conjugate(mu[name])[0]
+            for name, conjugate in zip(self.names, self._conjugates, strict=True)
         ]
         rows = (
             np.array([self._system.potential(u, mu, name) for name in self.names])
@@ -131,15 +149,23 @@ class Device:
         return np.asarray(rows * self._units)
 
     def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
+        """Return the derivative of the residual (u, y) by the amplitude `name`.
+
+        That may be an amplitude of the inner system, or one that holds a conjugate.
+        """
         v, amplitudes = self._split(u, mu)
         if name in self._conjugates:
             is_held_by_name = np.array(self._conjugates, dtype=object) == name
             return join(0.0 * v, self._units * is_held_by_name, self.comm)
-        mixed = [self._system.curvature(v, amplitudes, other, name) for other in self.names]
+        mixed = [self._system.curvature(v, amplitudes, free_name, name) for free_name in self.names]
         load = self._system.load(v, amplitudes, name)
         return join(load, np.array(mixed) * self._units, self.comm)
 
     def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
+        """Return the derivative of the Legendre transform L by an amplitude.
+
+        By the amplitude of a held conjugate q_f it is mu_f.
+        """
         v, amplitudes = self._split(u, mu)
         if name in self._conjugates:
             return amplitudes[self.names[self._conjugates.index(name)]]
@@ -153,23 +179,32 @@ class Device:
     def tangent(
         self, u: Vector, mu: Amplitudes, stress: Sequence[WeightedDisplacement] = ()
     ) -> BorderedTangent:
+        """Assemble the tangent of the inner system, bordered by the unknown amplitudes."""
         v, amplitudes = self._split(u, mu)
         columns, D = self.border(v, amplitudes)
-        inner_stress = [(weight, self.displacement(w)) for weight, w in stress]
+        inner_stress = [
+            (weight, self.displacement(displacement)) for weight, displacement in stress
+        ]
         K = self._system.tangent(v, amplitudes, inner_stress)
         assert not isinstance(K, BorderedTangent)  # a device of a device is one device
         return BorderedTangent(K, columns, D, self.multipliers)
 
     def border(self, u: Vector, mu: Amplitudes) -> tuple[list[Vector], Array]:
-        """Return the columns C, and D (k, k), at a state of the inner system."""
+        """Return the border of the tangent at a state of the inner system.
+
+        Returns
+        -------
+        The k columns R_mu, each the part of this rank, and D (k, k): the second derivatives by the
+        amplitudes with the slopes dq/dmu. Both are by y.
+        """
         system, names = self._system, self.names
         columns = [
             unit * system.load(u, mu, name) for name, unit in zip(names, self._units, strict=True)
         ]
         D = np.array([[system.curvature(u, mu, i, j) for j in names] for i in names])
         slopes = [
-            0.0 if isinstance(q, str) else q(mu[name])[1]
-            for name, q in zip(names, self._conjugates, strict=True)
+            0.0 if isinstance(conjugate, str) else conjugate(mu[name])[1]
+            for name, conjugate in zip(names, self._conjugates, strict=True)
         ]
         D += np.diag(slopes)
         return columns, np.asarray(D * np.outer(self._units, self._units))
@@ -180,14 +215,15 @@ class Device:
         return sum(name not in self.coordinates for name in self.names)
 
     def values(self, y: Array) -> dict[str, float]:
-        """Return the amplitudes of the unknowns y."""
+        """Return the unknown amplitudes by name, from the unknowns y (k,)."""
         return dict(zip(self.names, (float(v) for v in y * self._units), strict=True))
 
     def unknowns(self, mu: Amplitudes) -> Array:
-        """Return the unknowns y of amplitudes."""
+        """Return the unknowns y (k,) of the device, from amplitudes by name."""
         return np.asarray(np.array([mu[name] for name in self.names]) / self._units)
 
     def _split(self, x: Vector, mu: Amplitudes) -> tuple[Vector, dict[str, float]]:
+        """Return u and all amplitudes of the inner system, from a state (u, y) of the device."""
         u, y = split(x, len(self.names), self.comm)
         return u, {**mu, **self.values(y)}
 
@@ -201,6 +237,11 @@ def natural_scale(system: System, factors: Factorisation, state: State, name: st
     """Return the amplitude that moves the system by about its length. Collective.
 
     It is a power of two: the same on any number of ranks.
+
+    Parameters
+    ----------
+    factors
+        Factors of the tangent at the state.
     """
     response = factors.solve(system.load(state.u, state.mu, name))
     lengths = max_abs(system.comm, response) / system.length
@@ -210,12 +251,14 @@ def natural_scale(system: System, factors: Factorisation, state: State, name: st
 class ParametrisedSystem:
     """A system in one amplitude t; the inner system has the amplitudes mu_i = f_i(t).
 
+    It is a `System` again.
+
     Parameters
     ----------
     name
         Name of the amplitude t.
     curves
-        Amplitude of the inner system -> f_i with its first two derivatives.
+        Amplitude of the inner system -> function that returns f_i with its first two derivatives.
     begin
         The value of t at the states that `contract` gets.
     """
@@ -232,27 +275,30 @@ class ParametrisedSystem:
         return ParametrisedSystem(system, self._name, self._curves, self._begin)
 
     def contract(self, state: State) -> State:
-        """Return a state of the inner system with t in place of its amplitudes."""
+        """Return a state of the inner system with t in place of the amplitudes of the curves."""
         others = {name: value for name, value in state.mu.items() if name not in self._curves}
         return State(state.u, {self._name: self._begin, **others})
 
     def expand(self, state: State) -> State:
-        """Return a state with the amplitudes of the inner system in place of t."""
+        """Return a state of the inner system, with the amplitudes f_i(t) in place of t."""
         return State(state.u, self._expanded(state.mu))
 
     def residual(self, u: Vector, mu: Amplitudes) -> Vector:
         return self._system.residual(u, self._expanded(mu))
 
     def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
+        """Return d2Pi/du dt by the chain rule, or the load vector of another amplitude."""
         amplitudes, rates = self._expanded(mu), self._rates(mu, name)
         columns = [rate * self._system.load(u, amplitudes, i) for i, rate in rates.items()]
         return sum(columns[1:], columns[0])
 
     def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
+        """Return dPi/dt by the chain rule, or dPi/dmu of another amplitude."""
         amplitudes, rates = self._expanded(mu), self._rates(mu, name)
         return sum(rate * self._system.potential(u, amplitudes, i) for i, rate in rates.items())
 
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
+        """Return a second derivative of Pi by t and other amplitudes, by the chain rule."""
         amplitudes, t = self._expanded(mu), mu[self._name]
         first_rates, second_rates = self._rates(mu, name), self._rates(mu, other)
         mixed = (
@@ -274,13 +320,15 @@ class ParametrisedSystem:
         return self._system.tangent(u, self._expanded(mu), stress)
 
     def _expanded(self, mu: Amplitudes) -> dict[str, float]:
+        """Return the amplitudes of the inner system, from those with t."""
         others = {name: value for name, value in mu.items() if name != self._name}
         return {**others, **{i: f(mu[self._name])[0] for i, f in self._curves.items()}}
 
     def _rates(self, mu: Amplitudes, name: str) -> dict[str, float]:
-        """Return the rates of the inner system's amplitudes with an amplitude: dmu_i/dt with t.
+        """Return the derivatives of the inner system's amplitudes by the amplitude `name`.
 
-        An amplitude of the inner system changes only itself, with the rate 1.
+        They are dmu_i/dt by t. An amplitude of the inner system changes only itself, with the rate
+        1.
         """
         if name != self._name:
             return {name: 1.0}
@@ -288,7 +336,10 @@ class ParametrisedSystem:
 
 
 class HoldingForceSystem:
-    """A system with one more amplitude, `FORCE`, of a force along a vector b."""
+    """A system with one more amplitude, `FORCE`: the factor of a force along a vector b.
+
+    It is a `System` again, and serves solves in which this force holds a displacement.
+    """
 
     def __init__(self, system: System, b: Vector) -> None:
         self.comm, self.size, self.length = system.comm, system.size, system.length

@@ -162,6 +162,7 @@ class Factorisation:
         return float(self.matrix.norm(PETSc.NormType.NORM_INFINITY))
 
     def _factor_symmetric(self, K: PETSc.Mat) -> None:
+        """Factor a sparse symmetric matrix, by CHOLMOD if possible, else by MUMPS."""
         self.matrix, self.inertia_uncertainty, self.inertia_is_known = K, np.inf, True
         if self._rhs is None:
             self._rhs, self._solution = K.createVecs()
@@ -174,7 +175,17 @@ class Factorisation:
         return self._products is not None and self._full_factorisations_left <= 1
 
     def _factor_sparse_part(self, tangent: CorrectedTangent, *, needs_inertia: bool) -> bool:
-        """Factor the sparse part of K + D; return False if D is not small."""
+        """Factor the sparse part K of K + D, for solutions by iteration with D.
+
+        Parameters
+        ----------
+        needs_inertia
+            Whether the negative pivots of K + D are counted now.
+
+        Returns
+        -------
+        Whether these factors serve; False if D is not small compared with K, now or shortly before.
+        """
         self._full_factorisations_left -= 1
         if self._full_factorisations_left > 0:
             return False
@@ -186,31 +197,33 @@ class Factorisation:
     def count_corrected_inertia(self) -> bool:
         """Count the negative pivots of K + D by the factors of K. Collective.
 
+        It also determines how certain the count is, see `inertia_uncertainty`.
+
         Returns
         -------
-        False if D is not small compared with K.
+        Whether the factors of K serve; False if D is not small compared with K.
         """
         tangent, products = self._corrected, self._products
         if not tangent or not products:  # an earlier count failed
             return False
         random = np.random.default_rng(self.comm.rank)
-        first = self._solve_sparse(random.standard_normal(tangent.K.getLocalSize()[0]))
-        crossings = count_crossings(products.times, self._solve_sparse, first, self.comm)
+        start_vector = self._solve_sparse(random.standard_normal(tangent.K.getLocalSize()[0]))
+        crossings = count_crossings(products.times, self._solve_sparse, start_vector, self.comm)
         if crossings is None:
             self._full_factorisations_left = FULL_FACTORISATIONS_AFTER_FAILURE
             self._products = self._correction = None
             return False
         crossings = crossings_with_lag(
-            tangent, crossings, self._solve_sparse, self._sparse_product, first, self.comm
+            tangent, crossings, self._solve_sparse, self._sparse_product, start_vector, self.comm
         )
         self.inertia_uncertainty, self.inertia_is_known = crossings.uncertainty, True
         self.negative_pivots += crossings.added
         return True
 
     def missing_product(self, x: Vector) -> Vector:
-        """Return x times what the lagged part of the latest tangent lacks, as extrapolated.
+        """Return x times the difference of the present and the lagged part of the latest tangent.
 
-        Collective.
+        The present part is extrapolated. The product is zero if no part is lagged. Collective.
         """
         product, rows = np.zeros_like(x), self.matrix.getLocalSize()[0]
         if self._correction and self._corrected:
@@ -218,7 +231,17 @@ class Factorisation:
         return product
 
     def _factor_by_cholmod(self, K: PETSc.Mat) -> bool:
-        """Try CHOLMOD; return False if K is not positive definite, or CHOLMOD cannot be used."""
+        """Try to factor K by CHOLMOD.
+
+        Returns
+        -------
+        Whether this succeeded; False if K is not positive definite, or CHOLMOD cannot be used.
+
+        Raises
+        ------
+        PETSc.Error
+            If CHOLMOD fails for another reason.
+        """
         if self._cholmod is None or not self._cholmod.is_for(K):
             self._pc = self._mumps = None
             self._cholmod = _CholmodFactors(K)
@@ -234,6 +257,11 @@ class Factorisation:
         return True
 
     def _factor_by_mumps(self, K: PETSc.Mat) -> None:
+        """Factor K by MUMPS as LDL^T, and count its negative pivots. Collective.
+
+        The symbolic work is kept as long as K is the same object with the same number of entries.
+        After some matrices without a negative pivot, CHOLMOD is tried again.
+        """
         entries = _entry_count(K)
         if self._mumps is None or (self._mumps.getOperators()[1].handle, self._entries) != (
             K.handle,
@@ -260,7 +288,10 @@ class Factorisation:
         self._tries_cholmod = self._has_cholmod and self._definite_count >= DEFINITE_BEFORE_CHOLMOD
 
     def _factor_sum(self, tangent: SkewedTangent) -> None:
-        """Factor K + N by LU, for the solutions and for the sign of its determinant."""
+        """Factor K + N by LU, for the solutions and for the sign of its determinant. Collective.
+
+        If that sign differs from that of det K, the tangent has one unstable direction less than K.
+        """
         self.matrix = sum_matrix = tangent.K.copy()
         for option in (PETSc.Mat.Option.SYMMETRIC, PETSc.Mat.Option.SYMMETRY_ETERNAL):
             sum_matrix.setOption(option, False)
@@ -272,6 +303,7 @@ class Factorisation:
         F.setMumpsIcntl(14, 50)
         _renew(pc, sum_matrix)
         is_positive = self.comm.bcast(F.getMumpsRinfog(12) > 0.0 if self.comm.rank == 0 else None)
+        # det K is positive for an even number of negative pivots
         if self.negative_pivots % 2 == is_positive:
             self.negative_pivots -= 1
 
@@ -280,10 +312,13 @@ class Factorisation:
         return self._border.times(x) if self._border else self._product(x)
 
     def solve(self, rhs: Vector, *, low_accuracy: bool = False) -> Vector:
-        """Return the solution with the latest factors. Collective.
+        """Return the solution of the matrix last factored for a right side. Collective.
 
         Parameters
         ----------
+        rhs
+            This rank's part of the right side; for a bordered matrix with its unknowns on the last
+            rank.
         low_accuracy
             Whether a relative residual of `LOOSE_TOLERANCE` is enough for a corrected matrix K + D.
         """
@@ -294,9 +329,11 @@ class Factorisation:
         )
 
     def solve_transposed(self, rhs: Vector) -> Vector:
-        """Return the solution with the transposed matrix and the latest factors. Collective."""
+        """Return the solution of the transposed matrix for a right side. Collective."""
 
         def as_map(operation: Callable[[PETSc.Vec, PETSc.Vec], None]) -> Callable[[Vector], Vector]:
+            """Return an operation of PETSc on two vectors as a function from arrays to arrays."""
+
             def applied(x: Vector) -> Vector:
                 v, y = self.matrix.createVecs()
                 v.setArray(x)
@@ -314,18 +351,20 @@ class Factorisation:
         return solve(rhs)
 
     def _product(self, x: Vector) -> Vector:
+        """Return the inner matrix, K, K + N or K + D, times x. Collective."""
         return self._sparse_product(x) + (self._correction.times(x) if self._correction else 0.0)
 
     def _sparse_product(self, x: Vector) -> Vector:
+        """Return the sparse matrix last factored times x. Collective."""
         v, y = self.matrix.createVecs()
         v.setArray(x)
         self.matrix.mult(v, y)
         return np.array(y.array_r)
 
     def _solve_inner(self, rhs: Vector, *, low_accuracy: bool = False) -> Vector:
-        """Return K^-1 rhs, or (K + D)^-1 rhs.
+        """Return K^-1 rhs, or (K + D)^-1 rhs if there is a dense correction. Collective.
 
-        NaN if K + D is so nearly singular that the factors of K do not serve.
+        The result is NaN if K + D is so nearly singular that the factors of K do not serve.
         """
         if self._correction is None:
             return self._solve_sparse(rhs)
@@ -337,7 +376,7 @@ class Factorisation:
         return self._correction_solver.solve(self._solve_sparse(rhs), tolerance)
 
     def _solve_sparse(self, rhs: Vector) -> Vector:
-        """Return K^-1 rhs."""
+        """Return K^-1 rhs with the sparse factors alone; its time is counted. Collective."""
         assert self._pc is not None
         assert self._rhs is not None
         with self.solving:
@@ -346,7 +385,13 @@ class Factorisation:
             return np.array(self._solution.array_r)
 
     def _solve_columns(self, columns: Array) -> Array:
-        """Return K^-1 times the columns (rows of this rank, count), all in one solve."""
+        """Return K^-1 times columns, all in one solve. Collective.
+
+        Parameters
+        ----------
+        columns
+            (rows of this rank, count).
+        """
         assert self._pc is not None
         rows = (len(columns), PETSc.DETERMINE)
         B = PETSc.Mat().createDense(
@@ -363,9 +408,9 @@ class Factorisation:
 
 @cache
 def has_cholmod() -> bool:
-    """Return whether PETSc was built with CHOLMOD.
+    """Return whether PETSc was built with CHOLMOD, by setting up a factorisation.
 
-    Without it PETSc would report CHOLMOD's options as unused.
+    Without CHOLMOD, PETSc would report its options as unused.
     """
     K = PETSc.Mat().createSBAIJ([1, 1], 1, nnz=1, comm=MPI.COMM_SELF)
     K.setValue(0, 0, 1.0)
@@ -384,7 +429,7 @@ def has_cholmod() -> bool:
 
 
 class _CholmodFactors:
-    """CHOLMOD's factors of a copy of a matrix's upper triangle.
+    """CHOLMOD's factors of a copy of a matrix's upper triangle, on one rank.
 
     From any other format PETSc itself makes such a copy each time, and leaks it if CHOLMOD fails.
     """
@@ -399,11 +444,12 @@ class _CholmodFactors:
         return K.handle == self._K.handle and _entry_count(K) == self._entries
 
     def factor(self) -> None:
-        """Factor the matrix as it is now."""
+        """Factor the matrix with its present values; raise PETSc.Error if it is indefinite."""
         self._copy_upper(self._upper)
         _renew(self.pc, self._upper)
 
     def _copy_upper(self, upper: PETSc.Mat) -> PETSc.Mat:
+        """Copy the upper triangle of the matrix into `upper`, and return that."""
         K = self._K
         if K.getBlockSize() > 1:  # the copy would have the blocks too
             K = PETSc.Mat().createAIJ(K.getSize(), csr=K.getValuesCSR(), comm=K.comm)
@@ -417,6 +463,13 @@ def _entry_count(K: PETSc.Mat) -> float:
 
 
 def _new_pc(K: PETSc.Mat, solver: str, kind: str = "cholesky") -> PETSc.PC:
+    """Return a preconditioner that factors K by a solver, `cholmod` or `mumps`.
+
+    Parameters
+    ----------
+    kind
+        "cholesky" for a symmetric matrix, "lu" for any.
+    """
     if solver == "cholmod":  # its simplicial method factors indefinite matrices without an error
         options = PETSc.Options(PREFIX)
         options["mat_cholmod_supernodal_switch"], options["mat_cholmod_print"] = 0.0, 0
@@ -430,6 +483,7 @@ def _new_pc(K: PETSc.Mat, solver: str, kind: str = "cholesky") -> PETSc.PC:
 
 
 def _renew(pc: PETSc.PC, K: PETSc.Mat) -> None:
+    """Factor K, whose values or pattern have changed, by a preconditioner."""
     pc.setReusePreconditioner(False)
     pc.setOperators(K)
     pc.setUp()
@@ -439,11 +493,13 @@ def _renew(pc: PETSc.PC, K: PETSc.Mat) -> None:
 class BlockElimination:
     """Block elimination for a bordered matrix [K C; C^T D], with the factors of K.
 
-    The k further unknowns y, which follow u on the last rank, have the Schur complement
-    S = D - C^T K^-1 C.
+    The k further unknowns y, which follow u on the last rank, have the Schur complement S = D - C^T
+    K^-1 C. All methods are collective.
 
     Parameters
     ----------
+    bordered
+        The matrix, of which C, D and the number of multipliers are used.
     solve, times
         K^-1 and K times a vector.
 
@@ -466,6 +522,7 @@ class BlockElimination:
         self._C, self._D, self._comm = bordered.C, bordered.D, comm
         self._solve, self._times = solve, times
         self.count = len(bordered.C)
+        # K^-1 C, and the Schur complement S of K
         self._X = [solve(column) for column in self._C]
         self._S = self._D - self._products(self._X).T
         eigenvalues = np.linalg.eigvalsh((self._S + self._S.T) / 2)
@@ -478,7 +535,7 @@ class BlockElimination:
         return join(self._times(u) + forces, self._products([u])[0] + self._D @ y, self._comm)
 
     def solve(self, rhs: Vector) -> Vector:
-        """Return the solution, refined once if a nearly singular K loses digits."""
+        """Return (u, y) for a right side, refined once if a nearly singular K loses digits."""
         x = self._eliminate(rhs)
         residual = rhs - self.times(x)
         allowed = REFINEMENT_TOLERANCE**2 * dot(self._comm, rhs, rhs)
@@ -487,6 +544,7 @@ class BlockElimination:
         return x
 
     def _eliminate(self, rhs: Vector) -> Vector:
+        """Return (u, y) for a right side by S y = g - C^T K^-1 f and K u = f - C y."""
         f, g = split(rhs, self.count, self._comm)
         u = self._solve(f)
         y = np.linalg.solve(self._S, g - self._products([u])[0])
@@ -494,24 +552,34 @@ class BlockElimination:
         return join(u - change, y, self._comm)
 
     def _products(self, vectors: list[Vector]) -> NDArray[np.float64]:
-        """Return the inner products (len(vectors), k) with the columns of C."""
+        """Return the inner products (len(vectors), k) of vectors with the columns of C."""
         return np.array([[dot(self._comm, v, column) for column in self._C] for v in vectors])
 
 
 def join(u: Vector, y: Vector, comm: MPI.Comm) -> Vector:
-    """Return (u, y), with y on the last rank; a new array on every rank."""
+    """Return the vector (u, y), with y on the last rank; a new array on every rank."""
     return np.concatenate([u, y if comm.rank == comm.size - 1 else y[:0]])
 
 
 def split(x: Vector, k: int, comm: MPI.Comm) -> tuple[Vector, Vector]:
-    """Return u, a view of this rank's part, and y (k,) on every rank. Collective."""
-    last = comm.size - 1
-    rows = x.size - k * (comm.rank == last)
-    return x[:rows], np.asarray(comm.bcast(x[rows:], root=last))
+    """Split a vector (u, y) whose y is on the last rank. Collective.
+
+    Parameters
+    ----------
+    k
+        Number of entries of y.
+
+    Returns
+    -------
+    u, a view of this rank's part, and a copy of y (k,) on every rank.
+    """
+    last_rank = comm.size - 1
+    rows = x.size - k * (comm.rank == last_rank)
+    return x[:rows], np.asarray(comm.bcast(x[rows:], root=last_rank))
 
 
 class Stopwatch:
-    """A context manager that measures time.
+    """A context manager that adds up the time spent in its blocks.
 
     Attributes
     ----------

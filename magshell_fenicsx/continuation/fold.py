@@ -55,12 +55,14 @@ MAX_DISTANCE_TO_FOLD = 0.6
 
 @dataclass(frozen=True)
 class _Spring:
-    """A spring at one degree of freedom, where a mode is largest, of its own stiffness.
+    """A spring at the degree of freedom where a mode is largest.
 
     Attributes
     ----------
     e
-        One at the degree of freedom, zero elsewhere.
+        One at the degree of freedom, zero elsewhere; this rank's part.
+    stiffness
+        The number s that is added to the diagonal of the tangent.
     """
 
     e: Vector
@@ -68,9 +70,10 @@ class _Spring:
 
 
 def _add_spring(tangent: Tangent, mode: Vector, comm: MPI.Comm) -> _Spring:
-    """Add a spring to a tangent, which is then regular at a simple fold. Collective.
+    """Add a spring to a tangent in place, which is then regular at a simple fold. Collective.
 
-    The spring is about as stiff as the diagonal entry of the tangent.
+    The spring acts on the largest entry of the mode, and is about as stiff as the diagonal entry of
+    the tangent there.
     """
     K = symmetric_part(tangent)
     sizes = np.abs(mode[: K.getLocalSize()[0]])  # without the entries of a border
@@ -90,10 +93,19 @@ def _add_spring(tangent: Tangent, mode: Vector, comm: MPI.Comm) -> _Spring:
 
 
 class AugmentedTangent:
-    """The tangent at a state, bordered by b, from factors of K + s e e with a spring s.
+    """The tangent K at a state, bordered by b, from factors of K + s e e with a spring s.
 
     A factorisation of K itself would break down at the fold. One more border removes the spring
-    exactly.
+    exactly. The constructor factors, and is collective.
+
+    Parameters
+    ----------
+    newton
+        Its system gives the tangent; its factorisation is overwritten.
+    b
+        A vector near the null vector, of any length.
+    stress
+        As in `System.tangent`.
 
     Attributes
     ----------
@@ -110,6 +122,7 @@ class AugmentedTangent:
         b: Vector,
         stress: Sequence[WeightedDisplacement] = (),
     ) -> None:
+        """Factor the tangent with a spring, and solve K v + g b = 0, b . v = 1. Collective."""
         self._system = system = newton.system
         K = system.tangent(state.u, state.mu, stress)
         spring = _add_spring(K, b, system.comm)
@@ -120,6 +133,7 @@ class AugmentedTangent:
         self._b, self._e, self._inner = b / np.sqrt(inner(b, b)), spring.e, inner
         self._p, self._q = self._factors.solve(self._e), self._factors.solve(self._b)
         q = inner(self._e, self._q)
+        # 2 x 2 Schur complement, whose unknowns are the spring's force and the factor of b
         self._border = np.array(
             [[1 / spring.stiffness - inner(self._e, self._p), q], [q, -inner(self._b, self._q)]]
         )
@@ -132,7 +146,7 @@ class AugmentedTangent:
     def _solve_bordered(self, y: Vector, c: float) -> tuple[Vector, float]:
         """Return x and t with K x + t b = f and b . x = c, from y = (K + s e e)^-1 f.
 
-        s e . x is the spring's force.
+        The force s e . x of the spring is the third unknown, which removes the spring.
         """
         right_side = [self._inner(self._e, y), c - self._inner(self._b, y)]
         force, t = np.linalg.solve(self._border, right_side)
@@ -141,10 +155,14 @@ class AugmentedTangent:
     def null_vector_at(self, old: State, new: State) -> Vector:
         """Return the null vector at a nearby state, by one chord iteration of K v + g b = 0.
 
+        Differences of the residual replace K times v. Collective.
+
         Parameters
         ----------
         old
             The state of this tangent.
+        new
+            The nearby state.
         """
         old_product, new_product = (
             times_tangent(self._system, state, self.v) for state in (old, new)
@@ -158,17 +176,21 @@ def held_along(
     """Return the equilibrium in which a force along b holds the guess's component along b.
 
     This problem is regular where b is the null vector (the Lyapunov-Schmidt reduction). Where
-    contact forces begin within a step, it is solved between soft faces first, as
-    `BorderedNewton.solve` does. Collective.
+    contact forces begin within a step and full steps fail, it is solved between soft faces first,
+    as `BorderedNewton.solve` does. Collective.
 
     Parameters
     ----------
+    guess
+        A state near the equilibrium; its amplitudes stay.
+    b
+        The direction of the force, of any length.
     stress
         The stress of the guess, see `System.tangent`.
 
     Returns
     -------
-    The state and its estimated error in lengths; None if Newton's method fails.
+    The state and its estimated error in lengths of the system; None if Newton's method fails.
 
     Raises
     ------
@@ -190,9 +212,16 @@ def held_along(
 def _held_by_full_steps(
     newton: BorderedNewton, guess: State, b: Vector, stress: Sequence[WeightedDisplacement] = ()
 ) -> tuple[State, float] | None:
-    """Return the same as `held_along` by full steps of Newton's method alone."""
+    """Return the equilibrium held along b, as `held_along` does, by full steps alone.
+
+    One augmented tangent serves several steps. It is renewed when the steps do not shrink enough.
+
+    Returns
+    -------
+    The state and its estimated error in lengths; None if the steps do not converge.
+    """
     system, u, last_size = newton.system, guess.u, np.inf
-    tangent, tangents, is_own = AugmentedTangent(newton, guess, b, stress), 1, True
+    tangent, tangent_count, is_own = AugmentedTangent(newton, guess, b, stress), 1, True
     while True:
         du, _ = tangent.solve(system.residual(u, guess.mu))
         size = max_abs(system.comm, du) / system.length
@@ -201,9 +230,9 @@ def _held_by_full_steps(
             return State(u - du, guess.mu), size
         if not is_own and size > CONTRACTION * last_size:
             tangent = AugmentedTangent(newton, State(u, guess.mu), b, stress)
-            tangents, is_own = tangents + 1, True
+            tangent_count, is_own = tangent_count + 1, True
             continue
-        if tangents > MAX_TANGENTS or not np.isfinite(size):
+        if tangent_count > MAX_TANGENTS or not np.isfinite(size):
             return None
         u, last_size, is_own, stress = u - du, size, False, extrapolated_stress(u, -du)
 
@@ -211,17 +240,17 @@ def _held_by_full_steps(
 def third_derivative(
     system: System, state: State, v: Vector, residual: Vector | None = None
 ) -> Vector:
-    """Return Pi'''(v, v, .), by a second difference of the residual. Collective.
+    """Return Pi'''(v, v, .) at a state, by a second difference of the residual. Collective.
 
     Parameters
     ----------
     residual
-        The residual at the state, if it is known.
+        The residual at the state; None: it is computed.
     """
-    d = difference_step(system, v)
-    backward, forward = (system.residual(state.u + i * d * v, state.mu) for i in (-1, 1))
+    step = difference_step(system, v)
+    backward, forward = (system.residual(state.u + i * step * v, state.mu) for i in (-1, 1))
     residual = system.residual(state.u, state.mu) if residual is None else residual
-    return np.asarray((backward - 2 * residual + forward) / d**2)
+    return np.asarray((backward - 2 * residual + forward) / step**2)
 
 
 def times_tangent(system: System, state: State, v: Vector) -> Vector:
@@ -230,13 +259,13 @@ def times_tangent(system: System, state: State, v: Vector) -> Vector:
 
 
 def first_difference(f: Callable[[Vector], Vector], system: System, u: Vector, v: Vector) -> Vector:
-    """Return the derivative of f at u along v. Collective."""
-    d = difference_step(system, v)
-    return np.asarray((f(u + d * v) - f(u - d * v)) / (2 * d))
+    """Return the derivative of f at u along v, by a central difference. Collective."""
+    step = difference_step(system, v)
+    return np.asarray((f(u + step * v) - f(u - step * v)) / (2 * step))
 
 
 def difference_step(system: System, v: Vector) -> float:
-    """Return the factor of v in a difference along it. Collective.
+    """Return the factor of v in a difference along it, so that it moves u by little. Collective.
 
     Raises
     ------
@@ -255,7 +284,15 @@ class FoldLost(RuntimeError):
 
 @dataclass(frozen=True)
 class FoldGuess:
-    """A state near a fold, and the null vector; None if it is to be computed from the tangent."""
+    """A guess of a fold.
+
+    Attributes
+    ----------
+    state
+        A state near the fold.
+    phi
+        A vector near the null vector; None: it is computed from the tangent.
+    """
 
     state: State
     phi: Vector | None = None
@@ -299,14 +336,14 @@ class Fold:
 def find_fold(newton: BorderedNewton, guess: FoldGuess, name: str) -> Fold:
     """Locate the fold in the amplitude `name` near a guess. Collective.
 
-    Its error is 1e-9 lengths if rounding allows that. With tiny elements, rounding of K leaves an
-    error of 1e-8 lengths along phi. The amplitude is stationary along phi, so it is accurate
+    The error of u is 1e-9 lengths if rounding allows that. With tiny elements, rounding of K leaves
+    an error of 1e-8 lengths along phi. The amplitude is stationary along phi, so it is accurate
     nevertheless.
 
     Raises
     ------
     FoldLost
-        If Newton's method diverges or takes too long.
+        If Newton's method diverges or takes too long, or the tangent is singular in two directions.
     """
     system, state, count = newton.system, guess.state, newton.factorisation.count
     b, sizes = guess.phi, list[float]()
@@ -325,9 +362,9 @@ def find_fold(newton: BorderedNewton, guess: FoldGuess, name: str) -> Fold:
         grows = len(sizes) > 2 and sizes[-1] > max(2 * sizes[-2], FOLD_ROUNDING_STEP)
         if grows or not sizes[-1] <= MAX_STEP:
             raise FoldLost("Newton's method diverged on its way to a fold")
-        last, state = state, state.with_(state.u + du, name, state.mu[name] + dmu)
+        last_state, state = state, state.with_(state.u + du, name, state.mu[name] + dmu)
     load = system.load(state.u, state.mu, name)
-    phi = _oriented(system, tangent.null_vector_at(last, state), load)
+    phi = _oriented(system, tangent.null_vector_at(last_state, state), load)
     work = dot(system.comm, phi, system.load(state.u, state.mu, name))
     cubic = third_derivative(system, state, phi)
     is_symmetric = not newton.factorisation.skewed
@@ -345,12 +382,14 @@ def find_fold(newton: BorderedNewton, guess: FoldGuess, name: str) -> Fold:
 
 
 def sensitivity(system: System, fold: Fold, column: Vector) -> float:
-    """Return the derivative of the fold's amplitude by a parameter p: -(l . R_p)/(l . R_mu).
+    """Return the derivative of a fold's amplitude by a parameter p: -(l . R_p)/(l . R_mu).
 
     Here l is the left null vector. Collective.
 
     Parameters
     ----------
+    system
+        The system at the fold.
     column
         R_p at the fold. For another amplitude it is that amplitude's load vector.
     """
@@ -363,7 +402,7 @@ def sensitivity(system: System, fold: Fold, column: Vector) -> float:
 def predict_fold(
     system: System, folds: Sequence[tuple[float, Fold]], p: float, others: Amplitudes
 ) -> FoldGuess:
-    """Extrapolate folds at other values of a parameter to `p`. Collective.
+    """Extrapolate the folds at other values of a parameter to its value `p`. Collective.
 
     The polynomials through the last one, two and three folds are compared, and the one with the
     least residual is used: for long or uneven steps a quadratic may be worse than no extrapolation.
@@ -373,7 +412,8 @@ def predict_fold(
     system
         The system at `p`.
     folds
-        Parameters and folds, in the unknowns of `system`, in the order of the continuation.
+        Pairs of a parameter value and its fold, in the unknowns of `system`, in the order of the
+        continuation.
     others
         The other amplitudes at `p`.
     """
@@ -383,20 +423,32 @@ def predict_fold(
 
 
 def _extrapolated(located: Sequence[tuple[float, Fold]], p: float, others: Amplitudes) -> FoldGuess:
+    """Extrapolate folds to `p` by the polynomial through all of them.
+
+    Parameters
+    ----------
+    located
+        Pairs of a parameter value and its fold.
+    others
+        The amplitudes of the guess, apart from that of the folds.
+    """
     values, folds = [value for value, _ in located], [fold for _, fold in located]
     weights = [_lagrange_weight(values, i, p) for i in range(len(values))]
-    u = np.sum([w * fold.state.u for w, fold in zip(weights, folds, strict=True)], axis=0)
-    mu = sum(w * fold.value for w, fold in zip(weights, folds, strict=True))
+    u = np.sum([weight * fold.state.u for weight, fold in zip(weights, folds, strict=True)], axis=0)
+    mu = sum(weight * fold.value for weight, fold in zip(weights, folds, strict=True))
     return FoldGuess(State(u, {**others, folds[-1].name: mu}), folds[-1].phi)
 
 
 def _response_to_load(newton: BorderedNewton, state: State, name: str) -> Vector:
-    """Return the response to the load, which near a fold is nearly the null vector."""
+    """Return K^-1 R_mu, the response to the load, which near a fold is nearly the null vector."""
     return newton.factor_at(state).solve(newton.system.load(state.u, state.mu, name))
 
 
 def _left_null_vector(newton: BorderedNewton, state: State, v: Vector) -> Vector:
-    """Return the null vector of the transposed tangent, by inverse iteration from v."""
+    """Return the null vector of the transposed tangent, by inverse iteration from v.
+
+    Its largest entry is one in magnitude. Collective.
+    """
     factors = newton.factor_at(state)
     for _ in range(3):
         v = factors.solve_transposed(v)
@@ -407,9 +459,14 @@ def _left_null_vector(newton: BorderedNewton, state: State, v: Vector) -> Vector
 def _newton_step(
     system: System, state: State, name: str, tangent: AugmentedTangent
 ) -> tuple[Vector, float]:
-    """Return Newton's step (du, dmu) for R = 0 and g = 0.
+    """Return Newton's step (du, dmu) for R = 0 and g = 0. Collective.
 
     du = alpha v - w_R - dmu w_mu; the rows for alpha and dmu are R along v, and g.
+
+    Parameters
+    ----------
+    tangent
+        The augmented tangent at the state.
     """
     comm, u, v = system.comm, state.u, tangent.v
     w_R, t_R = tangent.solve(system.residual(u, state.mu))
@@ -423,13 +480,29 @@ def _newton_step(
 
 
 def _oriented(system: System, v: Vector, load: Vector) -> Vector:
-    """Return v with its largest entry one in magnitude, along which the conjugate grows."""
+    """Return a multiple of v along which the displacement conjugate to a load grows.
+
+    Its largest entry is one in magnitude.
+
+    Parameters
+    ----------
+    load
+        R_mu of the amplitude; its conjugate changes by -v . R_mu along v.
+    """
     sense = -np.sign(dot(system.comm, v, load))
     return np.asarray(sense * v / max_abs(system.comm, v))
 
 
 def _remaining_error(sizes: Sequence[float]) -> float:
-    """Return the error after the last step, if sizes shrink like a geometric series or faster."""
+    """Return the error after the last step, if sizes shrink like a geometric series or faster.
+
+    It is zero for steps at the level of rounding, and infinite if the sizes grow.
+
+    Parameters
+    ----------
+    sizes
+        Sizes of the steps so far, in lengths of the system.
+    """
     ratio = sizes[-1] / sizes[-2] if len(sizes) > 1 else 0.5
     if ratio > 0.5 and sizes[-1] <= FOLD_ROUNDING_STEP:
         return 0.0
@@ -447,12 +520,12 @@ def fold_ahead(newton: BorderedNewton, point: Point, name: str) -> FoldGuess | N
     Along the softest mode phi (of length one, K phi = lambda phi) with the amplitude a, and with mu
     varied by m, equilibrium is lambda a + c a^2/2 = b m with c = Pi'''(phi, phi, phi) and b = -phi
     . R_mu = lambda phi . du/dmu. The fold is at a = -lambda/c, m = -lambda^2/(2 b c); all other
-    modes follow mu linearly. The null vector of the guess points the way that the path goes. It
-    takes one factorisation.
+    modes follow mu linearly. The null vector of the guess points the way that the path goes. The
+    prediction takes one factorisation.
 
     Returns
     -------
-    None if the fold is far, or the path does not show it yet.
+    The guess; None if the fold is far, or the path does not show it yet.
     """
     system, state = newton.system, point.state
     comm, mu = system.comm, state.mu[name]

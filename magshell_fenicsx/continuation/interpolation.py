@@ -18,7 +18,7 @@ MIN_KINK_DISTANCE = 0.05  # the same of a kink
 def slope_weights(places: Sequence[float]) -> list[tuple[float, float]]:
     """Return the weights of a difference formula for the slope at the first of some places.
 
-    The formula differentiates the polynomial through all places.
+    The formula differentiates the polynomial through the values at all places.
 
     Returns
     -------
@@ -27,8 +27,9 @@ def slope_weights(places: Sequence[float]) -> list[tuple[float, float]]:
     offsets = np.array(places) - places[0]
     scale = np.abs(offsets).max()
     vandermonde = np.vander(offsets / scale, increasing=True)
+    # exact for all powers: of these the first alone has a slope at zero
     weights = np.linalg.solve(vandermonde.T, np.eye(len(places))[1]) / scale
-    return [(float(weight), float(q)) for weight, q in zip(weights, places, strict=True)]
+    return [(float(weight), float(place)) for weight, place in zip(weights, places, strict=True)]
 
 
 def interpolated(x: Sequence[float], y: Sequence[float], place: float) -> float:
@@ -37,13 +38,13 @@ def interpolated(x: Sequence[float], y: Sequence[float], place: float) -> float:
 
 
 def _stationary_places(rise: float, d0: float, d1: float) -> list[float]:
-    """Return the places where a cubic is stationary; for the parameters see `stationary`."""
+    """Return all places where a cubic is stationary; for the parameters see `stationary`."""
     roots = np.roots([3 * (d0 + d1 - 2 * rise), 2 * (3 * rise - 2 * d0 - d1), d0])
     return [float(r.real) for r in roots if abs(r.imag) < REAL_ROOT_TOLERANCE]
 
 
 def stationary(rise: float, d0: float, d1: float) -> float:
-    """Return the place between 0 and 1 where a cubic is stationary, not too close to these.
+    """Return the place between 0 and 1 where a cubic is stationary, not too close to the ends.
 
     Parameters
     ----------
@@ -60,7 +61,7 @@ def stationary(rise: float, d0: float, d1: float) -> float:
 def flat_beyond(rise: float, d0: float, d1: float) -> float:
     """Return the first place beyond 1 where a cubic is stationary; infinite if there is none.
 
-    The parameters are those of `stationary`.
+    The cubic has the value change `rise` from 0 to 1, and the slopes d0 and d1 there.
     """
     return min((t for t in _stationary_places(rise, d0, d1) if t > 1), default=np.inf)
 
@@ -68,7 +69,14 @@ def flat_beyond(rise: float, d0: float, d1: float) -> float:
 def hermite(s: float, nodes: Sequence[float]) -> list[tuple[float, float]]:
     """Return the weights of values and slopes at nodes in the Hermite polynomial's value at `s`.
 
-    The polynomial takes the values and slopes at all nodes.
+    The polynomial takes given values and slopes at all nodes.
+
+    Parameters
+    ----------
+    s
+        The place where the polynomial is evaluated.
+    nodes
+        Distinct places with known values and slopes.
 
     Returns
     -------
@@ -77,6 +85,8 @@ def hermite(s: float, nodes: Sequence[float]) -> list[tuple[float, float]]:
     weights = []
     for i, a in enumerate(nodes):
         others = [*nodes[:i], *nodes[i + 1 :]]
+        # the square of the Lagrange polynomial of node a, and the logarithmic derivative of it
+        # there
         square = prod((s - b) / (a - b) for b in others) ** 2
         derivative = 2 * sum(1 / (a - b) for b in others)
         weights.append((square * (1 - derivative * (s - a)), square * (s - a)))
@@ -84,8 +94,15 @@ def hermite(s: float, nodes: Sequence[float]) -> list[tuple[float, float]]:
 
 
 def kink(rise: float, d0: float, d1: float) -> float:
-    """Return the place where straight lines from both ends of the interval meet.
+    """Return the place between 0 and 1 where straight lines from both ends meet.
 
-    It is not too close to the ends. The parameters are those of `stationary`.
+    It is not too close to the ends.
+
+    Parameters
+    ----------
+    rise
+        Difference of the values at 0 and 1.
+    d0, d1
+        The slopes of the lines through 0 and 1.
     """
     return min(max((rise - d1) / (d0 - d1), MIN_KINK_DISTANCE), 1 - MIN_KINK_DISTANCE)

@@ -27,10 +27,12 @@ Verdict = Literal["go on", "converged", "diverged", "far", "rounding"]
 
 
 def extrapolated_error(sizes: Sequence[float], ratios: int) -> float:
-    """Return the error after the last of some steps, if all further ones shrink like the last ones.
+    """Return the error after the last step, if all further steps shrink like the last ones.
 
     Parameters
     ----------
+    sizes
+        Sizes of the steps so far.
     ratios
         Number of the last ratios of successive steps of which the largest counts.
 
@@ -41,21 +43,22 @@ def extrapolated_error(sizes: Sequence[float], ratios: int) -> float:
     if len(sizes) <= ratios:
         return np.inf
     ratio = max(b / a for a, b in pairwise(sizes[-1 - ratios :]))
+    # the sum of a geometric series
     return sizes[-1] * ratio / (1 - ratio) if ratio <= EXTRAPOLATION_RATIO else np.inf
 
 
 @dataclass(frozen=True)
 class NewtonStep:
-    """The next step at an iterate.
+    """The next step at an iterate of Newton's method, by its size.
 
     Attributes
     ----------
     size
-        Size of the step, see `BorderedMatrix.size`.
+        Size of the step in lengths of the system, see `BorderedMatrix.size`.
     is_own
         Whether the matrix was computed at this iterate.
     pivots
-        Number of negative pivots of the matrix.
+        Number of negative pivots of a new matrix; 0 if the matrix was kept.
     """
 
     size: float
@@ -67,7 +70,7 @@ class NewtonStep:
 class Iterates:
     """The steps of one solve, in lengths of the system, by which its convergence is judged.
 
-    Parameters
+    Attributes
     ----------
     largest
         A longer step counts as divergence.
@@ -81,6 +84,8 @@ class Iterates:
         Whether the solve is given up early where a shorter step of the path costs less.
     relative_tolerance
         Fraction of the first step; an error of that size is accepted.
+    steps
+        The next step at each iterate so far; a new one is appended before `judge` is called.
     allowed
         The extrapolated error up to which the last iterate was accepted.
     """
@@ -113,14 +118,17 @@ class Iterates:
         return min(self.steps[-1].size, max(self.extrapolated_error, self.allowed))
 
     def judge(self, tolerance: float, rounding: Callable[[], float]) -> Verdict:
-        """Return the verdict on the iterate, from the last step.
+        """Return the verdict on the last iterate, from the sizes of all steps.
+
+        "far" means that a shorter step of the path should be tried. "rounding" means that rounding
+        hides the solution.
 
         Parameters
         ----------
         tolerance
-            Largest error of the iterate.
+            Largest error of the iterate, in lengths of the system.
         rounding
-            Computes the error from rounding of the residual.
+            Computes the error from rounding of the residual, in lengths; expensive.
         """
         step, earlier = self.steps[-1], self.steps[:-1]
         tolerance = max(tolerance, self.relative_tolerance * self.steps[0].size)
@@ -148,7 +156,15 @@ class Iterates:
         return "go on"
 
     def _leads_astray(self, earlier: Sequence[NewtonStep], step: NewtonStep) -> bool:
-        """Return whether steps with own matrices lead away, past an instability, or stay long."""
+        """Return whether steps with own matrices lead away, past an instability, or stay long.
+
+        Parameters
+        ----------
+        earlier
+            Earlier steps with own matrices.
+        step
+            The last step, with its own matrix.
+        """
         if len(earlier) == 1 and step.pivots != earlier[0].pivots:
             # past an instability, which a shorter step of the path meets too
             is_past = step.pivots > earlier[0].pivots

@@ -58,22 +58,23 @@ class ArnoldiBasis:
         self.H = np.zeros((max_size + 1, max_size))
 
     def grow(self) -> int:
-        """Add a vector, which is zero in an invariant space; return the number of columns of H.
+        """Extend the Krylov space by one vector; return the number of columns of H. Collective.
 
-        Collective.
+        The vector is zero if the space is invariant.
         """
-        j, w = len(self.basis) - 1, np.array(self._times(self.basis[-1]))
+        j, new_vector = len(self.basis) - 1, np.array(self._times(self.basis[-1]))
+        # Gram-Schmidt, twice for what rounding has left
         for _ in range(2):
-            for i, q in enumerate(self.basis):
-                component = dot(self._comm, q, w)
+            for i, vector in enumerate(self.basis):
+                component = dot(self._comm, vector, new_vector)
                 self.H[i, j] += component
-                w -= component * q
-        self.H[j + 1, j] = np.sqrt(dot(self._comm, w, w))
-        self.basis.append(w / (self.H[j + 1, j] or 1.0))
+                new_vector -= component * vector
+        self.H[j + 1, j] = np.sqrt(dot(self._comm, new_vector, new_vector))
+        self.basis.append(new_vector / (self.H[j + 1, j] or 1.0))
         return j + 1
 
     def combination(self, coefficients: Array) -> Vector:
-        """Return the linear combination of the first basis vectors."""
+        """Return the linear combination of the first basis vectors, as many as coefficients."""
         return np.asarray(sum(c * q for c, q in zip(coefficients, self.basis, strict=False)))
 
 
@@ -82,37 +83,40 @@ class ProductCache:
 
     Attributes
     ----------
+    D
+        The correction.
     pairs
-        Vectors v with D v.
+        Pairs of a vector v and D v, at most `MAX_STORED_PRODUCTS`.
     """
 
     def __init__(self, D: DenseCorrection) -> None:
         self.D, self.pairs = D, list[tuple[Vector, Vector]]()
 
     def times(self, v: Vector) -> Vector:
-        """Return D v. Collective."""
+        """Return D v, and store the pair while there is room. Collective."""
         product = self.D.times(v)
         if len(self.pairs) < MAX_STORED_PRODUCTS:
             self.pairs.append((np.array(v), product))
         return product
 
     def cache_for(self, D: DenseCorrection) -> "ProductCache":
-        """Return a cache for a matrix, with scaled products if it is a multiple of this one."""
+        """Return a cache for a correction, with scaled products if it is a multiple of this one."""
         factor = D.multiple_of(self.D)
         if factor == 1.0:
             return self
-        other = ProductCache(D)
+        cache = ProductCache(D)
         if factor:
-            other.pairs = [(v, factor * product) for v, product in self.pairs]
-        return other
+            cache.pairs = [(v, factor * product) for v, product in self.pairs]
+        return cache
 
 
 class CorrectionSolver:
-    """Solves (I + A) x = b, A = K0^-1 D, by generalised conjugate residuals.
+    """Solver of (I + A) x = b, A = K0^-1 D, by generalised conjugate residuals.
 
     The iteration begins with all earlier products. So a solution needs few new ones, or none: A has
-    few large eigenvalues, and earlier vectors hold their directions (M. L. Parks, E. de Sturler,
-    G. Mackey, D. D. Johnson, S. Maiti, SIAM J. Sci. Comput. 28, 2006, 1651).
+    few large eigenvalues, and earlier vectors hold their directions (M. L. Parks, E. de Sturler, G.
+    Mackey, D. D. Johnson, S. Maiti, SIAM J. Sci. Comput. 28, 2006, 1651). The constructor is
+    collective.
 
     Parameters
     ----------
@@ -132,6 +136,7 @@ class CorrectionSolver:
         comm: MPI.Comm,
         size: int,
     ) -> None:
+        """Orthonormalise the earlier products, with which each solution begins. Collective."""
         self._solve_sparse, self._products, self._comm = solve_sparse, products, comm
         # columns u, and c = (I + A) u, orthonormal; the first `_count` are in use
         shape = (size, MAX_STORED_PRODUCTS + MAX_PRODUCTS)
@@ -141,6 +146,7 @@ class CorrectionSolver:
             U, DU = (np.column_stack(vectors) for vectors in zip(*products.pairs, strict=True))
             C = U + solve_columns(DU)
             for _ in range(2):
+                # orthonormal columns C from the eigenvectors of C^T C; dependent ones are left out
                 squares, Q = np.linalg.eigh(comm.allreduce(C.T @ C))
                 independent = squares > DEPENDENCE_TOLERANCE * squares[-1]
                 scale = np.sqrt(squares[independent])
@@ -149,41 +155,65 @@ class CorrectionSolver:
             self._U[:, : self._count], self._C[:, : self._count] = U, C
 
     def solve(self, b: Vector, tolerance: float) -> Vector:
-        """Return the solution to a relative residual; NaN if the tolerance is not reached.
+        """Return the solution x of (I + A) x = b, with b = K0^-1 times a right side. Collective.
 
-        Collective.
+        Parameters
+        ----------
+        tolerance
+            Residual of the solution, relative to b.
+
+        Returns
+        -------
+        The solution; NaN if neither the tolerance nor the level of rounding is reached.
         """
         size = np.sqrt(dot(self._comm, b, b))
         if not 0.0 < size < np.inf:
             return b
-        x, r = self._project_out(np.zeros_like(b), np.array(b), -1.0)
-        residual, m = np.sqrt(dot(self._comm, r, r)) / size, self._count
-        while residual > tolerance and m < MAX_STORED_PRODUCTS + MAX_PRODUCTS:
-            u, c = self._project_out(r, r + self._solve_sparse(self._products.times(r)), 1.0, m)
+        x, remainder = self._project_out(np.zeros_like(b), np.array(b), -1.0)
+        residual, column_count = np.sqrt(dot(self._comm, remainder, remainder)) / size, self._count
+        while residual > tolerance and column_count < MAX_STORED_PRODUCTS + MAX_PRODUCTS:
+            # a new direction r and its image (I + A) r, orthogonal to all earlier images
+            u, c = self._project_out(
+                remainder,
+                remainder + self._solve_sparse(self._products.times(remainder)),
+                1.0,
+                column_count,
+            )
             norm = np.sqrt(dot(self._comm, c, c))
-            self._U[:, m], self._C[:, m] = u / norm, c / norm
-            component = dot(self._comm, self._C[:, m], r)
-            x, r = x + component * self._U[:, m], r - component * self._C[:, m]
-            m, previous = m + 1, residual
-            residual = np.sqrt(dot(self._comm, r, r)) / size
+            self._U[:, column_count], self._C[:, column_count] = u / norm, c / norm
+            component = dot(self._comm, self._C[:, column_count], remainder)
+            x, remainder = (
+                x + component * self._U[:, column_count],
+                remainder - component * self._C[:, column_count],
+            )
+            column_count, previous = column_count + 1, residual
+            residual = np.sqrt(dot(self._comm, remainder, remainder)) / size
             if previous < ACCEPTED_TOLERANCE and residual > previous / 2:
                 break
-        self._count = min(m, MAX_STORED_PRODUCTS)
+        self._count = min(column_count, MAX_STORED_PRODUCTS)
         if not residual <= max(ACCEPTED_TOLERANCE, tolerance):
             return np.full_like(b, np.nan)
-        return x + r if residual <= tolerance else x
+        return x + remainder if residual <= tolerance else x
 
     def _project_out(
         self, u: Vector, c: Vector, sign: float, count: int | None = None
     ) -> tuple[Vector, Vector]:
-        """Remove from c its components along the columns C, and from u those of U times the sign.
+        """Remove from c its components along the columns C, and from u the same columns of U.
 
-        With the sign -1 the columns of U are added to u.
+        Parameters
+        ----------
+        sign
+            With -1 the columns of U are added to u instead, which makes u a solution.
+        count
+            Number of columns; None: all in use.
         """
-        m = self._count if count is None else count
+        column_count = self._count if count is None else count
         for _ in range(2):  # the second time for what rounding has left
-            components = self._comm.allreduce(self._C[:, :m].T @ c)
-            u, c = u - sign * (self._U[:, :m] @ components), c - self._C[:, :m] @ components
+            components = self._comm.allreduce(self._C[:, :column_count].T @ c)
+            u, c = (
+                u - sign * (self._U[:, :column_count] @ components),
+                c - self._C[:, :column_count] @ components,
+            )
         return u, c
 
 
@@ -209,6 +239,8 @@ class EigenvalueCrossings:
 
 class ConjugateComplement:
     """The complement, in the inner product of K, of the space of some vectors X.
+
+    The constructor and all methods are collective.
 
     Parameters
     ----------
@@ -240,6 +272,10 @@ class SymmetricUpdate:
 
     Parameters
     ----------
+    D
+        The lagged correction.
+    X, KX
+        Vectors, and K times each.
     missing
         Y, the products of what D lacks with X.
     """
@@ -252,6 +288,7 @@ class SymmetricUpdate:
         KX: Sequence[Vector],
         comm: MPI.Comm,
     ) -> None:
+        """Compute the small matrices of the update. Collective."""
         self._D, self._comm = D, comm
         self._complement, self._Y = ConjugateComplement(X, KX, comm), np.column_stack(missing)
         XY = comm.allreduce(self._complement.X.T @ self._Y)
@@ -268,6 +305,9 @@ def count_crossings(
     D: LinearMap, solve_sparse: LinearMap, first: Vector, comm: MPI.Comm
 ) -> EigenvalueCrossings | None:
     """Count how many more negative eigenvalues K0 + D has than K0. Collective.
+
+    Arnoldi runs find the eigenvalues of A = K0^-1 D, each run without the vectors found before,
+    until no large one is left.
 
     Parameters
     ----------
@@ -307,6 +347,7 @@ def count_crossings(
             vectors_of_value = [krylov.combination(c) for c in coefficients]
             if values[i].imag == 0 and values[i].real < -1:
                 x = vectors_of_value[0]
+                # on the way from K0 to K0 + D the matrix is singular once along x
                 added += 1 if dot(comm, x, D(x)) < 0 else -1
             for x in vectors_of_value:
                 x = orthogonal_to_found(x)
@@ -319,7 +360,7 @@ def _converged_eigenpairs(krylov: ArnoldiBasis) -> tuple[Array, Array] | None:
 
     Returns
     -------
-    Eigenvalues of H and their vectors in the basis, as columns; None if they do not converge.
+    Eigenvalues of H and, as columns, their vectors in the basis; None if they do not converge.
     """
     while (size := krylov.grow()) <= MAX_PRODUCTS:
         H = krylov.H[:size, :size]
@@ -348,10 +389,22 @@ def crossings_with_lag(
 ) -> EigenvalueCrossings:
     """Return a count with the uncertainty that the lagged part of a tangent adds. Collective.
 
-    The lagged part L, with an error as large as itself, changes the sign along a vector x where
-    x . L x is larger than x . (K + D) x. Among vectors that are K-conjugate to those of large
-    eigenvalues, only the largest is computed. Where the uncertainty is large, a few vectors are
-    corrected with the present product.
+    The lagged part L may have an error as large as itself. Such an error changes the sign along a
+    vector x where x . L x is larger than x . (K + D) x. The uncertainty is the largest ratio of
+    both, along the vectors of large eigenvalues and in their K-conjugate complement. Where it is
+    large along a few vectors, D is corrected there with the present product, and the count is
+    repeated.
+
+    Parameters
+    ----------
+    tangent
+        K + D with its lagged part; without one the count is returned unchanged.
+    crossings
+        The count with the lagged D.
+    solve_sparse, K
+        K^-1 and K times a vector.
+    first
+        Start vector of the iterations.
     """
     lagged = tangent.lagged
     if lagged is None:
@@ -360,9 +413,9 @@ def crossings_with_lag(
     KX = [K(x) for x in X]
     uncertainties = list[float]()
     for x, y in zip(X, KX, strict=True):
-        change = dot(comm, x, lagged.times(x))
+        lagged_part = dot(comm, x, lagged.times(x))
         stiffness = dot(comm, x, y) + dot(comm, x, tangent.D.times(x))
-        uncertainties.append(abs(change / stiffness))
+        uncertainties.append(abs(lagged_part / stiffness))
     complement = ConjugateComplement(X, KX, comm)
     project = complement.project
 
@@ -372,26 +425,38 @@ def crossings_with_lag(
 
         return spectral_radius(product, project(first), comm)
 
-    others = max(smallest, spectral_radius_in_complement(lagged.times))
+    in_complement = max(smallest, spectral_radius_in_complement(lagged.times))
     if tangent.extrapolated_product:  # the lagged part may be small where the present one is not
         missing = spectral_radius_in_complement(tangent.missing_product)
-        others = max(others, missing / MAX_MISSING_PART)
+        in_complement = max(in_complement, missing / MAX_MISSING_PART)
     large_indices = [i for i, value in enumerate(uncertainties) if not value <= MAX_UNCERTAINTY]
     present = tangent.present_product
-    if present and others <= MAX_UNCERTAINTY and 0 < len(large_indices) <= MAX_CORRECTED_VECTORS:
+    if (
+        present
+        and in_complement <= MAX_UNCERTAINTY
+        and 0 < len(large_indices) <= MAX_CORRECTED_VECTORS
+    ):
         X, KX = ([vectors[i] for i in large_indices] for vectors in (X, KX))
         missing_products = [present(x) - lagged.times(x) for x in X]
         D = SymmetricUpdate(tangent.D, X, missing_products, KX, comm)
         if corrected := count_crossings(D.times, solve_sparse, first, comm):
             small_uncertainties = [value for value in uncertainties if value <= MAX_UNCERTAINTY]
-            return replace(corrected, uncertainty=max([others, *small_uncertainties]))
-    return replace(crossings, uncertainty=max([others, *uncertainties]))
+            return replace(corrected, uncertainty=max([in_complement, *small_uncertainties]))
+    return replace(crossings, uncertainty=max([in_complement, *uncertainties]))
 
 
 def spectral_radius(times: LinearMap, first: Vector, comm: MPI.Comm) -> float:
-    """Return the largest magnitude of an eigenvalue, to `EIGENVALUE_TOLERANCE`. Collective.
+    """Return the largest magnitude of an eigenvalue of a linear map. Collective.
 
-    It is infinite if Arnoldi's method does not converge.
+    Its relative error is at most `EIGENVALUE_TOLERANCE`. It is infinite if Arnoldi's method does
+    not converge.
+
+    Parameters
+    ----------
+    times
+        The map times a vector.
+    first
+        Start vector of the iteration.
     """
     krylov = ArnoldiBasis(times, first, comm, MAX_PRODUCTS)
     while (size := krylov.grow()) < MAX_PRODUCTS:

@@ -41,10 +41,10 @@ class NoEigenpair(RuntimeError):
 
 
 def nearest_to_zero(factors: Factorisation) -> tuple[float, Vector]:
-    """Return the eigenvalue nearest to zero and its eigenvector of length one. Collective.
+    """Return the eigenvalue of a factored tangent nearest to zero, and its eigenvector. Collective.
 
-    For a nearly singular tangent the eigenvector is the null vector. Its sign is arbitrary; for a
-    multiple eigenvalue it is any vector of the eigenspace.
+    The vector has length one. For a nearly singular tangent it is the null vector. Its sign is
+    arbitrary; for a multiple eigenvalue it is any vector of the eigenspace.
 
     Raises
     ------
@@ -74,6 +74,8 @@ class _RitzPair:
 
     Attributes
     ----------
+    value, vector
+        The eigenvalue lambda, and its vector of length one.
     error
         The residual over 1/|lambda|, including that of a pair of the other sign that may be nearer
         to zero.
@@ -85,9 +87,20 @@ class _RitzPair:
 
 
 class _InverseKrylovSpace:
-    """A Krylov space of K^-1: orthonormal vectors V and their images W = K^-1 V, as rows."""
+    """A Krylov space of K^-1: orthonormal vectors V and their images W = K^-1 V, as rows.
+
+    All methods are collective.
+
+    Attributes
+    ----------
+    solves
+        Number of solves so far.
+    norm
+        Largest sum of magnitudes in a row of K.
+    """
 
     def __init__(self, factors: Factorisation) -> None:
+        """Begin with an empty space and a fixed start vector. Collective."""
         self._factors, self._comm = factors, factors.comm
         n, self._size = factors.size
         self._count, self.solves = 0, 0
@@ -101,7 +114,15 @@ class _InverseKrylovSpace:
         return self._count == self._size
 
     def grow(self) -> _RitzPair:
-        """Add one vector; return the pair nearest to zero in the larger space."""
+        """Add one vector to the space; return the pair nearest to zero in the larger space.
+
+        A full space is reduced to the vectors of the eigenvalues nearest to zero.
+
+        Raises
+        ------
+        NoEigenpair
+            If a solution is not finite.
+        """
         v, k = self._next, self._count
         for _ in range(2):  # a second time against rounding
             v = v - self._sums(self._V[:k] @ v) @ self._V[:k]
@@ -116,6 +137,7 @@ class _InverseKrylovSpace:
             theta, Y = _real_pairs(inverse)
         else:
             theta, Y = np.linalg.eigh((inverse + inverse.T) / 2)  # ascending, of K^-1
+        # the largest of either sign is at an end of the ascending list
         pairs = [self._pair(theta[i], Y[:, i]) for i in {0, len(theta) - 1}]
         pair = self._nearest(pairs)
         if self._count == MAX_VECTORS:
@@ -126,34 +148,53 @@ class _InverseKrylovSpace:
         return pair
 
     def _pair(self, theta: float, y: NDArray[np.float64]) -> tuple[float, Vector, Vector]:
-        """Return 1/lambda, its vector after one more inverse iteration, and the residual."""
+        """Return an eigenpair of K^-1 in the space, and its residual.
+
+        Parameters
+        ----------
+        theta, y
+            Eigenvalue 1/lambda, and the vector in the basis V.
+
+        Returns
+        -------
+        1/lambda, its vector after one more inverse iteration, and the residual K^-1 v - theta v.
+        """
         V, W = self._V[: self._count], self._W[: self._count]
-        w = y @ W
-        return theta, w / np.sqrt(dot(self._comm, w, w)), w - theta * (y @ V)
+        image = y @ W
+        return theta, image / np.sqrt(dot(self._comm, image, image)), image - theta * (y @ V)
 
     def _nearest(self, pairs: list[tuple[float, Vector, Vector]]) -> _RitzPair:
-        """Return the pair nearest to zero; its residual is the next vector of the space."""
-        (theta, w, residual), *rivals = sorted(pairs, key=lambda pair: -abs(pair[0]))
-        size = np.sqrt(dot(self._comm, residual, residual))
-        self._next, error = residual, size / abs(theta)
+        """Return the pair nearest to zero, and choose the next vector of the space.
+
+        The next vector is the larger residual of this pair and of a rival of the other sign, if
+        that may be as near to zero. Of two equally near the negative one is returned.
+
+        Parameters
+        ----------
+        pairs
+            For each pair 1/lambda, its vector and its residual.
+        """
+        (theta, vector, residual), *rivals = sorted(pairs, key=lambda pair: -abs(pair[0]))
+        residual_size = np.sqrt(dot(self._comm, residual, residual))
+        self._next, error = residual, residual_size / abs(theta)
         for rival, rival_w, rival_residual in rivals:
             rival_size = np.sqrt(dot(self._comm, rival_residual, rival_residual))
             if rival * theta < 0 and abs(rival) + rival_size >= (1 - TIE_TOLERANCE) * abs(theta):
                 error = max(error, rival_size / abs(theta))
-                self._next = residual if size > rival_size else rival_residual
+                self._next = residual if residual_size > rival_size else rival_residual
                 if rival < 0 and abs(rival) >= (1 - TIE_TOLERANCE) * abs(theta):
-                    theta, w = rival, rival_w
-        return _RitzPair(1 / theta, w, error)
+                    theta, vector = rival, rival_w
+        return _RitzPair(1 / theta, vector, error)
 
     def _sums(self, local_products: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return inner products over all ranks, from those on this rank."""
+        """Return the sums over all ranks of inner products on this rank."""
         return np.asarray(self._comm.allreduce(local_products))
 
 
 def _real_pairs(A: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the eigenpairs of a small matrix, ascending.
+    """Return the real eigenvalues of a small matrix, ascending, with their vectors as columns.
 
-    They are those of real eigenvalues alone if there are any, else the real parts of all.
+    Without real eigenvalues they are the real parts of all pairs.
     """
     theta, Y = np.linalg.eig(A)
     real = theta.imag == 0.0
@@ -179,7 +220,13 @@ class CriticalMode:
 
 
 def critical_mode(stability: Stability, state: State) -> CriticalMode:
-    """Return the eigenpair of a tangent nearest to zero; the vector has length one. Collective."""
+    """Return the eigenpair of a tangent nearest to zero; the vector has length one. Collective.
+
+    Raises
+    ------
+    NoEigenpair
+        If the pair is not found.
+    """
     factors = stability.factor_at(state)
     return CriticalMode(*nearest_to_zero(factors), factors.negative_pivots)
 
@@ -210,8 +257,8 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int, kernel: int = 0) -> lis
     Parameters
     ----------
     K
-        A symmetric tangent. It may be indefinite. Exactly singular it is only with the `kernel`
-        that is given.
+        A symmetric tangent. It may be indefinite. It may be exactly singular only if `kernel` is
+        given.
     M
         A symmetric matrix, positive definite on the free degrees of freedom, with zero rows and
         columns for the constrained ones. Its sparsity pattern is part of that of K.
@@ -241,8 +288,8 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int, kernel: int = 0) -> lis
     computed = requested
     for _ in range(MAX_TRIALS):
         modes = slices.nearest_to(shift, computed, LANCZOS_TOLERANCE)
-        last = modes[requested - 1].eigenvalue
-        upper_bound = last + MULTIPLE_TOLERANCE * (last - shift)
+        last_eigenvalue = modes[requested - 1].eigenvalue
+        upper_bound = last_eigenvalue + MULTIPLE_TOLERANCE * (last_eigenvalue - shift)
         missed = slices.count_below(upper_bound) - sum(
             mode.eigenvalue < upper_bound for mode in modes
         )
@@ -254,7 +301,7 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int, kernel: int = 0) -> lis
 
 
 def null_vector(K: Tangent) -> Vector:
-    """Return the eigenvector of length one of a tangent's eigenvalue nearest to zero. Collective.
+    """Return the eigenvector of a tangent's eigenvalue nearest to zero, of length one. Collective.
 
     Raises
     ------
@@ -272,12 +319,12 @@ def null_vector(K: Tangent) -> Vector:
 class _SpectrumSlices:
     """The inertia of K - sigma M for several sigma, and the eigenpairs nearest to sigma.
 
-    The latest factors are kept.
+    The latest factors are kept. All methods are collective.
 
     Attributes
     ----------
     finite_count
-        Number of finite eigenvalues.
+        Number of finite eigenvalues: of unknowns with mass.
     """
 
     def __init__(self, K: PETSc.Mat, M: PETSc.Mat) -> None:
@@ -296,7 +343,7 @@ class _SpectrumSlices:
         return float(ROUNDING * self._K.norm(norm) / self._M.norm(norm))
 
     def count_below(self, sigma: float) -> int:
-        """Return the number of eigenvalues below sigma: negative pivots of K - sigma M."""
+        """Return the number of eigenvalues below sigma: of negative pivots of K - sigma M."""
         if sigma != self._sigma:
             self._K.copy(self._shifted, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
             self._shifted.axpy(-sigma, self._M, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
@@ -305,7 +352,18 @@ class _SpectrumSlices:
         return self._factorisation.negative_pivots
 
     def nearest_to(self, sigma: float, count: int, tolerance: float) -> list[Eigenpair]:
-        """Return the eigenpairs nearest to sigma, ascending."""
+        """Return the `count` eigenpairs nearest to sigma, ascending, by SLEPc's Lanczos iteration.
+
+        Parameters
+        ----------
+        tolerance
+            Error of an eigenvalue, relative to its distance from sigma.
+
+        Raises
+        ------
+        ModesNotFound
+            If the iteration finds fewer.
+        """
         self.count_below(sigma)
         count = min(count, self.finite_count)
         eps = SLEPc.EPS().create(self._K.comm)

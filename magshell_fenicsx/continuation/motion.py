@@ -33,20 +33,20 @@ DIFFERENCE_STEP = 1e-3  # in lengths that a velocity moves the system by, for th
 
 @dataclass(frozen=True)
 class Motion:
-    """A moving state.
+    """A moving state: displacement, velocity, acceleration and amplitudes at a time.
 
     Attributes
     ----------
     t
         Time.
     u, v, a
-        Displacement, velocity and acceleration.
+        Displacement, velocity and acceleration; this rank's parts.
     mu
-        Amplitudes.
+        Amplitudes by name.
     work, dissipated
         Work of the loads, and of drag and viscosity, since the begin.
     potentials
-        dPi/dmu of the loads.
+        dPi/dmu of the loads, by name.
     error
         Estimated error of the last step, over the system's length.
     memory
@@ -71,7 +71,7 @@ class Motion:
 
 
 class ViscousForces(Protocol):
-    """Forces that depend on the strains along a time step.
+    """Forces that depend on the strains along a time step. All methods are collective.
 
     Attributes
     ----------
@@ -86,35 +86,45 @@ class ViscousForces(Protocol):
     creep_time: float
 
     def force(self, u0: Vector, u1: Vector, v: Vector, fraction: float, dt: float) -> Vector:
-        """Return the force at a fraction of the step from u0 to u1; zero at supports.
+        """Return the viscous force at a fraction of the step from u0 to u1; zero at supports.
 
         Parameters
         ----------
         v
-            The velocity there.
+            The velocity at that fraction.
+        fraction
+            0 at the begin of the step, 1 at its end.
+        dt
+            Length of the step; 0 at the begin of a motion.
         """
 
     def tangent(self, u: Vector, mu: Amplitudes, dt: float, rate: float) -> Tangent:
-        """Return the system's tangent with the derivative of the force by u1.
+        """Return the system's tangent with the derivative of the viscous force by u1.
 
         Parameters
         ----------
+        u, mu
+            The state within the step at which the tangent is taken.
+        dt
+            Length of the step.
         rate
             dv/du at the end of the step.
         """
 
     def begin(self) -> None:
-        """Begin a motion, or continue after a kink of a load."""
+        """Begin a motion, or continue it after a kink of a load."""
 
     def accept(self, u0: Vector, u1: Vector, dt: float) -> Vector:
-        """Go on from u1; return the force there."""
+        """Accept a step from u0 to u1: renew the history variables, and return the force there."""
 
     def error_force(self, u0: Vector, u1: Vector, dt: float) -> Vector | None:
-        """Return the estimated error of the force at u1; None without an estimate."""
+        """Return the estimated error of the force after a step from u0 to u1; None without one."""
 
 
 class AveragedContact(Protocol):
     """Contact forces, which begin and end within a step: each step takes their mean along it.
+
+    All methods are collective.
 
     Attributes
     ----------
@@ -128,19 +138,29 @@ class AveragedContact(Protocol):
     settings: frozenset[str]
 
     def stiffened_settings(self, begin: State, v: Vector) -> dict[str, float]:
-        """Return the stiffnesses to raise before a step.
+        """Return the stiffnesses to raise before a step, by name.
 
         They belong to pairs that may meet too fast, and store no energy yet.
+
+        Parameters
+        ----------
+        begin, v
+            State and velocity at the begin of the step.
         """
 
     def average_along(self, begin: State, end: State, fraction: float) -> None:
-        """Let the system have the mean forces of a step, with their tangent at a fraction of it.
+        """Replace the system's contact forces by their mean along a step, until `use_state_forces`.
 
-        They stay until `use_state_forces`.
+        Parameters
+        ----------
+        begin, end
+            States at both ends of the step.
+        fraction
+            Fraction of the step at which the tangent of the mean forces is taken.
         """
 
     def use_state_forces(self) -> None:
-        """Let the system have the forces of its state again."""
+        """Restore the contact forces of the present state, after `average_along`."""
 
     def penetration_message(self, begin: State, end: State) -> str:
         """Return which surfaces pass through each other in a step; empty if none do."""
@@ -181,18 +201,27 @@ def consistent_state(
 ) -> tuple[Vector, Vector, dict[str, float]]:
     """Return the nearest displacement and velocity that a device allows, with its amplitudes.
 
-    They are nearest in the norm of the mass. Collective.
+    They are nearest in the norm of the mass; Newton's method finds them. Collective.
 
     Parameters
     ----------
+    system
+        The inner system, without the device.
     inverse_mass
         Solves with the mass.
+    u, v, mu
+        Displacement, velocity and amplitudes that need not be consistent.
+
+    Returns
+    -------
+    Displacement, velocity and all amplitudes.
     """
     y, comm = device.unknowns(mu), system.comm
     for _ in range(MAX_ITERATIONS):
         amplitudes = {**mu, **device.values(y)}
         C, D = device.border(u, amplitudes)
         X, is_spring = [inverse_mass(c) for c in C], np.diag(D) != 0
+        # amplitudes with a spring are unknowns themselves; the others constrain u along X
         S = np.where(is_spring, D, [[dot(comm, c, x) for x in X] for c in C])
         correction = np.linalg.solve(S, device.rows(u, amplitudes))
         step = _combination(np.where(is_spring, 0.0, correction), X)
@@ -207,6 +236,7 @@ def consistent_state(
 
 
 def _combination(coefficients: Array, vectors: list[Vector]) -> Vector:
+    """Return the linear combination of vectors with the coefficients."""
     terms = [c * x for c, x in zip(coefficients, vectors, strict=True)]
     return np.asarray(np.sum(terms, axis=0))
 
@@ -214,14 +244,19 @@ def _combination(coefficients: Array, vectors: list[Vector]) -> Vector:
 def constrained_acceleration(
     system: System, device: Device, inverse_mass: InverseMass, motion: Motion
 ) -> tuple[Vector, dict[str, float]]:
-    """Return the acceleration with the forces of constraints, and the amplitudes that are these.
+    """Return the acceleration with the forces of a device's constraints, and all amplitudes.
 
-    Collective.
+    The amplitudes of constraints are their forces. They are chosen so that C . a + v . (dC/du v) =
+    0 for each constraint with the column C. Collective.
 
     Parameters
     ----------
+    system
+        The inner system, without the device.
+    inverse_mass
+        Solves with the mass.
     motion
-        Its acceleration is without the change of these forces.
+        The motion with the acceleration that its present amplitudes give.
     """
     C, D = device.border(motion.u, motion.mu)
     is_constraint, speed = np.diag(D) == 0, max_abs(system.comm, motion.v)
@@ -233,6 +268,7 @@ def constrained_acceleration(
         )
     X = [inverse_mass(c) for c in C]
     S = np.where(is_constraint, [[dot(system.comm, c, x) for x in X] for c in C], np.eye(len(C)))
+    # v . (dC/du v) by a central difference along the velocity
     curvature = [
         dot(system.comm, a - b, motion.v) / (2 * dt) for a, b in zip(forward, backward, strict=True)
     ]

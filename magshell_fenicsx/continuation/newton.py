@@ -52,6 +52,8 @@ class NewtonResult:
 
     Attributes
     ----------
+    state
+        The last iterate, which is the solution if `converged`.
     reason
         "converged", or why the iteration ended.
     error
@@ -84,9 +86,16 @@ class Response:
 
 
 class BorderedNewton:
-    """Newton's method for R(u, mu) = 0 with one more row.
+    """Newton's method for R(u, mu) = 0 with one more row, by PETSc's SNES.
 
     One solver serves every amplitude and row of a system.
+
+    Parameters
+    ----------
+    options
+        Tolerance and rules of convergence; None: the defaults.
+    factorisation
+        Shared factors of another solver; None: this solver has factors of its own.
 
     Attributes
     ----------
@@ -113,13 +122,13 @@ class BorderedNewton:
             self._line_search = make_snes(self._callbacks, self._x, self.options, "bt")
 
     def for_system(self, system: System) -> "BorderedNewton":
-        """Return a solver for another system whose tangent contains this one's.
+        """Return a solver for another system that shares the factors and the counts of work.
 
-        Both share the factors and the counts of work.
+        The tangent of that system is the one of this system, or has it as a block.
         """
-        other = BorderedNewton(system, self.options, self.factorisation)
-        other._work = self._work
-        return other
+        solver = BorderedNewton(system, self.options, self.factorisation)
+        solver._work = self._work
+        return solver
 
     @property
     def iterations(self) -> int:
@@ -139,7 +148,8 @@ class BorderedNewton:
     ) -> NewtonResult:
         """Find the equilibrium near `guess` on which `row` holds, with mu the amplitude `name`.
 
-        Collective.
+        If full steps with extrapolated forces fail, they are repeated with computed forces; then
+        softer faces and a line search are tried. Collective.
 
         Parameters
         ----------
@@ -166,18 +176,22 @@ class BorderedNewton:
             return result
         if not (search and self._line_search):
             return result
-        other_result = self._solve_by_stiffening(guess, name, row) or self._run_snes(
+        second_result = self._solve_by_stiffening(guess, name, row) or self._run_snes(
             self._line_search, guess, name, row, SolveOptions(stress, searched=True)
         )
-        return other_result if other_result.converged else result
+        return second_result if second_result.converged else result
 
     def _solve_by_stiffening(
         self, guess: State, name: str, row: ConstraintRow
     ) -> NewtonResult | None:
-        """Solve between touching faces that are soft at first and then harder; None if this fails.
+        """Solve between touching faces that are soft at first and then harder.
 
         Faces that penetrate each other deeply at a guess push shells far away, from where full
         steps do not come back. Soft ones, as stiff as the shells, show where these touch.
+
+        Returns
+        -------
+        The result with the final stiffnesses; None if a solve on the way fails.
         """
         state, iterations = guess, 0
         for fraction in STIFFNESS_FRACTIONS:
@@ -208,7 +222,15 @@ class BorderedNewton:
         row: ConstraintRow,
         options: SolveOptions,
     ) -> NewtonResult:
-        """Run SNES from a guess."""
+        """Run SNES from a guess, and return its result.
+
+        Parameters
+        ----------
+        snes
+            PETSc's SNES with full steps or with a line search.
+        options
+            The way this one solve runs.
+        """
         callbacks = self._callbacks
         callbacks.begin(guess, name, row, snes.getTolerances()[2], options)
         callbacks.join((guess.u, guess.mu[name]), self._x)
@@ -222,9 +244,14 @@ class BorderedNewton:
         return NewtonResult(guess.with_(u, name, mu), code > 0, iterations, reason, callbacks.error)
 
     def ensure_factors_near(self, state: State, distance: float = np.inf) -> None:
-        """Factor the tangent at a state unless factors of one within some lengths are known.
+        """Factor the tangent at a state unless factors of a near state are known. Collective.
 
-        A resumed run may have none. Collective.
+        A resumed run may have none. The inertia of the factors is not counted.
+
+        Parameters
+        ----------
+        distance
+            Largest difference of an entry of u, in lengths of the system.
         """
         if not self._tangent.is_near(state, distance):
             self._tangent.factor_at(state, needs_inertia=False)
@@ -234,7 +261,14 @@ class BorderedNewton:
     ) -> State | None:
         """Return a guess after one Newton step with the present factors. Collective.
 
-        None if the step is longer than `max_step` lengths.
+        Parameters
+        ----------
+        max_step
+            Largest size of the step, in lengths of the system.
+
+        Returns
+        -------
+        The corrected state; None if the step is longer.
         """
         system = self.system
         matrix = BorderedMatrix(system, self.factorisation, guess, name, row)
@@ -247,7 +281,13 @@ class BorderedNewton:
         return guess.with_(u, name, mu)
 
     def factor_at(self, state: State, stress: Sequence[WeightedDisplacement] = ()) -> Factorisation:
-        """Factor the tangent at a state, unless its factors are known. Collective."""
+        """Factor the tangent at a state, unless its factors are known. Collective.
+
+        Parameters
+        ----------
+        stress
+            As in `System.tangent`.
+        """
         return self._tangent.factor_at(state, stress)
 
     def response(
@@ -260,13 +300,19 @@ class BorderedNewton:
         may_lag: bool = True,
         needs_inertia: bool = True,
     ) -> Response:
-        """Return the path's tangent at a solution: K du + R_mu dmu = 0, c.du + d dmu = 1.
+        """Return the path's tangent at a solution: K du + R_mu dmu = 0, c . du + d dmu = 1.
 
         Factors of a nearby state are used if they serve; the tangent is then refined by differences
         of the residual. Collective.
 
         Parameters
         ----------
+        state
+            The solution.
+        name
+            The amplitude mu.
+        row
+            The last row, whose gradient is (c, d).
         exact
             Whether K is factored at the solution itself; a small part of it may lag.
         may_lag
@@ -310,15 +356,32 @@ class BorderedNewton:
     def _bordered_matrix(
         self, state: State, name: str, row: ConstraintRow, *, may_lag: bool, needs_inertia: bool
     ) -> BorderedMatrix:
-        """Return the bordered matrix at a state, or that of the last solve with the same row."""
-        last, count = self._callbacks.matrix, self.factorisation.count
+        """Return the bordered matrix at a state.
+
+        It is that of the last solve, if this had the same state and row.
+
+        Parameters
+        ----------
+        may_lag
+            Whether a small part of K may belong to an earlier state.
+        needs_inertia
+            Whether the number of negative pivots must be valid.
+        """
+        last_matrix, count = self._callbacks.matrix, self.factorisation.count
         factors = self._tangent.factor_at(state, may_lag=may_lag, needs_inertia=needs_inertia)
         # the same objects, not equal ones
-        if count == factors.count and last and last.row is row and last.state is state:
-            return last
+        if (
+            count == factors.count
+            and last_matrix
+            and last_matrix.row is row
+            and last_matrix.state is state
+        ):
+            return last_matrix
         return BorderedMatrix(self.system, factors, state, name, row, lagged=self._tangent.lagged)
 
 
 @dataclass
 class _Work:
+    """Count of the iterations of all solves, which several solvers share."""
+
     iterations: int = 0

@@ -86,15 +86,19 @@ class NotANumber(RuntimeError):
 class Path:
     """An equilibrium path in one amplitude, the others being fixed.
 
+    All methods that solve or compare displacements are collective.
+
     Parameters
     ----------
     newton
         The corrector.
     name
-        The amplitude that varies.
+        The amplitude mu that varies.
     control
         The meaning of s. "load": the amplitude; "conjugate": the displacement conjugate to it;
         "arc": the arc length in a `Metric`, along the tangent of the previous point.
+    options
+        Lengths of steps, in units of s, and the rules of their change.
     scale
         An amplitude that counts as of order one in the arc length.
     journal
@@ -102,8 +106,8 @@ class Path:
     progress
         Is told of every step before it is tried.
     step_event
-        Returns the onset and loss of forces on the straight segment from a point to a prediction;
-        None if there is none.
+        Called with the state of a point and a predicted state. It returns the onset and loss of
+        forces on the straight segment between them; None: forces never begin within a step.
     """
 
     def __init__(
@@ -131,12 +135,12 @@ class Path:
         Parameters
         ----------
         sense
-            The sign of dmu/ds with arc-length control.
+            The sign of dmu/ds with arc-length control; ignored with another control.
 
         Raises
         ------
         NotANumber
-            If the tangent there is not a number.
+            If the tangent at the state is not a number.
         """
         row = PrescribedLoad(self.name, 0.0)
         response = self.newton.response(state, self.name, row, exact=True)
@@ -159,7 +163,7 @@ class Path:
         base
             Arc length is measured from this point, along its tangent.
         max_step
-            As in `BorderedNewton.solve`.
+            Length, in lengths of the system, of an iteration's step that ends the solve as failed.
         """
         stress: Sequence[WeightedDisplacement] = ()
         if self._has_many_hard_solves:
@@ -171,12 +175,14 @@ class Path:
     ) -> Point | str:
         """Return the point at `s` between two others, or the reason why the solve failed.
 
+        The cubic through both points and their tangents is the guess.
+
         Parameters
         ----------
         base
             Arc length is measured from this point, along its tangent.
         needs_inertia
-            Whether the numbers of unstable directions are needed.
+            Whether the numbers of unstable directions of the result must be valid.
         """
         t = (s - low.s) / (high.s - low.s)
         stress = [(1 - t, low.state.u), (t, high.state.u)]
@@ -190,11 +196,20 @@ class Path:
     def estimate_between(self, s: float, low: Point, high: Point, base: Point) -> Point | str:
         """Estimate the point at `s` between two others by one correction with known factors.
 
-        Its tangent is interpolated, and its inertia is that of `low`. If the correction is too
-        large, return the reason.
+        The tangent of the point is interpolated, and its inertia is that of `low`.
+
+        Parameters
+        ----------
+        base
+            Arc length is measured from this point, along its tangent.
+
+        Returns
+        -------
+        The point, or the reason if the correction is too large.
         """
 
         def estimate() -> Point | str:
+            """Correct the interpolated state once, and give it the interpolated tangent."""
             guess = self.interpolated_state(s, low, high)
             self.newton.ensure_factors_near(high.state)
             state = self.newton.correct_once(
@@ -208,12 +223,21 @@ class Path:
         return self.recorded(estimate)
 
     def recorrected(self, point: Point, state: State) -> Point:
-        """Return the point at the same s with the other amplitudes of a nearby state.
+        """Solve again at the s of a point, with other values of the fixed amplitudes.
+
+        Parameters
+        ----------
+        state
+            The guess, near the point, with the other values.
+
+        Returns
+        -------
+        The new point, as base of the next step.
 
         Raises
         ------
         PathStopped
-            If none is found.
+            If the solve fails.
         """
         corrected = self.correct(point.s, state, point)
         if isinstance(corrected, str):
@@ -231,23 +255,30 @@ class Path:
         max_step: float = np.inf,
         needs_inertia: bool = True,
     ) -> Point | str:
-        """Return the point on which a row holds, or the reason why the solve failed.
+        """Return the point near a guess on which a row holds, or the reason why the solve failed.
 
-        Its tangent is per unit of the row.
+        The tangent of the point is per unit of the row. Collective.
 
         Parameters
         ----------
+        row
+            The scalar equation g(u, mu) = 0 that is solved together with equilibrium.
+        s
+            The value of s that the point gets.
+        stress
+            The stress of the guess, as in `System.tangent`.
         neighbour
-            A nearby solution, whose factors may begin the solve.
+            A nearby solution, whose factors may begin the solve; None: no other factors may.
         max_step
-            As in `BorderedNewton.solve`.
+            Length, in lengths of the system, of an iteration's step that ends the solve as failed.
         needs_inertia
-            Whether the numbers of unstable directions are needed.
+            Whether the numbers of unstable directions of the point must be valid.
         """
         # a tangent of the path must not depend on what was factored before its point
         reuse_distance = FACTOR_REUSE_DISTANCE if neighbour else 0.0
 
         def solve() -> Point | str:
+            """Run Newton's method, and compute the tangent at its result."""
             if neighbour:
                 distance = np.inf
                 reach = FACTOR_REUSE_DISTANCE * self.system.length
@@ -292,10 +323,22 @@ class Path:
 
     @property
     def _has_many_hard_solves(self) -> bool:
+        """Whether so many solves were hard that the tangents take an extrapolated stress."""
         return self._hard_solves >= HARD_SOLVES_BEFORE_EXTRAPOLATED_STRESS
 
     def recorded(self, solve: Callable[[], Point | str]) -> Point | str:
-        """Return the result of `solve`, or what the journal has of an interrupted run here."""
+        """Return the result of `solve`, or that which an interrupted run recorded at this place.
+
+        All results pass through the journal, in a fixed order. A replayed point also restores the
+        choice of the factorisation, so that a resumed run continues with the same rounding.
+        Collective.
+
+        Parameters
+        ----------
+        solve
+            Called, if no recorded result is left. It returns a point, or the reason why there is
+            none.
+        """
         recorded_result, factors = self._journal.replay(), self.newton.factorisation
         if recorded_result is not None:
             if isinstance(recorded_result, Point):
@@ -310,11 +353,14 @@ class Path:
         return result
 
     def recorded_values(self, find: Callable[[], RecordedValues]) -> RecordedValues:
-        """Return the values of `find`, or what the journal has of an interrupted run here."""
+        """Return the values of `find`, or those of an interrupted run at this place. Collective."""
         return self._journal.recorded_values(find)
 
     def _event(self, current: State, guess: State) -> StepEvent:
-        """Return the onset and loss of forces on the straight segment between two states."""
+        """Return the onset and loss of forces on the straight segment between two states.
+
+        The event is recorded in the journal, as it costs as much as a solve.
+        """
         step_event = self._step_event
         if step_event is None:
             return StepEvent()
@@ -324,12 +370,16 @@ class Path:
     def point_at_state(
         self, state: State, direction: Direction, base: Point, negative_pivots: int
     ) -> Point:
-        """Return the point of a state on the path, with a given tangent of any length.
+        """Return the point of the path at a state in equilibrium, with a given tangent.
 
         Parameters
         ----------
+        direction
+            Tangent (du, dmu) of any length.
         base
             Arc length is measured from this point.
+        negative_pivots
+            Number of unstable directions of the state at fixed amplitudes.
         """
         du, dmu = direction
         u, mu, name = state.u, state.mu, self.name
@@ -344,23 +394,30 @@ class Path:
         return self._point(state, s, response).with_tangent_per(rate)
 
     def _arc_length(self, state: State, base: Point) -> float:
+        """Return the arc length of a state: that of the base plus the chord along its normal."""
         chord = (state.u - base.state.u, state.mu[self.name] - base.state.mu[self.name])
         return base.s + self.metric.inner(base.normal, chord)
 
     def measured_from(self, base: Point, point: Point) -> Point:
-        """Return the point with its arc length from a base; unchanged with another control."""
+        """Return a point with arc length measured from a base; unchanged with another control."""
         if self.control != "arc":
             return point
         return replace(point, s=self._arc_length(point.state, base))
 
     def as_base(self, point: Point) -> Point:
-        """Return the point with a tangent of length one, so that arc length is measured from it."""
+        """Return a point with a tangent of length one, as base from which arc length is measured.
+
+        The point is unchanged with another control, or if its arc length goes along `across`.
+        """
         if self.control != "arc" or point.across:
             return point
         return point.with_tangent_per(self.metric.norm(point.du, point.dmu))
 
     def relative_to(self, base: Point, point: Point) -> Point:
-        """Return the point with its tangent per unit of s, where s is measured from `base`."""
+        """Return a point with its tangent per unit of s, where s is measured from `base`.
+
+        The point is unchanged with another control than by arc length.
+        """
         if self.control != "arc":
             return point
         rate = self.metric.inner(base.normal, (point.du, point.dmu))
@@ -369,22 +426,22 @@ class Path:
     def base_before(self, low: Point, high: Point) -> Point:
         """Return the first of two points as the base from which the second is measured.
 
-        Where the path turns sharply between them, arc length goes along the displacement: see
-        `_measured_along_displacement`.
+        Where the path turns by more than 90 degrees between them, arc length goes along the
+        displacement: see `_measured_along_displacement`.
         """
         if self.control == "arc" and self.metric.inner(low.normal, (high.du, high.dmu)) <= 0:
             return self._measured_along_displacement(low)
         return low
 
     def _measured_along_displacement(self, point: Point) -> Point:
-        """Return the point with arc length along its displacement rather than its tangent.
+        """Return a point with arc length along its displacement du, not its tangent (du, dmu).
 
-        A path that turns sharply has no arc length along the tangent.
+        Behind a sharp turn of the path, arc length along the tangent would fall.
         """
-        square = self.metric.inner((point.du, 0.0), (point.du, 0.0))
-        if not square:
+        squared_norm = self.metric.inner((point.du, 0.0), (point.du, 0.0))
+        if not squared_norm:
             return point
-        return replace(point, across=(np.asarray(point.du / square, dtype=np.float64), 0.0))
+        return replace(point, across=(np.asarray(point.du / squared_norm, dtype=np.float64), 0.0))
 
     def value(self, quantity: Quantity, state: State) -> float:
         """Return the amplitude of the path, or the displacement conjugate to it, at a state."""
@@ -404,15 +461,18 @@ class Path:
         targets: Sequence[float],
         step_end: StepEnd = lambda s, predictors: s,
     ) -> Iterator[tuple[Point, bool]]:
-        """Yield accepted points through every target in turn; the flag marks the targets.
+        """Yield accepted points through every target in turn, each with whether it is a target.
 
-        A point that was rejected as too far is compared with the next accepted points: if it lies
-        one step ahead of one of them, it is accepted without a solve.
+        A point that was rejected as too far is compared with the next accepted points. If it lies
+        one step ahead of one of them, it is accepted without a solve. Collective.
 
         Parameters
         ----------
+        targets
+            Values of s, in the order of the path; infinite values have no end.
         step_end
-            May shorten a step, given its s and the points that predict its end.
+            Called with the planned end of a step and the points that predict it. It returns the s
+            at which the step ends, the planned one or less far.
 
         Raises
         ------
@@ -443,7 +503,17 @@ class Path:
     def _plan(self, controller: StepController, target: float, step_end: StepEnd) -> StepPlan:
         """Plan the next step towards a target.
 
-        It ends a little behind a fold, or where forces begin.
+        The step is shortened so that its prediction is good. It ends a little behind a fold, or
+        where forces begin.
+
+        Parameters
+        ----------
+        controller
+            The last points and the length of the next step.
+        target
+            The value of s to reach; it may be infinite.
+        step_end
+            As in `continue_to`.
         """
         points, current, distance = (
             controller.points,
@@ -453,6 +523,7 @@ class Path:
         length = controller.length(distance)
         length = min(length, self._length_past_fold(points, length))
         cubic_error, quintic_error = self._prediction_errors(points)
+        # of both polynomials the one that predicted the last point better predicts the next
         smooth = quintic_error < cubic_error
         is_third_point = len(points) == PREDICTOR_POINTS - 1
         if smooth or (is_third_point and not self.newton.options.has_onsets):
@@ -471,7 +542,12 @@ class Path:
         return StepPlan(s, predictors, length, event)
 
     def _try_plan(self, current: Point, plan: StepPlan) -> Point | RejectedPoint | str:
-        """Return the next point, one that is too far away, or the reason why there is none."""
+        """Try a planned step from the current point.
+
+        Returns
+        -------
+        The next point, a rejected point that is too far away, or the reason why there is none.
+        """
         result, event = self._try_step(plan.s, plan.predictors), plan.event
         if event.fraction < 1 and not event.ends_behind:
             return self._checked_before_onset(current, result)
@@ -480,12 +556,18 @@ class Path:
         return result
 
     def _retry(self, controller: StepController, rejected: RejectedPoint, sense: float) -> bool:
-        """Accept a rejected point if it lies one step from the last point; return whether it does.
+        """Accept a rejected point if it lies one step ahead of the last point.
 
         Parameters
         ----------
+        controller
+            Gets the point as its last one, or keeps it as rejected.
         sense
             The sign of the change of s towards the target.
+
+        Returns
+        -------
+        Whether the point was accepted.
         """
         current = controller.current
         point = self.measured_from(current, rejected.point)
@@ -500,22 +582,33 @@ class Path:
         return False
 
     def _length_past_fold(self, points: Sequence[Point], length: float) -> float:
-        """Return the length to a little behind the next fold of mu.
+        """Return the length in s from the last point to a little behind the next fold of mu.
 
-        The fold is where the cubic through two points has its maximum; infinite if it has none.
+        The fold is where the cubic through the last two points is stationary. The length is
+        infinite if there is none, or with load control.
+
+        Parameters
+        ----------
+        length
+            The length that is planned without a fold, of which a fraction is always allowed.
         """
         if len(points) < 2 or self.control == "load":
             return np.inf
         previous, current = points[-2:]
-        step, last = current.s - previous.s, self.relative_to(previous, current)
+        step, current_per_s = current.s - previous.s, self.relative_to(previous, current)
         slope = (current.state.mu[self.name] - previous.state.mu[self.name]) / step
-        to_fold = MAX_STEP_PAST_FOLD * (flat_beyond(slope, previous.dmu, last.dmu) - 1) * abs(step)
+        to_fold = (
+            MAX_STEP_PAST_FOLD
+            * (flat_beyond(slope, previous.dmu, current_per_s.dmu) - 1)
+            * abs(step)
+        )
         return max(to_fold, MIN_FRACTION_BEFORE_FOLD * length)
 
     def _prediction_errors(self, points: Sequence[Point]) -> list[float]:
-        """Return the errors at the last point of the cubic and the quintic through earlier ones.
+        """Return the errors of the cubic and of the quintic at the last point.
 
-        The cubic goes through two points, the quintic through three; infinite if there are fewer.
+        The cubic goes through the two points before the last one, the quintic through three. An
+        error is the largest displacement; it is infinite if there are too few points.
         """
         return [
             self._prediction_error(points[-n:-1], points[-1]) if len(points) >= n else np.inf
@@ -523,9 +616,15 @@ class Path:
         ]
 
     def _predictable_fraction(self, points: Sequence[Point], s: float, last_error: float) -> float:
-        """Return the fraction of a step to `s` whose prediction error is allowed.
+        """Return the fraction of a step to `s` at which the cubic still predicts well enough.
 
-        An error is allowed if it is harmless, or about as large as that of the last cubic.
+        The error of the cubic is its difference from the quintic. It is allowed if it is harmless,
+        or about as large as that of the last cubic.
+
+        Parameters
+        ----------
+        last_error
+            The error of the cubic at the last point, as a displacement.
         """
         cubic, quintic = (self.predicted_state(s, points[-count:]).u for count in (2, 3))
         error = max_abs(self.system.comm, quintic - cubic)
@@ -534,22 +633,31 @@ class Path:
         return min(1.0, (allowed / error) ** 0.25) if error else 1.0
 
     def _prediction_error(self, points: Sequence[Point], point: Point) -> float:
-        """Return the largest displacement between a point and its prediction by earlier ones."""
+        """Return the largest displacement between a point and its prediction by earlier points."""
         guess = self.predicted_state(self.measured_from(points[-1], point).s, points)
         return max_abs(self.system.comm, guess.u - point.state.u)
 
     def predicted_state(self, s: float, points: Sequence[Point]) -> State:
         """Extrapolate the polynomial through points with their tangents to `s`.
 
-        Arc length is measured from the last point. Points before a reversal of s do not count.
+        Parameters
+        ----------
+        s
+            Controlled quantity at the predicted state; arc length is measured from the last point.
+        points
+            Points in the order of the path. Those before a reversal of s do not count.
         """
-        last = points[-1]
+        last_point = points[-1]
         predictors = [
-            *(self.relative_to(last, self.measured_from(last, point)) for point in points[:-1]),
-            last,
+            *(
+                self.relative_to(last_point, self.measured_from(last_point, point))
+                for point in points[:-1]
+            ),
+            last_point,
         ]
         while len(predictors) > 1:
             steps = np.diff([point.s for point in predictors])
+            # s changes in one sense from each point to the next
             if not min(steps) * max(steps) <= 0:
                 break
             predictors.pop(0)
@@ -558,24 +666,33 @@ class Path:
     def interpolated_state(self, s: float, *points: Point) -> State:
         """Interpolate a guess at `s` by the polynomial through points with their tangents.
 
-        Through two points it is a cubic.
+        Through two points it is a cubic. The tangents must be per unit of one and the same s.
         """
         return self._hermite_state(s, points)
 
     def _hermite_state(self, s: float, points: Sequence[Point]) -> State:
-        last, name = points[-1].state, self.name
-        u, mu = np.array(last.u), last.mu[name]
+        """Return the state at `s` of the Hermite polynomial through points with their tangents."""
+        last_point, name = points[-1].state, self.name
+        u, mu = np.array(last_point.u), last_point.mu[name]
         weights = hermite(s, [point.s for point in points])
         for (value, slope), point in zip(weights, points, strict=True):
             # what does not move stays, to the last digit
-            u += value * (point.state.u - last.u) + slope * point.du
-            mu += value * (point.state.mu[name] - last.mu[name]) + slope * point.dmu
-        return last.with_(u, name, float(mu))
+            u += value * (point.state.u - last_point.u) + slope * point.du
+            mu += value * (point.state.mu[name] - last_point.mu[name]) + slope * point.dmu
+        return last_point.with_(u, name, float(mu))
 
     def _try_step(self, s: float, predictors: Sequence[Point]) -> Point | RejectedPoint | str:
-        """Predict and correct the next point.
+        """Predict and correct the point at `s`.
 
-        Return it, one that is too far away, or the reason why there is none.
+        Parameters
+        ----------
+        predictors
+            Points of which the last is the current one; the polynomial through them is the guess.
+
+        Returns
+        -------
+        The point as base of the next step, a rejected point that is too far away, or the reason why
+        there is none.
         """
         current = predictors[-1]
         self.progress.trying(current, s - current.s)
@@ -595,21 +712,34 @@ class Path:
         return RejectedPoint(point, reason, exact) if reason else self.as_base(point)
 
     def _jump(self, current: Point, next_point: Point) -> str | None:
-        """Return why the ends of a step are not on one smooth arc; None if they are."""
-        instabilities = abs(next_point.negative_pivots - current.negative_pivots)
-        if instabilities > 1 and abs(next_point.s - current.s) > self.options.max_step_past_several:
+        """Return why the ends of a step do not lie on one smooth arc; None if they do.
+
+        Parameters
+        ----------
+        next_point
+            The corrected point, whose tangent is per unit of s measured from `current`.
+        """
+        changed_pivots = abs(next_point.negative_pivots - current.negative_pivots)
+        if (
+            changed_pivots > 1
+            and abs(next_point.s - current.s) > self.options.max_step_past_several
+        ):
             return "the step passed several instabilities, or jumped to another branch"
         # no kink is an instability, but where the load turns back
         may_have_kink = self.newton.options.has_onsets and (
-            instabilities == 0 or current.across is not None
+            changed_pivots == 0 or current.across is not None
         )
         if may_have_kink:
             return None if self._is_explained_by_kink(current, next_point) else SHARP_TURN
         return None if self._is_smooth(current, next_point) else SHARP_TURN
 
     def _is_smooth(self, current: Point, next_point: Point) -> bool:
-        """Return whether the tangents at both ends of a step allow a smooth arc between them."""
+        """Return whether the tangents at both ends of a step allow a smooth arc between them.
+
+        Their cosine must be large enough, and their mean must explain the displacement of the step.
+        """
         chord = next_point.state.u - current.state.u
+        # the trapezoidal rule: what the mean of both tangents leaves of the displacement
         unexplained = chord - (next_point.s - current.s) / 2 * (current.du + next_point.du)
         gap, distance = (
             max_abs(self.system.comm, v) / self.system.length for v in (unexplained, chord)
@@ -620,7 +750,11 @@ class Path:
     def _checked_before_onset(
         self, current: Point, next_point: Point | RejectedPoint | str
     ) -> Point | RejectedPoint | str:
-        """Return a point before an onset of forces, unless forces began, or there is a kink."""
+        """Return the result of a step that ends before an onset of forces, if it is right.
+
+        The next point is replaced by the reason `SHARP_TURN` if forces have begun, or if the path
+        has a kink before the point. Other results are returned unchanged.
+        """
         if not isinstance(next_point, Point):
             return next_point
         is_before = self._event(current.state, next_point.state).fraction == 1.0
@@ -631,7 +765,7 @@ class Path:
     def _has_kink(self, current: Point, next_point: Point) -> bool:
         """Return whether the path has a kink between two points.
 
-        Then points before it predict nothing behind it.
+        A kink separates the points: those before it predict nothing behind it.
         """
         if not self.newton.options.has_onsets:
             return False
@@ -640,8 +774,13 @@ class Path:
     def _passes_kinks(self, current: Point, rejected: RejectedPoint, plan: StepPlan) -> bool:
         """Return whether the shortest step turns sharply at kinks, where points of a body touch.
 
-        Half as long a step would end before a kink that is just ahead, or behind two that are
-        close.
+        Such a step is accepted. Half as long a step would end before a kink that is just ahead, or
+        behind two that are close.
+
+        Parameters
+        ----------
+        rejected
+            The end of the step, which was rejected for its sharp turn.
         """
         if plan.length / 2 >= self.options.smallest or self.control != "arc":
             return False
@@ -652,8 +791,9 @@ class Path:
         return not self.are_apart(current, self.relative_to(current, rejected.point))
 
     def _smallest_step(self, reason: str) -> float:
-        """Return the smallest step after a failure: a shorter one by arc length where a body may
-        be just ahead.
+        """Return the smallest length of a step in s, after a failure for a reason.
+
+        By arc length it is less than `StepOptions.smallest` where a body may be just ahead.
         """
         is_astray = reason in (GUESS_TOO_FAR, DIVERGED) and self.newton.options.allows_kinks
         smallest = self.options.smallest
@@ -662,12 +802,14 @@ class Path:
         return smallest
 
     def are_apart(self, low: Point, high: Point, rounding: float = ZERO_DISPLACEMENT) -> bool:
-        """Return whether two points are too far apart for one path with their tangents.
+        """Return whether two points lie too far apart for one path, given their tangents.
 
         Parameters
         ----------
+        high
+            The second point, whose tangent is per unit of s measured from `low`.
         rounding
-            A smaller distance, in lengths, counts as zero.
+            Distances below it, in lengths of the system, count as zero.
         """
         comm = self.system.comm
         speed = max(max_abs(comm, low.du), max_abs(comm, high.du))
@@ -684,6 +826,7 @@ class Path:
         turn = next_point.du - current.du
         deviation = next_point.state.u - current.state.u - length * current.du
         square = dot(comm, turn, turn)
+        # least squares: the length in s behind the kink, within that of the step
         after_kink = dot(comm, turn, deviation) / square if square else 0.0
         after_kink = min(max(after_kink / length, 0.0), 1.0) * length
         gap = max_abs(comm, deviation - after_kink * turn)
@@ -691,9 +834,9 @@ class Path:
         return gap <= max(self.options.max_gap * distance, ZERO_DISPLACEMENT * self.system.length)
 
     def _cosine(self, a: Point, b: Point) -> float:
-        """Return the cosine between the displacements of two tangents.
+        """Return the cosine between the displacements du of the tangents at two points.
 
-        It is 1 if the amplitude moves nothing there.
+        It is 1 if the amplitude moves nothing at one of them.
         """
         lengths = self.metric.norm(a.du, 0.0) * self.metric.norm(b.du, 0.0)
         if lengths < ZERO_DISPLACEMENT**2:
@@ -701,7 +844,15 @@ class Path:
         return self.metric.inner((a.du, 0.0), (b.du, 0.0)) / lengths
 
     def with_own_inertia(self, point: Point, base: Point) -> Point:
-        """Return the point with the tangent and inertia of its own K, not of a nearby one."""
+        """Return a point with the tangent and inertia of its own K, not of a nearby one.
+
+        It takes a factorisation. Collective.
+
+        Parameters
+        ----------
+        base
+            The point from which the arc length of `point` is measured.
+        """
         row = self._row(point.s, base)
         response = self.newton.response(point.state, self.name, row, exact=True)
         return replace(
@@ -712,6 +863,7 @@ class Path:
         )
 
     def _row(self, s: float, base: Point) -> ConstraintRow:
+        """Return the row that holds at `s`, with arc length measured from `base`."""
         if self.control == "arc":
             return Hyperplane(self.metric, self.name, base.state, base.normal, s - base.s)
         return self.prescribed(self.control, s)
@@ -719,9 +871,14 @@ class Path:
     def _point(self, state: State, s: float, response: Response) -> Point:
         """Return a point with its tangent and both numbers of unstable directions.
 
-        With q held instead of mu, there is one unstable direction less where dq/dmu < 0. This is
-        Haynsworth's inertia additivity: dq/dmu = R_mu . K^-1 R_mu - Pi_mumu is minus the Schur
-        complement. A coordinate whose force is held has one more instead where dq/dmu > 0.
+        With the conjugate q held instead of mu, there is one unstable direction less where dq/dmu <
+        0. This is Haynsworth's inertia additivity: dq/dmu = R_mu . K^-1 R_mu - Pi_mumu is minus the
+        Schur complement. A coordinate whose force is held has one more instead where dq/dmu > 0.
+
+        Parameters
+        ----------
+        response
+            The tangent, its softness dq/dmu, and the number of negative pivots at fixed amplitudes.
         """
         pivots = response.negative_pivots
         pivots_held = (
@@ -730,7 +887,7 @@ class Path:
         return Point(state, s, response.du, response.dmu, pivots, pivots_held)
 
     def with_step_options(self, options: StepOptions) -> "Path":
-        """Return the same path with other step lengths."""
-        other = copy(self)
-        other.options = options
-        return other
+        """Return a copy of the path with other step lengths, which shares solver and journal."""
+        path = copy(self)
+        path.options = options
+        return path

@@ -15,12 +15,14 @@ from magshell_fenicsx.continuation.system import Direction, State, Vector
 
 @dataclass(frozen=True)
 class Point:
-    """An accepted point of a path.
+    """An accepted point of an equilibrium path.
 
     Attributes
     ----------
+    state
+        Displacement and amplitudes, in equilibrium.
     s
-        The controlled quantity: mu, the conjugate displacement -Pi_i(u), or the arc length.
+        The controlled quantity: mu, the conjugate displacement -dPi/dmu, or the arc length.
     du, dmu
         Tangent of the path, d(u, mu)/ds.
     negative_pivots
@@ -117,7 +119,7 @@ class SolverJournal(Protocol):
         """
 
     def record(self, result: Point | str) -> None:
-        """Store a result. Collective."""
+        """Store a result: a point, or the reason why a solve failed. Collective."""
 
     def recorded_values(self, find: Callable[[], RecordedValues]) -> RecordedValues:
         """Return what `find` returns, or what it returned here in an interrupted run. Collective.
@@ -132,14 +134,14 @@ class SolverJournal(Protocol):
         """
 
     def check(self, is_recorded: bool) -> None:
-        """Allow the run to stop between two time steps towards one result. Collective.
+        """Allow the run to stop between two time steps of one result. Collective.
 
         It may raise an exception to stop the run.
 
         Parameters
         ----------
         is_recorded
-            Whether the result is already recorded.
+            Whether the result of these steps is already recorded.
         """
 
 

@@ -61,7 +61,14 @@ def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]
     """Yield guesses of equilibria on the path of a force along b that first holds a guess.
 
     Each is a state where the force is zero. The path begins in the direction in which the force
-    falls in size.
+    falls in size. Collective.
+
+    Parameters
+    ----------
+    guess
+        A state out of equilibrium.
+    b
+        The direction of the force, of any length.
     """
     system = newton.system
     residual, square = system.residual(guess.u, guess.mu), dot(system.comm, b, b)
@@ -78,14 +85,16 @@ def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]
     options = StepOptions(FIRST_STEP, MAX_STEP_RATIO * FIRST_STEP, MIN_STEP_RATIO * FIRST_STEP)
     path = Path(holder, FORCE, "arc", options, FORCE_SCALE)
     max_force = MAX_FORCE_RATIO * abs(result.state.mu[FORCE])
-    last = path.start(result.state, -float(np.copysign(1.0, result.state.mu[FORCE])))
+    last_point = path.start(result.state, -float(np.copysign(1.0, result.state.mu[FORCE])))
     try:
-        for count, (point, _) in enumerate(path.continue_to(last, [np.inf]), 1):
-            force_before, force_after = (p.state.mu[FORCE] for p in (last, point))
+        for count, (point, _) in enumerate(path.continue_to(last_point, [np.inf]), 1):
+            force_before, force_after = (
+                step_end.state.mu[FORCE] for step_end in (last_point, point)
+            )
             if force_before * force_after <= 0 and force_before != force_after:
-                state = _state_without_force(path, last, path.relative_to(last, point))
+                state = _state_without_force(path, last_point, path.relative_to(last_point, point))
                 yield State(state.u, dict(guess.mu))
-            last = point
+            last_point = point
             if count == MAX_STEPS or abs(force_after) > max_force:
                 return
     except PathStopped:
@@ -93,20 +102,25 @@ def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]
 
 
 def _state_without_force(path: Path, base: Point, high: Point) -> State:
-    """Return the state between two points where the holding force is zero.
+    """Return the state between two points of a path where the holding force is zero.
 
     Regula falsi is repeated until little of the force is left.
+
+    Parameters
+    ----------
+    base, high
+        Points with forces of opposite signs; arc length is measured from the first.
     """
-    low, change = base, abs(base.state.mu[FORCE]) + abs(high.state.mu[FORCE])
+    low, force_change = base, abs(base.state.mu[FORCE]) + abs(high.state.mu[FORCE])
     for _ in range(MAX_BRACKETS):
-        first, last = low.state.mu[FORCE], high.state.mu[FORCE]
-        s = low.s + (high.s - low.s) * first / (first - last)
+        low_force, high_force = low.state.mu[FORCE], high.state.mu[FORCE]
+        s = low.s + (high.s - low.s) * low_force / (low_force - high_force)
         middle = path.correct_between(s, low, high, base)
         if isinstance(middle, str):
             return path.interpolated_state(s, low, high)
-        if abs(middle.state.mu[FORCE]) <= FORCE_TOLERANCE * change:
+        if abs(middle.state.mu[FORCE]) <= FORCE_TOLERANCE * force_change:
             return middle.state
-        low, high = (middle, high) if middle.state.mu[FORCE] * first > 0 else (low, middle)
+        low, high = (middle, high) if middle.state.mu[FORCE] * low_force > 0 else (low, middle)
     return min(low, high, key=lambda end: abs(end.state.mu[FORCE])).state
 
 
@@ -114,12 +128,15 @@ def _state_without_force(path: Path, base: Point, high: Point) -> State:
 class Settling:
     """The flow of a system from any guess towards a stable equilibrium.
 
+    Each step solves (K + s K0) du = -R; the module's docstring explains why.
+
     Parameters
     ----------
     unloaded
         A state with a positive definite tangent K0.
     passes
-        Whether shells would pass through each other in a step, which is then refused.
+        Called with the states before and after a step. It returns whether shells would pass through
+        each other; the step is then refused.
     """
 
     system: System
@@ -136,7 +153,8 @@ class Settling:
     def settled(self, guess: State) -> State:
         """Return the state after some steps, or near the stable equilibrium where they end.
 
-        Collective.
+        The shift s grows while K + s K0 is not positive definite or a step leaves much of the
+        residual, and falls after good steps. Collective.
         """
         system, u, shift, factorisations = self.system, guess.u, 1.0, 0
         residual = system.residual(u, guess.mu)
@@ -149,11 +167,13 @@ class Settling:
                 structure = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
                 shifted.axpy(shift, self._K0, structure)
                 self._factors.factor(shifted)
+                # not positive definite: a shorter step in time
                 if self._factors.negative_pivots:
                     shift *= 2
                     continue
                 du = -self._factors.solve(residual)
                 next_residual = system.residual(u + du, guess.mu)
+                # the residual that a linear system would not leave
                 unexplained_force = next_residual + shift * self._K0_factors.times(du)
                 unexplained = self._size(unexplained_force) / self._size(residual)
                 if unexplained <= MAX_UNEXPLAINED and not self.passes(
@@ -171,7 +191,7 @@ class Settling:
         return State(u, guess.mu)
 
     def _size(self, residual: Vector) -> float:
-        """Return the size of a residual: of its displacement, in the norm of K0."""
+        """Return the size of a residual: of the displacement K0^-1 R, in the norm of K0."""
         square = dot(self.system.comm, residual, self._K0_factors.solve(residual))
         return float(np.sqrt(abs(square))) or np.finfo(float).tiny
 
@@ -200,10 +220,11 @@ class AcceptanceRules:
     Attributes
     ----------
     passes
-        Whether shells pass through each other on the straight segment between two states.
+        Called with two states. It returns whether shells pass through each other on the straight
+        segment between them.
     with_own_parameters
-        Returns a solution with penalties and cuts of its own, to be solved again; None if it has
-        them.
+        Called with a solution. It returns the solution with penalties and cuts that fit it, to be
+        solved again; None if it has them already.
     """
 
     passes: Callable[[State, State], bool] = lambda here, there: False
@@ -211,12 +232,21 @@ class AcceptanceRules:
 
 
 class SearchGuess:
-    """A guess, computed when it is needed, and its direction from a known solution.
+    """A guess of a solution, computed when it is needed, and its direction from a known solution.
+
+    Parameters
+    ----------
+    make
+        Returns the state of the guess.
+    base
+        The known solution.
+    displacement
+        Returns a vector of the system with zeros for unknowns that are no displacements.
 
     Attributes
     ----------
     reachable
-        Whether a path without shells that pass through each other leads there.
+        Whether a path leads there on which no shells pass through each other.
     """
 
     def __init__(
@@ -232,6 +262,7 @@ class SearchGuess:
 
     @cached_property
     def state(self) -> State:
+        """The state of the guess."""
         return self._make()
 
     @property
@@ -251,6 +282,8 @@ def further_solutions(
 ) -> Iterator[Point]:
     """Yield solutions at the amplitudes of a known one, each accepted like a point of a path.
 
+    Each solution that is found adds two guesses along its softest mode. Collective.
+
     Parameters
     ----------
     path
@@ -258,15 +291,17 @@ def further_solutions(
     start
         A solution.
     guesses
-        Further guesses, which are tried first; paths lead there on which no shells pass through
-        each other.
+        Functions that return further guesses, which are tried first; paths lead there on which no
+        shells pass through each other.
+    limits
+        The numbers of solutions and guesses, and the time, at which the search ends.
     displacement
         Returns a vector of the system with zeros for unknowns that are no displacements.
     descend
         Lets a state go down in energy by some steps; then only stable solutions count. None: all
         count.
     rules
-        Conditions on shells in contact.
+        Conditions on shells in contact; None: there are none.
     """
     search = _SolutionSearch(
         path, [start], descend, limits.time_is_over, rules or AcceptanceRules()
@@ -306,9 +341,10 @@ def _unless_over(
     attempt: Callable[[SearchGuess], Point | str],
     guess: SearchGuess,
 ) -> Point | str:
-    """Return the result of an attempt, or `TIME_IS_OVER`.
+    """Return the result of an attempt with a guess, or `TIME_IS_OVER`.
 
-    States without meaning, far from equilibrium, may have no factors: that is a failure.
+    States without meaning, far from equilibrium, may have no factors: such an error is returned as
+    the reason of failure.
     """
     try:
         return TIME_IS_OVER if time_is_over() else attempt(guess)
@@ -317,7 +353,18 @@ def _unless_over(
 
 
 class _SolutionSearch:
-    """The attempts of a search.
+    """The attempts of a search, each of which returns a point or the reason of its failure.
+
+    Parameters
+    ----------
+    path
+        The path by load control on which the solutions are points.
+    known_solutions
+        The solutions that are deflated; at least one.
+    descend, rules
+        As in `further_solutions`.
+    time_is_over
+        Whether the time of the search is over.
 
     Attributes
     ----------
@@ -341,10 +388,10 @@ class _SolutionSearch:
         self._row = path.prescribed("load", self._value)
 
     def accept_by_rules(self, guess: SearchGuess, point: Point) -> Point | str:
-        """Return a solution that obeys the rules, or the reason why it is none.
+        """Return a solution that obeys the rules, or the reason why it is refused.
 
-        It has penalties of its own, and a known solution or a reachable guess leads there without
-        shells passing through each other.
+        The solution gets penalties of its own and is solved again. It must be new. A known solution
+        or a reachable guess must lead there without shells passing through each other.
         """
         for _ in range(MAX_PARAMETER_CHANGES):
             if (state := self._rules.with_own_parameters(point.state)) is None:
@@ -357,23 +404,24 @@ class _SolutionSearch:
             return "the shells that touch have no cuts and penalties that last"
         if self._is_known(point.state):
             return "the solution is a known one"
-        begins = [*self.known_solutions, *([guess.state] if guess.reachable else [])]
-        if all(self._rules.passes(begin, point.state) for begin in begins):
+        states_before = [*self.known_solutions, *([guess.state] if guess.reachable else [])]
+        if all(self._rules.passes(begin, point.state) for begin in states_before):
             return "shells have passed through each other"
         return point
 
     def _solve_from(self, state: State) -> Point | str:
+        """Return the solution near a state with its own inertia, or the reason of failure."""
         point = self._solver.solve(self._row, self._value, state)
         return point if isinstance(point, str) else self._solver.with_own_inertia(point, point)
 
     def by_newton(self, guess: SearchGuess) -> Point | str:
-        """Return the solution that deflated Newton's method finds from a guess."""
+        """Return the new solution that deflated Newton's method finds, or the reason of failure."""
         return self._new_solution(guess.state)
 
     def by_descent(self, guess: SearchGuess) -> Point | str:
-        """Return the stable solution below a guess.
+        """Return the new stable solution below a guess, or the reason of failure.
 
-        From an unstable one it descends further along the softest mode.
+        From an unstable solution it descends further along the softest mode.
         """
         assert self._descend
         state, reason = guess.state, "it does not come to rest"
@@ -399,7 +447,10 @@ class _SolutionSearch:
         return reason
 
     def by_release(self, guess: SearchGuess) -> Point | str:
-        """Return the first solution on the path of a force that holds the guess."""
+        """Return the first new solution on the path of a force that holds a guess.
+
+        If there is none, return the reason of failure.
+        """
         for state in released(self._newton, guess.state, guess.direction):
             point = self._new_solution(state)
             if not isinstance(point, str):
@@ -409,7 +460,15 @@ class _SolutionSearch:
     def guesses_along_mode(
         self, state: State, displacement: Callable[[Vector], Vector]
     ) -> list[SearchGuess]:
-        """Return guesses on both sides of a solution along its softest mode."""
+        """Return two guesses, on both sides of a solution along its softest mode.
+
+        Parameters
+        ----------
+        state
+            The solution.
+        displacement
+            As in `further_solutions`.
+        """
         mode = _SoftestMode(self._path, state)
         return [
             SearchGuess(partial(mode.displaced_state, size), state, displacement, reachable=False)
@@ -417,6 +476,10 @@ class _SolutionSearch:
         ]
 
     def _new_solution(self, guess: State) -> Point | str:
+        """Return a solution near a guess that is none of the known ones, or the reason of failure.
+
+        Newton's method with all known solutions deflated comes first, then the solver confirms.
+        """
         path, known_solutions = self._path, [state.u for state in self.known_solutions]
         start = find_deflated(self._newton, guess, path.name, self._row, known_solutions)
         if start is None:
@@ -429,6 +492,7 @@ class _SolutionSearch:
         return self._solver.with_own_inertia(point, point)
 
     def _is_known(self, solution: State) -> bool:
+        """Return whether a solution is nearly equal to a known one."""
         distances = (
             max_abs(self._system.comm, solution.u - state.u) for state in self.known_solutions
         )

@@ -130,7 +130,7 @@ class LatestTangent:
     Attributes
     ----------
     lagged
-        Whether a small part of the tangent belongs to an earlier state.
+        Whether a small part of the tangent, of dense terms, belongs to an earlier state.
     """
 
     def __init__(self, system: System, factorisation: Factorisation) -> None:
@@ -152,7 +152,13 @@ class LatestTangent:
         return self._factorisation
 
     def is_near(self, state: State, distance: float) -> bool:
-        """Return whether the factored state is less than some lengths from another, at any load."""
+        """Return whether the factored state is near another one, at any load. Collective.
+
+        Parameters
+        ----------
+        distance
+            Largest difference of an entry of u, in lengths of the system.
+        """
         factored, system = self.state, self.system
         if factored is None:
             return False
@@ -175,7 +181,11 @@ class LatestTangent:
         may_lag
             Whether a small part of the tangent may belong to an earlier state.
         needs_inertia
-            Whether the number of unstable directions must be right in spite of that.
+            Whether the number of unstable directions must be right in spite of such a part.
+
+        Returns
+        -------
+        The factors, which the next call overwrites.
         """
         factored, factors = self.state, self._factorisation
         is_other = factored is not state and (
@@ -195,7 +205,10 @@ class LatestTangent:
 
     @property
     def may_extrapolate(self) -> bool:
-        """Whether forces of dense terms may be extrapolated: these exist and have been small."""
+        """Whether forces of dense terms may be extrapolated from earlier states.
+
+        There must be such terms, and their part of the tangent must have been small so far.
+        """
         return (
             isinstance(self.system, InexactSystem)
             and self.system.has_dense_terms
@@ -204,7 +217,10 @@ class LatestTangent:
 
     @property
     def inertia_is_certain(self) -> bool:
-        """Whether the number of unstable directions is right in spite of a lagged part."""
+        """Whether the number of unstable directions is right in spite of a lagged part. Collective.
+
+        The negative pivots are counted, if they were not yet.
+        """
         factors = self._factorisation
         is_known = factors.inertia_is_known or factors.count_corrected_inertia()
         return is_known and (
@@ -222,9 +238,19 @@ def factor_with_lag(
 ) -> bool:
     """Factor a tangent whose dense terms belong to an earlier state. Collective.
 
+    Parameters
+    ----------
+    factors
+        Gets the factors.
+    stress
+        As in `System.tangent`.
+    needs_inertia
+        Whether the number of unstable directions must be right in spite of the lag.
+
     Returns
     -------
-    False if the system has none, or they are not small, now or before.
+    Whether the factors serve; False if the system has no dense terms, or these are not small, now
+    or before.
     """
     if not (isinstance(system, InexactSystem) and system.has_dense_terms):
         return False
@@ -262,12 +288,18 @@ class SolveOptions:
 class SnesCallbacks:
     """The callbacks of SNES in a solve: function, Jacobian, linear solver, test of convergence.
 
-    It holds no reference to the SNES, which refers to it: PETSc would keep both in memory for ever.
+    PETSc calls them on all ranks. The object holds no reference to the SNES, which refers to it:
+    PETSc would keep both in memory for ever.
+
+    Parameters
+    ----------
+    tangent
+        The factors of the system, which serve successive solves.
 
     Attributes
     ----------
     matrix
-        The bordered matrix of the present solve, or of the last one.
+        The bordered matrix of the present solve, or of the last one; None before the first.
     extrapolating
         Whether the solve may extrapolate forces of dense terms.
     """
@@ -289,7 +321,15 @@ class SnesCallbacks:
         tolerance: float,
         options: SolveOptions,
     ) -> None:
-        """Begin a solve from a guess on which `row` shall hold, with mu the amplitude `name`."""
+        """Begin a solve from a guess to a state on which `row` holds, with mu the amplitude `name`.
+
+        Parameters
+        ----------
+        tolerance
+            Estimated error of u at which the solve ends, over the system's length.
+        options
+            The way this one solve runs.
+        """
         # the extrapolation: whether the present residual uses it, the largest step since forces
         # were computed, and the steps with computed forces
         self.extrapolating, self._is_extrapolated = options.extrapolating, False
@@ -313,7 +353,7 @@ class SnesCallbacks:
 
     @property
     def error(self) -> float:
-        """The estimated error of the solution."""
+        """The estimated error of the solution, over the system's length."""
         return self._iterates.error
 
     def step_at(self, x: PETSc.Vec) -> Direction | None:
@@ -321,11 +361,12 @@ class SnesCallbacks:
         return self._next if x.stateGet() == self._x_counter else None
 
     def function(self, snes: PETSc.SNES, x: PETSc.Vec, f: PETSc.Vec) -> None:
-        """Write R and g into f."""
+        """Write the residuals R of equilibrium and g of the row into f; PETSc's callback."""
         self._is_extrapolated = self.extrapolating
         self._compute(self._state_of(x), f)
 
     def _compute(self, state: State, f: PETSc.Vec) -> None:
+        """Write R, extrapolated where the present iterate may be, and g at a state into f."""
         if self._is_extrapolated:
             assert isinstance(self._system, InexactSystem)
             R = self._system.residual(state.u, state.mu, inexact=True)
@@ -334,19 +375,22 @@ class SnesCallbacks:
         self.join((R, self._row.residual(state)), f)
 
     def jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, J: PETSc.Mat, P: PETSc.Mat) -> None:
-        """Choose the matrix for an iterate: that of an earlier one while the steps shrink."""
+        """Choose the matrix for an iterate; PETSc's callback.
+
+        While the steps shrink it is the matrix of an earlier iterate.
+        """
         self._linearise(x, snes.getFunction()[0])
         J.assemble()
 
     def mult(self, J: PETSc.Mat, x: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Write the matrix times a vector into y."""
+        """Write the bordered matrix times a vector into y; PETSc's callback."""
         assert self.matrix
         self.join(self.matrix.times(*self.split(x)), y)
 
     def apply(self, pc: PETSc.PC, f: PETSc.Vec, y: PETSc.Vec) -> None:
-        """Write the inverse of the matrix times f into y.
+        """Write the inverse of the bordered matrix times f into y; PETSc's callback.
 
-        For the iterate's residual it is known since the test of convergence.
+        If f is the residual of the iterate, the result is known from the test of convergence.
         """
         assert self._chord
         assert self._next
@@ -354,7 +398,10 @@ class SnesCallbacks:
         self.join(self._next if is_known else self._chord.solve(self.split(f), self._next), y)
 
     def test(self, snes: PETSc.SNES, iteration: int, norms: tuple[float, float, float]) -> Any:
-        """Return PETSc's reason: whether the next step is small enough, or never will be."""
+        """Return PETSc's reason to end or go on; PETSc's callback after each iteration.
+
+        The size of the next step decides, not the norms that PETSc passes.
+        """
         x, f = snes.getSolution(), snes.getFunction()[0]
         state = self._linearise(x, f)
         verdict = self._iterates.judge(
@@ -363,14 +410,31 @@ class SnesCallbacks:
         return REASON_OF_VERDICT[verdict]
 
     def _converged_size(self, state: State) -> float:
-        """Return the size of a step that counts as converged."""
+        """Return the size of a step that counts as converged, in lengths of the system.
+
+        The tolerance counts relative to a tenth of the largest displacement, where that exceeds the
+        length.
+        """
         displacement = max_abs(self._system.comm, state.u)
         return self._tolerance * max(
             1.0, LENGTH_PER_DISPLACEMENT * displacement / self._system.length
         )
 
     def _linearise(self, x: PETSc.Vec, f: PETSc.Vec) -> State:
-        """Choose the matrix for an iterate, and compute its next step; once for each iterate."""
+        """Choose the matrix for an iterate, and compute its next step; once for each iterate.
+
+        If the step is too small for extrapolated forces, the forces are computed and f is
+        overwritten.
+
+        Parameters
+        ----------
+        x, f
+            The iterate, and its residual.
+
+        Returns
+        -------
+        The state of the iterate.
+        """
         if self._state is not None and x.stateGet() == self._x_counter:
             return self._state
         state, previous = self._state_of(x), self._state
@@ -391,9 +455,10 @@ class SnesCallbacks:
         return state
 
     def _extrapolated_size(self, state: State) -> float:
-        """Return the size down to which a step may use extrapolated forces.
+        """Return the size down to which a step may use extrapolated forces, in lengths.
 
-        For a smaller step the forces are computed. Negative if that is not necessary any more.
+        For a smaller step the forces are computed. The result is negative once computed forces have
+        shown an error far below the tolerance.
         """
         converged = self._converged_size(state)
         # one ratio is enough here: each costs much
@@ -403,18 +468,23 @@ class SnesCallbacks:
         return max(converged, ratio * self._largest_step)
 
     def is_misled_by_extrapolation(self) -> bool:
-        """Return whether computed forces make the last step much shorter; True if unknown.
+        """Return whether extrapolated forces have misled the last step. Collective.
 
-        Collective.
+        This is so if computed forces make the step much shorter; True too if no such comparison is
+        possible.
         """
         if not (self._is_extrapolated and self._state and self._chord and self.matrix):
             return True
         state, size = self._state, self._iterates.steps[-1].size
         R = self._system.residual(state.u, state.mu), self._row.residual(state)
+        # with computed forces the step is at most half as long
         return not self.matrix.size(self._chord.step(R)) > QUADRATIC_RATIO * size
 
     def _repeated_step(self, f: Direction) -> Direction:
-        """Return the next step by the same matrix, in place of one with extrapolated forces."""
+        """Replace the last step, which had extrapolated forces, by that for a residual `f`.
+
+        The matrix stays the same. Return the new step.
+        """
         assert self.matrix
         assert self._chord
         step = self._chord.step(f)
@@ -422,7 +492,12 @@ class SnesCallbacks:
         return step
 
     def _go_on(self, previous: State, state: State) -> None:
-        """Go on to a new iterate; a line search may have shortened the step to it."""
+        """Go on from the previous iterate to a new one.
+
+        After a full step the chord method keeps its matrix. A line search may have shortened the
+        step; then the next step takes a new matrix. The stress for the next tangent is
+        extrapolated.
+        """
         assert self._chord
         assert self._next
         after_full = add_scaled((previous.u, previous.mu[self._name]), -1.0, self._next)
@@ -434,13 +509,14 @@ class SnesCallbacks:
             self._chord = None
         # the stress after the step is extrapolated linearly from before it (MIP Newton: Magisano,
         # Leonetti, Garcea, Computer Methods in Applied Mechanics and Engineering 313, 2017)
-        step = -self._next[0] if is_full else state.u - previous.u
-        self._stress = extrapolated_stress(previous.u, step)
+        du = -self._next[0] if is_full else state.u - previous.u
+        self._stress = extrapolated_stress(previous.u, du)
 
     def _next_step(self, state: State, f: Direction) -> Direction:
-        """Return the next step, which SNES subtracts.
+        """Return the next step (du, dmu), which SNES subtracts, at the residual `f` of a state.
 
-        It comes from the latest matrix while that serves, else from a new one at this iterate.
+        It comes from the latest matrix while that serves, else from a new one at this iterate. Its
+        size is appended to the steps of the solve.
         """
         steps = self._iterates.steps
         if self._chord and self.matrix:
@@ -468,17 +544,22 @@ class SnesCallbacks:
     def _matrix_and_step(
         self, factors: Factorisation, state: State, f: Direction
     ) -> tuple[BorderedMatrix, Direction]:
-        """Return the bordered matrix with some factors, and its step."""
+        """Return the bordered matrix with given factors, and its step for the residual f."""
         matrix = BorderedMatrix(
             self._system, factors, state, self._name, self._row, lagged=self._tangent.lagged
         )
         return matrix, matrix.solve(*f, low_accuracy=True)
 
     def _lag_slows(self, matrix: BorderedMatrix, step: Direction) -> bool:
-        """Return whether the lagged part of the matrix is why steps do not shrink.
+        """Return whether the lagged part of the matrix is the reason why steps do not shrink.
 
-        The part was small at its state, but need not be so now. After the step the residual is what
-        the matrix lacks, times the step; that is extrapolated.
+        The part was small at its own state, but need not be so now. After the step the residual is
+        what the matrix lacks, times the step; this product is extrapolated.
+
+        Parameters
+        ----------
+        step
+            The step by the matrix.
         """
         own_sizes = [s.size for s in self._iterates.steps if s.is_own]
         size, contraction = matrix.size(step), self._options.late_contraction
@@ -490,11 +571,15 @@ class SnesCallbacks:
         return not matrix.size(matrix.solve(missing, 0.0, low_accuracy=True)) <= contraction * size
 
     def _matrix_serves(self, size: float) -> bool:
-        """Return whether to keep a matrix whose next step has this size."""
+        """Return whether to keep the matrix, whose next step has this size in lengths.
+
+        It is kept if the steps shrink fast enough, or if few more of them reach the tolerance.
+        """
         steps, options = self._iterates.steps, self._options
         ratio = size / steps[-1].size
         is_first = sum(step.is_own for step in steps) <= 1 and not self._has_stress
         if not self._has_stress and ratio <= 0.5:
+            # the size after as many chord steps as cost one factorisation
             size_at_end = size * ratio**options.chord_steps_per_factorisation
             if size_at_end <= self._tolerance:
                 return True
@@ -504,16 +589,21 @@ class SnesCallbacks:
         return ratio <= (options.contraction if is_first else options.late_contraction)
 
     def _rounding_error(self, state: State, f: PETSc.Vec) -> float:
-        """Return the error from rounding of the residual.
+        """Return the error of u from rounding of the residual, in lengths of the system.
 
         It is estimated from the change of the residual when u is rounded differently.
+
+        Parameters
+        ----------
+        f
+            The residual at the state.
         """
         matrix = self.matrix
         assert matrix
         signs = np.random.default_rng(self._system.comm.rank).choice([-1.0, 1.0], state.u.size)
         rounded = state.u + signs * np.spacing(state.u)
-        change = self._system.residual(rounded, state.mu) - self.split(f)[0]
-        remainder = change - matrix.times(rounded - state.u, 0.0)[0]
+        residual_change = self._system.residual(rounded, state.mu) - self.split(f)[0]
+        remainder = residual_change - matrix.times(rounded - state.u, 0.0)[0]
         return matrix.size(matrix.solve(remainder, 0.0))
 
     def new_vector(self) -> PETSc.Vec:
@@ -522,7 +612,7 @@ class SnesCallbacks:
         return PETSc.Vec().createMPI((size, PETSc.DETERMINE), comm=self._system.comm)
 
     def join(self, values: Direction, x: PETSc.Vec) -> None:
-        """Write (u, mu) into a vector."""
+        """Write this rank's u, and mu on the last rank, into a vector."""
         x.setArray(np.append(*values) if self._is_last_rank else values[0])
 
     def split(self, x: PETSc.Vec) -> Direction:
@@ -532,6 +622,7 @@ class SnesCallbacks:
         return local[: self._system.size].copy(), mu
 
     def _state_of(self, x: PETSc.Vec) -> State:
+        """Return the state of an iterate x, with the fixed amplitudes of the guess. Collective."""
         u, mu = self.split(x)
         return self._guess.with_(u, self._name, mu)
 
@@ -539,7 +630,7 @@ class SnesCallbacks:
 def make_snes(
     callbacks: SnesCallbacks, x: PETSc.Vec, options: NewtonOptions, line_search: str = "basic"
 ) -> PETSc.SNES:
-    """Create a SNES for vectors like `x`.
+    """Create a SNES for vectors like `x`, whose matrix and linear solver are the callbacks.
 
     Parameters
     ----------

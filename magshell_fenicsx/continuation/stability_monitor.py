@@ -35,7 +35,13 @@ GENERAL_FRACTION = 0.1
 
 @dataclass(frozen=True)
 class InertiaChange:
-    """The numbers of unstable directions of a family of modes before and after a step."""
+    """The numbers of unstable directions of a family of modes before and after a step.
+
+    Attributes
+    ----------
+    stability
+        The tangent of the family at any state.
+    """
 
     stability: Stability
     count_before: int
@@ -45,7 +51,12 @@ class InertiaChange:
 class PathSegment:
     """The path between two successive points, with all points on it that were computed.
 
-    Arc length is measured along the tangent of the first point.
+    Arc length is measured along the tangent of the first point. Methods that solve are collective.
+
+    Parameters
+    ----------
+    low, high
+        The two points.
     """
 
     def __init__(self, path: Path, low: Point, high: Point) -> None:
@@ -57,14 +68,17 @@ class PathSegment:
         return abs(self._path.measured_from(self._low, point).s - self._low.s)
 
     def middle(self) -> Point | None:
-        """Return the point half way between both ends; None if it is not found."""
+        """Return the point half way in s between both ends; None if it is not found.
+
+        Its numbers of unstable directions are not valid.
+        """
         try:
             return self._middle(self._points[0], self._points[-1], solve=True, needs_inertia=False)
         except PathStopped:
             return None
 
     def estimated_middle(self) -> Point | None:
-        """Estimate the point half way without a solve; None if that is too uncertain."""
+        """Estimate the point half way in s without a solve; None if that is too uncertain."""
         low, high = self._points[0], self._points[-1]
         estimate = self._path.estimate_between(
             (low.s + high.s) / 2, low, self._path.relative_to(low, high), low
@@ -72,7 +86,11 @@ class PathSegment:
         return None if isinstance(estimate, str) else estimate
 
     def crossings(self, change: InertiaChange) -> Iterator[tuple[Point, int]]:
-        """Yield each point at which a mode is neutral, and the change of the unstable count there.
+        """Yield each point at which a mode of a family is neutral, in the order of the path.
+
+        Yields
+        ------
+        The point, and the change of the number of unstable directions there.
 
         Raises
         ------
@@ -86,7 +104,15 @@ class PathSegment:
     def _crossings_between(
         self, low: Point, high: Point, change: InertiaChange, counts: dict[int, int], halvings: int
     ) -> Iterator[tuple[Point, int]]:
-        """Yield the crossings between two points; `counts` has the inertia of points by id."""
+        """Yield the crossings between two points, as `crossings` does.
+
+        Parameters
+        ----------
+        counts
+            Identity `id` of a point -> number of unstable directions of the family there; it grows.
+        halvings
+            Number of halvings that are left; without any, several crossings count as one.
+        """
         count_before, count_after = counts[id(low)], counts[id(high)]
         if count_before == count_after:
             return
@@ -106,12 +132,29 @@ class PathSegment:
     def _middle(
         self, low: Point, high: Point, *, solve: bool, needs_inertia: bool = True
     ) -> Point | None:
-        """Return a point between two others: a known one, else a new one if `solve` is set."""
-        first, last = (
+        """Return a point between two points of the segment, preferably one that is known.
+
+        Parameters
+        ----------
+        solve
+            Whether a new point half way is computed if none is known.
+        needs_inertia
+            Whether the numbers of unstable directions of a new point must be valid.
+
+        Returns
+        -------
+        The point; None if none is known and `solve` is not set.
+
+        Raises
+        ------
+        PathStopped
+            If the solve fails.
+        """
+        low_index, high_index = (
             next(i for i, p in enumerate(self._points) if p is end) for end in (low, high)
         )
-        if last - first > 1:
-            return self._points[(first + last) // 2]
+        if high_index - low_index > 1:
+            return self._points[(low_index + high_index) // 2]
         if not solve:
             return None
         path, s = self._path, (low.s + high.s) / 2
@@ -123,7 +166,7 @@ class PathSegment:
         return self._insert(middle)
 
     def _insert(self, point: Point) -> Point:
-        """Insert a point in the order of the path; return it with its arc length from the first."""
+        """Insert a point in the order of the path, and return it with its s measured from `low`."""
         measured = self._path.measured_from(self._low, point)
         self._points.append(measured)
         self._points.sort(key=lambda p: abs(p.s - self._low.s))
@@ -142,20 +185,26 @@ class ModeFamily(Protocol):
 
 
 class FamilyTangents(Protocol):
-    """The tangents of several families together, as one array in which they are linear."""
+    """The tangents of several families of modes, as one array that is linear in the matrices."""
 
     def sampled_tangents(self, state: State) -> Vector:
-        """Return the tangents at a state of the model."""
+        """Return the array of tangents at a state of the model. Collective."""
 
     def counts_from(self, numbers: Vector) -> Sequence[int]:
-        """Return the numbers of unstable directions of all families."""
+        """Return the numbers of unstable directions of all families from an array of tangents."""
 
     def indefinite(self, numbers: Vector) -> set[int]:
-        """Return the indices in `counts` of families whose tangents are not positive definite."""
+        """Return the indices in `counts` of families whose tangents are not positive definite.
+
+        Parameters
+        ----------
+        numbers
+            An array of tangents, or a linear combination of such arrays.
+        """
 
 
 class SymmetryBreakingModes(Protocol):
-    """All modes that a model excludes."""
+    """All symmetry-breaking modes that a model excludes, in families that share a tangent."""
 
     @property
     def tangents(self) -> FamilyTangents | None:
@@ -191,19 +240,20 @@ class Crossing:
 
 @dataclass(frozen=True)
 class _InertiaEvaluation:
-    """The inertia of the symmetry-breaking modes at a point.
+    """The inertia of the symmetry-breaking modes at a point of a path.
 
     Attributes
     ----------
     distance
-        The length of the path up to the point.
+        Length of the path from its first point up to this one, in the path's metric.
     counts
         Numbers of unstable directions of all families.
     softest, vector
         Magnitude of the eigenvalue nearest to zero of the only family, and its mode; infinite and
         None if there are several.
     numbers
-        Computes the tangents of several families, see `FamilyTangents`; None if there are none.
+        Computes the array of tangents of several families, see `FamilyTangents`; None if there are
+        none.
     """
 
     point: Point
@@ -266,11 +316,12 @@ class StabilityMonitor:
         *,
         evaluate: bool = False,
     ) -> None:
-        """Begin to monitor a path at its first point.
+        """Begin to monitor a path at its first point. Collective.
 
-        If that is not the last point of the previous path, it is evaluated only if the second point
-        is unstable. If it is unstable too, `pass_to` returns it as a crossing of each family whose
-        number is not that of the last evaluation.
+        The last evaluation is kept if the path begins at the last point of the previous one.
+        Otherwise the first point is evaluated only if the second proves to be unstable. `pass_to`
+        then returns it as a crossing of each family that is unstable there and was not so at the
+        last evaluation, or not in this number.
 
         Parameters
         ----------
@@ -279,10 +330,12 @@ class StabilityMonitor:
         evaluate
             Whether the first point is evaluated now; then it is no crossing.
         """
-        last = self._last_evaluation
-        self._counts_before_path = last.counts if last else (0,) * len(self._families)
+        last_evaluation = self._last_evaluation
+        self._counts_before_path = (
+            last_evaluation.counts if last_evaluation else (0,) * len(self._families)
+        )
         is_last_point = start.state.u is self._u and not self._skipped
-        known_evaluation = last if is_last_point else None
+        known_evaluation = last_evaluation if is_last_point else None
         self._path, self._expand = path, expand
         self._last_point, self._u, self._distance = start, start.state.u, 0.0
         self._softening_rate: float | None = None
@@ -296,12 +349,12 @@ class StabilityMonitor:
             self._skipped.append((start, 0.0))
 
     def pass_to(self, point: Point, *, evaluate: bool = False) -> list[Crossing]:
-        """Go on to the next accepted point; return the crossings on the way, in order.
+        """Go on to the next accepted point; return the crossings on the way, in order. Collective.
 
         Parameters
         ----------
         evaluate
-            Whether the point must be evaluated.
+            Whether the point must be evaluated; else the only family may be skipped there.
         """
         self._distance += self._distance_between(self._last_point, point)
         self._last_point, self._u = point, point.state.u
@@ -316,7 +369,10 @@ class StabilityMonitor:
         return self._path.metric.norm(b.u - a.u, b.mu[name] - a.mu[name])
 
     def end(self) -> list[Crossing]:
-        """Evaluate the last point, if it was skipped; return the crossings, see `pass_to`."""
+        """End the path: evaluate its last point, if that was skipped. Collective.
+
+        Return the crossings on the way to the point, as `pass_to` does.
+        """
         if self._last_evaluation and self._last_evaluation.point is self._last_point:
             return []
         self._skipped = [
@@ -331,9 +387,10 @@ class StabilityMonitor:
 
     @property
     def _least_softest(self) -> float:
-        """The least eigenvalue that the softest mode may have at the last point.
+        """The least eigenvalue that the softest mode of the only family may have at the last point.
 
-        It is -inf without a rate of softening.
+        The mode softens at most `MAX_SOFTENING_RATIO` times as fast as before. The value is -inf
+        without a known rate of softening.
         """
         evaluation, rate = self._last_evaluation, self._softening_rate
         if evaluation is None or rate is None:
@@ -342,21 +399,31 @@ class StabilityMonitor:
         return evaluation.softest - MAX_SOFTENING_RATIO * rate * distance
 
     def _crossings_to_last_point(self) -> list[Crossing]:
-        """Evaluate the last point and, if necessary, the skipped ones; return the crossings."""
+        """Evaluate the last point, and locate all crossings since the last evaluation.
+
+        Skipped points are evaluated too if the last one shows that a mode softened unexpectedly.
+        The number of points that may be skipped next is adapted.
+
+        Returns
+        -------
+        The crossings, in the order of the path.
+        """
         previous = self._last_evaluation
-        last = self._evaluate(self._last_point, self._distance)
-        softened = previous is not None and last.softest < min(
+        new_evaluation = self._evaluate(self._last_point, self._distance)
+        softened = previous is not None and new_evaluation.softest < min(
             self._least_softest, previous.softest / 2
         )
-        changed = last.counts != previous.counts if previous else any(last.counts)
-        evaluations = [last]
+        changed = (
+            new_evaluation.counts != previous.counts if previous else any(new_evaluation.counts)
+        )
+        evaluations = [new_evaluation]
         self._may_skip = min(max(1, 2 * len(self._skipped)), MAX_SKIPPED)
         if self._skipped and (softened or changed):
-            evaluations = [*(self._evaluate(*skipped) for skipped in self._skipped), last]
+            evaluations = [*(self._evaluate(*skipped) for skipped in self._skipped), new_evaluation]
             self._may_skip = 0
         if previous:
             evaluations = self._with_recoveries([previous, *evaluations])
-        self._last_evaluation, self._skipped = last, []
+        self._last_evaluation, self._skipped = new_evaluation, []
         self._previous_evaluation = evaluations[-2] if len(evaluations) > 1 else None
         self._softening_rate = _softening_rate(*evaluations[-2:]) if len(evaluations) > 1 else None
         crossings = [] if previous else list(self._crossings_at_start(evaluations[0]))
@@ -366,7 +433,10 @@ class StabilityMonitor:
         return crossings
 
     def _with_recoveries(self, evaluations: list[_InertiaEvaluation]) -> list[_InertiaEvaluation]:
-        """Return evaluations with those between them where modes may soften and recover."""
+        """Return successive evaluations, with new ones in between where modes may recover.
+
+        A mode recovers if it becomes unstable and stable again within a step.
+        """
         refined, earlier = evaluations[:1], self._previous_evaluation
         for low, high in pairwise(evaluations):
             refined += [*self._recoveries(earlier, low, high, MAX_RECOVERY_HALVINGS), high]
@@ -380,21 +450,27 @@ class StabilityMonitor:
         high: _InertiaEvaluation,
         halvings: int,
     ) -> Iterator[_InertiaEvaluation]:
-        """Yield evaluations between two, where modes may soften and recover.
+        """Yield new evaluations between two, where a mode may become unstable and stable again.
 
         Parameters
         ----------
         other
-            A third evaluation, before or after both, for a parabola; without one the middle is
-            evaluated.
+            A third evaluation, before or after both, for a parabola; None: the middle is evaluated.
+        low, high
+            Successive evaluations.
+        halvings
+            Number of halvings of the step that are left.
         """
         if not halvings or low.point.s == high.point.s or not self._may_recover(other, low, high):
             return
         segment = PathSegment(self._path, low.point, high.point)
         estimate = self._evaluate_between(low, high, segment.estimated_middle())
         if estimate and estimate.counts == low.counts == high.counts:
-            halves = (other or high, low, estimate), (low, estimate, high)
-            if not any(self._may_recover(*three) for three in halves):
+            evaluations_by_half = (other or high, low, estimate), (low, estimate, high)
+            if not any(
+                self._may_recover(*parabola_evaluations)
+                for parabola_evaluations in evaluations_by_half
+            ):
                 yield estimate
                 return
         middle = self._evaluate_between(low, high, segment.middle())
@@ -407,6 +483,10 @@ class StabilityMonitor:
     def _evaluate_between(
         self, low: _InertiaEvaluation, high: _InertiaEvaluation, point: Point | None
     ) -> _InertiaEvaluation | None:
+        """Evaluate the inertia at a point between two evaluations; None without a point.
+
+        The length of the path between them is divided in the ratio of the straight distances.
+        """
         if point is None:
             return None
         to_low, to_high = (self._distance_between(end.point, point) for end in (low, high))
@@ -419,9 +499,18 @@ class StabilityMonitor:
         low: _InertiaEvaluation,
         high: _InertiaEvaluation,
     ) -> bool:
-        """Return whether a family that is stable at both ends of a step may be unstable in it.
+        """Return whether a family that is stable at both ends of a step may be unstable within it.
 
-        The tangents are interpolated by a parabola.
+        The tangents are interpolated by a parabola through three evaluations. Its inner Bernstein
+        coefficient decides: if that is positive definite, as at both ends, so is the tangent
+        between.
+
+        Parameters
+        ----------
+        other
+            A third evaluation, before or after both; None: a recovery is always possible.
+        low, high
+            The evaluations at both ends.
         """
         tangents = self._excluded.tangents if self._excluded else None
         if not tangents or low.numbers is None or high.numbers is None:
@@ -436,6 +525,7 @@ class StabilityMonitor:
         numbers = other.numbers, low.numbers, high.numbers
 
         def find() -> RecordedValues:
+            """Compute whether the matrix between the ends is indefinite for a stable family."""
             tangents_between = _inner_bernstein_coefficient(
                 distances, [compute() for compute in numbers]
             )
@@ -446,7 +536,10 @@ class StabilityMonitor:
         return bool(self._path.recorded_values(find).values["recovers"])
 
     def _crossings_at_start(self, evaluation: _InertiaEvaluation) -> Iterator[Crossing]:
-        """Yield the families that became unstable between the last path and the first point."""
+        """Yield a crossing at the first point for each family that became unstable before it.
+
+        The numbers of unstable directions are compared with those at the end of the last path.
+        """
         counts = zip(self._families, evaluation.counts, self._counts_before_path, strict=False)
         for family, count, count_before in counts:
             if count and count != count_before:
@@ -455,30 +548,36 @@ class StabilityMonitor:
     def _crossings_between(
         self, low: _InertiaEvaluation, high: _InertiaEvaluation
     ) -> list[Crossing]:
-        """Return the crossings between two points, in the order of the path."""
+        """Return the crossings between two evaluated points, in the order of the path.
+
+        If a crossing cannot be located, the reason is kept in `unlocated`.
+        """
         segment = PathSegment(self._path, low.point, high.point)
         located = list[tuple[float, str, Point, int]]()
         for family, count_before, count_after in zip(
             self._families, low.counts, high.counts, strict=False
         ):
-            change = InertiaChange(
+            inertia_change = InertiaChange(
                 _ExpandedStability(family, self._expand), count_before, count_after
             )
             try:
                 located += [
                     (segment.distance(point), family.label, point, rise)
-                    for point, rise in segment.crossings(change)
+                    for point, rise in segment.crossings(inertia_change)
                 ]
             except PathStopped as e:
                 self.unlocated = self.unlocated or str(e)
-        crossings, unstable = list[Crossing](), sum(low.counts)
+        crossings, unstable_count = list[Crossing](), sum(low.counts)
         for _, label, point, rise in sorted(located, key=lambda crossing: crossing[0]):
-            crossings.append(Crossing(label, point, min(unstable, unstable + rise)))
-            unstable += rise
+            crossings.append(Crossing(label, point, min(unstable_count, unstable_count + rise)))
+            unstable_count += rise
         return crossings
 
     def _evaluate(self, point: Point, distance: float) -> _InertiaEvaluation:
-        """Evaluate the inertia at a point at a distance along the path."""
+        """Evaluate the inertia of all families at a point, a distance along the path. Collective.
+
+        The result is recorded in the journal of the path.
+        """
         excluded = self._excluded
         if excluded is None:
             return _InertiaEvaluation(point, distance, ())
@@ -487,6 +586,7 @@ class StabilityMonitor:
         start_vector = self._last_evaluation.vector if self._last_evaluation else None
 
         def find() -> RecordedValues:
+            """Compute the inertia; of a single family also the softest mode."""
             if tangents and numbers:
                 counts = [*tangents.counts_from(numbers())]
                 return RecordedValues({"counts": counts, "softest": np.inf})
@@ -519,7 +619,9 @@ class _ExpandedStability:
 
 
 def _softest_mode(factors: Factorisation, start_vector: Vector | None) -> tuple[float, Vector]:
-    """Return the magnitude of the eigenvalue nearest to zero, an upper bound, and its vector.
+    """Return an upper bound of the least magnitude of an eigenvalue, and its vector.
+
+    Inverse iteration finds them; the vector has length one. Collective.
 
     Parameters
     ----------
@@ -530,25 +632,43 @@ def _softest_mode(factors: Factorisation, start_vector: Vector | None) -> tuple[
     v = np.sin(1.0 + np.arange(factors.matrix.getLocalSize()[0]) + comm.rank)
     if start_vector is not None:
         v = start_vector + GENERAL_FRACTION * v / np.sqrt(dot(comm, v, v))
-    size = np.inf
+    eigenvalue_size = np.inf
     for _ in range(ITERATIONS_FROM_RANDOM if start_vector is None else ITERATIONS_FROM_LAST_MODE):
         v = factors.solve(v / np.sqrt(dot(comm, v, v)))
-        size = 1 / np.sqrt(dot(comm, v, v))
-    return size, size * v
+        eigenvalue_size = 1 / np.sqrt(dot(comm, v, v))
+    return eigenvalue_size, eigenvalue_size * v
 
 
 def _inner_bernstein_coefficient(distances: Sequence[float], numbers: Sequence[Vector]) -> Vector:
-    """Return the inner Bernstein coefficient of a parabola over its last interval."""
-    (other, low, high), (at_other, at_low, at_high) = distances, numbers
+    """Return the inner Bernstein coefficient of a parabola over its last interval.
+
+    On the interval a parabola is a mean, with weights between 0 and 1, of its values at both ends
+    and of this coefficient.
+
+    Parameters
+    ----------
+    distances
+        Three places: another one, and the ends of the interval.
+    numbers
+        The values at these places.
+    """
+    (third, low, high), (at_other, at_low, at_high) = distances, numbers
     step = high - low
-    slopes = (at_high - at_low) / step, (at_low - at_other) / (low - other)
-    half_curvature = (slopes[0] - slopes[1]) / (high - other)
+    slopes = (at_high - at_low) / step, (at_low - at_other) / (low - third)
+    # the second divided difference of the parabola
+    half_curvature = (slopes[0] - slopes[1]) / (high - third)
     return np.asarray((at_low + at_high) / 2 - step**2 / 2 * half_curvature)
 
 
 def _softening_rate(a: _InertiaEvaluation, b: _InertiaEvaluation) -> float | None:
-    """Return the change of the softest eigenvalue per length of the path; None for zero length."""
+    """Return the change of the softest eigenvalue per length of the path between evaluations.
+
+    If the numbers of unstable directions differ, the eigenvalue has changed its sign. The rate is
+    None between points at one place.
+    """
     if b.distance == a.distance:
         return None
-    change = abs(b.softest - a.softest) if a.counts == b.counts else a.softest + b.softest
-    return change / (b.distance - a.distance)
+    eigenvalue_change = (
+        abs(b.softest - a.softest) if a.counts == b.counts else a.softest + b.softest
+    )
+    return eigenvalue_change / (b.distance - a.distance)

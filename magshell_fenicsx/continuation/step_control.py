@@ -38,16 +38,16 @@ class StepEvent:
 
 @dataclass(frozen=True)
 class StepPlan:
-    """A planned step.
+    """A planned step from the current point of a path.
 
     Attributes
     ----------
     s
-        The controlled quantity at its end.
+        The controlled quantity at the end of the step.
     predictors
-        Points from which the end is extrapolated.
+        Points from which the end is extrapolated, the current one last.
     length
-        Length without an onset of forces.
+        Length of the step in s without an onset of forces.
     event
         Onset and loss of forces on the step.
     """
@@ -108,9 +108,14 @@ class StepController:
         return self.points[-1]
 
     def length(self, distance: float) -> float:
-        """Return the length of the next step towards a target at a distance in s.
+        """Return the length in s of the next step towards a target.
 
         The last steps before a target have equal lengths, so that none of them is tiny.
+
+        Parameters
+        ----------
+        distance
+            Distance of the target in s, of either sign; it may be infinite.
         """
         steps = np.inf
         if np.isfinite(distance):
@@ -118,12 +123,23 @@ class StepController:
         return abs(distance) / steps if steps < 3 else self.step
 
     def reject_step(self, plan: StepPlan, reason: str, smallest: float) -> None:
-        """Choose another step after one that failed.
+        """Choose the length of another step after one that failed.
+
+        It is half as long; where rounding hides the solution it is twice as long, a few times.
+
+        Parameters
+        ----------
+        plan
+            The step that failed.
+        reason
+            Why it failed.
+        smallest
+            The smallest length in s.
 
         Raises
         ------
         PathStopped
-            If it would be shorter than the smallest.
+            If the next step would be shorter than the smallest.
         """
         if plan.event.fraction < 1 and plan.event.ends_behind:
             self.onset_without_solution, self.rejected = self.current, None
@@ -138,10 +154,14 @@ class StepController:
     def accept_step(
         self, point: Point, plan: StepPlan, options: StepOptions, *, straight: bool, kink: bool
     ) -> None:
-        """Append the end of a step, and adapt the step length.
+        """Append the end of a step to the points, and adapt the step length.
 
         Parameters
         ----------
+        point
+            The end of the step, with the work of its solve.
+        plan
+            The step as it was planned.
         straight
             Whether the path is straight enough for a longer step.
         kink
@@ -162,12 +182,18 @@ class StepController:
         self.points, self.leaps = [*earlier_points, point], 0
 
     def accept_rejected(self, point: Point, length: float) -> None:
-        """Append the rejected solution, which lies one step of a length from the last point."""
+        """Append a solution that was rejected before, a step of a length from the last point."""
         self.points, self.step = [*self.points[1 - PREDICTOR_POINTS :], point], length
         self.rejected = None
 
     def keep_rejected(self, rejected: RejectedPoint, length: float) -> None:
-        """Keep a solution that is still too far, at a length ahead; behind if it is negative."""
+        """Keep a solution that is still too far, or drop it after too many comparisons.
+
+        Parameters
+        ----------
+        length
+            How far ahead it lies in s; negative if it lies behind the last point.
+        """
         if length > 0:
             self.step = min(self.step, max(length / 2, MIN_FRACTION_BEFORE_FOLD * self.step))
         self.rejected = rejected if rejected.retries < MAX_RETRIES else None

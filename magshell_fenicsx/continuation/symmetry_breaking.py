@@ -24,13 +24,16 @@ DIFFERENCE_STEP = 1e-4  # relative, of an amplitude
 
 
 class SymmetryBreakingSystems(SystemFamily, Protocol):
-    """Systems that differ by a parameter p, with the tangents of their symmetry-breaking modes."""
+    """Systems that differ by a parameter p, with the tangents of their symmetry-breaking modes.
+
+    All methods are collective.
+    """
 
     def factored_tangent(self, p: float, state: State, m: int) -> Factorisation:
-        """Factor the tangent K_m of a family at a state; the next call may overwrite it."""
+        """Factor the tangent K_m of a family at p and a state; the next call may overwrite it."""
 
     def quadratic_form(self, p: float, state: State, m: int, v: Vector) -> float:
-        """Return v . K_m v."""
+        """Return v . K_m v of the family m, at p and a state."""
 
     def counts(self, p: float, state: State) -> Sequence[int]:
         """Return the numbers of unstable directions of the families 1, 2, ..."""
@@ -39,8 +42,21 @@ class SymmetryBreakingSystems(SystemFamily, Protocol):
 class SymmetryBreakingRows:
     """The rows of Newton's step at a state of a boundary: du = -w_R - dmu w_mu - dp w_p.
 
+    They are the counterpart of `augmented.AugmentedRows` for a family of symmetry-breaking modes.
+    The constructor is collective.
+
     Parameters
     ----------
+    newton
+        The solver of the model's system at p.
+    name
+        The unknown amplitude mu.
+    b
+        A vector near the null vector of K_m, by which K_m is bordered.
+    m
+        The family of the modes, from 1.
+    family
+        The systems at all p.
     difference
         Weights and values of p of a difference by p.
 
@@ -63,6 +79,7 @@ class SymmetryBreakingRows:
         p: float,
         difference: Sequence[tuple[float, float]],
     ) -> None:
+        """Factor the tangents of the model and of the family, and differentiate g by mu and p."""
         self._system, self._family, self._m = newton.system, family, m
         self.pull = self.bend = 0.0
         self._p, self._state, self._b = p, state, b
@@ -71,39 +88,58 @@ class SymmetryBreakingRows:
         self._comm = comm = system.comm
         family_factors = family.factored_tangent(p, state, m)
         y = family_factors.solve(b)
+        # K_m v + g b = 0 and b . v = 1 by block elimination
         compliance = dot(comm, b, y)
         self.v: Vector = np.asarray(y / compliance)
         self.g = -1 / compliance
+        # where b . K_m^-1 b < 0, v itself counts among the negative pivots
         self._other_unstable = family_factors.negative_pivots - (compliance < 0)
         R_p, K_p = 0.0 * u, 0.0
-        for weight, q in difference:
-            state_at_q = State(u, {**family.amplitudes(q), name: value})
-            R_p = R_p + weight * family.solver_at(q).system.residual(u, state_at_q.mu)
-            K_p += weight * family.quadratic_form(q, state_at_q, m, self.v)
+        # derivatives by p at fixed u: R_p, and K_p = v . dK_m/dp v
+        for weight, other_p in difference:
+            state_at_other_p = State(u, {**family.amplitudes(other_p), name: value})
+            R_p = R_p + weight * family.solver_at(other_p).system.residual(u, state_at_other_p.mu)
+            K_p += weight * family.quadratic_form(other_p, state_at_other_p, m, self.v)
         self._w_mu = self._factors.solve(system.load(u, mu, name))
         self._w_p = self._factors.solve(R_p)
-        d = DIFFERENCE_STEP * (abs(value) or 1.0)
+        mu_step = DIFFERENCE_STEP * (abs(value) or 1.0)
         forward, backward = (
             family.quadratic_form(p, State(u, {**mu, name: value + step}), m, self.v)
-            for step in (d, -d)
+            for step in (mu_step, -mu_step)
         )
-        self._g_mu = -(forward - backward) / (2 * d) - self._derivative_of_g(self._w_mu)
+        # total derivatives: directly, and by the response of u
+        self._g_mu = -(forward - backward) / (2 * mu_step) - self._derivative_of_g(self._w_mu)
         self._g_p = -K_p - self._derivative_of_g(self._w_p)
         self.set_residual(system.residual(u, mu))
 
     def counts(self) -> list[int]:
-        """Return the numbers of unstable directions other than v, of the model and each family."""
+        """Return the numbers of unstable directions other than v: of the model, and of each family.
+
+        Collective.
+        """
         m, counts = self._m, list(self._family.counts(self._p, self._state))
         counts += [0] * (m - len(counts))
         counts[m - 1] = self._other_unstable
         return [self._factors.negative_pivots, *counts]
 
     def set_residual(self, residual: Vector) -> None:
-        """Use the residual at a nearby state, with the same factors."""
+        """Replace the residual by that of a nearby state, with the same factors."""
         self._w_R = self._factors.solve(residual)
 
     def step(self, row: CurveRow, value: float | None, *, settled: bool = False) -> CurveVector:
-        """Return Newton's step, or the tangent of the curve; see `augmented.AugmentedRows.step`."""
+        """Return Newton's step (du, dmu, dp), or the tangent of the boundary. Collective.
+
+        The rows g = 0 and the given one determine dmu and dp.
+
+        Parameters
+        ----------
+        row
+            The equation that says where on the boundary the point is.
+        value
+            The value of the row at the state; None for the tangent instead of a step.
+        settled
+            Whether only the residual and the row are not yet zero.
+        """
         comm, w_mu, w_p = self._comm, self._w_mu, self._w_p
         is_tangent = value is None
         w_R = 0.0 * w_mu if is_tangent else self._w_R
@@ -118,13 +154,13 @@ class SymmetryBreakingRows:
     def eigenvalue(self, m: int, p: float, state: State) -> float:
         """Return the eigenvalue nearest to zero of a family's tangent; of the model's for m = 0.
 
-        Of the family of v it is that of the space orthogonal to b.
+        For the family of v only the space orthogonal to b counts. Collective.
         """
         factors = self._family.factored_tangent(p, state, m) if m else self._factors
         return nearest_eigenvalue(factors, self._comm, self._b if m == self._m else None)
 
     def _derivative_of_g(self, w: Vector) -> float:
-        """Return the derivative of g along a displacement."""
+        """Return the derivative of g = -v . K_m v along a displacement w, by a difference."""
         if not max_abs(self._comm, w):
             return 0.0
         d, state = difference_step(self._system, w), self._state
@@ -140,10 +176,12 @@ class SymmetryBreakingRows:
 def nearest_eigenvalue(factors: Factorisation, comm: MPI.Comm, b: Vector | None = None) -> float:
     """Return the eigenvalue nearest to zero of a factored matrix. Collective.
 
+    Inverse iteration finds it.
+
     Parameters
     ----------
     b
-        A vector by which the matrix is bordered: only the space orthogonal to it counts.
+        A vector by which the matrix is bordered: only the space orthogonal to it counts; None: all.
     """
     solution_for_b = None if b is None else factors.solve(b)
     x, value = np.sin(1.0 + np.arange(factors.matrix.getLocalSize()[0]) + comm.rank), np.inf
@@ -151,8 +189,8 @@ def nearest_eigenvalue(factors: Factorisation, comm: MPI.Comm, b: Vector | None 
         y = factors.solve(x)
         if b is not None and solution_for_b is not None:  # the bordered tangent is regular
             y = y - dot(comm, b, y) / dot(comm, b, solution_for_b) * solution_for_b
-        last, value = value, float(dot(comm, x, x) / dot(comm, x, y))
-        if abs(value - last) <= EIGENVALUE_TOLERANCE * abs(value):
+        previous_value, value = value, float(dot(comm, x, x) / dot(comm, x, y))
+        if abs(value - previous_value) <= EIGENVALUE_TOLERANCE * abs(value):
             break
         x = y / np.sqrt(dot(comm, y, y))
     return value

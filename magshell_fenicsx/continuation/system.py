@@ -60,9 +60,9 @@ class CorrectedTangent:
     extrapolated_product: Callable[[Vector], Vector] | None = None
 
     def missing_product(self, v: Vector) -> Vector:
-        """Return v times what the lagged part lacks, as extrapolated; zero if no part is lagged.
+        """Return a vector times the difference of the present and the lagged part, as extrapolated.
 
-        Collective.
+        It is zero if no part is lagged. Collective.
         """
         if self.extrapolated_product is None or self.lagged is None:
             return np.zeros_like(v)
@@ -102,9 +102,10 @@ Tangent: TypeAlias = PETSc.Mat | CorrectedTangent | SkewedTangent | BorderedTang
 
 
 def symmetric_part(tangent: Tangent) -> PETSc.Mat:
-    """Return the symmetric block of u of a tangent: the matrix itself, not a copy.
+    """Return the symmetric matrix of PETSc in a tangent: K or, for a corrected one, K + D.
 
-    For a `CorrectedTangent` it is the sum K + D with all entries.
+    A border and a skew part are left out. K is the matrix itself, not a copy; K + D has all entries
+    and is overwritten by the next call.
     """
     while isinstance(tangent, SkewedTangent | BorderedTangent):
         tangent = tangent.K
@@ -114,7 +115,8 @@ def symmetric_part(tangent: Tangent) -> PETSc.Mat:
 class System(Protocol):
     """Equilibrium of a potential Pi(u; mu), distributed over the ranks of `comm`.
 
-    Most amplitudes multiply a term, Pi = Pi_0 + sum_i mu_i Pi_i; others enter nonlinearly.
+    Most amplitudes multiply a term, Pi = Pi_0 + sum_i mu_i Pi_i; others enter nonlinearly. All
+    methods are collective.
 
     Attributes
     ----------
@@ -148,7 +150,7 @@ class System(Protocol):
     def tangent(
         self, u: Vector, mu: Amplitudes, stress: Sequence[WeightedDisplacement] = ()
     ) -> Tangent:
-        """Assemble K = d2Pi/du2, or dR/du where a load has no potential.
+        """Assemble K = d2Pi/du2, or dR/du where a load has no potential. Collective.
 
         The next call overwrites the matrix.
 
@@ -177,9 +179,12 @@ class InexactSystem(Protocol):
     def has_dense_terms(self) -> bool: ...
 
     def residual(self, u: Vector, mu: Amplitudes, *, inexact: bool = False) -> Vector:
-        """Return the residual, see `System`.
+        """Return the residual, see `System`. Collective.
 
-        If `inexact`, forces of the dense terms may be extrapolated from earlier states.
+        Parameters
+        ----------
+        inexact
+            Whether forces of the dense terms may be extrapolated from earlier states.
         """
 
     def extrapolation_holds_along(self, u: Vector, mu: Amplitudes, du: Vector) -> bool:
@@ -193,9 +198,12 @@ class InexactSystem(Protocol):
         *,
         inexact: bool = False,
     ) -> Tangent:
-        """Assemble the tangent, see `System`.
+        """Assemble the tangent, see `System`. Collective.
 
-        If `inexact`, its dense terms may be those of an earlier state.
+        Parameters
+        ----------
+        inexact
+            Whether its dense terms may be those of an earlier state.
         """
 
 

@@ -24,10 +24,12 @@ class TargetMissed(PathStopped):
 def end_near_last_target(
     path: Path, quantity: Quantity, target: float, s: float, predictors: Sequence[Point]
 ) -> float:
-    """Return the end of a step to `s`, close behind the last target if the step would pass it.
+    """Return where a step to `s` ends: close behind the last target, if it would pass that.
 
     Parameters
     ----------
+    quantity, target
+        The quantity that is prescribed at the target, and its value there.
     predictors
         Points from which the step is extrapolated, the last one its start.
     """
@@ -45,16 +47,20 @@ def end_near_last_target(
 def targets_between(
     path: Path, quantity: Quantity, targets: Sequence[float], sense: float, points: Sequence[Point]
 ) -> Iterator[tuple[float, Point]]:
-    """Yield the targets between two successive points with their points, in the order of the path.
+    """Yield the targets between two successive points of a path, in its order. Collective.
 
     Parameters
     ----------
     quantity, targets
-        The quantity that has these values at the requested points.
+        The quantity that is requested, and its values at the requested points.
     sense
-        The sign of its change along the path.
+        The sign of the change of the quantity along the path.
     points
         The two points, and before them the previous one, if there is one.
+
+    Yields
+    ------
+    A target and its point, whose arc length is measured from the first of both points.
 
     Raises
     ------
@@ -62,25 +68,29 @@ def targets_between(
         If the path turns back at once, or a target is not found.
     """
     low, high = points[-2:]
-    a, b = path.value(quantity, low.state), path.value(quantity, high.state)
-    if a in targets and (b - a) * sense < 0:  # a shorter step sees the load rise first
+    low_value, high_value = path.value(quantity, low.state), path.value(quantity, high.state)
+    if (
+        low_value in targets and (high_value - low_value) * sense < 0
+    ):  # a shorter step sees the load rise first
         raise PathStopped(f"{path.name} falls from the start", low)
     # no polynomial continues behind a kink
-    smooth = points[-2:] if path.newton.options.has_onsets else points
-    predictors = [path.relative_to(low, path.measured_from(low, point)) for point in smooth]
+    smooth_points = points[-2:] if path.newton.options.has_onsets else points
+    predictors = [path.relative_to(low, path.measured_from(low, point)) for point in smooth_points]
     crossed_targets = [
-        target for target in targets if (target - a) * (target - b) < 0 or b == target
+        target
+        for target in targets
+        if (target - low_value) * (target - high_value) < 0 or high_value == target
     ]
-    for target in sorted(crossed_targets, key=lambda target: abs(target - a)):
+    for target in sorted(crossed_targets, key=lambda target: abs(target - low_value)):
         point = path.measured_from(low, _solve(path, quantity, target, predictors))
         predictors.insert(-1, path.relative_to(low, point))
         yield target, point
 
 
 def _solve(path: Path, quantity: Quantity, target: float, points: Sequence[Point]) -> Point:
-    """Return the point at a target between the last two of some points.
+    """Return the point at a target between the last two of some points of a path.
 
-    The polynomial through them and some earlier ones predicts it.
+    The polynomial through these and some earlier ones predicts it.
 
     Raises
     ------
@@ -114,7 +124,7 @@ def _solve(path: Path, quantity: Quantity, target: float, points: Sequence[Point
 def _zero(f: Callable[[float], float], low: float, high: float) -> float:
     """Return about where a function is zero between two places, by Illinois' regula falsi.
 
-    It is the second place if the function has one sign.
+    It is the second place if the function has one sign at both.
     """
     a, b = f(low), f(high)
     place, side = high, 0
@@ -123,6 +133,7 @@ def _zero(f: Callable[[float], float], low: float, high: float) -> float:
         is_same = abs(place - previous) <= ZERO_TOLERANCE * abs(high - low)
         if is_same or not (value := f(place)):
             break
+        # Illinois: the value at an end that stays twice in turn is halved
         if value * b < 0:
             low, a, b = place, value, b / 2 if side < 0 else b
             side = -1

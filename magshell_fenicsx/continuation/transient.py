@@ -63,7 +63,7 @@ MAX_STEP_CHANGE = 0.05  # relative change of the time step after which factors a
 # Gauss points of a step and their weights: exact for the membrane's energy, of degree 4
 GAUSS_POINTS = ((0.5 - np.sqrt(1 / 12), 0.5), (0.5 + np.sqrt(1 / 12), 0.5))
 Array = NDArray[np.float64]
-Loads = Callable[[float, bool], dict[str, float]]  # mu(t), at a jump before or after it
+Loads = Callable[[float, bool], dict[str, float]]  # (t, before a jump) -> mu
 
 
 @dataclass(frozen=True)
@@ -86,10 +86,15 @@ class AlphaParameters:
 
     @classmethod
     def from_spectral_radius(cls, rho: float) -> "AlphaParameters":
-        """Return the parameters for a spectral radius at infinite frequency, 0 to 1."""
-        m, f = (2 * rho - 1) / (rho + 1), rho / (rho + 1)
-        forces = GAUSS_POINTS if rho == 1 else ((1 - f, 1.0),)
-        return cls(m, f, (1 - m + f) ** 2 / 4, 0.5 - m + f, forces)
+        """Return the parameters for a spectral radius at infinite frequency, 0 to 1.
+
+        Radius 1 dissipates nothing, and radius 0 damps the highest frequencies in one step.
+        """
+        alpha_m, alpha_f = (2 * rho - 1) / (rho + 1), rho / (rho + 1)
+        forces = GAUSS_POINTS if rho == 1 else ((1 - alpha_f, 1.0),)
+        return cls(
+            alpha_m, alpha_f, (1 - alpha_m + alpha_f) ** 2 / 4, 0.5 - alpha_m + alpha_f, forces
+        )
 
 
 @dataclass(frozen=True)
@@ -98,8 +103,12 @@ class FactoredState:
 
     Attributes
     ----------
+    u, mu
+        Displacement and amplitudes at which the tangent was taken, within a step.
+    dt
+        Length of the step.
     habit
-        `Factorisation.habit` with which they were made.
+        `Factorisation.habit` with which the factors were made.
     """
 
     u: Vector
@@ -132,21 +141,26 @@ class Surroundings:
 
 
 class Integrator:
-    """Makes steps in time; factors are kept while they serve.
+    """Integrator of the motion in time; factors are kept while they serve.
+
+    All methods that solve or sum over unknowns are collective.
 
     Parameters
     ----------
+    system
+        The shell with its loads, without inertia.
     mass
         The mass matrix; its pattern is part of that of the tangent, with zero rows and columns at
         supports.
     loads
-        All amplitudes; at a jump the step before it ends with the value before.
+        Called with a time and whether a jump is still ahead; it returns all amplitudes. A step that
+        ends at a jump takes the values before it.
     rho
         Spectral radius at infinite frequency, 0 to 1.
     drag
         c, force per mass and velocity.
     viscous
-        Forces that depend on the strain's history.
+        Forces that depend on the history of the strain; None: there are none.
     surroundings
         What the shell is held by and touches.
 
@@ -197,8 +211,10 @@ class Integrator:
 
         Parameters
         ----------
+        u, v
+            Displacement and velocity at the time t.
         earlier
-            An earlier motion whose sums of work and dissipation continue.
+            An earlier motion whose sums of work and dissipation continue; None: they begin at zero.
         """
         mu = self.loads(t, False)
         work, dissipated = (earlier.work, earlier.dissipated) if earlier else (0.0, 0.0)
@@ -218,16 +234,16 @@ class Integrator:
         if self.viscous:
             self.viscous.memory = earlier.memory if earlier else self.viscous.memory
             self.viscous.begin()
-        r = self.system.residual(u, mu) + self.drag * self._times(v)
+        residual = self.system.residual(u, mu) + self.drag * self._times(v)
         if self.supports:
             acceleration, velocity = (
                 self.supports.acceleration(t, False),
                 self.supports.velocity(t, False),
             )
-            r = r + self._mass_times_supports(acceleration + self.drag * velocity)
+            residual = residual + self._mass_times_supports(acceleration + self.drag * velocity)
         if self.viscous:
-            r = r + self.viscous.force(u, u, v, 1.0, 0.0)
-        a = -inverse_mass(r)
+            residual = residual + self.viscous.force(u, u, v, 1.0, 0.0)
+        a = -inverse_mass(residual)
         if self.device:
             motion = Motion(t, u, v, a, mu)
             a, mu = constrained_acceleration(self.system, self.device, inverse_mass, motion)
@@ -240,10 +256,10 @@ class Integrator:
         return self.with_imbalance(replace(motion, potentials=potentials))
 
     def begins_anew(self, t: float) -> bool:
-        """Return whether a motion begins anew at a kink or jump of the loads.
+        """Return whether a motion begins anew at a kink or jump of the loads at time t.
 
-        In contact with a body it does not at a kink: the acceleration is continuous, and that of
-        the remaining residual would be large where the contact is stiff.
+        In contact with a body it does not begin anew at a kink. There the acceleration is
+        continuous; a new one from the remaining residual would be large where the contact is stiff.
         """
         return (
             not self.contact
@@ -252,7 +268,10 @@ class Integrator:
         )
 
     def with_imbalance(self, motion: Motion) -> Motion:
-        """Return the motion with its imbalance of energy, where that is checked. Collective."""
+        """Return a motion with its imbalance and turnover of energy. Collective.
+
+        Without contact the balance is not checked, and the motion is returned unchanged.
+        """
         if not self.contact:
             return motion
         stored_energy = self.contact.stored_energy(motion.u, motion.mu)
@@ -264,35 +283,53 @@ class Integrator:
         )
 
     def _inverse_mass(self) -> Callable[[Vector], Vector]:
-        """Return a solver with the mass, with ones on the diagonal of massless unknowns."""
+        """Return a function that solves with the mass matrix.
+
+        Massless unknowns, as at supports, get ones on the diagonal, so the matrix is regular.
+        """
         M = self.mass.copy()
-        massless = M.getDiagonal()
-        massless.setArray((massless.array_r == 0).astype(float))
+        massless_diagonal = M.getDiagonal()
+        massless_diagonal.setArray((massless_diagonal.array_r == 0).astype(float))
         M.setOption(PETSc.Mat.Option.NEW_NONZERO_ALLOCATION_ERR, False)
         M.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, False)
-        M.setDiagonal(massless, PETSc.InsertMode.ADD_VALUES)
+        M.setDiagonal(massless_diagonal, PETSc.InsertMode.ADD_VALUES)
         M.setOption(PETSc.Mat.Option.SYMMETRIC, True)
         factors = Factorisation(self.system.comm)
         factors.factor(M)
         return factors.solve
 
     def kinetic(self, motion: Motion) -> float:
-        """Return v . M v/2 on all ranks, with the velocity of supports. Collective."""
+        """Return the kinetic energy v . M v/2, with the velocity of supports. Collective."""
         return self._kinetic_energy(motion.v, motion.t, before_jump=True)
 
     def _kinetic_energy(self, v: Vector, t: float, *, before_jump: bool) -> float:
+        """Return the kinetic energy at time t of nodes with the velocities v, and of supports.
+
+        Parameters
+        ----------
+        before_jump
+            Whether supports have their velocity before or after a jump at t.
+        """
         if self.supports is None:
             return dot(self.system.comm, v, self._times(v)) / 2
         v = v + self.supports.velocity(t, before_jump)
         return dot(self.system.comm, v, self.supports.times(v)) / 2
 
     def _mass_times_supports(self, x: Vector) -> Vector:
-        """Return the mass times a vector of supports, at all other nodes."""
+        """Return the mass times a vector at supports: the forces at all other nodes."""
         assert self.supports
         return self.supports.zeroed_at_supports(self.supports.times(x))
 
     def step(self, motion: Motion, dt: float) -> Motion | str:
-        """Return the motion after a step, or the reason why there is none. Collective."""
+        """Return the motion after a time step, or the reason why there is none. Collective.
+
+        The step itself does not change `motion`. Contacts may become stiffer before it.
+
+        Parameters
+        ----------
+        dt
+            Length of the step.
+        """
         if self.contact:
             v = motion.v + self.supports.velocity(motion.t, False) if self.supports else motion.v
             settings = self.contact.stiffened_settings(State(motion.u, motion.mu), v)
@@ -306,18 +343,28 @@ class Integrator:
                 self.contact.use_state_forces()
 
     def _step(self, motion: Motion, dt: float) -> Motion | str:
+        """Solve one time step by Newton's method with kept factors.
+
+        The unknowns are u at its end and y, the device's amplitudes. Factors are renewed when the
+        steps of the iteration do not shrink enough.
+
+        Returns
+        -------
+        The motion at the end of the step, or the reason why there is none.
+        """
         comm, length = self.system.comm, self.system.length
         if self.viscous:
             self.viscous.memory = motion.memory
+        # a guess: constant velocity or, if the last step was accurate, constant acceleration
         u = motion.u + dt * motion.v
         if motion.error < MAX_ERROR_FOR_PREDICTION:
             u = u + dt**2 / 2 * motion.a
         y = self.device.unknowns(motion.mu) if self.device else np.empty(0)
         support_forces = self._support_forces(motion, dt)
-        last_size, first_size, fresh, growths = np.inf, np.inf, False, 0
+        last_size, first_size, has_new_factors, growths = np.inf, np.inf, False, 0
         if self.factored_state is None or abs(dt - self.factored_state.dt) > MAX_STEP_CHANGE * dt:
             self._factor_step(motion, u, y, dt)
-            fresh = True
+            has_new_factors = True
         chord = self._chord()
         for _ in range(MAX_ITERATIONS):
             a, v = self._rates(motion, u, dt)
@@ -326,13 +373,16 @@ class Integrator:
             du, dy = split(step, y.size, comm)
             u, y = u - du, y - dy
             self.iterations += 1
-            size = max_abs(comm, du) / length
-            if not np.isfinite(size):
+            step_size = max_abs(comm, du) / length
+            if not np.isfinite(step_size):
                 return "the step is not a number"
             displacement = LENGTH_PER_DISPLACEMENT * max_abs(comm, u) / length
-            stalled = size <= MAX_ROUNDING_STEP and size > last_size / 2 and fresh
-            if size <= TOLERANCE * max(1.0, displacement) or (
-                stalled and size <= ROUNDING_FACTOR * self._rounding_error(motion, u, y, dt)
+            # small steps that new factors do not shrink may be rounding
+            stalled = (
+                step_size <= MAX_ROUNDING_STEP and step_size > last_size / 2 and has_new_factors
+            )
+            if step_size <= TOLERANCE * max(1.0, displacement) or (
+                stalled and step_size <= ROUNDING_FACTOR * self._rounding_error(motion, u, y, dt)
             ):
                 end = State(u, self._amplitudes(motion, y, 1.0, dt))
                 if self.contact:
@@ -341,49 +391,63 @@ class Integrator:
                         return message
                 self.steps += 1
                 return self._accept(motion, u, y, dt)
-            if size > REFACTOR_RATIO * last_size:
-                growths = growths + 1 if fresh and size > last_size else 0
-                diverges = fresh and size > max(MAX_STEP, first_size)
+            if step_size > REFACTOR_RATIO * last_size:
+                # successive steps with new factors that have grown
+                growths = growths + 1 if has_new_factors and step_size > last_size else 0
+                diverges = has_new_factors and step_size > max(MAX_STEP, first_size)
                 if growths > (CONTACT_PATIENCE if self.contact else 0) or diverges:
                     break
                 self._factor_step(motion, u, y, dt)
-                fresh, chord = True, self._chord()
-            last_size, first_size = size, size if first_size == np.inf else first_size
+                has_new_factors, chord = True, self._chord()
+            last_size, first_size = step_size, step_size if first_size == np.inf else first_size
         self.factored_state = None
         return "Newton's method does not converge"
 
     def _chord(self) -> Chord[Vector]:
-        """Return the chord method with the latest factors."""
+        """Return Broyden's chord method for a residual (u, y), with the latest factors."""
         comm = self.system.comm
         return Chord(
             self.factorisation.solve, partial(dot, comm), lambda a, factor, b: a + factor * b
         )
 
     def _support_forces(self, motion: Motion, dt: float) -> Vector:
-        """Return the forces of inertia and drag by moving supports in a step.
+        """Return the forces of inertia and drag by moving supports in a step of length dt.
 
-        They have zeros for unknown amplitudes.
+        The method's averages of accelerations and velocities at both ends are used. Unknown
+        amplitudes have zeros.
         """
         forces, supports, end = 0.0 * motion.u, self.supports, motion.t + dt
         if supports:
-            m, f = self.parameters.alpha_m, self.parameters.alpha_f
-            a = (1 - m) * supports.acceleration(end, True) + m * supports.acceleration(
+            alpha_m, alpha_f = self.parameters.alpha_m, self.parameters.alpha_f
+            a = (1 - alpha_m) * supports.acceleration(end, True) + alpha_m * supports.acceleration(
                 motion.t, False
             )
-            v = (1 - f) * supports.velocity(end, True) + f * supports.velocity(motion.t, False)
+            v = (1 - alpha_f) * supports.velocity(end, True) + alpha_f * supports.velocity(
+                motion.t, False
+            )
             forces = self._mass_times_supports(a + self.drag * v)
         return self.device.padded(forces) if self.device else forces
 
     def _rates(self, motion: Motion, u: Vector, dt: float) -> tuple[Vector, Vector]:
-        """Return acceleration and velocity at the end of a step to u (Newmark)."""
+        """Return acceleration and velocity at the end of a step of length dt to u (Newmark)."""
         beta, gamma = self.parameters.beta, self.parameters.gamma
         a = (u - motion.u - dt * motion.v) / (beta * dt**2) - (0.5 / beta - 1) * motion.a
         return a, motion.v + dt * ((1 - gamma) * motion.a + gamma * a)
 
     def _amplitudes(self, motion: Motion, y: Array, fraction: float, dt: float) -> dict[str, float]:
-        """Return the amplitudes at a fraction of a step.
+        """Return all amplitudes at a fraction of a step.
 
-        Unknown ones and positions of supports grow linearly, as displacements do.
+        Loads follow their functions of time. Unknown amplitudes and positions of supports grow
+        linearly, as displacements do.
+
+        Parameters
+        ----------
+        motion
+            The begin of the step.
+        y
+            The device's unknowns at its end, (k,).
+        fraction
+            0 at the begin, 1 at the end.
         """
         mu = self.loads(motion.t + fraction * dt, True)
         ends = self.device.values(y) if self.device else {}
@@ -396,7 +460,7 @@ class Integrator:
         return mu | self._contact_settings(motion) | linear
 
     def _contact_settings(self, motion: Motion) -> dict[str, float]:
-        """Return the stiffnesses of contacts, which a motion raises and keeps."""
+        """Return the stiffnesses of contacts by name, which a motion raises and keeps."""
         if not self.contact:
             return {}
         return {name: motion.mu[name] for name in self.contact.settings & set(motion.mu)}
@@ -404,48 +468,69 @@ class Integrator:
     def _residual(
         self, motion: Motion, u: Vector, y: Array, v: Vector, a: Vector, dt: float
     ) -> Vector:
-        """Return the residual of a step to u and y, without the forces by moving supports."""
-        m, f = self.parameters.alpha_m, self.parameters.alpha_f
+        """Return the residual of a step to u and y, without the forces by moving supports.
+
+        Inertia, drag and forces are averaged over the step by the weights of the method.
+
+        Parameters
+        ----------
+        motion
+            The begin of the step.
+        u, y, v, a
+            Displacement, the device's unknowns, velocity and acceleration at the end of the step.
+
+        Returns
+        -------
+        The forces, followed by the device's rows on the last rank.
+        """
+        alpha_m, alpha_f = self.parameters.alpha_m, self.parameters.alpha_f
         self._average_contact(motion, u, y, dt)
-        r = self._times((1 - m) * a + m * motion.a + self.drag * ((1 - f) * v + f * motion.v))
+        residual = self._times(
+            (1 - alpha_m) * a
+            + alpha_m * motion.a
+            + self.drag * ((1 - alpha_f) * v + alpha_f * motion.v)
+        )
         for fraction, weight in self.parameters.forces:
-            r = r + weight * self.system.residual(
+            residual = residual + weight * self.system.residual(
                 motion.u + fraction * (u - motion.u), self._amplitudes(motion, y, fraction, dt)
             )
         if self.viscous:
-            r = r + self.viscous.force(motion.u, u, (1 - f) * v + f * motion.v, 1 - f, dt)
+            residual = residual + self.viscous.force(
+                motion.u, u, (1 - alpha_f) * v + alpha_f * motion.v, 1 - alpha_f, dt
+            )
         if self.device is None:
-            return r
+            return residual
         if self.contact:
             self.contact.use_state_forces()
-        rows = (1 - f) * self.device.rows(u, self._amplitudes(motion, y, 1.0, dt))
-        return join(r, rows, self.system.comm)
+        rows = (1 - alpha_f) * self.device.rows(u, self._amplitudes(motion, y, 1.0, dt))
+        return join(residual, rows, self.system.comm)
 
     def _average_contact(self, motion: Motion, u: Vector, y: Array, dt: float) -> None:
-        """Let the contact forces be the mean ones of a step to u and y."""
+        """Replace the contact forces by their mean along a step to u and y, until reset."""
         if self.contact:
             end = State(u, self._amplitudes(motion, y, 1.0, dt))
             self.contact.average_along(State(motion.u, motion.mu), end, 1 - self.parameters.alpha_f)
 
     def _rounding_error(self, motion: Motion, u: Vector, y: Array, dt: float) -> float:
-        """Return the size of a step that rounding of the forces makes.
+        """Return the size of an iteration's step that rounding of the forces makes, in lengths.
 
-        It is estimated from the change of the forces when u is rounded differently.
+        It is estimated from the change of the residual when u is rounded differently.
         """
         signs = np.random.default_rng(self.system.comm.rank).choice([-1.0, 1.0], u.size)
 
         def residual(u: Vector) -> Vector:
+            """Return the residual of the step to u."""
             a, v = self._rates(motion, u, dt)
             return self._residual(motion, u, y, v, a, dt)
 
-        change = residual(u + signs * np.spacing(u)) - residual(u)
-        du, _ = split(self.factorisation.solve(change), y.size, self.system.comm)
+        residual_change = residual(u + signs * np.spacing(u)) - residual(u)
+        du, _ = split(self.factorisation.solve(residual_change), y.size, self.system.comm)
         return max_abs(self.system.comm, du) / self.system.length
 
     def _factor_step(self, motion: Motion, u: Vector, y: Array, dt: float) -> None:
-        """Factor the derivative of `_residual` by u and y.
+        """Factor the derivative of `_residual` by u and y, at a guess of the end of a step.
 
-        One tangent serves all fractions of the step.
+        The tangent is taken at one place within the step, and serves all fractions.
         """
         fraction = 1 - self.parameters.alpha_f
         u_between = motion.u + fraction * (u - motion.u)
@@ -454,7 +539,11 @@ class Integrator:
         self.factor(FactoredState(u_between, mu, dt, self.factorisation.habit))
 
     def factor(self, state: FactoredState) -> None:
-        """Factor the matrix of a step at a state. Collective."""
+        """Factor the matrix of a step at a state. Collective.
+
+        The matrix is (1 - alpha_f) K + ((1 - alpha_m)/(beta dt^2) + drag (1 - alpha_f) gamma/(beta
+        dt)) M, bordered by the device's rows.
+        """
         self.factorisation.habit = state.habit
         parameters, u, mu, dt = self.parameters, state.u, state.mu, state.dt
         fraction, rate = 1 - parameters.alpha_f, parameters.gamma / (parameters.beta * dt)
@@ -476,14 +565,25 @@ class Integrator:
             matrix = CorrectedTangent(self._K, tangent.D.scaled(fraction))
         if self.device:
             C, D = self.device.border(u, mu)
-            columns = [fraction * c for c in C]
+            columns = [fraction * column for column in C]
             matrix = BorderedTangent(matrix, columns, fraction * D, self.device.multipliers)
         self.factorisation.factor(matrix)
         self.factored_state = state
 
     def _accept(self, motion: Motion, u: Vector, y: Array, dt: float) -> Motion:
-        """Return the motion at the end of a step that has converged."""
-        comm, f, t = self.system.comm, self.parameters.alpha_f, motion.t + dt
+        """Return the motion at the end of a step that has converged.
+
+        It has the new sums of work and dissipation, the potentials, and the estimated error.
+        Viscous forces go on to the end of the step.
+
+        Parameters
+        ----------
+        motion
+            The begin of the step.
+        u, y
+            Displacement and the device's unknowns at its end.
+        """
+        comm, alpha_f, t = self.system.comm, self.parameters.alpha_f, motion.t + dt
         a, v = self._rates(motion, u, dt)
         mu = self._advance(State(u, self._amplitudes(motion, y, 1.0, dt)), motion.mu).mu
         end_motion = Motion(t, u, v, a, mu)
@@ -492,11 +592,11 @@ class Integrator:
         work = sum(
             self._work(name, motion, mu, potentials, mean_forces.get(name)) for name in potentials
         )
-        step, velocity = u - motion.u, (1 - f) * v + f * motion.v
+        step, velocity = u - motion.u, (1 - alpha_f) * v + alpha_f * motion.v
         if self.supports and self.drag:
             begin, end = self.supports.velocity(motion.t, False), self.supports.velocity(t, True)
             step_of_all = step + dt / 2 * (begin + end)
-            velocity = velocity + (1 - f) * end + f * begin
+            velocity = velocity + (1 - alpha_f) * end + alpha_f * begin
             dissipated = self.drag * dot(comm, step_of_all, self.supports.times(velocity))
         else:
             dissipated = self.drag * dot(comm, step, self._times(velocity)) if self.drag else 0.0
@@ -512,15 +612,20 @@ class Integrator:
         return self.with_imbalance(replace(end_motion, potentials=potentials, error=error))
 
     def _error(self, motion: Motion, end_motion: Motion, dt: float) -> float:
-        """Return the estimated error of a step, over the system's length."""
+        """Return the estimated error of a step, over the system's length.
+
+        The change of the acceleration gives it (Zienkiewicz and Xie, 1991). Viscous forces that let
+        displacements creep increase it, since errors of steps then add up.
+        """
         comm, length, viscous = self.system.comm, self.system.length, self.viscous
-        change = max_abs(comm, end_motion.a - motion.a)
-        error = abs(self.parameters.beta - 1 / 6) * dt**2 * change / length
+        acceleration_change = max_abs(comm, end_motion.a - motion.a)
+        # Newmark's local error: (beta - 1/6) dt^2 times the change of the acceleration
+        error = abs(self.parameters.beta - 1 / 6) * dt**2 * acceleration_change / length
         if viscous is None:
             return error
         # errors add up in the motion's own time
-        if viscous.creep_time > dt and dt**2 * change > ACCELERATION_ROUNDING * length:
-            acceleration = max(max_abs(comm, end_motion.a), change)
+        if viscous.creep_time > dt and dt**2 * acceleration_change > ACCELERATION_ROUNDING * length:
+            acceleration = max(max_abs(comm, end_motion.a), acceleration_change)
             motion_time = max_abs(comm, end_motion.v) / max(acceleration, 1e-300)
             error *= max(1.0, min(viscous.creep_time, motion_time) / dt)
         force = viscous.error_force(motion.u, end_motion.u, dt)
@@ -532,9 +637,14 @@ class Integrator:
         return error
 
     def _potentials(self, motion: Motion, *, before_jump: bool) -> dict[str, float]:
-        """Return dPi/dmu of the loads, at a jump before or after it.
+        """Return dPi/dmu of the amplitudes that do work, by name.
 
-        Those of moving supports include the forces of inertia and drag.
+        For moving supports it includes the forces of inertia and drag.
+
+        Parameters
+        ----------
+        before_jump
+            Whether supports have their velocity and acceleration before or after a jump.
         """
         mu = motion.mu
         without_work = (self.system.coordinates - self._driven) | set(
@@ -557,7 +667,7 @@ class Integrator:
     def _mean_forces(
         self, motion: Motion, end_motion: Motion, y: Array, dt: float
     ) -> dict[str, float]:
-        """Return the mean forces in a step on moving positions, where there is contact."""
+        """Return the mean forces in a step on moving positions, by name; empty without contact."""
         if not self.contact:
             return {}
         support_names = self.supports.names if self.supports else frozenset[str]()
@@ -572,8 +682,18 @@ class Integrator:
     def _mean_force(
         self, name: str, motion: Motion, end_motion: Motion, y: Array, dt: float
     ) -> float:
-        """Return the mean force in a step on a moving position, with inertia for supports."""
-        supports, m, f = self.supports, self.parameters.alpha_m, self.parameters.alpha_f
+        """Return the mean force in a step on the moving position `name`.
+
+        It is the weighted mean of dPi/dmu within the step; for supports with inertia and drag.
+
+        Parameters
+        ----------
+        motion, end_motion
+            Begin and end of the step.
+        y
+            The device's unknowns at its end.
+        """
+        supports, alpha_m, alpha_f = self.supports, self.parameters.alpha_m, self.parameters.alpha_f
         force = 0.0
         for fraction, weight in self.parameters.forces:
             u = motion.u + fraction * (end_motion.u - motion.u)
@@ -583,9 +703,9 @@ class Integrator:
             ends = (end_motion, end_motion.t, True), (motion, motion.t, False)
             a, a_before = (end.a + supports.acceleration(t, is_end) for end, t, is_end in ends)
             v, v_before = (end.v + supports.velocity(t, is_end) for end, t, is_end in ends)
-            acceleration = (1 - m) * a + m * a_before
-            velocity = (1 - f) * v + f * v_before
-            rate = supports.displacement_rate(self._amplitudes(motion, y, 1 - f, dt), name)
+            acceleration = (1 - alpha_m) * a + alpha_m * a_before
+            velocity = (1 - alpha_f) * v + alpha_f * v_before
+            rate = supports.displacement_rate(self._amplitudes(motion, y, 1 - alpha_f, dt), name)
             inertia = supports.times(acceleration + self.drag * velocity)
             force += dot(self.system.comm, inertia, rate)
         return force
@@ -598,12 +718,14 @@ class Integrator:
         potentials: Mapping[str, float],
         mean_force: float | None,
     ) -> float:
-        """Return the work of an amplitude in a step.
+        """Return the work of the amplitude `name` in a step.
 
         A load works on its conjugate displacement; a moving position works with the force on it.
 
         Parameters
         ----------
+        motion
+            The begin of the step, with its potentials.
         mu, potentials
             Amplitudes and dPi/dmu at the end of the step.
         mean_force
@@ -616,7 +738,7 @@ class Integrator:
         return -(motion.mu[name] + mu[name]) / 2 * (end - begin)
 
     def _times(self, x: Vector) -> Vector:
-        """Return the mass times a vector."""
+        """Return the mass matrix times a vector. Collective."""
         self._x.setArray(x)
         self.mass.mult(self._x, self._y)
         return np.array(self._y.array_r)

@@ -56,11 +56,12 @@ class DistributionSection(Section):
 
     @model_validator(mode="after")
     def _keys_belong_to_the_kind(self) -> Self:
-        required, present = REQUIRED_KEYS[self.kind], self.model_fields_set - {"kind", "unit"}
-        if missing := [key for key in required if key not in present]:
-            raise ValueError(f"kind: {self.kind} needs {' and '.join(missing)}")
+        """Check that the keys are those of the law, and that their numbers go together."""
+        required, given_keys = REQUIRED_KEYS[self.kind], self.model_fields_set - {"kind", "unit"}
+        if missing_keys := [key for key in required if key not in given_keys]:
+            raise ValueError(f"kind: {self.kind} needs {' and '.join(missing_keys)}")
         allowed = {*required, *OPTIONAL_KEYS.get(self.kind, ())}
-        if unexpected := sorted(present - allowed):
+        if unexpected := sorted(given_keys - allowed):
             raise ValueError(f"{unexpected[0]} does not belong to kind: {self.kind}")
         low, high = self._bounds
         if low >= high:
@@ -87,7 +88,10 @@ class DistributionSection(Section):
         return self.quantile(float(rng.random()))
 
     def quantile(self, probability: float) -> Value:
-        """Return the quantile of a probability: the inverse of the distribution function."""
+        """Return the quantile of a probability (0 to 1): the inverse of the distribution function.
+
+        A word or a number of `values`, or a number, with its unit as text if it has one.
+        """
         if self.kind == "choice":
             assert self.values
             weights = np.array(self.weights or [1.0] * len(self.values))
@@ -98,9 +102,16 @@ class DistributionSection(Section):
         low, high = self._bounds
         if self.kind == "uniform":
             return self._with_unit(low + probability * (high - low))
-        first, last = self._probabilities
+        # the distribution between the bounds is a part of the normal one
+        first_probability, last_probability = self._probabilities
         centre, width = self._normal
-        inner = min(max(first + probability * (last - first), nextafter(0, 1)), nextafter(1, 0))
+        inner = min(
+            max(
+                first_probability + probability * (last_probability - first_probability),
+                nextafter(0, 1),
+            ),
+            nextafter(1, 0),
+        )
         x = NormalDist(centre, width).inv_cdf(inner)
         value = np.exp(x) if self.kind == "lognormal" else x
         return self._with_unit(float(np.clip(value, low, high)))
@@ -112,12 +123,13 @@ class DistributionSection(Section):
 
     @property
     def _bounds(self) -> tuple[float, float]:
+        """Least and largest number; infinite without a bound."""
         low = -inf if self.above is None else self.above
         return low, inf if self.below is None else self.below
 
     @property
     def _normal(self) -> tuple[float, float]:
-        """Mean and deviation of the number, or of the logarithm of a lognormal one."""
+        """Mean and standard deviation of the number, or of the logarithm of a lognormal number."""
         assert self.deviation is not None
         if self.kind == "normal":
             return self._mean, self.deviation
@@ -126,20 +138,21 @@ class DistributionSection(Section):
 
     @property
     def _probabilities(self) -> tuple[float, float]:
-        """The probabilities of smaller numbers than above and below."""
+        """Probabilities of numbers below each bound, of the distribution without bounds."""
         centre, width = self._normal
         ends = np.array(self._bounds)
         with np.errstate(divide="ignore"):
             ends = np.log(np.maximum(ends, 0.0)) if self.kind == "lognormal" else ends
-        first, last = (NormalDist(centre, width).cdf(end) for end in ends)
-        return first, last
+        below_low, below_high = (NormalDist(centre, width).cdf(end) for end in ends)
+        return below_low, below_high
 
     def _with_unit(self, value: Value) -> Value:
+        """Return a value, as text with the unit if there is one."""
         return value if self.unit is None else f"{value!r} {self.unit}"
 
 
 def _number_as_choice(value: Any) -> Any:
-    """Return a number as a choice of one value."""
+    """Return a number as a choice of one value, and anything else unchanged."""
     if isinstance(value, float | int) and not isinstance(value, bool):
         return {"kind": "choice", "values": [value]}
     return value
@@ -157,7 +170,7 @@ DENSEST_PACKING = pi / 12**0.5  # part of the plane that equal discs can cover
 
 
 class NoRoom(ValueError):
-    """The places do not fit at their least distance; the message has the numbers."""
+    """Error that places do not fit at their least distance; the message has the numbers."""
 
 
 def random_places(
@@ -169,8 +182,12 @@ def random_places(
 
     Parameters
     ----------
-    polar, distance
-        In degrees; the distance is the angle between two places, seen from the centre.
+    count
+        Number of places.
+    polar
+        Least and largest polar angle, in degrees.
+    distance
+        Least angle between two places, seen from the centre, in degrees.
 
     Returns
     -------
@@ -190,11 +207,11 @@ def random_places(
         for _ in range(count):
             for _ in range(MAX_TRIES):
                 z, azimuth = rng.uniform(low, high), rng.uniform(0.0, 2 * pi)
-                new = np.array(
+                place = np.array(
                     [np.sqrt(1 - z * z) * np.cos(azimuth), np.sqrt(1 - z * z) * np.sin(azimuth), z]
                 )
-                if (places @ new <= max_cosine).all():
-                    places = np.vstack([places, new])
+                if (places @ place <= max_cosine).all():
+                    places = np.vstack([places, place])
                     break
             else:
                 break
@@ -210,17 +227,31 @@ def random_places(
 
 
 def refuse_no_room(count: int, polar: tuple[float, float], distance: float) -> None:
-    """Compare the area of discs around the places with the area that they may lie in.
+    """Refuse places on a sphere if discs around them have more area than their zone.
+
+    Parameters
+    ----------
+    count
+        Number of places.
+    polar
+        Least and largest polar angle of the places, in degrees.
+    distance
+        Least angle between two places, in degrees.
 
     Raises
     ------
     NoRoom
         If the discs are too large or too many even for a hexagonal packing.
     """
-    half = radians(distance) / 2
-    low, high = max(radians(polar[0]) - half, 0.0), min(radians(polar[1]) + half, pi)
-    if half:
-        max_count = max(DENSEST_PACKING * (cos(low) - cos(high)) / (1 - cos(half)), 1.0)
+    disc_radius = radians(distance) / 2
+    zone_begin, zone_end = (
+        max(radians(polar[0]) - disc_radius, 0.0),
+        min(radians(polar[1]) + disc_radius, pi),
+    )
+    if disc_radius:
+        max_count = max(
+            DENSEST_PACKING * (cos(zone_begin) - cos(zone_end)) / (1 - cos(disc_radius)), 1.0
+        )
     else:
         max_count = np.inf
     if count > max_count:
@@ -254,10 +285,12 @@ class DefectsSection(Section):
 
     @model_validator(mode="after")
     def _there_is_room(self) -> Self:
+        """Check the number of defects, and that their zone has room for the largest number."""
         if self.polar[0] >= self.polar[1]:
             raise ValueError(
                 f"polar: the first angle must be less than the second, here {self.polar}"
             )
+        # a sample of all numbers that can be drawn
         values = [self.count.quantile(p) for p in np.linspace(0, 1 - 1e-9, 101)]
         numbers = [float(n) for n in values if not isinstance(n, str)]
         if any(not n.is_integer() or not 0 <= n <= 500 for n in numbers):
@@ -266,7 +299,7 @@ class DefectsSection(Section):
         return self
 
     def draw(self, rng: np.random.Generator) -> list[dict[str, Any]]:
-        """Draw defects, as in `shell.imperfections`.
+        """Draw defects, as plain data of items of `shell.imperfections`.
 
         Raises
         ------
@@ -287,6 +320,14 @@ class DefectsSection(Section):
 
 
 def generator(seed: int, number: int, name: str) -> np.random.Generator:
-    """Return the generator of random numbers of a sample for one name."""
+    """Return the generator of random numbers for one name (such as a key) in one sample of a study.
+
+    Parameters
+    ----------
+    seed
+        Seed of the study.
+    number
+        Number of the sample.
+    """
     spawn_key = number, zlib.crc32(name.encode())
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=spawn_key))

@@ -1,9 +1,9 @@
 """Interval arithmetic with first derivatives: bounds of all values of a formula in a box.
 
-Values at places show a formula only there. The arithmetic of intervals shows that it has no others
-between them, or that it may have, however narrow a step or a Gaussian is. After each operation the
-range is also the value in the middle of the box and what the derivatives can add to it, so that it
-shrinks with the square of the box.
+Values at places show a formula only at these places. Interval arithmetic shows whether the formula
+may have other values between them, however narrow a step or a Gaussian is. After each operation the
+range is also bounded by the value in the middle of the box plus or minus the change that the
+derivatives allow. So the excess of the range shrinks with the square of the box.
 """
 
 from collections.abc import Callable
@@ -27,46 +27,50 @@ class Interval:
 
     @classmethod
     def between(cls, low: Any, high: Any) -> "Interval":
-        """Return the interval between two bounds."""
+        """Return the intervals between bounds; a bound that is not a number becomes infinite."""
         unknown = np.isnan(low) | np.isnan(high)
         return cls(np.where(unknown, -np.inf, low), np.where(unknown, np.inf, high))
 
     @classmethod
     def number(cls, value: Any) -> "Interval":
-        """Return the interval of one number."""
+        """Return intervals that contain one number each."""
         number = np.asarray(value, dtype=np.float64)
         return cls(number, number)
 
     def contains(self, value: float) -> NDArray[np.bool_]:
-        """Return whether the intervals contain a number."""
+        """Return whether each interval contains a number."""
         return np.asarray((self.low <= value) & (value <= self.high))
 
     @property
     def size(self) -> Array:
-        """The largest absolute value."""
+        """The largest absolute value in each interval."""
         return np.asarray(np.maximum(np.abs(self.low), np.abs(self.high)))
 
     def intersection(self, other: "Interval") -> "Interval":
-        """Return the intersection; where rounding makes it empty, the gap between both."""
+        """Return the intersections with other intervals.
+
+        Where rounding makes an intersection empty, it is the gap between both intervals.
+        """
         low, high = np.maximum(self.low, other.low), np.minimum(self.high, other.high)
         return Interval(np.minimum(low, high), np.maximum(low, high))
 
     def monotone(self, function: Callable[[Array], Array]) -> "Interval":
-        """Return the image under an increasing function."""
+        """Return the images of the intervals under an increasing function."""
         return Interval.between(function(self.low), function(self.high))
 
     def hull(self, *values: Any) -> "Interval":
-        """Return the smallest interval with some values."""
+        """Return the smallest intervals that contain some values, whatever this interval is."""
         return Interval.between(reduce(np.minimum, values), reduce(np.maximum, values))
 
     def unless(
         self, which: NDArray[np.bool_], low: float = -np.inf, high: float = np.inf
     ) -> "Interval":
-        """Return these intervals, with other bounds where `which` is true."""
+        """Return these intervals, with the bounds `low` and `high` where `which` is true."""
         return Interval(np.where(which, low, self.low), np.where(which, high, self.high))
 
 
 def _add(a: Interval, b: Interval) -> Interval:
+    """Return all sums of two numbers of the intervals."""
     return Interval.between(a.low + b.low, a.high + b.high)
 
 
@@ -75,6 +79,7 @@ def _negative(a: Interval) -> Interval:
 
 
 def _multiply(a: Interval, b: Interval) -> Interval:
+    """Return all products of two numbers of the intervals."""
     ends = [(c.low,) if c.low is c.high else (c.low, c.high) for c in (a, b)]
     products = [x * y for x in ends[0] for y in ends[1]]
     if np.isnan(sum(products)).any():
@@ -83,6 +88,7 @@ def _multiply(a: Interval, b: Interval) -> Interval:
 
 
 def _inverse(a: Interval) -> Interval:
+    """Return all inverses: everything if 0 is inside, a half line if 0 is an end."""
     inverse = Interval(1 / a.high, 1 / a.low).unless(a.contains(0.0))
     inverse = inverse.unless((a.low == 0) & (a.high > 0), high=np.inf, low=0.0)
     return inverse.unless((a.high == 0) & (a.low < 0), low=-np.inf, high=0.0)
@@ -93,6 +99,10 @@ def _divide(a: Interval, b: Interval) -> Interval:
 
 
 def _power(a: Interval, p: Interval) -> Interval:
+    """Return all powers x**n of numbers x of `a` with exponents n of `p`, as NumPy defines them.
+
+    A negative x has powers with integer n alone.
+    """
     if p.low.ndim or p.low != p.high:
         # NumPy has no real power of a negative number with a broken exponent.
         return _exp(_multiply(p, _log(a)))
@@ -109,6 +119,7 @@ def _power(a: Interval, p: Interval) -> Interval:
 
 
 def _power_positive(a: Interval, n: float) -> Interval:
+    """Return all powers x**n of numbers that are not negative, or all squares."""
     if n == 2:
         return a.hull(np.square(a.low), np.square(a.high))
     if n < 0:
@@ -117,15 +128,21 @@ def _power_positive(a: Interval, n: float) -> Interval:
 
 
 def _absolute(a: Interval) -> Interval:
+    """Return all absolute values of the numbers of the intervals."""
     smallest = np.minimum(np.abs(a.low), np.abs(a.high))
     return Interval(np.where(a.contains(0.0), 0.0, smallest), a.size)
 
 
 def _sin(a: Interval) -> Interval:
+    """Return all sines of numbers of the intervals.
+
+    They lie between those of the ends, or reach 1 or -1 where an interval passes such a peak.
+    """
     turns = 2 * np.pi
     ends = a.hull(np.sin(a.low), np.sin(a.high))
 
     def passes(peak: float) -> NDArray[np.bool_]:
+        """Return whether each interval contains the angle `peak` up to full turns."""
         passed = np.floor((a.high - peak) / turns) > np.floor((a.low - peak) / turns)
         return np.asarray(passed | ~np.isfinite(a.size))
 
@@ -138,6 +155,7 @@ def _cos(a: Interval) -> Interval:
 
 
 def _tan(a: Interval) -> Interval:
+    """Return all tangents: everything if a pole lies in the interval."""
     low_branch, high_branch = (np.floor((x - np.pi / 2) / np.pi) for x in (a.low, a.high))
     pole: NDArray[np.bool_] = high_branch > low_branch
     return a.monotone(np.tan).unless(pole | ~np.isfinite(a.size))
@@ -160,12 +178,13 @@ def _sign(a: Interval) -> Interval:
 
 
 def _arctan2(y: Interval, x: Interval) -> Interval:
+    """Return all angles of points (x, y): all from -pi to pi where the angle jumps."""
     angles = y.hull(*(np.arctan2(v, u) for v in (y.low, y.high) for u in (x.low, x.high)))
     return angles.unless(_on_cut(y, x), -np.pi, np.pi)
 
 
 def _on_cut(y: Interval, x: Interval) -> NDArray[np.bool_]:
-    """Return where the angle jumps, or has no value."""
+    """Return where boxes of points (x, y) meet the negative x axis, on which the angle jumps."""
     return np.asarray((x.low <= 0) & (y.low <= 0) & (y.high >= 0))
 
 
@@ -194,6 +213,7 @@ VALUES: dict[np.ufunc, Callable[..., Interval]] = {
 
 
 def _power_slopes(a: Interval, p: Interval) -> list[Interval]:
+    """Return the derivatives of x**n by the base and by the exponent."""
     by_base = _multiply(p, _power(a, Interval(p.low - 1, p.high - 1)))
     # A single exponent is a number, which does not vary.
     by_exponent = _multiply(_power(a, p), _log(a)) if p.low.ndim else Interval.number(0.0)
@@ -201,6 +221,7 @@ def _power_slopes(a: Interval, p: Interval) -> list[Interval]:
 
 
 def _angle_slopes(y: Interval, x: Interval) -> list[Interval]:
+    """Return the derivatives of arctan2(y, x) by y and by x."""
     squared = _inverse(_add(_power(x, Interval.number(2.0)), _power(y, Interval.number(2.0))))
     slopes = [_multiply(x, squared), _negative(_multiply(y, squared))]
     return [slope.unless(_on_cut(y, x)) for slope in slopes]
@@ -230,7 +251,7 @@ SLOPES: dict[np.ufunc, Callable[..., list[Interval]]] = {  # by each argument
 
 @dataclass(frozen=True)
 class Enclosure(NDArrayOperatorsMixin):
-    """Bounds of a function in boxes; NumPy's functions of it return bounds too.
+    """Bounds of a function in n boxes; NumPy's functions of an enclosure return enclosures.
 
     Attributes
     ----------
@@ -251,7 +272,7 @@ class Enclosure(NDArrayOperatorsMixin):
 
     @classmethod
     def coordinates(cls, low: Array, high: Array) -> "list[Enclosure]":
-        """Return x, y and z in boxes between corners (n, 3)."""
+        """Return the functions x, y and z in boxes between corners `low` and `high` (n, 3)."""
         halves, ones, zeros = (high - low).T / 2, np.ones(len(low)), np.zeros(len(low))
         units = [
             tuple(Interval.number(ones if i == j else zeros) for j in range(3)) for i in range(3)
@@ -262,15 +283,19 @@ class Enclosure(NDArrayOperatorsMixin):
         ]
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *arguments: Any, **options: Any) -> Any:
-        """Return a function of this and of numbers, by the chain rule."""
+        """Return the enclosure of a NumPy function of enclosures and numbers, by the chain rule.
+
+        The values are bounded in two ways, whose intersection counts: by interval arithmetic, and
+        by the value in the middle with the largest change that the slopes allow.
+        """
         if method != "__call__" or options or ufunc not in VALUES:
             return NotImplemented
         intervals = [
             a.values if isinstance(a, Enclosure) else Interval.number(a) for a in arguments
         ]
-        partial = SLOPES[ufunc](*intervals)
+        partial_slopes = SLOPES[ufunc](*intervals)
         slopes = [Interval.number(np.zeros_like(self.middle))] * 3
-        for a, factor in zip(arguments, partial, strict=True):
+        for a, factor in zip(arguments, partial_slopes, strict=True):
             if isinstance(a, Enclosure):
                 pairs = zip(slopes, a.slopes, strict=True)
                 slopes = [_add(total, _multiply(factor, slope)) for total, slope in pairs]

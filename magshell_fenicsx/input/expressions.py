@@ -36,23 +36,27 @@ class Taylor(NDArrayOperatorsMixin):
 
     @classmethod
     def coordinates(cls, x: Array) -> list[Self]:
-        """Return x, y and z at places (n, 3)."""
+        """Return the functions x, y and z at places (n, 3), with their derivatives."""
         ones, zeros = np.ones(len(x)), np.zeros((3, 3, len(x)))
         return [cls(x[:, i], np.eye(3)[i, :, None] * ones, zeros) for i in range(3)]
 
     def __array_ufunc__(self, ufunc: np.ufunc, method: str, *arguments: Any, **options: Any) -> Any:
-        """Return a function of this and of numbers, by the chain rule."""
+        """Return a NumPy function of this and other arguments, with derivatives by the chain rule.
+
+        NumPy calls it for each of its functions. Arguments are `Taylor` objects or numbers.
+        Functions without an entry in `PARTIALS` are not implemented.
+        """
         if method != "__call__" or options or ufunc not in PARTIALS:
             return NotImplemented
         values = [a.value if isinstance(a, Taylor) else a for a in arguments]
-        varying = [i for i, a in enumerate(arguments) if isinstance(a, Taylor)]
-        first, second = PARTIALS[ufunc](*values)
+        positions = [i for i, a in enumerate(arguments) if isinstance(a, Taylor)]
+        first_partials, second_partials = PARTIALS[ufunc](*values)
         gradient, hessian = np.zeros_like(self.gradient), np.zeros_like(self.hessian)
-        for i in varying:
-            gradient = gradient + first[i] * arguments[i].gradient
-            hessian = hessian + first[i] * arguments[i].hessian
-        for (i, j), partial in second.items():
-            if i in varying and j in varying:
+        for i in positions:
+            gradient = gradient + first_partials[i] * arguments[i].gradient
+            hessian = hessian + first_partials[i] * arguments[i].hessian
+        for (i, j), partial in second_partials.items():
+            if i in positions and j in positions:
                 product = arguments[i].gradient[:, None] * arguments[j].gradient
                 if i != j:
                     product = product + product.swapaxes(0, 1)
@@ -61,6 +65,8 @@ class Taylor(NDArrayOperatorsMixin):
 
 
 def _power(x: Any, p: Any) -> Partials:
+    """Return the first and second derivatives of x**p by both arguments."""
+
     def term(factor: Any, exponent: Any) -> Any:
         # Not 0/0, for instance of x**1 at 0.
         return np.where(factor == 0, 0.0, factor * np.power(x, exponent))
@@ -75,12 +81,18 @@ def _power(x: Any, p: Any) -> Partials:
 
 
 def _arctan2(y: Any, x: Any) -> Partials:
+    """Return the first and second derivatives of arctan2(y, x) by both arguments."""
     r2 = x**2 + y**2
-    bend = 2 * x * y / r2**2
-    return [x / r2, -y / r2], {(0, 0): -bend, (0, 1): (y**2 - x**2) / r2**2, (1, 1): bend}
+    mixed_part = 2 * x * y / r2**2
+    return [x / r2, -y / r2], {
+        (0, 0): -mixed_part,
+        (0, 1): (y**2 - x**2) / r2**2,
+        (1, 1): mixed_part,
+    }
 
 
 def _tan(x: Any) -> Partials:
+    """Return the first and second derivative of tan x."""
     t = np.tan(x)
     return [1 + t**2], {(0, 0): 2 * t * (1 + t**2)}
 
@@ -133,7 +145,13 @@ _Program = list[_Operation | np.float64 | str]
 
 @dataclass(frozen=True)
 class FormulaFunction:
-    """A formula as a function of x, y, z (in lengths of R)."""
+    """A formula of the case as a function of x, y, z, in the case's unit of length.
+
+    Attributes
+    ----------
+    steps
+        The program that evaluates the formula, see `_without_repetition`.
+    """
 
     steps: _Program
 
@@ -143,13 +161,15 @@ class FormulaFunction:
         )
 
     def bounds(self, low: Array, high: Array) -> tuple[Array, Array, Array]:
-        """Return bounds of the formula in boxes between corners (n, 3).
+        """Return bounds of the formula in boxes between corners `low` and `high`, (n, 3) each.
 
         Returns
         -------
-        tuple
-            (n,) each: a least and a largest value, and the variation of the derivatives within a
-            box times its sides, summed.
+        least, largest
+            (n,) each: the formula's values in a box lie between them.
+        variation
+            (n,) bound of the variation of the first derivatives within a box, each times the side
+            of the box, summed.
         """
         enclosure, n = _evaluate(self.steps, *Enclosure.coordinates(low, high)), len(low)
         if not isinstance(enclosure, Enclosure):
@@ -169,8 +189,13 @@ class FormulaGroup:
 
     Attributes
     ----------
+    functions
+        The formulas.
     frame
-        Its axes, in the formulas' frame, are its rows; None if it is the same.
+        Rotation (3, 3): the axes of the frame of the places, in the formulas' frame, are its rows.
+        None if the frames are the same.
+    length
+        Unit of the places in the formulas' unit of length.
     """
 
     functions: Sequence[FormulaFunction]
@@ -183,8 +208,13 @@ class FormulaGroup:
         return np.stack([f(*x.T) for f in self.functions], axis=-1)
 
     def bounds(self, low: Array, high: Array) -> tuple[Array, ...]:
-        """Return bounds (n, formulas) in boxes, see `FormulaFunction.bounds`."""
+        """Return least values, largest values and variations, (n, formulas) each, in boxes.
+
+        The boxes lie between corners (n, 3), see `FormulaFunction.bounds`. In another frame they
+        are replaced by boxes along its axes that contain them.
+        """
         if self.frame is not None:
+            # box along the formulas' axes that contains the rotated box
             middle, half = (low + high) / 2 @ self.frame, (high - low) / 2 @ np.abs(self.frame)
             low, high = middle - half, middle + half
         bounds = [f.bounds(self.length * low, self.length * high) for f in self.functions]
@@ -194,7 +224,10 @@ class FormulaGroup:
 def formula_group(
     functions: Sequence[object], frame: Array | None = None, length: float = 1.0
 ) -> FormulaGroup | None:
-    """Return the group of those functions that are formulas; None without."""
+    """Return the group of those of some functions that are formulas of a case; None without any.
+
+    `frame` and `length` are those of `FormulaGroup`.
+    """
     formulas = [f for f in functions if isinstance(f, FormulaFunction)]
     return FormulaGroup(formulas, frame, length) if formulas else None
 
@@ -211,12 +244,13 @@ def formula(text: str) -> FormulaFunction:
 
 
 def _checked(text: str) -> str:
+    """Return a text that is a formula; raise a ValueError if not."""
     formula(text)
     return text
 
 
 def _number_as_text(value: Any) -> Any:
-    """Return a number as a formula."""
+    """Return a number as the text of a formula, and any other value unchanged."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     return repr(value) if is_number else value
 
@@ -230,7 +264,7 @@ Formula = Annotated[
 
 
 def formula_with_derivatives(text: str) -> Callable[[Array], Taylor]:
-    """Return a formula with its first and second derivatives, as a function of places (n, 3)."""
+    """Return a formula as a function of places (n, 3), with its first and second derivatives."""
     steps = _parse(text)
 
     def evaluate(x: Array) -> Taylor:
@@ -242,7 +276,13 @@ def formula_with_derivatives(text: str) -> Callable[[Array], Taylor]:
 
 
 def _parse(text: str) -> _Program:
-    """Return the steps of a formula; raise a ValueError if it is none."""
+    """Return the program of a formula, with each repeated part computed once.
+
+    Raises
+    ------
+    ValueError
+        If the text is no formula, or too long or too deeply nested.
+    """
     excerpt = text if len(text) <= 60 else f"{text[:57]}..."
     try:
         tree = ast.parse(text, mode="eval")
@@ -255,13 +295,13 @@ def _parse(text: str) -> _Program:
         if "nested parentheses" in str(e):
             raise ValueError(f"{excerpt!r}: allowed are 200 brackets within each other") from None
         raise ValueError(f"{excerpt!r} is not a formula") from None
-    called = {id(node.func) for node in nodes if isinstance(node, ast.Call)}
+    called_functions = {id(node.func) for node in nodes if isinstance(node, ast.Call)}
     for node in nodes:
         allowed = isinstance(node, _ALLOWED)
         if isinstance(node, ast.Constant):
             allowed = isinstance(node.value, int | float) and not isinstance(node.value, bool)
         if isinstance(node, ast.Name):
-            allowed = node.id in (FUNCTIONS if id(node) in called else NAMES)
+            allowed = node.id in (FUNCTIONS if id(node) in called_functions else NAMES)
         if isinstance(node, ast.Call):
             name = node.func.id if isinstance(node.func, ast.Name) else ""
             allowed = (
@@ -276,25 +316,36 @@ def _parse(text: str) -> _Program:
 
 
 def _without_repetition(steps: list[_Step]) -> _Program:
-    """Return the steps with what is written several times computed once.
+    """Return a program that computes repeated parts of a formula once.
 
     Formulas of weights of points repeat themselves.
+
+    Parameters
+    ----------
+    steps
+        Steps of a stack machine, see `_steps`.
+
+    Returns
+    -------
+    _Program
+        Its step i makes value i: from a number, a name, or a function of earlier values by their
+        numbers. A function also lists the values that no later step uses, to free their memory.
     """
-    numbers, stack = dict[Any, int](), list[int]()
+    number_of_value, value_stack = dict[Any, int](), list[int]()
     unique_steps, operands = list[Any](), list[tuple[int, ...]]()
     for step in steps:
-        arguments = tuple(stack[-step[1] :]) if isinstance(step, tuple) else ()
-        stack = stack[: len(stack) - len(arguments)]
+        arguments = tuple(value_stack[-step[1] :]) if isinstance(step, tuple) else ()
+        value_stack = value_stack[: len(value_stack) - len(arguments)]
         key: Any = step
         if isinstance(step, tuple):
             key = step[0], arguments
         elif not isinstance(step, str):
             key = step.hex()  # 0.0 and -0.0 are not the same
-        if key not in numbers:
-            numbers[key] = len(unique_steps)
+        if key not in number_of_value:
+            number_of_value[key] = len(unique_steps)
             unique_steps.append(step)
             operands.append(arguments)
-        stack.append(numbers[key])
+        value_stack.append(number_of_value[key])
     last_use = {value: i for i, arguments in enumerate(operands) for value in arguments}
     program = _Program()
     for i, (step, arguments) in enumerate(zip(unique_steps, operands, strict=True)):
@@ -307,6 +358,10 @@ def _without_repetition(steps: list[_Step]) -> _Program:
 
 
 def _evaluate(steps: _Program, x: Any, y: Any, z: Any) -> Any:
+    """Return the value of a program at x, y, z, which are arrays, `Taylor` functions or enclosures.
+
+    The type of the result is theirs; it is a number if the formula has no variable.
+    """
     names, values = {"x": x, "y": y, "z": z, "pi": np.float64(np.pi)}, list[Any]()
     with np.errstate(all="ignore"):
         for step in steps:
@@ -321,7 +376,18 @@ def _evaluate(steps: _Program, x: Any, y: Any, z: Any) -> Any:
 
 
 def symbolic(text: str, functions: Mapping[str, Callable[..., Any]], x: Any, y: Any, z: Any) -> Any:
-    """Return a formula of symbols, with the functions that stand for those of `FUNCTIONS`."""
+    """Return a formula of the symbols x, y, z, such as those of UFL.
+
+    Parameters
+    ----------
+    functions
+        Name -> function of symbols that stands for the one of the same name in `FUNCTIONS`.
+
+    Raises
+    ------
+    ValueError
+        If the text is no formula.
+    """
     formula(text)
     replacements = {FUNCTIONS[name]: functions[name] for name in FUNCTIONS}
     names, stack = {"x": x, "y": y, "z": z, "pi": float(np.pi)}, list[Any]()
@@ -346,9 +412,9 @@ def is_formula(text: str) -> bool:
 def _steps(tree: ast.Expression) -> list[_Step]:
     """Return the steps of a stack machine that evaluates a formula.
 
-    A sum of thousand terms is as many levels deep, too deep for recursion.
-
-    Numbers are NumPy's: these neither grow without end, as 9**9**9 does, nor turn complex.
+    A step is a function with its number of arguments, a number, or a name. There is no recursion,
+    because a sum of a thousand terms is a thousand levels deep. Numbers are those of NumPy: these
+    neither grow without end, as 9**9**9 does, nor turn complex.
     """
     steps: list[_Step] = []
     pending: list[ast.AST] = [tree.body]
@@ -386,6 +452,8 @@ class FormulaVectors:
         Axes of the formulas' frame, as columns.
     length
         R in the formulas' unit of length.
+    factor
+        Factor of all values.
     vectors
         Whether components are those of a vector in the formulas' frame.
     """
@@ -398,6 +466,7 @@ class FormulaVectors:
     vectors: bool = False
 
     def __call__(self, r0: Array, n0: Array) -> Array:
+        """Return the vectors (..., components) at places (..., 3) over R; `n0` is not used."""
         x = np.moveaxis(self.length * r0 @ self.frame, -1, 0)
         values = self.factor * np.stack([f(*x) for f in self.of_position], axis=-1)
         return values @ self.frame.T if self.vectors else values
@@ -409,12 +478,19 @@ class FormulaVectors:
 
 @dataclass(frozen=True)
 class InwardPressure:
-    """A traction from a pressure by formula, which acts against the normal."""
+    """A traction from a pressure by formula, which acts against the normal.
+
+    Attributes
+    ----------
+    pressure
+        The pressure, as a vector of one component.
+    """
 
     by_formula: ClassVar[bool] = True
     pressure: FormulaVectors
 
     def __call__(self, r0: Array, n0: Array) -> Array:
+        """Return the tractions (..., 3) at places and outward unit normals (..., 3)."""
         return -self.pressure(r0, n0) * n0
 
     @property
@@ -445,9 +521,13 @@ class FormulasInSpace:
     axes: Array
 
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
-        parts, Q = [component(x @ self.axes) for component in self.components], self.axes
+        """Return the field (n, 3), its gradient (n, 3, 3) and second derivatives (n, 3, 3, 3).
+
+        Places `x` (n, 3) are in the formulas' unit of length; the first index is the component.
+        """
+        taylors, Q = [component(x @ self.axes) for component in self.components], self.axes
         B, G, H = (
-            np.stack([getattr(f, d) for f in parts]) for d in ("value", "gradient", "hessian")
+            np.stack([getattr(f, d) for f in taylors]) for d in ("value", "gradient", "hessian")
         )
         return (
             np.einsum("ai,in->na", Q, B),

@@ -24,7 +24,10 @@ NAME_PATTERN_PART = "[A-Za-z]"  # in patterns of names; other patterns are of te
 
 
 def meaning(section: type[BaseModel], key: str) -> str:
-    """Return the docstring or description of a key of a section or its base; empty without."""
+    """Return the docstring or description of a key of a section class; empty without.
+
+    The docstring may stand in a base class of the section.
+    """
     field = section.model_fields.get(key)
     if field is not None and field.description:
         return field.description
@@ -34,7 +37,10 @@ def meaning(section: type[BaseModel], key: str) -> str:
 
 @cache
 def _docstrings(section: type) -> dict[str, str]:
-    """Return the docstrings of a class's own keys, by key."""
+    """Return the docstrings of a section class's own keys, by key.
+
+    A docstring is a text that stands alone below the annotated key in the source.
+    """
     if not issubclass(section, BaseModel):
         return {}
     definition = _classes(section.__module__).get(section.__qualname__)
@@ -53,7 +59,10 @@ def _docstrings(section: type) -> dict[str, str]:
 
 @cache
 def _classes(module: str) -> dict[str, ast.ClassDef]:
-    """Return the classes at the top of a module's source, by name; none without a source."""
+    """Return the definitions of the classes at the top of a module's source, by name.
+
+    Empty without a source.
+    """
     try:
         tree = ast.parse(inspect.getsource(sys.modules[module]))
     except (OSError, TypeError, KeyError):
@@ -62,10 +71,16 @@ def _classes(module: str) -> dict[str, ast.ClassDef]:
 
 
 class InvalidCase(CaseError):
-    """A case that its sections refuse: one line for each mistake.
+    """Error that sections refuse a case; the message has one line for each mistake.
 
     Parameters
     ----------
+    errors
+        Errors of pydantic, as `ValidationError.errors()` returns them.
+    source
+        The text of the case with the lines of its keys.
+    case
+        Class of the case.
     in_words
         Replaces names in a message by those of the case file.
     """
@@ -81,7 +96,10 @@ class InvalidCase(CaseError):
         self._errors, self._source, self._case, self._in_words = errors, source, case, in_words
 
     def lines_of_kinds(self, *kinds: str) -> list[str]:
-        """Return the lines of pydantic's errors of some kinds."""
+        """Return the lines of the message for pydantic's errors of some kinds, such as "missing".
+
+        The result has one text, of one or several lines, or is empty.
+        """
         errors = [error for error in self._errors if error["type"] in kinds]
         return [self._in_words(explained(errors, self._source, self._case))] if errors else []
 
@@ -90,17 +108,27 @@ class InvalidCase(CaseError):
 
 
 def explained(errors: Sequence[Any], source: Source, case: type[BaseModel]) -> str:
-    """Return one line for each mistake.
+    """Return one line for each mistake in a case.
 
-    Pydantic tries all members of a union, and each has an error: what is a list or a mapping counts
-    as one, and what is neither as a value.
+    Pydantic tries all members of a union, and each has an error. Of these, errors within a list or
+    a mapping count, else one error about the value.
+
+    Parameters
+    ----------
+    errors
+        Errors of pydantic, as `ValidationError.errors()` returns them.
+    source
+        The text of the case with the lines of its keys.
+    case
+        Class of the case.
     """
     locations = [_without_tag(error["loc"], source.data, case) for error in errors]
 
     def is_explained(location: Location, kind: str) -> bool:
-        """Return whether another error says more about the same mistake."""
+        """Return whether another error says more about the mistake at a location."""
         has_inner_error = any(
-            len(other) > len(location) and other[: len(location)] == location for other in locations
+            len(other_location) > len(location) and other_location[: len(location)] == location
+            for other_location in locations
         )
         return has_inner_error or (kind in NO_CONTAINER and locations.count(location) > 1)
 
@@ -113,7 +141,19 @@ def explained(errors: Sequence[Any], source: Source, case: type[BaseModel]) -> s
 
 
 def explain(error: Any, location: Location, source: Source, case: type[BaseModel]) -> str:
-    """Return one line for one of pydantic's errors, at the location of its key."""
+    """Return one line for an error of pydantic: place in the file, key, value, what is allowed.
+
+    Parameters
+    ----------
+    error
+        Error of pydantic.
+    location
+        Keys that lead to the value in the case.
+    source
+        The text of the case with the lines of its keys.
+    case
+        Class of the case.
+    """
     value, kind = error["input"], error["type"]
     problem = error["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     problem = re.sub(
@@ -157,18 +197,19 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
 
 
 def _tag_problem(error: Any, location: Location, source: Source, case: type[BaseModel]) -> str:
-    """Return the key that tells the sections of a union apart, what is wrong there, and what is
-    allowed."""
+    """Return a message about a wrong key that chooses a section, such as `kind`."""
     keys = location[:-1] if isinstance(location[-1], int) else location
     field = _section_at(keys, source.data, case)[1] or case.model_fields[str(location[0])]
-    models = [m for m in _models(field.annotation) if _tag_key([m])]
-    tag, tags = error["ctx"].get("tag"), dict.fromkeys(tag for m in models for tag in _tags(m))
+    sections = [m for m in _models(field.annotation) if _tag_key([m])]
+    tag, tags = error["ctx"].get("tag"), dict.fromkeys(tag for m in sections for tag in _tags(m))
     problem = "is missing" if tag is None else shown_value(tag)
-    return f"{_tag_key(models)}: {problem}; allowed: {', '.join(tags)}"
+    return f"{_tag_key(sections)}: {problem}; allowed: {', '.join(tags)}"
 
 
 def unknown(key: str, allowed: Collection[str], what: str = "key") -> str:
-    """Return the message that there is no such key, with the nearest one.
+    """Return the message that there is no such key, with the nearest allowed one.
+
+    `what` is the word for the key in the message.
 
     Examples
     --------
@@ -183,12 +224,14 @@ def unknown(key: str, allowed: Collection[str], what: str = "key") -> str:
 def refuse_unknown(
     keys: Iterable[str], section: type[BaseModel], place: str, others: Iterable[str] = ()
 ) -> None:
-    """Refuse keys that are neither those of a section nor others that are allowed there.
+    """Refuse keys that are neither keys of a section class nor others that are allowed there.
+
+    `place` is the key of the section, for the message.
 
     Raises
     ------
     CaseError
-        With the first such key, and the nearest one that is allowed.
+        With the first such key, and the nearest allowed one.
     """
     allowed = {*section.model_fields, *others}
     if unexpected := next((key for key in keys if key not in allowed), None):
@@ -205,32 +248,44 @@ def shown_value(value: Any) -> str:
 
 
 def _without_tag(loc: Location, data: Any, case: type[BaseModel]) -> Location:
-    """Return a location without tags: pydantic puts those of a union's members after their key."""
-    models, keys, below_names = [case], list[str | int](), False
+    """Return the location of an error in a case, without the tags that pydantic inserts.
+
+    Pydantic puts the tag of a union's member after the key of the union.
+
+    Parameters
+    ----------
+    loc
+        Location of an error of pydantic.
+    data
+        Plain data of the case.
+    case
+        Class of the case.
+    """
+    sections, keys, below_names = [case], list[str | int](), False
     for key in loc:
         if key in NO_KEYS:
             continue
-        fields = models[0].model_fields if len(models) == 1 else ()
-        may_be_tag = len(models) < 2 and not below_names and isinstance(key, str)
+        fields = sections[0].model_fields if len(sections) == 1 else ()
+        may_be_tag = len(sections) < 2 and not below_names and isinstance(key, str)
         if may_be_tag and key not in {*fields, *_data_at(data, keys, dict)}:
             continue  # of a union of values, or of a section and a list of it
-        if below_names:
+        if below_names:  # a name of the user, whatever its tag or key is
             keys.append(key)
             below_names = False
             continue
-        if len(models) > 1 and not isinstance(key, int):
-            models = [m for m in models if _tag_key([m]) and key in _tags(m)][:1] or models
+        if len(sections) > 1 and not isinstance(key, int):
+            sections = [m for m in sections if _tag_key([m]) and key in _tags(m)][:1] or sections
             continue
         keys.append(key)
-        if isinstance(key, str) and models:
-            field = models[0].model_fields.get(key)
-            models = list(dict.fromkeys(_models(field.annotation))) if field else []
+        if isinstance(key, str) and sections:
+            field = sections[0].model_fields.get(key)
+            sections = list(dict.fromkeys(_models(field.annotation))) if field else []
             below_names = _has_names(field)
     return tuple(keys)
 
 
 def _data_at(data: Any, location: Sequence[str | int], kind: type) -> Any:
-    """Return the part of plain data at a location; an empty one if it is of another kind."""
+    """Return the part of plain data at a location; an empty `kind` if it is of another type."""
     for key in location:
         if isinstance(data, dict):
             data = data.get(key)
@@ -242,12 +297,12 @@ def _data_at(data: Any, location: Sequence[str | int], kind: type) -> Any:
 
 
 def _allowed_keys(location: Location, data: Any, case: type[BaseModel]) -> list[str]:
-    """Return the keys of the section at a location."""
+    """Return the keys of the section at a location in a case."""
     return list(_section_at(location, data, case)[0].model_fields)
 
 
 def _meaning(location: Location, data: Any, case: type[BaseModel]) -> str:
-    """Return the first words of a key's meaning, in brackets, with its unit."""
+    """Return the first words of a key's meaning and its unit, in brackets; empty without."""
     section, field = _section_at(location, data, case)
     description = meaning(section, str(location[-1])) if field else ""
     description = " ".join(description.split())  # of several lines of a docstring
@@ -259,20 +314,25 @@ def _meaning(location: Location, data: Any, case: type[BaseModel]) -> str:
 
 
 def _example(value: Any, location: Location, data: Any, case: type[BaseModel]) -> str:
-    """Return the begin of a mapping that was written as a word or a list of words."""
+    """Return the begin of a mapping, such as "ball: ...", as an example in a message.
+
+    `value` is a word or a list of words that a case has in place of the mapping.
+    """
     field = _section_at(location, data, case)[1]
-    annotations = _nested_annotations(field.annotation if field else None)
-    mappings = (get_args(each_type) for each_type in annotations if get_origin(each_type) is dict)
+    parts_of_annotation = _nested_annotations(field.annotation if field else None)
+    mappings = (
+        get_args(each_type) for each_type in parts_of_annotation if get_origin(each_type) is dict
+    )
     key_type, value_type = next(mappings, (str, str))
-    words = value if isinstance(value, list) else [value]
-    names = [word for word in words if isinstance(word, str) and word.isidentifier()]
+    items = value if isinstance(value, list) else [value]
+    names = [word for word in items if isinstance(word, str) and word.isidentifier()]
     first_key = (names or [*get_args(key_type), "NAME"])[0]
     values = (part for part in _nested_annotations(value_type) if isinstance(part, str))
     return f"{first_key}: {next(values, '...')}"
 
 
 def _nested_annotations(annotation: Any) -> Iterator[Any]:
-    """Iterate over an annotation and all within it."""
+    """Iterate over a type annotation and all annotations within it."""
     yield annotation
     for part in get_args(annotation):
         yield from _nested_annotations(part)
@@ -281,45 +341,63 @@ def _nested_annotations(annotation: Any) -> Iterator[Any]:
 def _section_at(
     location: Location, data: Any, case: type[BaseModel]
 ) -> tuple[type[BaseModel], FieldInfo | None]:
-    """Return the innermost section at a location, and the last key if it is one of a section."""
-    model, field, models, below_names = case, None, list[type[BaseModel]](), False
+    """Return the section class at a location in a case, and the field of the location's last key.
+
+    The field is None if the last key is no key of a section, but an index or a name of the user.
+
+    Parameters
+    ----------
+    location
+        Keys that lead to a value.
+    data
+        Plain data of the case, by which members of unions are chosen.
+    case
+        Class of the case.
+    """
+    section, field, sections, below_names = case, None, list[type[BaseModel]](), False
     for key in location:
         if isinstance(data, dict):
             data = data.get(key)
         else:
             data = data[key] if isinstance(data, list) and isinstance(key, int) else None
         # None: of a list or mapping of sections, or a part of a union
-        field = None if below_names else model.model_fields.get(str(key))
+        field = None if below_names else section.model_fields.get(str(key))
         if field or not (below_names or isinstance(key, int)):
-            models = _models(field.annotation) if field else []
+            sections = _models(field.annotation) if field else []
         below_names = _has_names(field)
-        if models and not below_names:
-            tag = data.get(_tag_key(models)) if len(models) > 1 and isinstance(data, dict) else None
-            model = next((m for m in models if tag is not None and tag in _tags(m)), models[0])
-    return model, field
+        if sections and not below_names:
+            tag = (
+                data.get(_tag_key(sections))
+                if len(sections) > 1 and isinstance(data, dict)
+                else None
+            )
+            section = next(
+                (m for m in sections if tag is not None and tag in _tags(m)), sections[0]
+            )
+    return section, field
 
 
 def _has_names(field: FieldInfo | None) -> bool:
-    """Return whether the keys below a key are names that the user gives to sections."""
+    """Return whether the keys below a field are names that the user gives to sections."""
     if field is None or get_origin(field.annotation) is not dict:
         return False
     return bool(_models(field.annotation))
 
 
 def _models(annotation: Any) -> list[type[BaseModel]]:
-    """Return every section class within an annotation."""
+    """Return every section class within a type annotation."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return [annotation]
     return [model for part in get_args(annotation) for model in _models(part)]
 
 
 def _tag_key(models: list[type[BaseModel]]) -> str:
-    """Return the key that selects one of several section classes; empty without one."""
+    """Return the key, kind or geometry, that chooses one of section classes; empty without."""
     return next(
         (key for key in ("kind", "geometry") if all(key in m.model_fields for m in models)), ""
     )
 
 
 def _tags(model: type[BaseModel]) -> list[str]:
-    """Return the values of that key that select a section class."""
+    """Return the values of the key that chooses a section class."""
     return [str(tag) for tag in get_args(model.model_fields[_tag_key([model])].annotation)]

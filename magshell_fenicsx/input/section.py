@@ -1,7 +1,7 @@
 """The base of all sections of a case: strict types, no unknown keys, units, files, choices.
 
-Of sections that are chosen by a key, only the validators of chosen ones are built: a case has few
-of many. Targets with units become numbers over the sizes of their case at the door.
+A case has few of many kinds of sections, so a validator is built only when a case has the section.
+Targets with units become numbers over sizes of the case, such as the thickness, at validation.
 """
 
 import re
@@ -47,7 +47,7 @@ _NUMBER_AND_UNITS = re.compile(rf"\s*{_NUMBER}[\s*]*{_UNIT}([\s*/]+{_UNIT})*\s*"
 
 @cache
 def _units() -> "pint.UnitRegistry":
-    """Return pint's units, imported on first use: the import is slow, and rarely needed."""
+    """Return pint's registry of units, imported on first use: the import is slow, rarely needed."""
     import pint
 
     return pint.UnitRegistry()
@@ -77,13 +77,19 @@ class Section(BaseModel):
 
 
 def with_unit(unit: str) -> Any:
-    """Return the schema of text with a unit; only pint checks the names of units."""
+    """Return the annotated type of text such as "25.2 mm", for validation and the JSON schema.
+
+    Its pattern checks for a number and something after it; only pint checks the names of units.
+    """
     pattern = rf"^\s*{_NUMBER}[\s*]*[^\s\d*]"
     return Annotated[str, Field(pattern=pattern, examples=[_example(unit)])]
 
 
 def _quantity(unit: str) -> Any:
-    """Return a validator: text with a unit -> a float in `unit`."""
+    """Return a pydantic validator that converts text with a unit to a float in `unit`.
+
+    `unit` is in pint's words, such as "metre". A bare number is refused.
+    """
 
     def convert(value: Any) -> float:
         if not isinstance(value, str):
@@ -94,7 +100,13 @@ def _quantity(unit: str) -> Any:
 
 
 def _converted(value: str, unit: str) -> float:
-    """Return a number with a unit in another unit; raise a ValueError if it is none."""
+    """Return the number of a text with a unit, such as "25.2 mm", converted to another unit.
+
+    Raises
+    ------
+    ValueError
+        If the text is no number with a unit, or of another dimension.
+    """
     import pint
 
     try:
@@ -109,9 +121,9 @@ def _converted(value: str, unit: str) -> float:
 
 
 def number_and_unit(text: str) -> tuple[str, str]:
-    """Return the number and the unit of a text.
+    """Return the number and the unit of a text, both as text.
 
-    The unit of a bare number is empty; of a word both are.
+    The unit of a bare number is empty. Of a text that does not begin with a number, both are empty.
 
     Examples
     --------
@@ -122,24 +134,26 @@ def number_and_unit(text: str) -> tuple[str, str]:
         return text.strip(), ""
     if not _NUMBER_AND_UNITS.fullmatch(text):
         return "", ""
-    number = re.match(rf"\s*({_NUMBER})", text)
-    return (number[1], text[number.end() :].strip(" *")) if number else ("", "")
+    number_match = re.match(rf"\s*({_NUMBER})", text)
+    return (number_match[1], text[number_match.end() :].strip(" *")) if number_match else ("", "")
 
 
 def in_unit(text: str, unit: str) -> float:
-    """Return a number with a unit in another unit; a bare zero has any.
+    """Return the number of a text in a unit; a bare zero counts as a number in any unit.
+
+    `unit` is in pint's words, and empty for a bare number.
 
     Raises
     ------
     ValueError
-        If it is none, or of another dimension.
+        If the text is no number with a unit, or of another dimension.
     """
-    number, text_unit = number_and_unit(text)
-    if not text_unit and number and (not unit or float(number) == 0):
+    number, unit_of_text = number_and_unit(text)
+    if not unit_of_text and number and (not unit or float(number) == 0):
         return float(number)
     if not unit or not number:
         raise ValueError(f"{text} is not convertible to {unit or 'a bare number'}")
-    return float(number) if text_unit == unit else _converted(text, unit)
+    return float(number) if unit_of_text == unit else _converted(text, unit)
 
 
 def si_size(unit: str) -> float:
@@ -154,9 +168,9 @@ def si_size(unit: str) -> float:
 
 
 def in_units(unit: str, *, bare: bool = False) -> Callable[[Any], float]:
-    """Return a validator: text with a unit -> a float in `unit`; a number stays as it is.
+    """Return a function that converts text with a unit to a float in `unit`, and keeps numbers.
 
-    With `bare`, the text is a unit without a number, and the result is its size.
+    If `bare`, the text is a unit without a number, and the result is the size of this unit.
     """
 
     def convert(value: Any) -> Any:
@@ -169,16 +183,18 @@ def in_units(unit: str, *, bare: bool = False) -> Callable[[Any], float]:
 
 @dataclass(frozen=True, slots=True)
 class WithUnit(BeforeValidator):
-    """The validator of a number that may have a unit."""
+    """The validator of a number that may have a unit, which `unit` names in pint's words."""
 
     unit: str = ""
 
 
 def or_number(unit: str, number: Any = float) -> WithUnit:
-    """Return a validator: a number unchanged, or text converted to `unit`.
+    """Return a pydantic validator that keeps a number, or converts text with a unit to `unit`.
 
     Parameters
     ----------
+    unit
+        The unit in pint's words.
     number
         Type of the number in the schema.
     """
@@ -187,19 +203,23 @@ def or_number(unit: str, number: Any = float) -> WithUnit:
 
 
 def numbers_with_units(validated: Any, data: Any, key: str) -> Iterator[str]:
-    """Iterate over keys within a section's plain data whose text became a number.
+    """Iterate over the keys whose values were text with a unit in the case, and became numbers.
 
-    These had a unit. Targets over a size of the case are left out; they say themselves what they
-    need.
+    Targets over a size of the case are left out, as their messages name the units that they need.
 
     Parameters
     ----------
     validated
         The section, list or mapping that was made of the data.
     data
-        Plain data of the case.
+        Plain data of the case, of the same structure.
     key
         Key of the data in the case.
+
+    Yields
+    ------
+    str
+        The key in the case, such as "shell.radius".
     """
     if isinstance(validated, BaseModel) and isinstance(data, Mapping):
         for name, field in type(validated).model_fields.items():
@@ -216,7 +236,15 @@ def numbers_with_units(validated: Any, data: Any, key: str) -> Iterator[str]:
 
 
 def is_length(annotation: Any, metadata: Iterable[Any] = ()) -> bool:
-    """Return whether a field with this annotation takes a length with a unit, or a list of them."""
+    """Return whether a field of a section takes a length with a unit, or a list of lengths.
+
+    Parameters
+    ----------
+    annotation
+        Type of the field.
+    metadata
+        Annotations that pydantic keeps apart from the type, such as validators.
+    """
     validators = (validator for validator in metadata if isinstance(validator, WithUnit))
     if any(validator.unit == "metre" for validator in validators):
         return True
@@ -225,12 +253,14 @@ def is_length(annotation: Any, metadata: Iterable[Any] = ()) -> bool:
 
 @dataclass(frozen=True)
 class OrInMemory:
-    """An annotation of a union, one of whose members only a program gives, as an object in memory.
+    """An annotation of a union, one member of which only a Python program can give, as an object.
+
+    The object is kept as it is. Other values are validated as the rest of the union.
 
     Attributes
     ----------
     kind
-        The class of these objects, which have a `digest`.
+        The class of these objects. Each has a `digest`, by which the written case refers to it.
     """
 
     kind: Any
@@ -238,17 +268,20 @@ class OrInMemory:
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
-        others = reduce(or_, (part for part in get_args(source) if part is not self.kind))
+        """Return the schema of the union's other members, wrapped to keep objects of `kind`."""
+        other_members = reduce(or_, (part for part in get_args(source) if part is not self.kind))
         serialization = core_schema.wrap_serializer_function_ser_schema(self._serialized)
-        schema = handler.generate_schema(others)
+        schema = handler.generate_schema(other_members)
         return core_schema.no_info_wrap_validator_function(
             self._validated, schema, serialization=serialization
         )
 
     def _validated(self, value: Any, validate: Callable[[Any], Any]) -> Any:
+        """Return an object of `kind` as it is, else what `validate` makes of the value."""
         return value if isinstance(value, self.kind) else validate(value)
 
     def _serialized(self, value: Any, serialize: Callable[[Any], Any]) -> Any:
+        """Return the digest of an object of `kind`, else the serialised value."""
         return value.digest if isinstance(value, self.kind) else serialize(value)
 
 
@@ -267,7 +300,7 @@ _EXAMPLES = {
 
 
 def _example(unit: str) -> str:
-    """Return an example of text with a unit."""
+    """Return an example of text with a unit, such as "25.2 mm" for "metre"."""
     power = re.sub(r"^1/(\w+)(?:\*\*(\d))?$", lambda match: f"{match[1]}^-{match[2] or 1}", unit)
     return _EXAMPLES.get(unit, f"5 {power.replace('**', '^')}")
 
@@ -328,14 +361,16 @@ class Direction(Section):
 
 @dataclass(frozen=True)
 class ChosenByKey:
-    """An annotation of a union of sections, one of which is chosen by a key.
+    """An annotation of a union of sections, one of which is chosen by a key such as `kind`.
 
-    Each section has the values that choose it as the key's `Literal`.
+    The key of each section is a `Literal` of the values that choose the section.
 
     Attributes
     ----------
+    key
+        The key that chooses.
     former_values
-        Values of the key in older case files, each with the one that stands for it now.
+        Pairs: a value of the key in older case files, and the present one with its meaning.
     """
 
     key: str
@@ -344,6 +379,10 @@ class ChosenByKey:
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> CoreSchema:
+        """Return a tagged union of the sections: each is validated as `LazyValidation` says.
+
+        Former values of the key are replaced before validation.
+        """
         choices = {
             tag: handler.generate_schema(Annotated[section, LazyValidation(section)])
             for section in get_args(source)
@@ -355,7 +394,7 @@ class ChosenByKey:
         return core_schema.no_info_before_validator_function(self._with_present_value, union)
 
     def _with_present_value(self, data: Any) -> Any:
-        """Return the data of a section with the present value of its key."""
+        """Return the data of a section, with the present value of its key for a former one."""
         value = data.get(self.key) if isinstance(data, dict) else None
         present_values = dict(self.former_values)
         if not isinstance(value, str) or value not in present_values:
@@ -365,7 +404,7 @@ class ChosenByKey:
 
 @dataclass(frozen=True)
 class LazyValidation:
-    """An annotation of a section whose validator is built when a case has it."""
+    """An annotation of a section class whose validator is built when a case has the section."""
 
     section: type[BaseModel]
 
@@ -375,6 +414,7 @@ class LazyValidation:
         return core_schema.with_info_plain_validator_function(self._validated)
 
     def _validated(self, value: Any, info: ValidationInfo) -> BaseModel:
+        """Return the section of a value; `info` holds the context of the validation of the case."""
         return self.section.model_validate(value, context=info.context)
 
     def __get_pydantic_json_schema__(
@@ -402,6 +442,7 @@ class FileKeys(Section):
     @field_validator("file", check_fields=False)
     @classmethod
     def _refuse_bad_name(cls, name: str | None) -> str | None:
+        """Refuse a name of a file that is empty or has a zero byte."""
         if name is not None and "\0" in name:
             raise ValueError(f"{name!r}: a file's name has no zero byte")
         if name == "":
@@ -410,12 +451,12 @@ class FileKeys(Section):
 
     @property
     def path(self) -> Path:
-        """Path of the file."""
+        """Path of the file; relative paths are from the folder of the case."""
         return self._folder / (self.file or "")
 
     @property
     def files(self) -> Files:
-        """The contents of the files of its case."""
+        """The store of file contents of the case, in which each file is read once."""
         return self._files
 
     @property
@@ -425,7 +466,18 @@ class FileKeys(Section):
 
 
 def digests(sections: Mapping[str, object]) -> dict[str, str | None]:
-    """Return hashes of the files that sections read, by the keys of the files."""
+    """Return hashes of the files that sections read, by the keys of the files.
+
+    Parameters
+    ----------
+    sections
+        Key of the case -> its section; only those with a file count.
+
+    Returns
+    -------
+    dict
+        Key of a file, such as "shell.file" -> hash; None if the file cannot be read.
+    """
     return {
         f"{key}.file": s.digest for key, s in sections.items() if isinstance(s, FileKeys) and s.file
     }
@@ -436,7 +488,21 @@ Rubberlike: TypeAlias = float | tuple[tuple[float, ...], tuple[float, ...]]
 
 
 class Sized(Protocol):
-    """A shell with or without units."""
+    """The sizes and the material of a shell, which a case may give with or without units.
+
+    Attributes
+    ----------
+    youngs_modulus
+        In Pa with units; None if the case has none.
+    R_over_h
+        Radius, or reference length, over the thickness.
+    reference
+        R in metres with units, else in the case's own length.
+    density
+        In kg/m³ with units; None if the case has none.
+    with_units
+        Whether lengths of the shell have units.
+    """
 
     @property
     def geometry(self) -> str: ...
@@ -458,11 +524,11 @@ class Sized(Protocol):
 
 
 def case_sizes(shell: Sized) -> CaseSizes:
-    """Return the sizes that a shell has with units."""
+    """Return the sizes that give units to numbers of a case, such as R and E; nan if missing."""
     # E of these geometries always has a unit.
-    in_pascals = shell.with_units or shell.geometry in ("hemisphere", "disc", "strip")
+    has_pascals = shell.with_units or shell.geometry in ("hemisphere", "disc", "strip")
     R = shell.reference if shell.with_units else nan
-    E = shell.youngs_modulus if in_pascals and shell.youngs_modulus else nan
+    E = shell.youngs_modulus if has_pascals and shell.youngs_modulus else nan
     rho = shell.density if shell.with_units and shell.density else nan
     return CaseSizes(shell.poisson_ratio, shell.R_over_h, R, E, rho)
 
@@ -479,32 +545,37 @@ NOTED = AfterValidator(_put_sizes_into_context)
 
 @dataclass(frozen=True, slots=True)
 class OverUnit(BeforeValidator):
-    """The validator of a number over a size of the case."""
+    """The validator of a number over a size of the case, such as a displacement over h."""
 
 
 def over_size(unit: Unit) -> OverUnit:
-    """Return a validator: text with a unit -> a number over a size of the case, such as h.
+    """Return a validator that converts text with a unit to a number over a size such as h.
 
-    A number is one already.
+    A number is kept: it is over that size already. The sizes are those of the shell, which
+    validation has put into its context before.
     """
 
     def convert(value: Any, info: ValidationInfo) -> Any:
+        """Return a text with a unit over the size in the context, and any other value unchanged."""
         if not isinstance(value, str):
             return value
-        exact = in_units(unit.text)(value)
+        value_in_unit = in_units(unit.text)(value)
         if info.context and "given" not in info.context:
             return 1.0  # the shell is wrong, and its own message says so: any number will do
         sizes = (info.context or {}).get("given")
         size = unit.size(sizes) if sizes else nan
         if isnan(size):
             raise ValueError(f"has a unit: that needs {unit.needs}; a number is in {unit.key}")
-        return exact / size
+        return value_in_unit / size
 
     return OverUnit(convert, json_schema_input_type=float | with_unit(unit.text))
 
 
 def is_over_unit(annotation: Any, metadata: Iterable[Any] = ()) -> bool:
-    """Return whether a field takes text with a unit as a number over a size of the case."""
+    """Return whether a field takes text with a unit as a number over a size of the case.
+
+    `annotation` is the type of the field, `metadata` what pydantic keeps apart, such as validators.
+    """
     nested = (
         validator
         for part in (annotation, *get_args(annotation))
@@ -514,12 +585,19 @@ def is_over_unit(annotation: Any, metadata: Iterable[Any] = ()) -> bool:
 
 
 def over_unit(annotation: Any, text: str, shell: Sized) -> float:
-    """Return the number that such a field makes of text with a unit.
+    """Return the number over a size of a shell that a field makes of text with a unit.
+
+    Parameters
+    ----------
+    annotation
+        Type of the field, for which `is_over_unit` is true.
+    text
+        A number with a unit, such as "2 mm".
 
     Raises
     ------
     ValueError
-        If it is none, of another dimension, or the shell lacks what it needs.
+        If the text is no number with a unit, has another dimension, or the shell lacks the size.
     """
     try:
         context = {"given": case_sizes(shell)}

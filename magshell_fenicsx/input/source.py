@@ -23,16 +23,17 @@ MAX_DEPTH = 20  # levels
 
 
 class CaseError(ValueError):
-    """The user's input cannot be used; the message says what and where."""
+    """Error that the user's input cannot be used; the message says what and where."""
 
 
 class _Loader(yaml.SafeLoader):  # type: ignore[misc]
-    """YAML 1.1 reads 1e-3 as a string; here it is a number, as in YAML 1.2.
+    """Loader of YAML 1.1 that reads 1e-3 as a number, as YAML 1.2 does, and each key as text.
 
-    A key is its text, also `on` and `no`.
+    Without this, 1e-3 would be text, and the keys `on` and `no` would be truth values.
     """
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        """Return the mapping of a node, with all of its keys as text but for the merge key <<."""
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.tag != MERGE:
                 key.tag = "tag:yaml.org,2002:str"
@@ -50,14 +51,18 @@ _Loader.add_implicit_resolver(
 
 @dataclass
 class Source:
-    """Plain data with the place that each key came from.
+    """Plain data of a case with the place where each key was written.
 
     Attributes
     ----------
+    name
+        Name of the file, for messages.
+    data
+        The data of the file.
     places
-        Location of a key or item -> "file:line" or the `--set` that gave it.
+        Location (keys that lead to a key or item) -> "file:line", or the `--set` that gave it.
     folder
-        Folder of the files that it names.
+        Folder from which the case names files.
     files
         Contents of these files, each read once.
     """
@@ -69,7 +74,7 @@ class Source:
     files: Files = field(default_factory=Files, compare=False)
 
     def place(self, location: Location) -> str:
-        """Return the place of a key, or of the innermost section around it."""
+        """Return the place where a key was written, or the innermost section around it."""
         for length in range(len(location), 0, -1):
             if location[:length] in self.places:
                 return self.places[location[:length]]
@@ -77,12 +82,13 @@ class Source:
 
 
 def read_source(file: Path, settings: Sequence[str] = ()) -> Source:
-    """Read a case file, with `key.path=value` settings in place of its own.
+    """Read a case file, and replace values in it by settings such as "mesh.degree=3".
 
     Raises
     ------
     CaseError
-        If the file cannot be read, is no YAML mapping, or has a key twice, or a setting is none.
+        If the file cannot be read, is no YAML mapping, or has a key twice, or if a setting has no
+        equals sign or no such key.
     """
     try:
         text = read_bounded(file, MAX_CASE_BYTES).decode("utf-8")
@@ -95,12 +101,12 @@ def read_source(file: Path, settings: Sequence[str] = ()) -> Source:
     except UnicodeDecodeError:
         raise CaseError(f"{file}: is not a text file in UTF-8") from None
     source = Source(str(file), {}, folder=file.parent.absolute())
-    node = _parsed(source, lambda: yaml.compose(text, Loader=_Loader))
-    if not isinstance(node, yaml.MappingNode):
+    root_node = _parsed(source, lambda: yaml.compose(text, Loader=_Loader))
+    if not isinstance(root_node, yaml.MappingNode):
         raise CaseError(
             f"{file}: a case file is a mapping of sections (shell, boundary, loading, ...)"
         )
-    _note_places(node, (), source)
+    _note_places(root_node, (), source)
     data = _parsed(source, lambda: _Loader(text).get_single_data())
     if not isinstance(data, dict):  # an explicit tag can make anything of a mapping
         raise CaseError(
@@ -113,12 +119,18 @@ def read_source(file: Path, settings: Sequence[str] = ()) -> Source:
 
 
 def _parsed(source: Source, parse: Callable[[], Any]) -> Any:
-    """Return what PyYAML parses; raise a `CaseError` for each of its many kinds of failure."""
+    """Return the result of `parse`, a call of PyYAML without arguments.
+
+    Raises
+    ------
+    CaseError
+        With the line, if PyYAML fails in one of its many ways.
+    """
     try:
         return parse()
     except yaml.YAMLError as e:
-        mark = getattr(e, "problem_mark", None)
-        place = f"{source.name}:{mark.line + 1}" if mark else source.name
+        error_mark = getattr(e, "problem_mark", None)
+        place = f"{source.name}:{error_mark.line + 1}" if error_mark else source.name
         problem = getattr(e, "problem", None) or getattr(e, "reason", e)
         raise CaseError(f"{place}: not valid YAML: {problem}") from None
     except RecursionError:
@@ -129,7 +141,18 @@ def _parsed(source: Source, parse: Callable[[], Any]) -> Any:
 
 
 def _note_places(node: yaml.Node, location: Location, source: Source) -> None:
-    """Note the places of all keys and items; refuse endless data, which aliases can make."""
+    """Note the places of all keys and items of a node in `source.places`.
+
+    Parameters
+    ----------
+    location
+        Keys that lead to the node.
+
+    Raises
+    ------
+    CaseError
+        If a key is given twice or is no word, or the data are endless, as aliases can make them.
+    """
     if len(source.places) > MAX_ENTRIES or len(location) > MAX_DEPTH:
         raise CaseError(
             f"{source.name}:{node.start_mark.line + 1}: more than {MAX_ENTRIES} entries, or deeper "
@@ -152,12 +175,14 @@ def _note_places(node: yaml.Node, location: Location, source: Source) -> None:
 
 
 def override(source: Source, assignment: str) -> None:
-    """Apply one `key.path=value` of the command line.
+    """Apply a setting "key.path=value" of the command line to the data of a case.
+
+    A setting of a key also removes the key beside it that it replaces, see `REPLACED_KEYS`.
 
     Raises
     ------
     CaseError
-        If it is not of that form, or a key on the way is not a section.
+        If the text has another form, or a key on the way is not a section.
     """
     path, equals, text = assignment.partition("=")
     if not equals or not path.strip():
@@ -167,6 +192,7 @@ def override(source: Source, assignment: str) -> None:
     keys = path.strip().split(".")
     section: Any = source.data
     location: list[str | int] = []
+    # walk down to the section of the last key, and make sections that are missing
     for i, key in enumerate(keys):
         if isinstance(section, list):
             if not key.isdecimal() or int(key) >= len(section):
@@ -183,12 +209,12 @@ def override(source: Source, assignment: str) -> None:
             else:
                 section = section.setdefault(key, {})
     setting = Source(f"--set {assignment}", {})
-    node = _parsed(setting, lambda: yaml.compose(text, Loader=_Loader))
-    _note_places(node or yaml.ScalarNode("", ""), (), setting)
+    setting_node = _parsed(setting, lambda: yaml.compose(text, Loader=_Loader))
+    _note_places(setting_node or yaml.ScalarNode("", ""), (), setting)
     section[location[-1]] = _parsed(setting, lambda: yaml.load(text, Loader=_Loader))
-    replaced = REPLACED_KEYS.get(tuple(location), "")
-    if not source.places.get((*location[:-1], replaced), "--set").startswith("--set"):
-        section.pop(replaced, None)
+    replaced_key = REPLACED_KEYS.get(tuple(location), "")
+    if not source.places.get((*location[:-1], replaced_key), "--set").startswith("--set"):
+        section.pop(replaced_key, None)
     for length in range(1, len(keys) + 1):
         if length == len(keys) or tuple(location[:length]) not in source.places:
             source.places[tuple(location[:length])] = f"--set {assignment}"

@@ -28,12 +28,22 @@ VECTORS = {3: ("bx", "by", "bz"), 2: ("b_rho", "b_z")}
 
 
 class TableError(ValueError):
-    """The file cannot be used; the message says what and where, without the file's name."""
+    """Error that a file cannot be used; the message says what and where, without its name."""
 
 
 @dataclass(frozen=True)
 class TableRows:
-    """The rows of a file: columns and their units by name, and the line of each row in the file."""
+    """The rows of a file of measured numbers.
+
+    Attributes
+    ----------
+    columns
+        Name -> numbers (rows,), nan where the cell is empty.
+    units
+        Name -> unit; None without.
+    lines
+        Line of each row in the file.
+    """
 
     columns: Mapping[str, Array]
     units: Mapping[str, str | None]
@@ -42,14 +52,16 @@ class TableRows:
 
 @dataclass(frozen=True)
 class _TableCells:
-    """The cells of a file as numbers, nan where there is none.
+    """The cells of a file as numbers, nan where there is no number.
 
     Attributes
     ----------
+    columns
+        Header of each column, with its unit -> numbers.
     lines
-        Line of each row in the file; empty of arrays.
+        Line of each row in the file; empty for an .npz file.
     word
-        The first cell that has text in place of a number, as a message has it; "" without.
+        Message about the first cell with text in place of a number; empty without.
     """
 
     columns: Mapping[str, Array]
@@ -58,12 +70,19 @@ class _TableCells:
 
 
 def read_table(file: Path, files: Files) -> tuple[dict[str, Array], dict[str, str | None]]:
-    """Return the columns of a CSV file or the arrays of an .npz file, and their units, by name.
+    """Return the columns of a CSV file, or the arrays of an .npz file, and their units.
+
+    Returns
+    -------
+    columns
+        Name -> numbers, nan where there is none.
+    units
+        Name -> unit; None without.
 
     Raises
     ------
     TableError
-        If it cannot be read, or has a column twice.
+        If the file cannot be read, or has a column twice.
     """
     return _by_name(_cells(file, files))
 
@@ -94,6 +113,13 @@ def read_rows(file: Path, files: Files) -> TableRows:
 
 
 def _cells(file: Path, files: Files) -> _TableCells:
+    """Return the cells of a CSV or .npz file as numbers.
+
+    Raises
+    ------
+    TableError
+        If the file cannot be read, is too large, or is no table.
+    """
     try:
         content = files.content(file)
     except OSError as e:
@@ -111,7 +137,7 @@ def _cells(file: Path, files: Files) -> _TableCells:
 
 
 def _by_name(cells: _TableCells) -> tuple[dict[str, Array], dict[str, str | None]]:
-    """Return columns and units by the names in the headers."""
+    """Return the columns by their names, and the units by these, from headers such as "x [mm]"."""
     headers = [_name_and_unit(header) for header in cells.columns]
     _refuse_double([name for name, _ in headers])
     values = [np.asarray(v, dtype=float) for v in cells.columns.values()]
@@ -119,6 +145,7 @@ def _by_name(cells: _TableCells) -> tuple[dict[str, Array], dict[str, str | None
 
 
 def _refuse_double(names: Sequence[str]) -> None:
+    """Raise a TableError if a name of a column occurs twice."""
     if len(set(names)) < len(names):
         raise TableError(f"has a column twice: {shorten(', '.join(names), 200)}")
 
@@ -126,10 +153,12 @@ def _refuse_double(names: Sequence[str]) -> None:
 def column_size(name: str, unit: str, target_unit: str) -> float:
     """Return the size of a column's unit in another unit, such as metre or tesla.
 
+    `name` is that of the column, for the message.
+
     Raises
     ------
     TableError
-        If the unit has another dimension.
+        If the unit is none, or has another dimension.
     """
     try:
         return float(in_units(target_unit, bare=True)(unit))
@@ -140,7 +169,14 @@ def column_size(name: str, unit: str, target_unit: str) -> float:
 def read_vectors(file: Path, key: str, files: Files | None = None) -> tuple[Array, Array]:
     """Return the places and vectors of a CSV file.
 
-    Its columns are x, y, z, bx, by, bz or rho, z, b_rho, b_z.
+    Its columns are x, y, z, bx, by, bz or rho, z, b_rho, b_z, in any order.
+
+    Parameters
+    ----------
+    key
+        Key of the case that names the file, for messages.
+    files
+        Contents of files of the case; None to read the file itself.
 
     Returns
     -------
@@ -150,7 +186,8 @@ def read_vectors(file: Path, key: str, files: Files | None = None) -> tuple[Arra
     Raises
     ------
     CaseError
-        If it has other columns, no row, or what is no number; the message begins with the key.
+        If the file has other columns, no row, or a cell without a number; the message begins with
+        the key.
     """
     try:
         lines = table_text((files or Files()).content(file)).splitlines()
@@ -185,6 +222,22 @@ def _points_and_vectors(
     columns: Sequence[str],
     dim: int,
 ) -> tuple[Array, Array]:
+    """Return the places (n, dim) and vectors (n, dim) in the rows of a file.
+
+    Parameters
+    ----------
+    header, rows
+        Names of the columns, and the texts of the cells, as the file has them.
+    columns
+        The names in order: coordinates of places, then components of vectors.
+    dim
+        3, or 2 on a meridian.
+
+    Raises
+    ------
+    CaseError
+        If a row lacks a finite number, or there are too many rows or none.
+    """
     try:
         values = np.array(
             [[float(row[header.index(name)]) for name in columns] for row in rows]
@@ -200,15 +253,25 @@ def _points_and_vectors(
 
 
 def _name_and_unit(header: str) -> tuple[str, str | None]:
+    """Return name and unit of a header such as "x [mm]"; None without a unit."""
     parts = HEADER.fullmatch(header)
     return (parts[1], parts[2]) if parts else (header, None)
 
 
 def _csv_cells(text: str) -> _TableCells:
+    """Return the cells of a CSV file from its text, as numbers.
+
+    Text in a cell is noted, see `_TableCells.word`.
+
+    Raises
+    ------
+    TableError
+        If a column occurs twice, there are no rows, or a row has another number of cells.
+    """
     header, begin = _header(text)
     separator, names = _separator(header), _names(header)
     _refuse_double(names)
-    values, lines, word = array("d"), list[int](), ""
+    cell_values, lines, word = array("d"), list[int](), ""
     for line, row in _rows(text, separator, begin):
         if len(row) != len(names):
             raise TableError(
@@ -222,18 +285,19 @@ def _csv_cells(text: str) -> _TableCells:
                     f"line {line}: {name}: {shorten(cell, 40)}: is no number; where nothing was "
                     "measured the cell is empty"
                 )
-            values.append(np.nan if value is None else value)
+            cell_values.append(np.nan if value is None else value)
         lines.append(line)
     if not lines:
         raise TableError("has no rows of numbers below a header with the names of its columns")
-    rows = np.array(values).reshape(-1, len(names))
+    rows = np.array(cell_values).reshape(-1, len(names))
     return _TableCells(dict(zip(names, rows.T, strict=True)), lines, word)
 
 
 def _header(text: str) -> tuple[str, int]:
-    """Return the line with the names, and its number.
+    """Return the line with the names of the columns, and its number from 1.
 
-    It is the first line without a #, or a comment above it if that line has numbers.
+    It is the first line without a #. If that line has numbers, it is the comment above it with as
+    many names as numbers, or else the first comment.
     """
     comments = list[tuple[str, int]]()
     for number, line in enumerate(io.StringIO(text), 1):
@@ -249,18 +313,22 @@ def _header(text: str) -> tuple[str, int]:
 
 
 def _separator(header: str) -> str | None:
-    """Return what separates columns; None for blanks."""
+    """Return the character that separates columns in a header; None for blanks."""
     return next((mark for mark in (";", "\t", ",") if mark in header), None)
 
 
 def _names(header: str) -> list[str]:
+    """Return the names of columns, with their units, in a header."""
     if separator := _separator(header):
         return [cell.strip() for cell in next(csv.reader([header], delimiter=separator))]
     return re.findall(r"[\w.]+(?:\s*[\[(][^\])]*[\])])?", header)
 
 
 def _rows(text: str, separator: str | None, begin: int) -> Iterator[tuple[int, list[str]]]:
-    """Iterate over rows of cells below the header, without comments and empty rows."""
+    """Iterate over the rows below the header: number of the line, and cells as text.
+
+    Comments and empty rows are left out. `begin` is the number of the header's line.
+    """
     numbered = enumerate(io.StringIO(text), 1)
     bare = (line.partition("#")[0] if number > begin else "" for number, line in numbered)
     if separator:
@@ -272,7 +340,7 @@ def _rows(text: str, separator: str | None, begin: int) -> Iterator[tuple[int, l
 
 
 def _number(cell: str) -> float | None:
-    """Return the number of a cell, nan of an empty one; None of text."""
+    """Return the number in a cell, nan for an empty cell, None for text."""
     try:
         return float(cell) if cell else np.nan
     except ValueError:

@@ -59,7 +59,13 @@ class Feature(Protocol):
 
 @dataclass(frozen=True)
 class DiscFeature:
-    """Elements of `size` within `radius` of `centre` (chart coordinates), growing outside."""
+    """Elements of `size` within `radius` of `centre` (chart coordinates), growing outside.
+
+    Attributes
+    ----------
+    growth
+        Growth of the size per distance.
+    """
 
     centre: tuple[float, float]
     radius: float
@@ -74,6 +80,7 @@ class DiscFeature:
         return self.size + self.growth * max(0.0, abs(x - self.centre[axis]) - self.radius)
 
     def size_bound(self, x: Array, distance: Array) -> Array:
+        """Return bounds (n,) of the sizes near points; see `Feature.size_bound`."""
         from_centre = np.hypot(x[:, 0] - self.centre[0], x[:, 1] - self.centre[1])
         from_disc = from_centre - self.radius + distance
         return np.asarray(self.size + self.growth * np.maximum(from_disc, 0.0))
@@ -129,24 +136,40 @@ class SquaresFeature:
         return float((self.sizes + self.growth * distances).min())
 
     def size_bound(self, x: Array, distance: Array) -> Array:
+        """Return bounds (n,) of the sizes near points; see `Feature.size_bound`.
+
+        Every square is considered for every point.
+        """
         offsets = np.abs(x[:, None] - self.centres) - self.halves[:, None]
+        # negative inside a square: the distance to its nearest side
         depth = np.minimum(offsets.max(axis=-1), 0.0)
         distance_outside = np.hypot(*np.moveaxis(np.maximum(offsets, 0.0), -1, 0))
         from_squares = distance_outside + depth + distance[:, None]
         return np.asarray((self.sizes + self.growth * np.maximum(from_squares, 0.0)).min(axis=1))
 
     def cells(self, reach: float) -> float:
-        """Return the number of triangles in the squares, and around a disc of their area."""
-        area, s, g = 4 * self.halves**2, self.size, self.growth
-        disc = DiscFeature((0.0, 0.0), sqrt(float(area.sum()) / pi), s, g)
-        cells_within = DiscFeature((0.0, 0.0), disc.radius, s, g).cells(min(disc.radius, reach))
+        """Return the estimated number of triangles up to a distance from the squares.
+
+        It is the number in the squares, and around a disc of their area with the least size.
+        """
+        area, least_size, growth = 4 * self.halves**2, self.size, self.growth
+        disc = DiscFeature((0.0, 0.0), sqrt(float(area.sum()) / pi), least_size, growth)
+        cells_within = DiscFeature((0.0, 0.0), disc.radius, least_size, growth).cells(
+            min(disc.radius, reach)
+        )
         cells_outside = max(disc.cells(reach) - cells_within, 0.0)
         return float(PER_AREA * (area / self.sizes**2).sum() + cells_outside)
 
 
 @dataclass(frozen=True)
 class RingFeature:
-    """Elements of `size` at the distance `radius` from the origin of the chart, growing away."""
+    """Elements of `size` at the distance `radius` from the origin of the chart, growing away.
+
+    Attributes
+    ----------
+    growth
+        Growth of the size per distance.
+    """
 
     radius: float
     size: float
@@ -159,13 +182,20 @@ class RingFeature:
         return inf  # a ring belongs to discs, which are no grids
 
     def size_bound(self, x: Array, distance: Array) -> Array:
+        """Return bounds (n,) of the sizes near points; see `Feature.size_bound`."""
         from_ring = np.abs(np.hypot(x[:, 0], x[:, 1]) - self.radius) + distance
         return np.asarray(self.size + self.growth * np.maximum(from_ring, 0.0))
 
 
 @dataclass(frozen=True)
 class LineFeature:
-    """Elements of `size` at the line x[axis] = place of a grid, growing away."""
+    """Elements of `size` at the line x[axis] = place of a grid, growing away.
+
+    Attributes
+    ----------
+    growth
+        Growth of the size per distance.
+    """
 
     axis: int
     place: float
@@ -179,23 +209,30 @@ class LineFeature:
         return self.size + self.growth * abs(x - self.place) if axis == self.axis else inf
 
     def size_bound(self, x: Array, distance: Array) -> Array:
+        """Return bounds (n,) of the sizes near points; see `Feature.size_bound`."""
         from_line = np.abs(x[:, self.axis] - self.place) + distance
         return np.asarray(self.size + self.growth * np.maximum(from_line, 0.0))
 
 
 @dataclass(frozen=True)
 class Grading:
-    """The least size of all features, at most `largest`."""
+    """The element size of a surface: the least size of all features, at most `largest`.
+
+    Calling it with a point (2,) of the chart returns the size there.
+    """
 
     features: Sequence[Feature]
     largest: float
 
     def __call__(self, x: Array) -> float:
+        """Return the element size at a point (2,) of the chart."""
         centres, radii, sizes, growths = self._discs
         distances = np.maximum(0.0, np.hypot(*(x - centres).T) - radii)
-        of_discs = sizes + growths * distances
-        others = (feature(x) for feature in self.features if not isinstance(feature, DiscFeature))
-        return float(min([self.largest, of_discs.min(initial=inf), *others]))
+        sizes_of_discs = sizes + growths * distances
+        sizes_of_others = (
+            feature(x) for feature in self.features if not isinstance(feature, DiscFeature)
+        )
+        return float(min([self.largest, sizes_of_discs.min(initial=inf), *sizes_of_others]))
 
     @cached_property
     def _discs(self) -> tuple[Array, ...]:
@@ -219,13 +256,14 @@ class Grading:
             len(f.halves) if isinstance(f, SquaresFeature) else 1 for f in self.features
         )
         budget = max(MIN_CELL_BUDGET, MAX_SIZE_EVALUATIONS // max(1, feature_count))
-        parts, total = _EstimateCells.of_shape(shape), 0.0
-        while len(parts.low):
-            x, area, radius = parts.centres_areas_radii()
+        undivided_cells, total = _EstimateCells.of_shape(shape), 0.0
+        while len(undivided_cells.low):
+            centres, area, radius = undivided_cells.centres_areas_radii()
             sizes, max_sizes, min_sizes = (
-                self._size_bound(x, factor * radius) for factor in (0.0, 1.0, -1.0)
+                self._size_bound(centres, factor * radius) for factor in (0.0, 1.0, -1.0)
             )
-            triangles = area / self._size_bound(x, -SIZE_SAMPLING_DISTANCE * sizes) ** 2
+            triangles = area / self._size_bound(centres, -SIZE_SAMPLING_DISTANCE * sizes) ** 2
+            # bounds of the number of triangles in a cell, by the bounds of its size
             uncertainty = area / min_sizes**2 - area / max_sizes**2
             divided = (uncertainty > CELL_TOLERANCE * triangles) & (
                 uncertainty > TOTAL_TOLERANCE * (total + triangles.sum())
@@ -233,7 +271,7 @@ class Grading:
             if divided.sum() * 4 > budget:
                 divided[:] = False
             total += float(triangles[~divided].sum())
-            parts, budget = parts.quarters(divided), budget - len(divided)
+            undivided_cells, budget = undivided_cells.quarters(divided), budget - len(divided)
         along_thin_strip = 2 * shape.reach / self.largest
         return PER_AREA * total + along_thin_strip
 
@@ -247,9 +285,14 @@ class Grading:
 
 @dataclass(frozen=True)
 class _EstimateCells:
-    """Rectangular cells of a shape between coordinates `low` and `high` (n, 2).
+    """Rectangular cells of a shape, over which the number of triangles is estimated.
 
-    The coordinates of a disc are `polar`: radius and angle. Else they are those of the chart.
+    Attributes
+    ----------
+    low, high
+        (n, 2) lower and upper coordinates of the cells.
+    polar
+        Whether the coordinates are radius and angle, as for a disc; else those of the chart.
     """
 
     low: Array
@@ -258,21 +301,24 @@ class _EstimateCells:
 
     @classmethod
     def of_shape(cls, shape: PlaneShape) -> "_EstimateCells":
+        """Return the first cells of a shape, which are divided later."""
         polar = isinstance(shape, DiscShape)
         low, high = shape.box
         if polar:
             counts = np.array([RADIAL_CELLS, ANGULAR_CELLS // 2 if shape.half else ANGULAR_CELLS])
         else:
             counts = np.maximum(1, np.ceil(CELLS_OF_REACH * (high - low) / shape.reach))
-        t = [np.linspace(a, b, int(n) + 1) for a, b, n in zip(low, high, counts, strict=True)]
+        bounds_by_axis = [
+            np.linspace(a, b, int(n) + 1) for a, b, n in zip(low, high, counts, strict=True)
+        ]
         low, high = (
             np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-            for axes in ([v[:-1] for v in t], [v[1:] for v in t])
+            for axes in ([v[:-1] for v in bounds_by_axis], [v[1:] for v in bounds_by_axis])
         )
         return cls(low, high, polar)
 
     def centres_areas_radii(self) -> tuple[Array, Array, Array]:
-        """Return centres in the chart (n, 2), areas, and distances of the corners (n,)."""
+        """Return centres (n, 2) in the chart, areas (n,), and half diagonals (n,)."""
         middle, (width, height) = (self.low + self.high) / 2, (self.high - self.low).T
         if not self.polar:
             return middle, width * height, np.hypot(width, height) / 2
@@ -281,7 +327,9 @@ class _EstimateCells:
         return x, r * width * height, np.hypot(width, self.high[:, 0] * height) / 2
 
     def quarters(self, divided: NDArray[np.bool_]) -> "_EstimateCells":
-        """Return the four quarters of each of some cells."""
-        low, half = self.low[divided], (self.high - self.low)[divided] / 2
-        low = np.concatenate([low + half * corner for corner in ([0, 0], [0, 1], [1, 0], [1, 1])])
-        return _EstimateCells(low, low + np.tile(half, (4, 1)), self.polar)
+        """Return the four quarters of each cell that is to be divided."""
+        low, half_sides = self.low[divided], (self.high - self.low)[divided] / 2
+        low = np.concatenate(
+            [low + half_sides * corner for corner in ([0, 0], [0, 1], [1, 0], [1, 1])]
+        )
+        return _EstimateCells(low, low + np.tile(half_sides, (4, 1)), self.polar)

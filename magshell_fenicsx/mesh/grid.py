@@ -75,7 +75,10 @@ class Grid:
         return self._cumulative_count(0), self._cumulative_count(1)
 
     def _cumulative_count(self, axis: int) -> tuple[Array, Array]:
-        """Return coordinates across an axis, and the number of quadrilaterals up to each."""
+        """Return coordinates (k,) across an axis, and the number of quadrilaterals up to each.
+
+        The number is the integral of one over the size, not rounded.
+        """
         low, high, size = self.low[axis], self.high[axis], self.size
         if not callable(size):
             return np.array([low, high]), np.array([0.0, (high - low) / size])
@@ -91,7 +94,8 @@ class Grid:
     def lines(self, axis: int, points: Sequence[Array]) -> Array:
         """Return the coordinates of the grid lines across an axis, with distances up to the size.
 
-        One is at every point, or near it where points nearly have the same coordinate.
+        Every point has a line at its coordinate, or near it where points nearly have the same
+        coordinate.
         """
         low, high = self.low[axis], self.high[axis]
         movable = [line for _, line in self._movable_groups(axis, points)]
@@ -100,6 +104,7 @@ class Grid:
         required = required[np.concatenate([[True], is_new])]
         required[-1] = high
         x, cumulative_count = self._counts[axis]
+        # quadrilaterals up to each required line, not yet whole numbers
         counts = np.interp(required, x, cumulative_count)
         intervals = [max(int(np.ceil(b - a - COUNT_TOLERANCE)), 1) for a, b in pairwise(counts)]
         if self.glued[axis] and sum(intervals) < MIN_GLUED_COUNT:
@@ -109,6 +114,7 @@ class Grid:
         for i, n in enumerate(intervals):
             new_lines = np.linspace(required[i], required[i + 1], n + 1)[1:]
             if callable(self.size):
+                # equal parts of the count: lines are dense where the size is small
                 inner_counts = np.linspace(counts[i], counts[i + 1], n + 1)[1:-1]
                 new_lines[:-1] = np.interp(inner_counts, cumulative_count, x)
             lines.append(new_lines)
@@ -122,9 +128,9 @@ class Grid:
         return np.asarray(lines[np.concatenate([[True], is_new])])
 
     def straight_line_at(self, axis: int, x: float) -> float | None:
-        """Return the straight line so near to a coordinate that this has no line of its own.
+        """Return the straight line near a coordinate, which then gets no line of its own.
 
-        None if there is none.
+        None if there is no straight line so near.
         """
         lines = self._straight_lines(axis)
         nearest = float(lines[np.abs(lines - x).argmin()])
@@ -135,7 +141,7 @@ class Grid:
     def _movable_groups(self, axis: int, points: Sequence[Array]) -> list[tuple[Array, float]]:
         """Return groups of coordinates near each other and near no straight line.
 
-        Each with the coordinate of its line.
+        Each group comes with the coordinate of its line.
         """
         rounding = CHART_TOLERANCE * (self.high[axis] - self.low[axis])
         coordinates = np.unique([*(float(x[axis]) for x in points), *self.movable_lines[axis]])
@@ -150,9 +156,9 @@ class Grid:
         return groups
 
     def vertices_of(self, points: Sequence[Array]) -> NDArray[np.int64]:
-        """Return the numbers (n, 2) of the grid lines whose crossing each point takes.
+        """Return the numbers (n, 2) of the two grid lines that cross at the vertex of each point.
 
-        Of glued ends the first.
+        Of glued ends the first counts.
         """
         numbers = np.zeros((len(points), 2), dtype=np.int64)
         for axis in range(2):
@@ -170,6 +176,8 @@ class Grid:
 
 def grid_mesh(grid: Grid, points: Mapping[str, Array], embedding: Embedding) -> PatchMesh:
     """Triangulate a grid, with the named points (2,) among its vertices.
+
+    Each quadrilateral is divided into four triangles, which meet at its centre.
 
     Raises
     ------
@@ -211,7 +219,7 @@ def grid_mesh(grid: Grid, points: Mapping[str, Array], embedding: Embedding) -> 
 
 
 def _move_to_points(vertices: Array, grid: Grid, points: Mapping[str, Array]) -> None:
-    """Move vertices (n, m, 2) to the points that take them, where lines are not exactly there.
+    """Move vertices (n, m, 2) to the named points whose grid lines are not exactly there.
 
     Raises
     ------
@@ -225,6 +233,7 @@ def _move_to_points(vertices: Array, grid: Grid, points: Mapping[str, Array]) ->
         i, j = int(numbers[number, 0]), int(numbers[number, 1])
         first_name, first_place = point_of_vertex.setdefault((i, j), (name, place))
         offset = np.asarray(place - vertices[i, j])
+        # across glued ends, places that differ by the extent are the same
         offset -= np.where(grid.glued, np.round(offset / extent) * extent, 0.0)
         distance = place - first_place
         distance = distance - np.where(grid.glued, np.round(distance / extent) * extent, 0.0)
@@ -240,6 +249,7 @@ def _move_to_points(vertices: Array, grid: Grid, points: Mapping[str, Array]) ->
                 offset[axis] = 0.0
             elif line is not None and not is_glued_end:
                 raise MeshError(f"the point {name} is too near to an edge or a plane of symmetry")
+        # a vertex on a glued end stands at both ends
         rows = (0, -1) if grid.glued[0] and i == 0 else (i,)
         columns = (0, -1) if grid.glued[1] and j == 0 else (j,)
         if first_name == name:
@@ -251,7 +261,7 @@ def _move_to_points(vertices: Array, grid: Grid, points: Mapping[str, Array]) ->
 class RimmedGrid:
     """A grid's rectangle with closed curves, points (n, 2) each, that element edges follow.
 
-    It is a `PlaneShape` for gmsh.
+    It is a `PlaneShape`, a plane figure for gmsh.
     """
 
     grid: Grid
@@ -277,44 +287,53 @@ class RimmedGrid:
 
     @property
     def glued(self) -> tuple[GluedSides, ...]:
+        """For each axis with glued ends: the axis, and the coordinates of both ends."""
         return tuple(
             (i, self.grid.low[i], self.grid.high[i]) for i in range(2) if self.grid.glued[i]
         )
 
     def faces(self, occ: Any) -> Faces:
-        """Make the rectangle, the rims with their images across glued sides, and the grid lines.
+        """Make the rectangle, the rims with images across glued sides, and the grid lines.
 
-        These are the fixed and the movable ones.
+        The lines are the fixed and the movable ones.
+
+        Parameters
+        ----------
+        occ
+            gmsh's geometry kernel, `gmsh.model.occ`.
         """
         grid = self.grid
         (x0, y0), (x1, y1) = grid.low, grid.high
 
         def rectangle() -> tuple[int, int]:
+            """Make the rectangle and return its dimension and tag."""
             return 2, occ.addRectangle(x0, y0, 0, x1 - x0, y1 - y0)
 
         steps = [(-1, 0, 1) if glued else (0,) for glued in grid.glued]
-        images = [
+        rims_and_images = [
             points + np.multiply(step, self.extent)
             for points in self.rims
             for step in product(*steps)
         ]
+        # those of which a part is inside the rectangle
         rims_inside = list[Array]()
-        for points in images:
+        for points in rims_and_images:
             begins_inside = (points.min(axis=0) < grid.high).all()
             if (points.max(axis=0) > grid.low).all() and begins_inside:
                 rims_inside.append(points)
         surfaces = [rectangle(), *faces_within(occ, rims_inside, rectangle)]
-        for axis, other in ((0, 1), (1, 0)):
+        for axis, other_axis in ((0, 1), (1, 0)):
             for coordinate in (*grid.fixed_lines[axis], *grid.movable_lines[axis]):
                 if not grid.low[axis] < coordinate < grid.high[axis]:
                     continue
                 ends = np.array([grid.low, grid.high])
                 ends[:, axis] = coordinate
-                ends[:, other] = (grid.low[other], grid.high[other])
+                ends[:, other_axis] = (grid.low[other_axis], grid.high[other_axis])
                 surfaces.append((1, occ.addLine(*(occ.addPoint(*end, 0) for end in ends))))
         return surfaces
 
     def on_edges(self, x: Array) -> dict[str, NDArray[np.bool_]]:
+        """Return name of an edge -> whether points x (n, 2) lie on it; glued sides are left out."""
         edges = dict[str, NDArray[np.bool_]]()
         for i, name in enumerate(self.grid.sides):
             axis, end = i // 2, (self.grid.low, self.grid.high)[i % 2]

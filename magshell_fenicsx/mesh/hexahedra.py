@@ -71,9 +71,10 @@ class Quadrilaterals:
 
 
 def split(patch: PatchMesh) -> Quadrilaterals:
-    """Divide each triangle into three quadrilaterals.
+    """Divide each triangle of a mid-surface into three quadrilaterals.
 
-    A vertex, the middle of a side, the centre and the middle of the other side make one.
+    The corners of a quadrilateral are a vertex, the middle of a side, the centre of the triangle,
+    and the middle of the other side.
     """
     reference, quads, nodes_on_sides = _reference_split()
     order = ORDERS[patch.cells.shape[1]]
@@ -85,14 +86,14 @@ def split(patch: PatchMesh) -> Quadrilaterals:
     vertices, corners = np.unique(patch.corners, return_inverse=True)
     corners = corners.reshape(-1, 3)
     sides, numbers = _node_numbers(corners, len(vertices), len(reference), nodes_on_sides)
-    ordered = patch.cells[:, to_dolfinx]
-    x = np.einsum("qk,ckx->cqx", values[0], patch.nodes[ordered])
+    dolfinx_cells = patch.cells[:, to_dolfinx]
+    nodes_of_cells = np.einsum("qk,ckx->cqx", values[0], patch.nodes[dolfinx_cells])
     nodes = np.empty((numbers.max() + 1, patch.nodes.shape[1]))
-    nodes[numbers] = x  # of glued sides either: they have one place in space
+    nodes[numbers] = nodes_of_cells  # of glued sides either: they have one place in space
     if nodes.shape[1] == 2:
         offsets = surface_normal(patch.embedding, nodes)
     else:
-        a1, a2 = np.einsum("dqk,ckx->dcqx", values[1:], patch.embedding(patch.nodes)[ordered])
+        a1, a2 = np.einsum("dqk,ckx->dcqx", values[1:], patch.embedding(patch.nodes)[dolfinx_cells])
         offsets = _mitred_offsets(a1, a2, numbers, quads)
     first_side_node = len(vertices)
     middle_of_side = {
@@ -154,9 +155,10 @@ def surface_normal(embedding: Embedding, x: Array) -> Array:
 def _mitred_offsets(a1: Array, a2: Array, numbers: Numbers, quads: Numbers) -> Array:
     """Return offsets (nodes, 3) for a surface that may have kinks.
 
-    At corners of quadrilaterals the mean normal, each cell's weighted by its angle there, over its
-    mean cosine with the cells' normals: exact between two faces and between three that are normal
-    to each other. What a cell's own normal lacks of it is interpolated to the nodes between.
+    At corners of quadrilaterals the offset is the mean normal over its mean cosine with the cells'
+    normals. Each cell's normal is weighted by the cell's angle there. This is exact between two
+    faces and between three that are normal to each other. The difference from a cell's own normal
+    is interpolated bilinearly to the nodes between.
 
     Parameters
     ----------
@@ -168,6 +170,7 @@ def _mitred_offsets(a1: Array, a2: Array, numbers: Numbers, quads: Numbers) -> A
         (3, 9) places of the three quadrilaterals.
     """
     n = _unit(np.cross(a1, a2))
+    # angle of the cell at each place: pi but at the vertices of the triangle
     weights = np.full(n.shape[:2], np.pi)
     for corner, (e, f) in enumerate(((a1, a2), (a2 - a1, -a1), (-a2, a1 - a2))):
         cosine = np.sum(_unit(e[:, corner]) * _unit(f[:, corner]), axis=1)
@@ -175,17 +178,19 @@ def _mitred_offsets(a1: Array, a2: Array, numbers: Numbers, quads: Numbers) -> A
     total = np.zeros((numbers.max() + 1, 3))
     np.add.at(total, numbers, weights[..., None] * n)
     total_weight = np.bincount(numbers.ravel(), weights.ravel())[:, None]
+    # mean normal over its mean cosine, which is |total|^2/total_weight^2
     mitre = total * total_weight / np.maximum(np.sum(total**2, axis=1, keepdims=True), TINY)
-    s, t = quadrilateral_nodes().T
-    bilinear = np.column_stack([(1 - s) * (1 - t), s * (1 - t), (1 - s) * t, s * t])
-    lacking = mitre[numbers[:, quads[:, :4]]] - n[:, quads[:, :4]]
-    directions = n[:, quads] + np.einsum("kc,mqcx->mqkx", bilinear, lacking)
+    xi, eta = quadrilateral_nodes().T
+    bilinear = np.column_stack([(1 - xi) * (1 - eta), xi * (1 - eta), (1 - xi) * eta, xi * eta])
+    difference = mitre[numbers[:, quads[:, :4]]] - n[:, quads[:, :4]]
+    directions = n[:, quads] + np.einsum("kc,mqcx->mqkx", bilinear, difference)
     offsets = np.zeros_like(total)
     np.add.at(offsets, numbers[:, quads], directions)
     return np.asarray(offsets / np.bincount(numbers[:, quads].ravel())[:, None])
 
 
 def _unit(v: NDArray[Any]) -> Array:
+    """Return vectors (..., 3) over their lengths."""
     return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), TINY))
 
 
@@ -201,7 +206,7 @@ def _reference_split() -> tuple[Array, Numbers, list[list[int]]]:
     nodes_on_sides
         For each side the numbers of the three places between its vertices.
     """
-    s, t = quadrilateral_nodes().T[:, :, None]
+    xi, eta = quadrilateral_nodes().T[:, :, None]
     centre = VERTICES.mean(axis=0)
     places = [*VERTICES]
     quads = []
@@ -209,21 +214,22 @@ def _reference_split() -> tuple[Array, Numbers, list[list[int]]]:
         vertex, next_vertex, previous_vertex = (VERTICES[(i + k) % 3] for k in range(3))
         middle, other_middle = (vertex + next_vertex) / 2, (vertex + previous_vertex) / 2
         quad = (
-            (1 - s) * (1 - t) * vertex
-            + s * (1 - t) * middle
-            + s * t * centre
-            + (1 - s) * t * other_middle
+            (1 - xi) * (1 - eta) * vertex
+            + xi * (1 - eta) * middle
+            + xi * eta * centre
+            + (1 - xi) * eta * other_middle
         )
-        numbers = []
+        quad_numbers = []
         for x in quad:
             known_numbers = [n for n, y in enumerate(places) if np.allclose(x, y)]
             if not known_numbers:
                 places.append(x)
-            numbers.append(known_numbers[0] if known_numbers else len(places) - 1)
-        quads.append(numbers)
+            quad_numbers.append(known_numbers[0] if known_numbers else len(places) - 1)
+        quads.append(quad_numbers)
     reference = np.array(places)
 
     def nodes_on_side(a: int, b: int) -> list[int]:
+        """Return the numbers of the three places on the side between two vertices."""
         points = VERTICES[a] + SIDE_NODES[:, None] * (VERTICES[b] - VERTICES[a])
         return [int(np.argmin(np.linalg.norm(reference - x, axis=1))) for x in points]
 
@@ -278,7 +284,7 @@ class BodyMesh:
     w0: Array | None = None
 
     def at_nodes(self, V: fem.FunctionSpace, values: Array) -> Array:
-        """Return values (n, ...) at the nodes of the geometry at those of a quadratic space."""
+        """Return nodal values of a quadratic space for values (n, ...) at the geometry's nodes."""
         nodes = V.dofmap.index_map
         nodal = np.empty((nodes.size_local + nodes.num_ghosts, *values.shape[1:]))
         nodal[V.dofmap.list] = values[compat.geometry_dofs(self.mesh)]
@@ -303,7 +309,7 @@ def sweep(
     layers
         Number of cells through the thickness, or where they begin and end, from 0 to 1.
     factor
-        What multiplies h at places (n, 3) of the mid-surface; None for 1.
+        Places (n, 3) of the mid-surface -> factor (n,) of the thickness; None for 1.
 
     Raises
     ------
@@ -322,13 +328,15 @@ def sweep(
     cells = _swept_cells(quads.cells, layer_count)
     _refuse_overlap(X, cells)
     domain = create_mesh(comm, basix.ufl.element("Lagrange", "hexahedron", 2, shape=(3,)), cells, X)
-    original = domain.topology.original_cell_index
-    triangle, layer = original // (3 * layer_count), original % layer_count
+    # number of the hexahedron in `cells`, from which its triangle and layer follow
+    original_cells = domain.topology.original_cell_index
+    triangle, layer = original_cells // (3 * layer_count), original_cells % layer_count
     points = {name: patch.embedding(x[None])[0] for name, x in patch.points.items()}
     normals = dict[str, Array]()
     for name, x in points.items():
         offset = quads.offsets[np.argmin(np.linalg.norm(quads.places - x, axis=1))]
         normals[name] = offset / np.linalg.norm(offset)
+    # node of the mid-surface and level of each node, see `_swept_cells`
     node, level = np.divmod(domain.geometry.input_global_indices, len(heights))
     w0 = None
     if isinstance(patch.embedding, DeviatedEmbedding):
@@ -348,7 +356,7 @@ def sweep(
 
 
 def _refuse_overlap(X: Array, cells: Numbers) -> None:
-    """Refuse cells with a volume that is not positive at one of their nodes.
+    """Check that the volume of all cells is positive at all of their nodes.
 
     Parameters
     ----------
@@ -356,6 +364,11 @@ def _refuse_overlap(X: Array, cells: Numbers) -> None:
         (n, 3) nodes.
     cells
         (m, 27) node numbers.
+
+    Raises
+    ------
+    MeshError
+        With the place of a cell that is turned over.
     """
     element = basix.create_element(
         basix.ElementFamily.P, basix.CellType.hexahedron, 2, basix.LagrangeVariant.equispaced
@@ -375,7 +388,15 @@ def _refuse_overlap(X: Array, cells: Numbers) -> None:
 def _swept_cells(quads: Numbers, layers: int) -> Numbers:
     """Return hexahedra (quads * layers, 27) in the order of basix.
 
-    Node q at level k has the number q levels + k.
+    The node of the body above node q of the mid-surface, at level k, has the number q levels + k. A
+    layer has three levels, of which neighbours share one.
+
+    Parameters
+    ----------
+    quads
+        (m, 9) nodes of the quadrilaterals.
+    layers
+        Number of layers.
     """
     points = basix.create_element(
         basix.ElementFamily.P, basix.CellType.hexahedron, 2, basix.LagrangeVariant.equispaced
@@ -391,7 +412,15 @@ def _swept_cells(quads: Numbers, layers: int) -> Numbers:
 def _named_faces(
     domain: mesh.Mesh, quads: Quadrilaterals, levels: int
 ) -> dict[str, NDArray[np.int32]]:
-    """Find the facets of the outer face and above the edges by the numbers of their nodes."""
+    """Return the facets (local numbers) of the outer face, and those above each named edge.
+
+    They are found by the numbers of their nodes.
+
+    Parameters
+    ----------
+    levels
+        Number of nodes through the thickness.
+    """
     for pair in ((2, 3), (2, 0), (0, 3), (3, 2)):
         domain.topology.create_connectivity(*pair)
     facets = mesh.exterior_facet_indices(domain.topology)
@@ -405,6 +434,7 @@ def _named_faces(
     faces = {OUTER_FACE: facets[(level == levels - 1).all(axis=1)]}
     for name, pairs in quads.edges.items():
         pairs_of_edge = as_set(pairs)
+        # a facet above an edge has two nodes of the mid-surface, those of a pair
         is_above = [len(set(c)) == 2 and (min(c), max(c)) in pairs_of_edge for c in chart_nodes]
         faces[name] = facets[np.array(is_above, dtype=bool)]
     return faces
@@ -416,12 +446,12 @@ def quadratic_space(domain: mesh.Mesh) -> fem.FunctionSpace:
 
 
 def face_measure(domain: mesh.Mesh, parts: Sequence[NDArray[np.int32]]) -> ufl.Measure:
-    """Return the measure of undeformed area of some facets.
+    """Return the measure of undeformed area over some facets.
 
     Parameters
     ----------
     parts
-        Local numbers of facets; those of each part have its number, from 1.
+        For each part the local numbers of its facets. Part i has the tag i + 1.
     """
     facets = np.concatenate(parts)
     tags = np.repeat(np.arange(1, len(parts) + 1, dtype=np.int32), [len(part) for part in parts])

@@ -48,21 +48,23 @@ def nodal_normals(nodes: Array, cells: NDArray[np.int64]) -> Array:
         ORDERS[count],
         basix.LagrangeVariant.equispaced,
     )
-    ordered = cells[:, perm_gmsh(mesh.CellType.triangle, count)]
+    dolfinx_cells = cells[:, perm_gmsh(mesh.CellType.triangle, count)]
+    # tangents (cells, nodes, 3)
     a1, a2 = np.einsum(
-        "dqk,ckx->dcqx", element.tabulate(1, element.points)[1:, :, :, 0], nodes[ordered]
+        "dqk,ckx->dcqx", element.tabulate(1, element.points)[1:, :, :, 0], nodes[dolfinx_cells]
     )
-    angles = np.full(ordered.shape, np.pi)
+    angles = np.full(dolfinx_cells.shape, np.pi)
     sides_at_vertices = ((a1, a2), (a2 - a1, -a1), (-a2, a1 - a2))  # vertices are the first nodes
     for vertex, (e, f) in enumerate(sides_at_vertices):
         cosine = np.sum(_unit(e[:, vertex]) * _unit(f[:, vertex]), axis=1)
         angles[:, vertex] = np.arccos(np.clip(cosine, -1, 1))
     total = np.zeros_like(nodes)
-    np.add.at(total, ordered, angles[..., None] * _unit(np.cross(a1, a2)))
+    np.add.at(total, dolfinx_cells, angles[..., None] * _unit(np.cross(a1, a2)))
     return _unit(total)
 
 
 def _unit(v: Array) -> Array:
+    """Return vectors (..., d) over their lengths."""
     return np.asarray(v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-300))
 
 
@@ -95,18 +97,24 @@ class Midsurface:
         return self._node_coordinates(compat.interpolation_points(V))[..., :3]
 
     def chart_coordinates_by_shell(self, V: fem.FunctionSpace) -> NDArray[np.float64]:
-        """Return the coordinates of the nodes of each cell in the chart of its shell.
+        """Return coordinates (cells, nodes, 2) of the nodes of each cell in its shell's chart.
 
-        Charts of several shells may overlap. Without charts the same as `chart_coordinates`.
+        Charts of several shells may overlap. Without charts they are places in space, as those of
+        `chart_coordinates`.
         """
         if not getattr(self._patch.embedding, "has_charts", False):
             return self.chart_coordinates(V)
         return self._node_coordinates(compat.interpolation_points(V))[..., 3:5]
 
     def _node_coordinates(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return what `PatchMesh.nodes` has at reference points (q, 2) of each cell, (cells, q, d).
+        """Return rows as in `PatchMesh.nodes` at reference points of each cell, (cells, q, d).
 
-        Of a mesh file with imperfections these are places and normals.
+        For a mesh file with imperfections these are places and normals.
+
+        Parameters
+        ----------
+        points
+            (q, 2) in the reference triangle.
         """
         return at_reference_points(
             self._patch.nodes, self._patch.cells[self._original_cells], points
@@ -148,7 +156,7 @@ class Midsurface:
         return self._vector_field(V, "r0", self._patch.embedding)
 
     def growth(self, V: fem.FunctionSpace, deviations: Sequence[Deviation]) -> fem.Function:
-        """Return what further deviations add to the placement, in the same space."""
+        """Return the displacement over R by further deviations, in the space `V`."""
         embedding = self._patch.embedding
         assert isinstance(embedding, DeviatedEmbedding)
         return self._vector_field(
@@ -156,6 +164,7 @@ class Midsurface:
         )
 
     def _vector_field(self, V: fem.FunctionSpace, name: str, values: Embedding) -> fem.Function:
+        """Return a function in the space `V` with values (n, 3) of nodes (n, d)."""
         function = fem.Function(V, name=name)
         nodal = self.evaluate(compat.interpolation_points(V), values)
         function.x.array.reshape(-1, 3)[V.dofmap.list] = nodal
@@ -177,7 +186,7 @@ class Midsurface:
 
     @property
     def kinked(self) -> bool:
-        """Whether cells may meet at angles: at joints, and in the mesh file of any shell."""
+        """Whether cells may meet at angles: at joints, and on a shell from a mesh file."""
         has_charts = getattr(self._patch.embedding, "has_charts", not self.from_mesh_file)
         return any(self._patch.joints) or not has_charts
 
@@ -194,8 +203,8 @@ class Midsurface:
     def cells_of_point(self, point: str) -> NDArray[np.bool_] | None:
         """Return whether each cell (cells,) is on the shell of a named point; None for one shell.
 
-        Another shell may have a vertex at the same place, or a sheet that ends on this one at a
-        T-junction.
+        Another shell may have a vertex at the same place. At T-junctions of a mesh file, cells of
+        the sheets that end there are excluded.
         """
         if self._patch.t_junctions:
             edges = [self._patch.edges[name].ravel() for name in self._patch.t_junctions]
@@ -211,7 +220,7 @@ class Midsurface:
 
     @cached_property
     def joints(self) -> list[NDArray[np.float64] | None]:
-        """Sides of each joint (cells,): 1 in cells on its first edge, -1 on its second one, else 0.
+        """Sides (cells,) of each joint: 1 in cells on its first edge, -1 on its second, else 0.
 
         None for a T-junction.
         """
@@ -275,7 +284,7 @@ def create_mesh(
 ) -> mesh.Mesh:
     """Return a distributed mesh of cells and nodes (n, 3) that every rank has; collective.
 
-    Of the same cells it has the same numbers on the same ranks.
+    For the same cells, numbers and ranks of the mesh are the same.
     """
     is_first_rank = comm.rank == 0
     return mesh.create_mesh(
@@ -314,7 +323,13 @@ def at_reference_points(
 def _named_facets(
     domain: mesh.Mesh, patch: PatchMesh, vertices: NDArray[np.int64]
 ) -> dict[str, NDArray[np.int32]]:
-    """Find the facets of each named edge by the vertex numbers of the triangulation."""
+    """Return the local facets of each named edge, found by the vertex numbers of the triangulation.
+
+    Parameters
+    ----------
+    vertices
+        Node of the triangulation for each vertex of the mesh, in the order of its making.
+    """
     domain.topology.create_connectivity(1, 2)
     domain.topology.create_connectivity(1, 0)
     facets = mesh.exterior_facet_indices(domain.topology)

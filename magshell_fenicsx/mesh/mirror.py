@@ -122,7 +122,13 @@ class Mirror:
         return np.concatenate([image.apply(x) for image in self.images])
 
     def sum_over_images(self, v: Array, parity: float = 1.0) -> Array:
-        """Return the sum (3,) of the images of a vector; mirrored ones count `parity` times."""
+        """Return the sum (3,) of the images of a vector.
+
+        Parameters
+        ----------
+        parity
+            Factor of mirrored images, 1 or -1.
+        """
         factors = [parity if image.sign < 0 else 1.0 for image in self.images]
         images = [image.Q @ v for image in self.images]
         return np.asarray(
@@ -130,12 +136,12 @@ class Mirror:
         )
 
     def rotated(self, azimuth: float) -> "Mirror":
-        """Return this plane in the frame of the case.
+        """Return this plane in the frame of the case, if it is given in a turned frame.
 
         Parameters
         ----------
         azimuth
-            Angle about e3 (rad) by which the frame is turned in which this plane is given.
+            Angle (rad) about e3 by which that frame is turned.
         """
         return replace(self, normal=self.normal @ rotation(azimuth))
 
@@ -263,10 +269,13 @@ class Sector(Mirror):
 
     @property
     def images(self) -> list[Image]:
-        of_half = super().images
+        """The copies that make the whole: the half at each of its turned places."""
+        half_images = super().images
         rotations = [rotation(-2 * self.angle * k) for k in range(self.waves)]
         return [
-            Image(Q @ image.Q, Q @ image.shift, image.sign) for Q in rotations for image in of_half
+            Image(Q @ image.Q, Q @ image.shift, image.sign)
+            for Q in rotations
+            for image in half_images
         ]
 
 
@@ -275,7 +284,9 @@ Y0_PLANE = Mirror(np.array([0.0, 1.0, 0.0]))
 
 
 def cut(patch: PatchMesh, mirror: Mirror) -> PatchMesh:
-    """Return the half or the sector of a triangulation; its edges in the planes are named so.
+    """Return the half or the sector of a triangulation.
+
+    Edges in the planes get the names of `Mirror.planes`.
 
     Raises
     ------
@@ -288,7 +299,18 @@ def cut(patch: PatchMesh, mirror: Mirror) -> PatchMesh:
 
 
 def _halved(patch: PatchMesh, mirror: Mirror, edge_name: str) -> PatchMesh:
-    """Return the triangles in the half of a plane; the edge in the plane gets a name."""
+    """Return the triangles in the half of a plane.
+
+    Parameters
+    ----------
+    edge_name
+        Name of the edge in the plane; border edges without another name belong to it.
+
+    Raises
+    ------
+    MeshError
+        If triangles lie across the plane or in it, or all are on one side.
+    """
     places = patch.embedding(patch.nodes)
     distances, extent = mirror.signed_distance(places), np.ptp(places, axis=0).max()
     corners = distances[patch.cells[:, :3]]
@@ -311,11 +333,12 @@ def _halved(patch: PatchMesh, mirror: Mirror, edge_name: str) -> PatchMesh:
     first_node[representative[used][::-1]] = np.arange(len(used))[::-1]
     edges = {name: first_node[representative[pairs]] for name, pairs in patch.edges.items()}
     border = border_pairs(first_node[representative[used[directed_sides(cells)]]])
+    # without edges of the other half
     edges = on_border(edges, border)
     named_pairs = {pair for pairs in edges.values() for pair in as_set(pairs)}
     if pairs_in_plane := sorted(as_set(border) - named_pairs):
         edges[edge_name] = np.array(pairs_in_plane, dtype=np.int64)
-    source = patch.source_triangles
+    source_triangles = patch.source_triangles
     return replace(
         patch,
         nodes=patch.nodes[used],
@@ -323,7 +346,7 @@ def _halved(patch: PatchMesh, mirror: Mirror, edge_name: str) -> PatchMesh:
         edges=edges,
         representative=None if glued is None else first_node[representative[used]],
         patches={name: mask[in_half] for name, mask in patch.patches.items()},
-        source_triangles=None if source is None else source[in_half],
+        source_triangles=None if source_triangles is None else source_triangles[in_half],
         t_junctions={name: mask[in_half] for name, mask in patch.t_junctions.items()},
     )
 

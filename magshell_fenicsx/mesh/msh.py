@@ -60,7 +60,7 @@ def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells
     Parameters
     ----------
     nodes, cells
-        (n, 3), and node numbers; an edge has two triangles at most.
+        (n, 3) places, and (m, 3 | 6 | 10) node numbers; an edge has two triangles at most.
     first_copy
         Nodes from this one on stand at places of others, see `non_manifold.separate_sheets`.
 
@@ -69,18 +69,19 @@ def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells
     MeshError
         If a triangle has no area, or the surface has one side or is torn.
     """
-    a, b, c = (nodes[cells[:, i]] for i in range(3))
-    areas = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
-    squared_side = np.linalg.norm(b - a, axis=1) ** 2
+    v0, v1, v2 = (nodes[cells[:, i]] for i in range(3))
+    areas = np.linalg.norm(np.cross(v1 - v0, v2 - v0), axis=1) / 2
+    squared_side = np.linalg.norm(v1 - v0, axis=1) ** 2
     flat = np.flatnonzero(areas <= FLAT_TRIANGLE_TOLERANCE * squared_side)
     if len(flat):
-        raise MeshError(f"the triangle at {place_text(a[flat[0]])} has no area")
+        raise MeshError(f"the triangle at {place_text(v0[flat[0]])} has no area")
     edges = directed_sides(cells)
-    _, edge_of_side, times = np.unique(
+    _, edge_of_side, side_counts = np.unique(
         np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
     )
+    # sort the sides by edge; of an inner edge both sides are then neighbours
     sides_by_edge = np.argsort(edge_of_side.ravel(), kind="stable")
-    first_of_inner = np.cumsum(times)[times == 2] - 2
+    first_of_inner = np.cumsum(side_counts)[side_counts == 2] - 2
     side, opposite_side = sides_by_edge[first_of_inner], sides_by_edge[first_of_inner + 1]
     # neighbours that agree run through their edge in opposite directions
     agree = edges[side, 0] != edges[opposite_side, 0]
@@ -115,14 +116,21 @@ def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells
 def _is_reversed(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.bool_]) -> bool:
     """Return whether a component has the orientation of the triangles that are not `as_first`.
 
-    The larger area decides. Halves of the same size, as refined meshes have them, do not depend on
-    the numbers of triangles: their normals point upwards on the whole, else along e2 or e1, else
-    out of the volume.
+    The larger area decides. If both areas are equal, the number of triangles must not decide. Then
+    the normals point upwards on the whole, else along e2 or e1, else out of the volume.
+
+    Parameters
+    ----------
+    cells, areas
+        Triangles of the component and their areas.
+    as_first
+        Whether each triangle has the orientation of the first one.
     """
     area_as_first, total_area = areas[as_first].sum(), areas.sum()
     if abs(2 * area_as_first - total_area) > AREA_TIE_TOLERANCE * total_area:
         return bool(2 * area_as_first < total_area)
     a, b, c = (nodes[cells[:, i]] - nodes[np.unique(cells)].mean(axis=0) for i in range(3))
+    # area vectors, all in the orientation of the first triangle
     vectors = np.where(as_first[:, None], 1, -1) * np.cross(b - a, c - a) / 2
     outward = (a * vectors).sum(axis=1) / np.ptp(nodes, axis=0).max()
     for components in (vectors[:, 2], vectors[:, 1], vectors[:, 0], outward):
@@ -134,7 +142,20 @@ def _is_reversed(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.
 def _refuse_torn(
     nodes: Array, cells: Cells, component: NDArray[np.int32], first_copy: int | None
 ) -> None:
-    """Refuse a surface with components that have nodes at one place and are not connected."""
+    """Check that components which are not connected have no nodes at one place.
+
+    Parameters
+    ----------
+    component
+        (m,) number of the component of each triangle.
+    first_copy
+        Nodes from this one on stand at places of others on purpose; None without.
+
+    Raises
+    ------
+    MeshError
+        With the place of two nodes.
+    """
     if (component == component[0]).all():
         return
     vertices = np.unique(cells[:, :3])
@@ -151,7 +172,12 @@ def _refuse_torn(
 
 
 def border_edges(nodes: Array, cells: Cells, curves: Mapping[str, Cells]) -> dict[str, Cells]:
-    """Return the part of each named curve (e, 2) that is a border of the surface.
+    """Return the part of each named curve that is a border of the surface.
+
+    Parameters
+    ----------
+    curves
+        Name -> (e, 2) vertex pairs.
 
     Raises
     ------
@@ -178,10 +204,10 @@ def border_edges(nodes: Array, cells: Cells, curves: Mapping[str, Cells]) -> dic
             "which belongs to no physical curve: close the hole, or name the edge "
             "(an edge without a condition is free)"
         )
-    ends, times = np.unique(border, return_counts=True)
-    if (times > 2).any():
+    ends, counts = np.unique(border, return_counts=True)
+    if (counts > 2).any():
         raise MeshError(
-            f"the surface touches itself in the vertex {place_text(nodes[ends[times > 2][0]])}"
+            f"the surface touches itself in the vertex {place_text(nodes[ends[counts > 2][0]])}"
         )
     return on_border(curves, border)
 
@@ -251,14 +277,20 @@ def read_msh(
 
     Parameters
     ----------
+    file
+        The mesh file, or what a program gives in its place.
     points
         Named places (3,) over R that must be vertices. If no "pole" is named, the highest vertex is
-        the pole; of several that are, one on no held edge, and best the pole of one of several
-        shells.
+        the pole. Of several highest vertices it is one on no held edge, and best the pole of one of
+        several shells.
     mirror
         The symmetry plane or the sector of which that part is read; None for the whole surface.
     held_edges
         Names of edges that are clamped or hinged.
+
+    Returns
+    -------
+    The triangulation with places over R, and the named points.
 
     Raises
     ------
@@ -283,7 +315,11 @@ def read_msh(
 def _with_points_of_shells(
     file: MeshFile, patch: PatchMesh, points: Mapping[str, Array], held_edges: Collection[str]
 ) -> PatchMesh:
-    """Return the triangulation of several shells with named points, as `read_msh`."""
+    """Return the triangulation of several shells with named points, as `read_msh` for a file.
+
+    Points that a shell names keep the vertex of that shell. All others take the vertex at their
+    place.
+    """
     points_of_shells = dict[str, Array]()
     for name_in_shell, x in patch.points.items():
         for name in _names_of_same_place(points, name_in_shell):
@@ -296,14 +332,23 @@ def _with_points_of_shells(
 
 
 def _names_of_same_place(points: Mapping[str, Array], name: str) -> list[str]:
-    """Return the names of all points at the place of one; none if there is no such point."""
+    """Return the names of all points at the place of a named point; empty without it."""
     if name not in points:
         return []
-    return [other for other, x in points.items() if np.array_equal(x, points[name])]
+    return [other_name for other_name, x in points.items() if np.array_equal(x, points[name])]
 
 
 def _patch_of_triangles(file: MeshFile) -> PatchMesh:
-    """Return the whole surface of a file or of a program, oriented and over R, without points."""
+    """Return the whole surface of a file or of a program, oriented and over R, without points.
+
+    Nodes without a triangle are dropped. Sheets that end on another sheet are separated at
+    T-junctions.
+
+    Raises
+    ------
+    MeshError
+        If the surface cannot carry a shell.
+    """
     triangles = file.content()
     nodes, cells, edges = triangles.nodes, triangles.cells, dict(triangles.edges)
     used, numbers = np.unique(cells, return_inverse=True)  # drops nodes without a triangle
@@ -346,7 +391,10 @@ def _patch_of_triangles(file: MeshFile) -> PatchMesh:
 
 
 def cell_count(file: MeshFile) -> int:
-    """Return the number of triangles; 0 of a file that cannot be read, which `read_msh` reports."""
+    """Return the number of triangles of a file or program.
+
+    It is 0 for a file that cannot be read, which `read_msh` reports.
+    """
     if file.in_memory:
         return len(file.in_memory.cells)
     try:
@@ -363,9 +411,21 @@ def _named_vertices(
     held_edges: Collection[str],
     shell_poles: Sequence[Array] = (),
 ) -> dict[str, Array]:
-    """Return the vertex of each named point, and the highest vertex as "pole".
+    """Return the vertex (d,) of each named point, and the highest vertex as "pole".
 
-    Of several highest ones the pole is one on no held edge, best one of `shell_poles` (d,).
+    Of several highest vertices the pole is one on no held edge, and best one of `shell_poles` (d,).
+
+    Parameters
+    ----------
+    points
+        Name -> place (3,) over R.
+    scale
+        Factor from the file's coordinates to lengths over R, for messages.
+
+    Raises
+    ------
+    MeshError
+        If a named point is no vertex.
     """
     numbers = np.unique(patch.cells[:, :3])
     corners = patch.nodes[numbers]
@@ -375,6 +435,7 @@ def _named_vertices(
     x, y, z = np.round(candidates[:, :3], HEIGHT_DIGITS).T
     is_shell_pole = np.arange(len(x)) >= len(corners)
     nearest_corner = scipy.spatial.cKDTree(corners[:, :3]).query(candidates[:, :3])[1]
+    # the last key counts first: height, free edge, a shell's pole, then y and x
     pole = np.lexsort((x, y, is_shell_pole, is_free[nearest_corner], z))[-1]
     vertices = {"pole": candidates[pole]}
     for name, x in points.items():
@@ -391,7 +452,15 @@ def _named_vertices(
 
 
 def _triangles_of_file(file: MeshFile) -> SurfaceTriangles:
-    """Return the triangles of a file, with curves and patches by its physical groups."""
+    """Return the triangles of a file, with curves and patches by its physical groups.
+
+    Coordinates are those of the file.
+
+    Raises
+    ------
+    MeshError
+        If the file cannot be read, or has no triangles or several orders of triangles.
+    """
     try:
         content = parsed(file.files.content(file.path))
     except FileNotFoundError:
@@ -423,7 +492,13 @@ def _triangles_of_file(file: MeshFile) -> SurfaceTriangles:
 def _blocks_of_dimension(
     file: MeshFile, content: MshContent, dimension: int, allowed_types: Collection[str]
 ) -> list[tuple[int, NDArray[np.int64]]]:
-    """Return entity and node numbers (m, k) of the blocks of one dimension."""
+    """Return entity and node numbers (m, k) of the blocks of elements of one dimension.
+
+    Raises
+    ------
+    MeshError
+        If a block has elements of another type than the allowed ones.
+    """
     blocks = []
     for name, dim, entity, nodes in content.blocks:
         if dim == dimension:
@@ -439,7 +514,13 @@ def _blocks_of_dimension(
 def _node_indices(
     file: MeshFile, content: MshContent, numbers: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """Return the indices of the nodes with these numbers of the file."""
+    """Return the indices in the content of nodes with numbers (tags) of the file, in any shape.
+
+    Raises
+    ------
+    MeshError
+        If a node is not there.
+    """
     order = np.argsort(content.tags)
     positions = np.searchsorted(content.tags, numbers, sorter=order).clip(max=len(order) - 1)
     indices: NDArray[np.int64] = order[positions]

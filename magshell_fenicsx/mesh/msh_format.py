@@ -57,6 +57,8 @@ def parsed(content: bytes) -> MshContent:
     ------
     MeshError
         If the file is of another kind, or damaged.
+    Unusable
+        If gmsh cannot be loaded.
     """
     if not content.startswith((b"$MeshFormat", b"$Comments")):
         raise MeshError(
@@ -92,7 +94,7 @@ def parsed(content: bytes) -> MshContent:
 def _fields_of_model(
     model: Any,
 ) -> tuple[Integers, NDArray[np.float64], Blocks, dict[int, dict[str, list[int]]]]:
-    """Return the fields of `MshContent` of gmsh's current model."""
+    """Return the fields of `MshContent`, in their order, for gmsh's current model."""
     tags, xyz, _ = model.mesh.getNodes()
     blocks, groups = Blocks(), dict[int, dict[str, list[int]]]({1: {}, 2: {}})
     for dim, entity in model.getEntities():
@@ -110,6 +112,7 @@ def _fields_of_model(
 
 
 def _main(file: Path) -> None:
+    """Write the fields of `MshContent` of a file beside it; the program of gmsh's own process."""
     try:
         gmsh = import_gmsh()
     except Unusable as e:

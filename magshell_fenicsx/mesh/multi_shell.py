@@ -62,6 +62,7 @@ class ShellPose:
     scale: float
 
     def __call__(self, x: Array) -> Array:
+        """Return the places (..., 3) over R of places x in the frame of the shell."""
         return np.asarray(self.scale * x @ self.Q.T + self.position)
 
     def to_shell_frame(self, x: Array) -> Array:
@@ -71,7 +72,7 @@ class ShellPose:
 
 @dataclass(frozen=True)
 class MemberShell:
-    """A shell of several.
+    """A shell of several, meshed alone.
 
     Attributes
     ----------
@@ -80,9 +81,9 @@ class MemberShell:
     patch
         The triangulation of the shell alone.
     place
-        Where the shell is.
+        Position, orientation and scale of the shell in space.
     points
-        Those of `patch.points` that the case names.
+        Names of those of `patch.points` that the case names.
     normal
         Nodes of `patch` -> normals of the perfect shell; None if they are not known.
     """
@@ -116,11 +117,12 @@ class MultiShellEmbedding:
         return all(dimension == CHART_DIMENSION for _, dimension, _ in self.embeddings)
 
     def __call__(self, nodes: Array) -> Array:
+        """Return the places (n, 3) over R of nodes (n, 10)."""
         shell_numbers, places = np.rint(nodes[:, -1]), np.array(nodes[:, :3])
         for i, (embedding, dimension, place) in enumerate(self.embeddings):
-            of_shell = shell_numbers == i
-            if of_shell.any():
-                places[of_shell] = place(embedding(nodes[of_shell, 3 : 3 + dimension]))
+            is_in_shell = shell_numbers == i
+            if is_in_shell.any():
+                places[is_in_shell] = place(embedding(nodes[is_in_shell, 3 : 3 + dimension]))
         return places
 
     def normal(self, nodes: Array) -> Array:
@@ -129,18 +131,18 @@ class MultiShellEmbedding:
         for i, (normal, (_, dimension, place)) in enumerate(
             zip(self.normals, self.embeddings, strict=True)
         ):
-            of_shell = shell_numbers == i
-            if normal and of_shell.any():
-                normals[of_shell] = normal(nodes[of_shell, 3 : 3 + dimension]) @ place.Q.T
+            is_in_shell = shell_numbers == i
+            if normal and is_in_shell.any():
+                normals[is_in_shell] = normal(nodes[is_in_shell, 3 : 3 + dimension]) @ place.Q.T
         return normals
 
     def w0(self, nodes: Array) -> Array:
         """Return the deviations (n,) of the imperfect shells, over R."""
         shell_numbers, w0 = np.rint(nodes[:, -1]), np.zeros(len(nodes))
         for i, (embedding, dimension, place) in enumerate(self.embeddings):
-            of_shell = shell_numbers == i
-            if isinstance(embedding, DeviatedEmbedding) and of_shell.any():
-                w0[of_shell] = place.scale * embedding.w0(nodes[of_shell, 3 : 3 + dimension])
+            is_in_shell = shell_numbers == i
+            if isinstance(embedding, DeviatedEmbedding) and is_in_shell.any():
+                w0[is_in_shell] = place.scale * embedding.w0(nodes[is_in_shell, 3 : 3 + dimension])
         return w0
 
 
@@ -221,6 +223,8 @@ def union_of_shells(
 
     Parameters
     ----------
+    members
+        Each shell with its own triangulation.
     one_symmetry_edge
         Whether the edges of all shells in a symmetry plane are one edge.
     """
@@ -235,10 +239,11 @@ def union_of_shells(
     cell_count = sum(len(member.patch.cells) for member in members)
 
     def with_shell_number(coordinates: Array, number: int) -> Array:
-        rows = np.zeros((len(coordinates), 3 + MAX_SHELL_COORDINATES + 1))
-        rows[:, 3 : 3 + coordinates.shape[1]], rows[:, -1] = coordinates, number
-        rows[:, :3] = embedding(rows)
-        return rows
+        """Return nodes (n, 10) for coordinates (n, d) of the shell with this number."""
+        nodes_of_shell = np.zeros((len(coordinates), 3 + MAX_SHELL_COORDINATES + 1))
+        nodes_of_shell[:, 3 : 3 + coordinates.shape[1]], nodes_of_shell[:, -1] = coordinates, number
+        nodes_of_shell[:, :3] = embedding(nodes_of_shell)
+        return nodes_of_shell
 
     first_node = first_cell = 0
     for number, member in enumerate(members):
@@ -264,6 +269,7 @@ def union_of_shells(
             in_patch[first_cell:end_cell] = mask
             patches[f"{member.name}_{name}" if name else member.name] = in_patch
         first_node, first_cell = first_node + node_count, end_cell
+    # (m, 2): each triangle is its own source, and not reversed
     source_triangles = np.column_stack(
         [np.arange(cell_count), np.zeros(cell_count, dtype=np.int64)]
     )
@@ -338,11 +344,17 @@ def glue_edges(patch: PatchMesh, edges: tuple[str, str], key: str) -> PatchMesh:
 
     Where one edge has a vertex and the other has none, the triangle there is divided.
 
+    Parameters
+    ----------
+    edges
+        Names of the first and the second edge.
+    key
+        Key of the joint, with which messages begin.
+
     Raises
     ------
     MeshError
-        If there is no such edge, the edges do not meet, or have different normals; the message
-        begins with the key.
+        If there is no such edge, the edges do not meet, or have different normals.
     """
     for name in edges:
         if name not in patch.edges:
@@ -361,6 +373,7 @@ def glue_edges(patch: PatchMesh, edges: tuple[str, str], key: str) -> PatchMesh:
     places = patch.nodes[:, :3]
     distances = np.linalg.norm(places[second][:, None] - places[first][None], axis=2)
     nearest = distances.argmin(axis=1)
+    # gluing needs one vertex of the second edge for each of the first
     if len(np.unique(nearest)) != len(first):
         near_pair = _nearest_pair_text(places[first], places[second])
         raise MeshError(
@@ -409,25 +422,28 @@ def _with_vertices_on_edge(
     patch
         With triangles divided at the targets that lie within their sides.
     gap
-        Largest distance of a target from the edge, and the target (3,).
+        Largest distance of a target from the edge over R, and the target (3,).
     """
     pairs, triangle_sides = patch.edges[edge], patch.corners[:, TRIANGLE_SIDES]
     cell_and_side = {
         tuple(sorted(triangle_sides[c, s])): (c, s)
         for c, s in np.ndindex(*triangle_sides.shape[:2])
     }
+    # triangle on the edge and its side (0 to 2), for each of the S pairs
     cell, side = np.array([cell_and_side[tuple(sorted(pair))] for pair in pairs]).T
     S, T = len(pairs), len(targets)
     start, end = REFERENCE_VERTICES[TRIANGLE_SIDES[side]].transpose(1, 0, 2)
     t = np.full((S, T), 0.5)
-    ends = patch.nodes[patch.cells[cell[:, None], TRIANGLE_SIDES[side]], :3]
-    chord = ends[:, 1] - ends[:, 0]
+    end_places = patch.nodes[patch.cells[cell[:, None], TRIANGLE_SIDES[side]], :3]
+    chord = end_places[:, 1] - end_places[:, 0]
 
     def place_on_sides(t: Array) -> Array:
+        """Return the places (S, T, 3) of parameters t (S, T) along the sides."""
         X = start[:, None] + t[..., None] * (end - start)[:, None]
         places = patch.embedding(_nodes_in_cells(patch, np.repeat(cell, T), X.reshape(-1, 2)))
         return np.asarray(places.reshape(S, T, 3))
 
+    # t (S, T): closest point of each side to each target, by steps along the chord
     squared_lengths = np.einsum("si,si->s", chord, chord)[:, None]
     for _ in range(PROJECTION_ITERATIONS):
         offset = targets[None] - place_on_sides(t)
@@ -437,6 +453,7 @@ def _with_vertices_on_edge(
     farthest = int(distance.min(axis=0).argmax())
     gap = float(distance[nearest_side[farthest], farthest]), targets[farthest]
     t_on_nearest = t[nearest_side, np.arange(T)]
+    # targets within a side, and not at its ends
     is_new = (t_on_nearest > SIDE_END_TOLERANCE) & (t_on_nearest < 1 - SIDE_END_TOLERANCE)
     for number in np.unique(nearest_side[is_new]):
         cuts = np.sort(t_on_nearest[is_new & (nearest_side == number)])
@@ -449,12 +466,14 @@ def _with_divided_triangle(
 ) -> PatchMesh:
     """Return the triangulation with one triangle divided from the vertex opposite to a side.
 
+    The first new triangle takes the number of the old one; the others are appended.
+
     Parameters
     ----------
     cell, side
         Number of the triangle, and of its side (0 to 2), which is on the edge.
     cuts
-        Where the side is divided, from 0 to 1, growing.
+        Places along the side at which it is divided, from 0 to 1, growing.
     """
     import basix  # slow to import, and not needed to read a case
     from dolfinx import mesh
@@ -467,20 +486,29 @@ def _with_divided_triangle(
     count, (i, j) = patch.cells.shape[1], TRIANGLE_SIDES[side]
     family, variant = basix.ElementFamily.P, basix.LagrangeVariant.equispaced
     points = basix.create_element(family, basix.CellType.triangle, ORDERS[count], variant).points
-    t = np.array([0.0, *cuts, 1.0])
-    X = REFERENCE_VERTICES[i] + t[:, None] * (REFERENCE_VERTICES[j] - REFERENCE_VERTICES[i])
+    cut_parameters = np.array([0.0, *cuts, 1.0])
+    X = REFERENCE_VERTICES[i] + cut_parameters[:, None] * (
+        REFERENCE_VERTICES[j] - REFERENCE_VERTICES[i]
+    )
+    # the vertex that is not on the side
     apex = 3 - i - j
-    first = len(patch.nodes)
-    numbers = [patch.cells[cell, i], *range(first, first + len(cuts)), patch.cells[cell, j]]
+    first_new_node = len(patch.nodes)
+    # nodes along the side: its ends and the new ones between
+    side_nodes = [
+        patch.cells[cell, i],
+        *range(first_new_node, first_new_node + len(cuts)),
+        patch.cells[cell, j],
+    ]
     new_nodes = [_nodes_in_cells(patch, np.full(len(cuts), cell), X[1:-1])]
     new_cells = list[NDArray[np.int64]]()
-    node_count = first + len(cuts)
-    for k in range(len(t) - 1):
+    node_count = first_new_node + len(cuts)
+    for k in range(len(cut_parameters) - 1):
         a, b, c = X[k], X[k + 1], REFERENCE_VERTICES[apex]
+        # nodes of the new triangle beyond its vertices, in the old triangle
         further_points = a + points[3:] @ np.array([b - a, c - a])
         further_count = len(further_points)
         new_nodes.append(_nodes_in_cells(patch, np.full(further_count, cell), further_points))
-        vertices = [numbers[k], numbers[k + 1], patch.cells[cell, apex]]
+        vertices = [side_nodes[k], side_nodes[k + 1], patch.cells[cell, apex]]
         new_cell = np.empty(count, dtype=np.int64)
         new_cell[perm_gmsh(mesh.CellType.triangle, count)] = [
             *vertices,
@@ -489,17 +517,19 @@ def _with_divided_triangle(
         new_cells.append(new_cell)
         node_count += further_count
     nodes = np.concatenate([patch.nodes, *new_nodes])
-    nodes[first:, :3] = patch.embedding(nodes[first:])
+    nodes[first_new_node:, :3] = patch.embedding(nodes[first_new_node:])
     cells = np.concatenate([patch.cells, np.array(new_cells[1:])])
     cells[cell] = new_cells[0]
     parent_cells = np.full(len(new_cells) - 1, cell)
-    representative = np.concatenate([patch.representative, np.arange(first, node_count)])
-    ends = {int(representative[numbers[0]]), int(representative[numbers[-1]])}
+    representative = np.concatenate([patch.representative, np.arange(first_new_node, node_count)])
+    ends = {int(representative[side_nodes[0]]), int(representative[side_nodes[-1]])}
+    # the side's pair in the edge is replaced by those of the new sides
     other_pairs = [pair for pair in patch.edges[edge] if {int(pair[0]), int(pair[1])} != ends]
-    new_pairs = representative[np.array([numbers[:-1], numbers[1:]]).T]
+    new_pairs = representative[np.array([side_nodes[:-1], side_nodes[1:]]).T]
     pairs = np.concatenate([np.array(other_pairs, dtype=np.int64).reshape(-1, 2), new_pairs])
 
     def with_new_cells(values: NDArray[Any]) -> NDArray[Any]:
+        """Append the values of the old triangle for the new ones."""
         return np.concatenate([values, values[parent_cells]])
 
     return replace(
@@ -514,7 +544,7 @@ def _with_divided_triangle(
 
 
 def _nodes_in_cells(patch: PatchMesh, cell: NDArray[np.int64], X: Array) -> Array:
-    """Return nodes (n, d) at reference points X (n, 2) of cells (n,)."""
+    """Return nodes (n, d) at reference points X (n, 2) of cells (n,), by their polynomials."""
     import basix
     from dolfinx import mesh
     from dolfinx.cpp.io import perm_gmsh
@@ -525,21 +555,25 @@ def _nodes_in_cells(patch: PatchMesh, cell: NDArray[np.int64], X: Array) -> Arra
     family, variant = basix.ElementFamily.P, basix.LagrangeVariant.equispaced
     element = basix.create_element(family, basix.CellType.triangle, ORDERS[count], variant)
     table = element.tabulate(0, X)[0, :, :, 0]
-    ordered = patch.cells[cell][:, perm_gmsh(mesh.CellType.triangle, count)]
-    return np.asarray(np.einsum("nk,nkd->nd", table, patch.nodes[ordered]))
+    dolfinx_cells = patch.cells[cell][:, perm_gmsh(mesh.CellType.triangle, count)]
+    return np.asarray(np.einsum("nk,nkd->nd", table, patch.nodes[dolfinx_cells]))
 
 
 def _cells_on_edge(patch: PatchMesh, edge: str) -> NDArray[np.bool_]:
-    """Return whether each triangle of the edge's own shell has a side on the edge, (m,)."""
+    """Return whether each triangle (m,) has a side on an edge; False on other shells."""
     pairs, sides = as_set(patch.edges[edge]), np.sort(directed_sides(patch.corners), axis=1)
     is_side_on_edge = np.array([(int(a), int(b)) in pairs for a, b in sides])
     has_side_on_edge = is_side_on_edge.reshape(3, -1).any(axis=0)
+    # the longest name of a patch with which the edge's name begins
     shell = max((name for name in patch.patches if edge.startswith(f"{name}_")), key=len)
     return np.asarray(has_side_on_edge & patch.patches[shell])
 
 
 def _with_nodes_per_cell(patch: PatchMesh, count: int) -> PatchMesh:
-    """Return the same triangles with `count` nodes each; vertices keep their numbers."""
+    """Return the same triangles with `count` nodes each (3, 6 or 10); vertices keep their numbers.
+
+    The new nodes are at the places that the old triangles have there. Neighbours do not share them.
+    """
     if patch.cells.shape[1] == count:
         return patch
     import basix  # slow to import, and not needed to read a case

@@ -40,27 +40,35 @@ class TJunction:
 def separate_sheets(nodes: Array, cells: Cells) -> tuple[Cells, Cells, dict[str, TJunction]]:
     """Take a triangulation (m, 3 | 6 | 10) apart until each edge has two triangles at most.
 
+    At an edge with more triangles the two nearest to one plane stay together. The sheets of all
+    others end there.
+
+    Parameters
+    ----------
+    nodes, cells
+        (n, 3) places, and node numbers.
+
     Returns
     -------
     origin
-        (n,) the old node at the place of each node. New nodes stand after the old ones.
+        For each node the old node at its place. New nodes stand after the old ones.
     cells
         Triangles with new nodes.
     t_junctions
         Name -> an edge at which a sheet was taken off.
     """
     m = len(cells)
-    pairs, edge_of_side, times = np.unique(
+    pairs, edge_of_side, triangle_counts = np.unique(
         np.sort(directed_sides(cells), axis=1), axis=0, return_inverse=True, return_counts=True
     )
-    if (times <= 2).all():
+    if (triangle_counts <= 2).all():
         return np.arange(len(nodes)), cells, {}
     sides_by_edge = np.argsort(edge_of_side.ravel(), kind="stable")
-    first_of_edge = np.concatenate([[0], np.cumsum(times)])
+    first_of_edge = np.concatenate([[0], np.cumsum(triangle_counts)])
     supporting_cells = dict[int, tuple[int, int]]()  # by edge
     neighbours = list[tuple[int, int]]()  # pairs of triangles of one sheet
     ending_cells = list[tuple[int, int]]()  # edges, and triangles whose sheet ends there
-    for edge in np.flatnonzero(times > 1):
+    for edge in np.flatnonzero(triangle_counts > 1):
         sides = sides_by_edge[first_of_edge[edge] : first_of_edge[edge + 1]]
         cells_at_edge = [int(side) % m for side in sides]
         if len(cells_at_edge) == 2:
@@ -69,6 +77,7 @@ def separate_sheets(nodes: Array, cells: Cells) -> tuple[Cells, Cells, dict[str,
         conormals = {cell: _conormal(nodes, pairs[edge], cells[cell, :3]) for cell in cells_at_edge}
 
         def cosine(two_cells: tuple[int, int], conormals: dict[int, Array] = conormals) -> float:
+            """Return the cosine between two triangles at the edge; -1 if they lie in one plane."""
             first, second = two_cells
             return round(float(conormals[first] @ conormals[second]), COSINE_DIGITS)
 
@@ -76,7 +85,7 @@ def separate_sheets(nodes: Array, cells: Cells) -> tuple[Cells, Cells, dict[str,
         neighbours.append(flattest)
         supporting_cells[int(edge)] = flattest
         ending_cells += [(int(edge), cell) for cell in cells_at_edge if cell not in flattest]
-    vertices = np.unique(pairs[times > 2])
+    vertices = np.unique(pairs[triangle_counts > 2])
     cells, copied_nodes = _with_own_nodes(len(nodes), cells, neighbours, vertices)
     sheets = _sheet_numbers(m, neighbours)
     origin = np.append(np.arange(len(nodes)), copied_nodes)
@@ -105,7 +114,13 @@ def _conormal(nodes: Array, edge: Cells, corners: Cells) -> Array:
 
 
 def _sheet_numbers(count: int, neighbours: list[tuple[int, int]]) -> NDArray[np.int32]:
-    """Return the number of the sheet of each triangle (count,), from pairs of one sheet."""
+    """Return the number of the sheet of each triangle (count,).
+
+    Parameters
+    ----------
+    neighbours
+        Pairs of triangles that belong to one sheet.
+    """
     first, second = np.array(neighbours, dtype=np.int64).reshape(-1, 2).T
     graph = scipy.sparse.coo_array((np.ones(len(first)), (first, second)), (count, count))
     return np.asarray(connected_components(graph, directed=False)[1])
@@ -128,8 +143,8 @@ def _with_own_nodes(
     Returns
     -------
     cells
-        Triangles with new nodes, whose numbers begin at `total`, in place of some of these
-        vertices and of nodes between them.
+        Triangles in which copies replace some of the vertices, and nodes on sides between them. The
+        numbers of new nodes begin at `total`.
     copied_nodes
         The old node of each new one.
     """
@@ -157,7 +172,13 @@ def _with_own_nodes(
 def _connected_groups(
     cells: Iterable[int], neighbours: Mapping[int, set[int]]
 ) -> Iterator[set[int]]:
-    """Yield the cells in groups that are connected by neighbours among them."""
+    """Yield the cells in groups that are connected through neighbours among the cells.
+
+    Parameters
+    ----------
+    neighbours
+        Cell -> all its neighbours.
+    """
     remaining = set(cells)
     while remaining:
         group, queue = set[int](), [min(remaining)]
@@ -166,16 +187,23 @@ def _connected_groups(
             if cell in remaining:
                 remaining.discard(cell)
                 group.add(cell)
-                queue += [other for other in neighbours.get(cell, ()) if other in remaining]
+                queue += [
+                    neighbour for neighbour in neighbours.get(cell, ()) if neighbour in remaining
+                ]
         yield group
 
 
 def edges_with_new_nodes(
     edges: Mapping[str, Cells], cells: Cells, origin: Cells
 ) -> dict[str, Cells]:
-    """Return named curves (e, 2) whose sides on the border have its new nodes.
+    """Return named curves (e, 2) with the new nodes of their sides on the border.
 
-    The parameters `cells` and `origin` are results of `separate_sheets`.
+    Parameters
+    ----------
+    edges
+        Name -> (e, 2) pairs of old nodes.
+    cells, origin
+        Triangles, and the old node of each node; results of `separate_sheets`.
     """
     border = border_pairs(directed_sides(cells))
     border_sides = dict[tuple[int, ...], list[Cells]]()

@@ -113,12 +113,13 @@ class UserField:
         return replace(self, nodal=linear_map(self.nodal))
 
     def in_cells(self, source_triangles: NDArray[np.int64]) -> Array:
-        """Return the values (cells, nodes, size) in triangles.
+        """Return the values (cells, nodes, size) in triangles of a triangulation.
 
         Parameters
         ----------
         source_triangles
-            (cells, 2), see `PatchMesh.source_triangles`.
+            (cells, 2) number of each triangle in `SurfaceTriangles`, and 1 where its orientation is
+            reversed.
         """
         number, is_reversed = source_triangles.T
         values = self.nodal[number]
@@ -126,6 +127,7 @@ class UserField:
 
 
 def _digest(*arrays: NDArray[Any]) -> str:
+    """Return a hash of types, shapes and contents of arrays."""
     digest = hashlib.sha256()
     for array in arrays:
         digest.update(str((array.dtype, array.shape)).encode())
@@ -181,7 +183,7 @@ class PatchMesh:
 
     @property
     def corners(self) -> NDArray[np.int64]:
-        """(m, 3) vertices of the triangles, glued ones under one number."""
+        """Vertices (m, 3) of the triangles; glued vertices have one number."""
         corners = self.cells[:, :3]
         return corners if self.representative is None else self.representative[corners]
 
@@ -191,14 +193,14 @@ class MeshError(ValueError):
 
 
 def refuse_places(bad_places: Array, what: str, comm: "MPI.Comm") -> None:
-    """Raise where a rank has found a place at which the mesh or a field is unfit; collective.
+    """Raise an error if a rank has found a place at which the mesh or a field is unfit; collective.
 
     Parameters
     ----------
     bad_places
-        (n, 3) over R, those that this rank has found.
+        (n, 3) unfit places over R that this rank has found; perhaps none.
     what
-        What is wrong there: how the message begins.
+        Begin of the message, which says what is wrong.
 
     Raises
     ------
@@ -247,7 +249,7 @@ def on_border(edges: Mapping[str, Pairs], border: Pairs) -> dict[str, Pairs]:
 
 
 def check_orientation(patch: PatchMesh) -> None:
-    """Refuse a triangulation whose normals do not all point to one side.
+    """Check that all normals of a triangulation point to one side.
 
     Raises
     ------
@@ -288,7 +290,7 @@ class DeviatedEmbedding:
         return np.asarray(self.perfect(chart) + self.w0(chart)[:, None] * self.normal(chart))
 
     def along_normal(self, chart: Array, deviations: Sequence[Deviation]) -> Array:
-        """Return the displacement (n, 3) that other deviations add."""
+        """Return the displacement (n, 3) over R of places by deviations along the normal."""
         w0 = replace(self, deviations=tuple(deviations)).w0(chart)
         return w0[:, None] * self.normal(chart)
 

@@ -53,7 +53,7 @@ class ScatteredSpline:
     residual: float = 0.0
 
     def __call__(self, x: Array) -> Array:
-        """Return values (n,) at places (n, 3); NaN where no patch reaches."""
+        """Return values (n,) at places (n, 3); nan where no patch reaches."""
         total, weights = np.zeros(len(x)), np.zeros(len(x))
         places_of_patches = scipy.spatial.cKDTree(x).query_ball_point(self.centres, self.radii)
         for centre, radius, spline, in_patch in zip(
@@ -100,9 +100,9 @@ def fit_scattered(
 
 
 def _covering_balls(tree: "scipy.spatial.cKDTree", cover: Array) -> tuple[Array, Array]:
-    """Return centres (p, 3) and radii (p,) of balls with enough places of the tree in each.
+    """Return centres (p, 3) and radii (p,) of balls that have enough places of the tree in each.
 
-    Their inner parts hold all places of `cover` (m, 3).
+    The balls with `INNER_RADIUS` of these radii cover all places of `cover` (m, 3).
     """
     nearest, farthest = tree.query(cover, [1, min(MIN_VALUES, tree.n)])[0].T
     radii = np.maximum(farthest, HOLE_RADIUS * nearest) * (1 + RADIUS_MARGIN)
@@ -117,7 +117,10 @@ def _covering_balls(tree: "scipy.spatial.cKDTree", cover: Array) -> tuple[Array,
 
 
 def _thinned(numbers: list[int]) -> NDArray[np.int64]:
-    """Return the numbers of the values of a patch; of too many around a hole a random part."""
+    """Return the numbers of the values that a patch uses: all, or a random part.
+
+    A patch that reaches across a hole of the data has too many.
+    """
     if len(numbers) <= 2 * MIN_VALUES:
         return np.array(numbers)
     generator = np.random.default_rng(len(numbers))
@@ -126,7 +129,19 @@ def _thinned(numbers: list[int]) -> NDArray[np.int64]:
 
 @dataclass(frozen=True)
 class _PatchSpline:
-    """A sum of kernels -r^5 and of quadratic polynomials, in lengths of `scale`."""
+    """The spline of a patch: a sum of kernels -r^5 and of quadratic polynomials.
+
+    Attributes
+    ----------
+    places
+        (n, 3) places of the kernels, relative to the centre and over `scale`.
+    centre, scale
+        (3,) and number, over R.
+    axes
+        (1 to 3, 3) directions of the polynomials.
+    kernel, polynomial
+        Coefficients of kernels (n,) and polynomials.
+    """
 
     places: Array
     centre: Array
@@ -136,14 +151,25 @@ class _PatchSpline:
     polynomial: Array
 
     def __call__(self, x: Array) -> Array:
-        y = np.asarray((x - self.centre) / self.scale)
-        of_kernels = _kernel(y, self.places) @ self.kernel
-        return np.asarray(of_kernels + _quadratics(y, self.axes) @ self.polynomial)
+        """Return the values (n,) of the spline at places (n, 3) over R."""
+        scaled = np.asarray((x - self.centre) / self.scale)
+        kernel_values = _kernel(scaled, self.places) @ self.kernel
+        return np.asarray(kernel_values + _quadratics(scaled, self.axes) @ self.polynomial)
 
 
 @dataclass(frozen=True)
 class _PatchPlaces:
-    """Places of a patch in lengths of `scale`, and the axes along which they extend."""
+    """Places of the values in a patch, and the axes along which they extend.
+
+    Attributes
+    ----------
+    places
+        (n, 3) places relative to the centre and over `scale`.
+    centre, scale
+        (3,) and number, over R: the ball around the patch.
+    axes
+        (1 to 3, 3) principal directions of the places; not the normal of a flat patch.
+    """
 
     places: Array
     centre: Array
@@ -166,9 +192,9 @@ class _PatchPlaces:
 
     @cached_property
     def modes(self) -> tuple[Array, Array]:
-        """Eigenvalues (n - q,) of the kernel on the complement of the polynomials, in lengths of R.
+        """Eigenvalues (n - q,) and eigenvectors (n, n - q) of the kernel, with lengths over R.
 
-        And its eigenvectors (n, n - q).
+        They are on the complement of the polynomials.
         """
         basis = np.linalg.qr(self.polynomials, mode="complete")[0]
         complement = basis[:, self.polynomials.shape[1] :]
@@ -178,17 +204,22 @@ class _PatchPlaces:
         return sizes * self.scale**5, complement @ vectors
 
     def spline(self, values: Array, noise: float) -> _PatchSpline:
-        """Return the spline through values (n,) with noise of a standard deviation."""
+        """Return the spline through values (n,) with noise of a standard deviation.
+
+        Its lambda has the least estimated risk (Mallows); without noise it is zero, and the spline
+        interpolates.
+        """
         sizes, modes = self.modes
         components, smoothing = modes.T @ values, 0.0
         if noise:
             candidates = sizes[-1] * SMOOTHINGS
+            # part of each mode that a lambda removes
             removed = candidates[:, None] / (candidates[:, None] + sizes)
             risk = removed**2 @ components**2 - 2 * noise**2 * removed.sum(axis=1)
             smoothing = candidates[np.argmin(risk)]
         kernel = modes @ (components / (sizes + smoothing)) * self.scale**5
-        of_kernels = _kernel(self.places, self.places) @ kernel
-        remainder = values - of_kernels - smoothing / self.scale**5 * kernel
+        kernel_values = _kernel(self.places, self.places) @ kernel
+        remainder = values - kernel_values - smoothing / self.scale**5 * kernel
         quadratics = _quadratics(self.places, self.axes)
         polynomial = np.asarray(np.linalg.lstsq(quadratics, remainder, rcond=RANK_TOLERANCE)[0])
         return _PatchSpline(self.places, self.centre, self.scale, self.axes, kernel, polynomial)
@@ -198,21 +229,30 @@ def _estimated_noise(patches: Sequence[tuple[_PatchPlaces, Array]]) -> float:
     """Return the standard deviation of the noise by generalised cross-validation.
 
     One lambda for all patches has the least score.
+
+    Parameters
+    ----------
+    patches
+        Places of each patch, and its values (n,).
     """
     sizes = np.concatenate([patch.modes[0] for patch, _ in patches])
     components = np.concatenate([patch.modes[1].T @ values for patch, values in patches])
     candidates = sizes.max() * SMOOTHINGS
+    # (lambdas, modes) part of each mode that a lambda removes from the spline
     removed = candidates[:, None] / (candidates[:, None] + sizes)
+    # sum of squared residuals, and the degrees of freedom that are left to them
     squares, freedom = removed**2 @ components**2, removed.sum(axis=1)
     best = np.argmin(squares / freedom**2)
     return float(np.sqrt(squares[best] / freedom[best]))
 
 
 def _kernel(x: Array, y: Array) -> Array:
+    """Return the kernel -|x - y|^5, (n, m), for places (n, 3) and (m, 3)."""
     return -np.asarray(scipy.spatial.distance.cdist(x, y) ** 5)
 
 
 def _quadratics(y: Array, axes: Array) -> Array:
+    """Return the monomials up to degree two, (n, q), of coordinates along axes."""
     t = y @ axes.T
     products = [t[:, i] * t[:, j] for i in range(t.shape[1]) for j in range(i + 1)]
     return np.column_stack([np.ones(len(y)), t, *products])

@@ -19,7 +19,7 @@ EDGE_TOLERANCE = 1e-9  # over the radius, or the length of a strip: a point so n
 
 
 class PlaneShape(Protocol):
-    """A shape for `triangulate`."""
+    """A plane shape that `triangulate` meshes with gmsh."""
 
     @property
     def area(self) -> float:
@@ -66,13 +66,17 @@ class DiscShape:
 
     Attributes
     ----------
+    radius
+        Radius of the disc.
+    half
+        Whether the half, or a sector of it, is modelled.
     circles
         Radii of inner circles that element edges follow (rims of dimples).
-    rims
-        Other closed curves that they follow, points (n, 2) each; parts beyond the edge are left
-        out.
     edge
         Name of its outer edge.
+    rims
+        Other closed curves that elements follow, points (n, 2) each; parts beyond the edge are left
+        out.
     waves
         m of the sector of 180/m degrees that is left of a half; 1 for all of it.
     """
@@ -98,7 +102,10 @@ class DiscShape:
         return np.zeros(2), np.array([self.radius, pi / self.waves if self.half else 2 * pi])
 
     def faces(self, occ: Any) -> Faces:
+        """Make the disc with inner circles and rims, cut to the modelled part."""
+
         def disc() -> tuple[int, int]:
+            """Make a disc and return its dimension and tag."""
             return 2, occ.addDisk(0, 0, 0, self.radius, self.radius)
 
         faces = [(2, occ.addDisk(0, 0, 0, r, r)) for r in (self.radius, *self.circles)]
@@ -124,6 +131,7 @@ class DiscShape:
         return np.array([np.cos(pi / self.waves), np.sin(pi / self.waves)])
 
     def on_edges(self, x: Array) -> dict[str, NDArray[np.bool_]]:
+        """Return name of an edge -> whether points x (n, 2) lie on it, (n,)."""
         radii = np.hypot(x[:, 0], x[:, 1])
         edges = {self.edge: np.isclose(radii, self.radius, rtol=EDGE_TOLERANCE)}
         if self.half:
@@ -160,14 +168,17 @@ class StripShape:
         return low, np.array([1.0, self.width / 2])
 
     def faces(self, occ: Any) -> Faces:
+        """Make the rectangle and the faces within the rims."""
         bottom = 0 if self.half else -self.width / 2
 
         def strip() -> tuple[int, int]:
+            """Make a rectangle and return its dimension and tag."""
             return 2, occ.addRectangle(0, bottom, 0, 1, self.width / 2 - bottom)
 
         return [strip(), *faces_within(occ, self.rims, strip)]
 
     def on_edges(self, x: Array) -> dict[str, NDArray[np.bool_]]:
+        """Return name of an edge -> whether points x (n, 2) lie on it, (n,)."""
         edges = {
             "root": np.abs(x[:, 0]) < EDGE_TOLERANCE,
             "tip": np.abs(x[:, 0] - 1) < EDGE_TOLERANCE,
@@ -185,10 +196,13 @@ def faces_within(
 
     Parameters
     ----------
+    occ
+        gmsh's geometry kernel, `gmsh.model.occ`.
     curves
         Points (n, 2) of each curve.
     make_face
-        Makes the other face, each time anew.
+        Makes the other face anew at each call, since an intersection consumes it; returns its
+        dimension and tag.
     """
     faces: Faces = []
     for points in curves:

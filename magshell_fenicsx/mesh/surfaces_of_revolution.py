@@ -44,7 +44,7 @@ class Profile(Protocol):
 
 @dataclass(frozen=True)
 class StraightProfile:
-    """A straight profile from `start` to `end`: cylinder, cone, ring."""
+    """A straight profile from `start` to `end`, places (r, z): cylinder, cone, ring."""
 
     start: tuple[float, float]
     end: tuple[float, float]
@@ -54,6 +54,7 @@ class StraightProfile:
         return float(np.hypot(*np.subtract(self.end, self.start)))
 
     def __call__(self, s: Array) -> Array:
+        """Return the places (..., 2) at lengths s (...)."""
         share = np.asarray(s)[..., None] / self.length
         return np.asarray(self.start + share * np.subtract(self.end, self.start))
 
@@ -61,13 +62,22 @@ class StraightProfile:
         return np.broadcast_to(np.subtract(self.end, self.start) / self.length, (*np.shape(s), 2))
 
     def nearest_parameter(self, rz: Array) -> float:
+        """Return s of the place nearest to a point (2,), by projection."""
         tangent = np.subtract(self.end, self.start) / self.length
         return float(np.clip((rz - self.start) @ tangent, 0.0, self.length))
 
 
 @dataclass(frozen=True)
 class ArcProfile:
-    """Arc around (centre, 0) from the angle `start` to `end` (rad, from r towards z)."""
+    """Arc around (centre, 0) from the angle `start` to `end` (rad, from r towards z).
+
+    Attributes
+    ----------
+    radius
+        Radius of the arc.
+    centre
+        r of its centre, as of a torus.
+    """
 
     radius: float
     start: float
@@ -79,6 +89,7 @@ class ArcProfile:
         return self.radius * (self.end - self.start)
 
     def __call__(self, s: Array) -> Array:
+        """Return the places (..., 2) at lengths s (...)."""
         angle = self.start + np.asarray(s) / self.radius
         return self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1) + [self.centre, 0.0]
 
@@ -87,6 +98,7 @@ class ArcProfile:
         return np.stack([-np.sin(angle), np.cos(angle)], axis=-1)
 
     def nearest_parameter(self, rz: Array) -> float:
+        """Return s of the place nearest to a point (2,), by its angle around the centre."""
         angle = np.arctan2(rz[1], rz[0] - self.centre) - self.start
         missing_angle = 2 * np.pi - (self.end - self.start)
         # a point beyond the arc belongs to the nearer end
@@ -95,19 +107,28 @@ class ArcProfile:
 
 
 class SplineProfile:
-    """A smooth profile through points (n, 2), over its arc length."""
+    """A smooth profile through points (n, 2), over its arc length.
+
+    Attributes
+    ----------
+    length
+        Length of the curve.
+    """
 
     def __init__(self, points: Array) -> None:
+        """Interpolate points (n, 2), and iterate until the parameter is the arc length."""
         steps = np.hypot(*np.diff(points, axis=0).T)
         for _ in range(ITERATIONS):  # from chords to arcs
             knots = np.concatenate([[0.0], np.cumsum(steps)])
             self._curve = scipy.interpolate.CubicSpline(knots, points)
+            # lengths of the parts by Gauss quadrature of the speed
             x, w = np.polynomial.legendre.leggauss(GAUSS_POINTS)
             s = knots[:-1, None] + np.diff(knots)[:, None] * (x + 1) / 2
             steps = np.diff(knots) / 2 * (np.linalg.norm(self._curve(s, 1), axis=2) @ w)
         self.length = float(knots[-1])
 
     def __call__(self, s: Array) -> Array:
+        """Return the places (..., 2) at lengths s (...)."""
         return np.asarray(self._curve(s))
 
     def tangent(self, s: Array) -> Array:
@@ -115,27 +136,35 @@ class SplineProfile:
         return np.asarray(derivative / np.linalg.norm(derivative, axis=-1)[..., None])
 
     def nearest_parameter(self, rz: Array) -> float:
+        """Return s of the place nearest to a point (2,): a sample, refined by minimisation."""
         samples = np.linspace(0, self.length, NEAREST_SAMPLES, dtype=np.float64)
         nearest = int(np.argmin(np.linalg.norm(self(samples) - rz, axis=1)))
-        bounds = samples[max(nearest - 1, 0)], samples[min(nearest + 1, NEAREST_SAMPLES - 1)]
+        neighbours = samples[max(nearest - 1, 0)], samples[min(nearest + 1, NEAREST_SAMPLES - 1)]
         minimum = scipy.optimize.minimize_scalar(
             lambda s: np.sum((self(s) - rz) ** 2),
-            bounds=bounds,
+            bounds=neighbours,
             method="bounded",
             options={"xatol": PARAMETER_TOLERANCE},
         )
-        candidates = [float(minimum.x), *(float(s) for s in bounds)]
+        candidates = [float(minimum.x), *(float(s) for s in neighbours)]
         return min(candidates, key=lambda s: float(np.sum((self(np.array(s)) - rz) ** 2)))
 
 
 @dataclass(frozen=True)
 class RevolvedEmbedding:
-    """Embedding of the chart (rho theta, s) into space."""
+    """Embedding of the chart (rho theta, s) into space.
+
+    Attributes
+    ----------
+    rho
+        Radius by which the azimuth theta is multiplied in the chart.
+    """
 
     profile: Profile
     rho: float
 
     def __call__(self, chart: Array) -> Array:
+        """Return the places (n, 3) of the chart (n, 2)."""
         theta, (r, z) = chart[:, 0] / self.rho, self.profile(chart[:, 1]).T
         return np.column_stack([r * np.cos(theta), r * np.sin(theta), z])
 
@@ -145,10 +174,13 @@ class RevolvedEmbedding:
         return np.column_stack([along_z * np.cos(theta), along_z * np.sin(theta), -along_r])
 
     def inverse(self, x: Array, first_azimuth: float) -> Array:
-        """Return the chart (2,) of a point (3,), theta in [first, first + 2 pi)."""
+        """Return the chart coordinates (2,) of a point (3,).
+
+        The azimuth theta is in [first_azimuth, first_azimuth + 2 pi).
+        """
         theta = np.arctan2(x[1], x[0])
-        on_first_rank = (theta - first_azimuth + AZIMUTH_TOLERANCE) % (2 * np.pi)
-        theta = first_azimuth + on_first_rank - AZIMUTH_TOLERANCE
+        from_first_azimuth = (theta - first_azimuth + AZIMUTH_TOLERANCE) % (2 * np.pi)
+        theta = first_azimuth + from_first_azimuth - AZIMUTH_TOLERANCE
         s = self.profile.nearest_parameter(np.array([np.hypot(x[0], x[1]), x[2]]))
         return np.array([theta * self.rho, s])
 
@@ -163,6 +195,7 @@ class CappedEmbedding:
     profile: Profile
 
     def __call__(self, chart: Array) -> Array:
+        """Return the places (n, 3) of the chart (n, 2)."""
         t = np.hypot(chart[:, 0], chart[:, 1])
         r, z = self.profile(self.profile.length - t).T
         return np.column_stack([r[:, None] * _direction(chart, t), z])
@@ -174,12 +207,14 @@ class CappedEmbedding:
         return np.column_stack([along_z[:, None] * _direction(chart, t), -along_r])
 
     def from_pole(self, places: Array) -> Array:
-        """Return the length (n,) of the meridian from the pole to places (n, 3) of the surface."""
-        rz = np.column_stack([np.hypot(places[:, 0], places[:, 1]), places[:, 2]])
+        """Return the lengths (n,) of the meridian from the pole to places (n, 3) of the surface."""
+        meridian_places = np.column_stack([np.hypot(places[:, 0], places[:, 1]), places[:, 2]])
         samples = np.linspace(0, self.profile.length, POLE_SAMPLES, dtype=np.float64)
-        s = samples[scipy.spatial.cKDTree(self.profile(samples)).query(rz)[1]]
+        s = samples[scipy.spatial.cKDTree(self.profile(samples)).query(meridian_places)[1]]
         for _ in range(ITERATIONS):  # Newton's method, whose residual vanishes on the surface
-            correction = np.sum((rz - self.profile(s)) * self.profile.tangent(s), axis=1)
+            correction = np.sum(
+                (meridian_places - self.profile(s)) * self.profile.tangent(s), axis=1
+            )
             s = np.clip(s + correction, 0, self.profile.length)
         return np.asarray(self.profile.length - s)
 

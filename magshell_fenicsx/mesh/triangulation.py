@@ -35,6 +35,8 @@ def triangulate(
 ) -> PatchMesh:
     """Triangulate a shape with gmsh; call it on one rank only.
 
+    The size is halved, and the shape meshed again, where cubic triangles are overturned.
+
     Parameters
     ----------
     size
@@ -42,7 +44,7 @@ def triangulate(
     points
         Named points (2,) that must be vertices.
     embedding
-        From the plane to the mid-surface.
+        Map from the plane to the mid-surface.
 
     Raises
     ------
@@ -51,15 +53,15 @@ def triangulate(
     """
     for attempt in range(MAX_ATTEMPTS):
         nodes, cells, lines = _gmsh_mesh(shape, size, points)
-        overturned = _overturned_corners(nodes[cells])
-        if not len(overturned):
+        overturned_corners = _overturned_corners(nodes[cells])
+        if not len(overturned_corners):
             break
-        size = _halved_at(size, overturned)
+        size = _halved_at(size, overturned_corners)
         if attempt == WIDENING_ATTEMPT:  # curves that touch leave cusps: they shall overlap
             rims = tuple(x + WIDENING * (x - x.mean(axis=0)) for x in shape.rims)
             shape = replace(shape, rims=rims)  # type: ignore[type-var]
     else:
-        place = place_text(embedding(overturned[:1])[0])
+        place = place_text(embedding(overturned_corners[:1])[0])
         raise MeshError(
             f"gmsh leaves an element without area around {place}, over R: rims of "
             "dimples nearly touch, or a rim nearly touches an edge; move one of them a little, "
@@ -82,7 +84,13 @@ def triangulate(
 def _gmsh_mesh(
     shape: PlaneShape, size: Size, points: Mapping[str, Array]
 ) -> tuple[Array, Numbers, Numbers]:
-    """Return nodes (n, 2), cubic triangles (m, 10) and vertices of lines (k, 2)."""
+    """Return nodes (n, 2), cubic triangles (m, 10) and vertices of border lines (k, 2) by gmsh.
+
+    Raises
+    ------
+    MeshError
+        If gmsh cannot mesh the shape.
+    """
     gmsh = import_gmsh()
 
     # ~/.gmshrc may change meshes, and run commands
@@ -129,7 +137,10 @@ def _halved_at(size: Size, places: Array) -> Size:
 
 
 def _with_images(shape: PlaneShape, points: Mapping[str, Array]) -> list[Array]:
-    """Return the points, each once, and on glued sides their images on the other side."""
+    """Return the places (2,) of the points, each once.
+
+    Points on a glued side have images on the opposite side.
+    """
     places = list(points.values())
     for axis, low, high in shape.glued:
         for side, opposite in ((low, high), (high, low)):
@@ -141,9 +152,16 @@ def _with_images(shape: PlaneShape, points: Mapping[str, Array]) -> list[Array]:
 
 
 def _make_periodic(model: Any, axis: int, low: float, high: float) -> None:
-    """Give the curves of two opposite sides the same nodes."""
+    """Give the curves of two opposite sides the same nodes.
+
+    Parameters
+    ----------
+    axis, low, high
+        Axis (0 or 1), and the coordinates across it of both sides.
+    """
 
     def curves_at(coordinate: float) -> list[tuple[float, int]]:
+        """Return middle and tag of the curves at a coordinate, sorted along the side."""
         curves = []
         for _, tag in model.getEntities(1):
             box = np.reshape(model.getBoundingBox(1, tag), (2, 3))
@@ -160,7 +178,13 @@ def _make_periodic(model: Any, axis: int, low: float, high: float) -> None:
 
 
 def _glued_nodes(shape: PlaneShape, nodes: Array) -> NDArray[np.int64]:
-    """Return for each node (n,) the node that it is glued to, or itself."""
+    """Return for each node (n,) the node that it is glued to, or itself.
+
+    Raises
+    ------
+    MeshError
+        If the nodes of two glued sides differ.
+    """
     representative = np.arange(len(nodes))
     for axis, low, high in shape.glued:
         first, second = (
@@ -177,9 +201,13 @@ def _glued_nodes(shape: PlaneShape, nodes: Array) -> NDArray[np.int64]:
 
 
 def _overturned_corners(nodes: Array) -> Array:
-    """Return the corners (k, 2) at which cubic triangles (m, 10, 2) are overturned."""
+    """Return the corners (k, 2) at which cubic triangles (m, 10, 2) are overturned.
+
+    There the tangents of both sides have a determinant that is not positive.
+    """
     x = nodes.transpose(1, 0, 2)
     sides = ((0, 3, 4, 1), (1, 5, 6, 2), (2, 7, 8, 0))  # nodes along each, in its direction
+    # derivatives of the cubic through four equispaced nodes, at its ends
     tangents_at_start = [-5.5 * x[a] + 9 * x[p] - 4.5 * x[q] + x[b] for a, p, q, b in sides]
     tangents_at_end = [-x[a] + 4.5 * x[p] - 9 * x[q] + 5.5 * x[b] for a, p, q, b in sides]
     corners = list[Array]()

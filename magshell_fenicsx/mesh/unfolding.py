@@ -25,7 +25,9 @@ MIRRORED_NODES = {
 
 
 class ChartUnfolding:
-    """Copies of a sector side by side in a chart.
+    """Copies of a sector side by side in a chart, which together are a half.
+
+    Copy 0 is the sector; copies with odd numbers are mirror images.
 
     Attributes
     ----------
@@ -48,10 +50,11 @@ class ChartUnfolding:
     """
 
     def __init__(self, angle: float, count: int, patch: PatchMesh) -> None:
+        """Find out by the embedding whether the chart turns with the surface, as a disc does."""
         self.count, self._angle = count, angle
         places, Q = patch.embedding(patch.nodes), rotation(-angle)
-        of_rotated_chart = patch.embedding(patch.nodes @ Q[:2, :2].T)
-        error = np.abs(of_rotated_chart - places @ Q.T).max()
+        rotated_chart_places = patch.embedding(patch.nodes @ Q[:2, :2].T)
+        error = np.abs(rotated_chart_places - places @ Q.T).max()
         self.round = bool(error < SAME_NODE_TOLERANCE * np.abs(places).max())
         self.end = angle if self.round else float(patch.nodes[:, 0].max())
 
@@ -63,7 +66,10 @@ class ChartUnfolding:
         return np.column_stack([x, chart[:, 1]])
 
     def turn(self, k: int) -> Array:
-        """Return the matrix (3, 3) that takes vectors of the sector to copy k."""
+        """Return the matrix (3, 3) that takes vectors of the sector to copy k.
+
+        Copies with odd numbers are mirror images.
+        """
         if k % 2:
             return np.asarray(rotation(-(k + 1) * self._angle) @ np.diag([1.0, -1.0, 1.0]))
         return rotation(-k * self._angle)
@@ -79,25 +85,26 @@ class ChartUnfolding:
         return of_sector
 
     def key(self, nodes: Array) -> Array:
-        """Return numbers (n, d) that are equal for nodes that are one: their places."""
+        """Return rows (n, d) that are equal for nodes that are the same: their places."""
         return nodes
 
     def to_sector(self, chart: Array) -> Array:
-        """Return the places (n, 2) of the sector whose copies these are."""
+        """Return the places (n, 2) of the sector whose copies are the places of the half."""
         places, copies = np.empty_like(chart), self.copies(chart)
         for k in range(self.count):
-            of_copy = copies == k
+            in_copy = copies == k
             if self.round:
-                places[of_copy] = chart[of_copy] @ self.turn(k)[:2, :2]
+                places[in_copy] = chart[in_copy] @ self.turn(k)[:2, :2]
             else:
-                x = chart[of_copy, 0]
-                places[of_copy, 0] = (k + 1) * self.end - x if k % 2 else x - k * self.end
-                places[of_copy, 1] = chart[of_copy, 1]
+                # copies with odd numbers run backwards
+                x = chart[in_copy, 0]
+                places[in_copy, 0] = (k + 1) * self.end - x if k % 2 else x - k * self.end
+                places[in_copy, 1] = chart[in_copy, 1]
         return places
 
 
 class SpaceUnfolding:
-    """Copies of a sector side by side in space: of a mesh file, or of several shells.
+    """Copies of a sector side by side in space, for a mesh file or several shells.
 
     The methods are those of `ChartUnfolding`. Copies of several shells do not share nodes: a node
     has the number of its copy, and `CopiesEmbedding` places it.
@@ -108,7 +115,10 @@ class SpaceUnfolding:
         self._several_shells = hasattr(patch.embedding, "has_charts")
 
     def image(self, nodes: Array, k: int) -> Array:
-        """Return nodes (n, d) in copy k; those of several shells get k as their last but one."""
+        """Return the nodes in copy k, from nodes (n, d) of the sector.
+
+        Nodes of several shells get a further number before their last: k.
+        """
         images = nodes.copy()
         # nodes are places, of a mesh file perhaps with normals
         vector_count = 1 if self._several_shells else nodes.shape[1] // 3
@@ -117,7 +127,10 @@ class SpaceUnfolding:
         return np.insert(images, -1, k, axis=1) if self._several_shells else images
 
     def turn(self, k: int) -> Array:
-        """Return the matrix (3, 3) that takes vectors of the sector to copy k."""
+        """Return the matrix (3, 3) that takes vectors of the sector to copy k.
+
+        Copies with odd numbers are mirror images.
+        """
         to_azimuth_zero = rotation(self._sector.azimuth)
         angle = self._sector.angle
         Q = rotation(-(k + k % 2) * angle)
@@ -134,7 +147,7 @@ class SpaceUnfolding:
         )
 
     def to_sector(self, x: Array) -> Array:
-        """Return the places (n, 3) of the sector whose copies these are."""
+        """Return the places (n, 3) of the sector whose copies are the places of the half."""
         turns = np.array([self.turn(k) for k in range(self.count)])[self.copies(x)]
         return np.asarray(np.einsum("ni,nij->nj", x, turns))
 
@@ -145,13 +158,13 @@ class SpaceUnfolding:
         return CopiesEmbedding(of_sector, tuple(self.turn(k) for k in range(self.count)))
 
     def key(self, nodes: Array) -> Array:
-        """Return numbers that are equal for nodes that are one: the place, and the shell."""
+        """Return rows that are equal for nodes that are the same: the place, and the shell."""
         return nodes[:, [0, 1, 2, -1]] if self._several_shells else nodes
 
 
 @dataclass(frozen=True)
 class CopiesEmbedding:
-    """Map of nodes of copies of several shells to places (n, 3).
+    """Map of nodes (n, d) of copies of several shells to places (n, 3).
 
     Attributes
     ----------
@@ -170,6 +183,7 @@ class CopiesEmbedding:
         return bool(getattr(self.of_sector, "has_charts", False))
 
     def __call__(self, nodes: Array) -> Array:
+        """Return the places of nodes, whose last number but one is that of the copy."""
         turns = np.array(self.turns)[np.rint(nodes[:, -2]).astype(int)]
         places_in_sector = self.of_sector(np.delete(nodes, -2, axis=1))
         return np.asarray(np.einsum("nij,nj->ni", turns, places_in_sector))
@@ -191,49 +205,54 @@ def unfold(
     ----------
     patch
         The triangulation of the sector.
+    unfolding
+        The copies of the sector.
     end_names
         Names of the edges where the first copy begins and the last one ends; equal names make one
         edge of both.
     """
     n, count = len(patch.nodes), unfolding.count
     nodes = np.concatenate([unfolding.image(patch.nodes, k) for k in range(count)])
-    mirrored = MIRRORED_NODES[patch.cells.shape[1]]
+    mirrored_order = MIRRORED_NODES[patch.cells.shape[1]]
     cells = np.concatenate(
-        [k * n + (patch.cells[:, mirrored] if k % 2 else patch.cells) for k in range(count)]
+        [k * n + (patch.cells[:, mirrored_order] if k % 2 else patch.cells) for k in range(count)]
     )
     keys = unfolding.key(nodes)
     distance = SAME_NODE_TOLERANCE * np.ptp(keys, axis=0).max()
-    near_nodes = scipy.spatial.cKDTree(keys).query_ball_point(keys, distance)
-    first_of_same = np.array([min(numbers) for numbers in near_nodes])
+    nodes_at_place = scipy.spatial.cKDTree(keys).query_ball_point(keys, distance)
+    # for each node the first node at its place
+    first_of_same = np.array([min(numbers) for numbers in nodes_at_place])
     glued_to = np.arange(n) if patch.representative is None else patch.representative
     representative = first_of_same[np.concatenate([k * n + glued_to for k in range(count)])]
     # copies of several shells keep their nodes, and vertices are glued
-    keeps_nodes = keys is not nodes
+    has_own_nodes = keys is not nodes
     used, numbers = np.unique(
-        np.arange(len(nodes)) if keeps_nodes else first_of_same, return_inverse=True
+        np.arange(len(nodes)) if has_own_nodes else first_of_same, return_inverse=True
     )
     new_number = np.full(len(nodes), -1, dtype=np.int64)
     new_number[used] = np.arange(len(used))
 
     def edge_of_copies(name: str, copies: Sequence[int]) -> NDArray[np.int64]:
+        """Return the vertex pairs of an edge of the sector in some copies."""
         return np.concatenate(
             [new_number[representative[k * n + patch.edges[name]]] for k in copies]
         )
 
-    last = count - 1
+    last_copy = count - 1
     edges = {
         name: edge_of_copies(name, range(count))
         for name in patch.edges
         if name not in (SYMMETRY_EDGE, SECOND_SYMMETRY_EDGE)
     }
     first_end = edge_of_copies(SYMMETRY_EDGE, [0])
-    last_end = edge_of_copies(SYMMETRY_EDGE if last % 2 else SECOND_SYMMETRY_EDGE, [last])
+    # an odd copy is a mirror image, and ends where the sector begins
+    last_end = edge_of_copies(SYMMETRY_EDGE if last_copy % 2 else SECOND_SYMMETRY_EDGE, [last_copy])
     if end_names == (SYMMETRY_EDGE, SYMMETRY_EDGE):
         edges[SYMMETRY_EDGE] = np.concatenate([first_end, last_end])
     else:
         edges |= dict(zip(end_names, (first_end, last_end), strict=True))
-    is_glued = keeps_nodes or patch.representative is not None
-    source = patch.source_triangles
+    is_glued = has_own_nodes or patch.representative is not None
+    source_triangles = patch.source_triangles
     return replace(
         patch,
         nodes=nodes[used],
@@ -243,7 +262,9 @@ def unfold(
         points={name: unfolding.image(x[None], 0)[0] for name, x in patch.points.items()},
         representative=new_number[representative[used]] if is_glued else None,
         patches={name: np.tile(mask, count) for name, mask in patch.patches.items()},
-        source_triangles=None if source is None else np.tile(source, (count, 1)),
+        source_triangles=None
+        if source_triangles is None
+        else np.tile(source_triangles, (count, 1)),
         joints=tuple(
             masks and (np.tile(masks[0], count), np.tile(masks[1], count)) for masks in patch.joints
         ),

@@ -41,6 +41,7 @@ class UserMesh:
     """
 
     def __init__(self, domain: mesh.Mesh) -> None:
+        """Check the mesh, and number its cells in the order of their making; collective."""
         self.mesh, self.comm = domain, domain.comm
         cell_type, dimension = domain.topology.cell_name(), domain.geometry.dim
         if cell_type != "triangle":
@@ -66,7 +67,9 @@ class UserMesh:
         facet_tags: mesh.MeshTags | None = None,
         cell_tags: mesh.MeshTags | None = None,
     ) -> SurfaceTriangles:
-        """Return the triangles of all ranks with named edges and patches.
+        """Return the triangles of all ranks with named edges and patches; collective.
+
+        Nodes are numbered in the order in which the cells name them, whatever the number of ranks.
 
         Parameters
         ----------
@@ -102,7 +105,12 @@ class UserMesh:
         )
 
     def field(self, function: fem.Function, name: str) -> UserField:
-        """Return a function on this mesh as a field, a polynomial in each triangle.
+        """Return a function on this mesh as a field, a polynomial in each triangle; collective.
+
+        Parameters
+        ----------
+        name
+            Name of the field in messages.
 
         Raises
         ------
@@ -120,6 +128,7 @@ class UserMesh:
             )
         element = V.element.basix_element
         nodes = lagrange_element(element.degree)
+        # from nodal values of the function to those of the field
         table = element.tabulate(0, nodes.points)[0, :, :, 0]
         values = function.x.array.reshape(-1, V.dofmap.bs)[V.dofmap.list[: self._owned]]
         nodal = self._gather_cells(np.matmul(table, np.asarray(values, dtype=float)))
@@ -130,7 +139,7 @@ class UserMesh:
     def displacement(
         self, u: fem.Function, source_triangles: Numbers, scale: float
     ) -> fem.Function:
-        """Return a field of a scene as a function on this mesh.
+        """Return a field of a scene as a function on this mesh; collective.
 
         Parameters
         ----------
@@ -140,14 +149,14 @@ class UserMesh:
             (cells, 2) of the scene's cells, ghosts perhaps included, see
             `PatchMesh.source_triangles`.
         scale
-            What the values are divided by.
+            Divisor of the values.
         """
         V = u.function_space
         degree, owned = V.element.basix_element.degree, V.mesh.topology.index_map(2).size_local
         nodal = u.x.array.reshape(-1, 3)[V.dofmap.list[:owned]] / scale
         number, is_reversed = source_triangles[:owned].T
-        of_reversed = nodal[:, swapped_nodes(V.element.basix_element)]
-        nodal = np.where(is_reversed[:, None, None] == 1, of_reversed, nodal)
+        nodal_of_reversed = nodal[:, swapped_nodes(V.element.basix_element)]
+        nodal = np.where(is_reversed[:, None, None] == 1, nodal_of_reversed, nodal)
         cell_count = self.mesh.topology.index_map(2).size_global
         nodal_of_all = np.zeros((cell_count, *nodal.shape[1:]))
         for numbers, values in self.comm.allgather((number, nodal)):
@@ -159,44 +168,62 @@ class UserMesh:
         return displacement
 
     def _original_numbers(self, cell_map: Any) -> Numbers:
-        """Return the number of each local cell, ghosts included, in the order of their making."""
+        """Return the number of each local cell, ghosts included, in the order of their making.
+
+        For a part of another mesh, which has no such order, it is dolfinx's global number.
+        """
         local_count = cell_map.size_local + cell_map.num_ghosts
-        original = compat.original_cells(self.mesh)[:local_count]
-        of_all_ranks = np.concatenate(self.comm.allgather(original[: self._owned]))
-        has_all = len(of_all_ranks) == cell_map.size_global
-        if has_all and (np.sort(of_all_ranks) == np.arange(cell_map.size_global)).all():
-            return original
+        original_numbers = compat.original_cells(self.mesh)[:local_count]
+        numbers_of_all_ranks = np.concatenate(self.comm.allgather(original_numbers[: self._owned]))
+        has_all = len(numbers_of_all_ranks) == cell_map.size_global
+        if has_all and (np.sort(numbers_of_all_ranks) == np.arange(cell_map.size_global)).all():
+            return original_numbers
         # the mesh is a part of another one
         return np.asarray(cell_map.local_to_global(np.arange(local_count, dtype=np.int32)))
 
     def _gather_cells(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return values of this rank's own cells for the cells of all ranks, in their order."""
-        parts = self.comm.allgather((self._numbers[: self._owned], values))
-        numbers, all_values = (np.concatenate(arrays) for arrays in zip(*parts, strict=True))
+        """Return values of the cells of all ranks, in the order of the cells' numbers; collective.
+
+        Parameters
+        ----------
+        values
+            (owned cells, ...) values of this rank's own cells.
+        """
+        numbers_and_values = self.comm.allgather((self._numbers[: self._owned], values))
+        numbers, all_values = (
+            np.concatenate(arrays) for arrays in zip(*numbers_and_values, strict=True)
+        )
         return np.asarray(all_values[np.argsort(numbers)])
 
     def _nodes_of_owned_cells(self) -> tuple[Array, Numbers]:
-        """Return coordinates (cells, nodes, 3) and global numbers of nodes, in gmsh's order.
+        """Return places (cells, nodes, 3) and global numbers of nodes of this rank's cells.
 
-        They are of this rank's own cells.
+        The nodes of a cell are equispaced and in gmsh's order.
         """
         geometry, dofs = self.mesh.geometry, compat.geometry_dofs(self.mesh)[: self._owned]
-        x = geometry.x[dofs]
+        places = geometry.x[dofs]
         if self._element.lagrange_variant != basix.LagrangeVariant.equispaced:
             degree = self._element.degree
             equispaced = basix.create_element(
                 basix.ElementFamily.P, TRIANGLE, degree, basix.LagrangeVariant.equispaced
             )
-            x = np.matmul(self._element.tabulate(0, equispaced.points)[0, :, :, 0], x)
-        ids = geometry.index_map().local_to_global(dofs.ravel().astype(np.int32))
-        ids = ids.reshape(dofs.shape)
+            places = np.matmul(self._element.tabulate(0, equispaced.points)[0, :, :, 0], places)
+        node_numbers = geometry.index_map().local_to_global(dofs.ravel().astype(np.int32))
+        node_numbers = node_numbers.reshape(dofs.shape)
         order = np.argsort(perm_gmsh(mesh.CellType.triangle, dofs.shape[1]))
-        return np.asarray(x[:, order]), np.asarray(ids[:, order])
+        return np.asarray(places[:, order]), np.asarray(node_numbers[:, order])
 
     def _entities_of_part(
         self, key: str, part: MeshPart, tags: mesh.MeshTags | None, dimension: int
     ) -> NDArray[np.int32]:
-        """Return local facets or cells.
+        """Return the local facets (dimension 1) or cells (dimension 2) of a named part; collective.
+
+        Parameters
+        ----------
+        key
+            Key with which messages begin.
+        part
+            A value of the tags, or local numbers.
 
         Raises
         ------
@@ -232,7 +259,7 @@ class UserMesh:
         return entities
 
     def _error_of_numbers(self, numbers: NDArray[Any], dimension: int, entities_name: str) -> str:
-        """Return what is wrong with local numbers of facets or cells; empty if nothing is."""
+        """Return what is wrong with local numbers of facets or cells; "" if they are right."""
         self.mesh.topology.create_entities(dimension)
         entities = self.mesh.topology.index_map(dimension)
         count = entities.size_local + entities.num_ghosts
@@ -241,13 +268,13 @@ class UserMesh:
             return (
                 f"is neither a value of tags nor a list of local numbers of {entities_name}{hint}"
             )
-        unknown = numbers[(numbers < 0) | (numbers >= count)]
-        if not len(unknown):
+        numbers_outside = numbers[(numbers < 0) | (numbers >= count)]
+        if not len(numbers_outside):
             return ""
-        return f"{unknown[0]}: this process has {entities_name} 0 to {count - 1}"
+        return f"{numbers_outside[0]}: this process has {entities_name} 0 to {count - 1}"
 
     def _vertex_pairs(self, facets: NDArray[np.int32]) -> Pairs:
-        """Return global numbers (e, 2) of the vertices of facets of all ranks."""
+        """Return global vertex numbers (e, 2) of facets of all ranks, each once; collective."""
         topology = self.mesh.topology
         for dimensions in ((1, 2), (1, 0), (2, 1)):
             topology.create_connectivity(*dimensions)
@@ -263,7 +290,7 @@ class UserMesh:
         return np.asarray(np.unique(np.sort(pairs, axis=1), axis=0))
 
     def _cell_mask(self, local_cells: NDArray[np.int32], count: int) -> NDArray[np.bool_]:
-        """Return whether each cell of all ranks is among local ones of any rank, (count,)."""
+        """Return whether each cell (count,) is in the list of any rank; collective."""
         mask = np.zeros(count, dtype=bool)
         for numbers in self.comm.allgather(self._numbers[local_cells]):
             mask[numbers] = True

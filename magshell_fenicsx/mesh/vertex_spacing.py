@@ -31,10 +31,12 @@ MAX_FLATNESS_OF_ANY_PENALTY = 400.0
 def grouped_by_distance(
     coordinates: Array, size: Callable[[float], float], rounding: float
 ) -> list[Array]:
-    """Return groups of sorted coordinates (n,), each of which has one grid line.
+    """Return groups of coordinates, sorted, each of which has one grid line.
 
     Parameters
     ----------
+    coordinates
+        (n,) in any order.
     size
         Coordinate -> element size there.
     rounding
@@ -59,9 +61,18 @@ def grouped_by_distance(
 def line_coordinates(
     coordinates: Array, size: Callable[[float], float], ends: tuple[float, float]
 ) -> list[float]:
-    """Return one coordinate for each group of near ones between two ends, and near neither."""
+    """Return one coordinate for each group of near coordinates between two ends.
+
+    Coordinates near an end are left out.
+
+    Parameters
+    ----------
+    size
+        Coordinate -> element size there.
+    """
 
     def is_inside(x: float) -> bool:
+        """Return whether a coordinate is so far from both ends that it has a line of its own."""
         distance_to_end = min(x - ends[0], ends[1] - x)
         return distance_to_end > max(SAME_PLACE_TOLERANCE, MIN_VERTEX_DISTANCE * size(x))
 
@@ -71,7 +82,7 @@ def line_coordinates(
 
 
 def _narrow_parts(group: Array, max_width: float) -> list[Array]:
-    """Return a group of sorted coordinates (n,), or halves of halves of it that are narrower."""
+    """Return a group of sorted coordinates (n,), halved until no part is wider than `max_width`."""
     if np.ptp(group) <= max_width:
         return [group]
     lower = group < (group[0] + group[-1]) / 2
@@ -79,7 +90,7 @@ def _narrow_parts(group: Array, max_width: float) -> list[Array]:
 
 
 def distinguishable_texts(a: Array, b: Array) -> tuple[str, str]:
-    """Return the coordinates (n,) of two places, with as many digits as show where they differ."""
+    """Return the coordinates (n,) of two places as texts, with digits that show the difference."""
     for digits in range(MIN_DIGITS, MAX_DIGITS + 1):
         texts = [[f"{c + 0.0:.{digits}g}" for c in place] for place in (a, b)]
         difference = np.array(texts[1], dtype=np.float64) - np.array(texts[0], dtype=np.float64)
@@ -92,8 +103,8 @@ def distinguishable_texts(a: Array, b: Array) -> tuple[str, str]:
 def flatness(patch: PatchMesh) -> Array:
     """Return for each triangle (m,) how high its neighbours are over its own heights.
 
-    The sum over its sides of (h + h') / (4 h), with the heights h and h' of the triangle and of its
-    neighbour over the side. Equal triangles have 1.5.
+    It is the sum over the sides of (h + h') / (4 h), with the heights h and h' over the side of the
+    triangle and of its neighbour. Equal triangles have 1.5.
     """
     corners = patch.embedding(patch.nodes)[patch.cells[:, :3]]
     sides = corners[:, [1, 2, 0]] - corners
@@ -104,6 +115,7 @@ def flatness(patch: PatchMesh) -> Array:
             np.sort(directed_sides(patch.corners), axis=1), axis=0, return_inverse=True
         )
         edge = edge.ravel()
+        # of both triangles at each side, in the order of `directed_sides`
         sum_of_heights = np.bincount(edge, weights=heights)[edge]
         has_neighbour = np.bincount(edge)[edge] > 1
         ratios = np.where(has_neighbour, sum_of_heights / (4 * heights), 0.0)
@@ -113,7 +125,7 @@ def flatness(patch: PatchMesh) -> Array:
 def flat_triangle(
     patch: PatchMesh, penalty: float, default: float, length: float, unit: str
 ) -> str:
-    """Return where a triangle is too flat for the penalty, and what helps; empty if none is.
+    """Return a message about a triangle too flat for the penalty; "" if there is none.
 
     Parameters
     ----------
@@ -122,7 +134,7 @@ def flat_triangle(
     length
         R in the coordinates of the message.
     unit
-        What the coordinates are in, such as "over R".
+        Unit of the coordinates in the message, such as "over R".
     """
     ratios = flatness(patch)
     flattest = int(ratios.argmax())
@@ -155,9 +167,14 @@ def _penalty_hint(triangle_flatness: float, default: float) -> str:
 
 
 def refuse_flat(patch: PatchMesh, default: float, length: float, unit: str, key: str) -> None:
-    """Refuse a triangulation with a triangle so flat that no penalty helps.
+    """Check that no triangle is so flat that no penalty helps.
 
-    The parameters are those of `flat_triangle`; `key` begins the message.
+    Parameters
+    ----------
+    default, length, unit
+        See `flat_triangle`.
+    key
+        Key with which the message begins.
 
     Raises
     ------

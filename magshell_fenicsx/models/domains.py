@@ -1,8 +1,7 @@
 """Integration domains of a shell: its mid-surface, or the meridian of what is closed around e3.
 
 A domain gives the jets of fields, the measures of cells, of the edges between them and of the
-boundary's edges, and how wide the cells are there. Whoever writes an energy writes its density
-alone.
+boundary's edges, and the width of cells there. So an energy is written as its density alone.
 
 On a surface of revolution the coordinates are (s, theta), s the meridian's parameter; jets are
 those at theta = 0. Their components are along (e_rho, e_theta, e_z), which turn with theta: e_rho'
@@ -32,12 +31,15 @@ Facets = NDArray[np.int32]
 
 
 def revolved_jet(f: Expr) -> Jet:
-    """Jet of the axisymmetric field f = (U, W), U e_rho + W e_z."""
+    """Return the jet of the axisymmetric field U e_rho + W e_z, with f = (U, W) on the meridian."""
     return revolved_jet_of(_derivatives(f, 2))
 
 
 def revolved_jet_of(derivatives: Sequence[Sequence[Expr]]) -> Jet:
-    """Jet of the axisymmetric field f, from the components of f, f' and f''."""
+    """Return the jet of an axisymmetric field f = (U, W), see `revolved_jet`.
+
+    `derivatives` are the components of f, f' and f'', derivatives by s.
+    """
     (U, W), (Us, Ws), (Uss, Wss) = derivatives
     return Jet(
         r=_vector(U, 0, W),
@@ -50,10 +52,10 @@ def revolved_jet_of(derivatives: Sequence[Sequence[Expr]]) -> Jet:
 
 
 def wave_jets(f: Expr, m: Expr) -> tuple[Jet, Jet]:
-    """Jets of v = U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z.
+    """Return jets of v = U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z.
 
-    The unknowns are f = (P, V, W) with P = U + V: on the axis P = 0 for m = 1 (a
-    translation has U = -V there), and for every other m all three vanish.
+    The unknowns are f = (P, V, W) with P = U + V. On the axis P = 0 for m = 1 (a translation has U
+    = -V there); for every other m all three vanish.
 
     Returns
     -------
@@ -64,7 +66,10 @@ def wave_jets(f: Expr, m: Expr) -> tuple[Jet, Jet]:
 
 
 def wave_jets_of(derivatives: Sequence[Sequence[Expr]], m: Expr) -> tuple[Jet, Jet]:
-    """Jets of the wave f, see `wave_jets`, from the components of f, f' and f''."""
+    """Return the cosine and sine jets of a wave f = (P, V, W), see `wave_jets`.
+
+    `derivatives` are the components of f, f' and f'', derivatives by s.
+    """
     (U, V, W), (Us, Vs, Ws), (Uss, Vss, Wss) = ((P - V, V, W) for P, V, W in derivatives)
     cosine = Jet(
         r=_vector(U, 0, W),
@@ -86,7 +91,7 @@ def wave_jets_of(derivatives: Sequence[Sequence[Expr]], m: Expr) -> tuple[Jet, J
 
 
 def _derivatives(f: Expr, components: int) -> list[list[Expr]]:
-    """Components of f, f' and f''."""
+    """Return the components of f, f' and f'', derivatives by the meridian's parameter."""
     Df = ufl.grad(f)
     DDf = ufl.grad(Df)
     indices = range(components)
@@ -99,24 +104,29 @@ def _vector(*components: Expr) -> Expr:
 
 @dataclass(frozen=True)
 class Energy:
-    """An energy as a function of the displacement's jet, so that waves may be added to a
-    displacement; see `Term`.
+    """An energy as a function of the displacement's jet, so that waves may be added to it.
+
+    Its attributes are otherwise those of a `Term` of the assembly.
 
     Attributes
     ----------
     form_of
         Energy on the domain as a function of the jet of u; the modelled part has
         `IntegrationDomain.revolution_factor` times as much.
+    amplitude
+        Name of the amplitude that multiplies the energy; None without one.
+    linear
+        Whether the energy is linear in the displacement.
     work
         Virtual work of a load without potential, a function of the jets of u and v, quadratic in u.
     density
         Density that is integrated; None for a load that is known by its vector.
     from_initial
         Whether it counts from the initial placement.
-    group, column
-        Group and column of the `Term`; a group "" is the name.
     reference_turn
-        The turn that the angle of a moment is counted from, and -Pi of one radian; else None.
+        The turn from which the angle of a moment is counted, and -Pi of one radian; else None.
+    group, column
+        Group and column of the `Term`; an empty group stands for the name.
     """
 
     name: str
@@ -131,8 +141,9 @@ class Energy:
     column: str = ""
 
     def perturbed_form(self, u: Jet, v: Jet) -> ufl.Form:
-        """Return a form whose Hessian in v, at v = 0, is that of the energy of u + v; of a work,
-        its symmetric part.
+        """Return a form whose Hessian in v, at v = 0, is that of the energy of u + v.
+
+        Of a virtual work, which may have no potential, it is the symmetric part of the derivative.
         """
         if self.work is None:
             return self.form_of(u + v)
@@ -145,10 +156,12 @@ class HeldEdge:
 
     Attributes
     ----------
+    facets
+        Local numbers of the edges.
     plane
         Normal of the mirror plane; None for a clamped edge.
     turn
-        The rotation of a clamped edge that moves.
+        The rotation of a clamped edge that moves; None if it does not move.
     """
 
     facets: Facets
@@ -162,6 +175,8 @@ class IntegrationDomain:
 
     Attributes
     ----------
+    r0
+        The placement.
     jet
         Function from a field of the placement's space to its value and derivatives.
     covector
@@ -172,8 +187,9 @@ class IntegrationDomain:
         Degrees of the quadrature on cells, along edges (None where these are points) and under
         contact.
     tables
-        Function of the placement's space and of points in the reference cell, away from singular
-        ones, to a function from nodal values, with ghosts, to jets (6, cells, points, 3).
+        Function of the placement's space and of points in the reference cell, which must not be
+        singular ones. It returns a function from nodal values, with ghosts, to jets (6, cells,
+        points, 3).
     variant
         Lagrange variant of discontinuous fields, with nodes where the coordinates are regular.
     revolution_factor
@@ -204,9 +220,7 @@ class IntegrationDomain:
         return self.jet(self.r0)
 
     def discontinuous(self, size: int) -> fem.FunctionSpace:
-        """Return the space of fields of so many numbers, discontinuous and as rich as the
-        placement.
-        """
+        """Return the space of discontinuous fields of `size` numbers, of the placement's degree."""
         cell, degree = self.mesh.basix_cell(), self.r0.function_space.element.basix_element.degree
         return fem.functionspace(
             self.mesh,
@@ -214,12 +228,13 @@ class IntegrationDomain:
         )
 
     def constant(self, value: float | NDArray[np.float64]) -> fem.Constant:
-        """Return a number or a vector as a constant of forms."""
+        """Return a number or a vector as a constant of forms on the domain."""
         return fem.Constant(self.mesh, value)
 
     def dx(self, rule: int | None = None) -> ufl.Measure:
-        """Return the measure of the cells, in the surface's coordinates; `rule` is the quadrature's
-        degree.
+        """Return the measure of the cells, in the surface's coordinates.
+
+        `rule` is the degree of the quadrature; None for that of the domain.
         """
         return ufl.Measure(
             "dx", domain=self.mesh, metadata={"quadrature_degree": rule or self.rule}
@@ -234,7 +249,7 @@ class IntegrationDomain:
         return self.measures_on([facets])[0]
 
     def measures_on(self, facet_groups: Sequence[Facets]) -> list[ufl.Measure]:
-        """Return the measures of some groups of boundary edges that do not overlap.
+        """Return the measures of groups of boundary edges that do not overlap, in their order.
 
         They are parts of one measure, since a form may have only one of the boundary.
         """
@@ -255,7 +270,7 @@ class IntegrationDomain:
         return {} if self.edge_rule is None else {"quadrature_degree": self.edge_rule}
 
     def over_area(self) -> Callable[[Expr], ufl.Form]:
-        """Return the integral over the undeformed area, as a function of what is integrated."""
+        """Return a function from an expression to its integral over the undeformed area."""
         ratio = kin.area_ratio(self.j0)
         return lambda f: f * ratio * self.dx()
 
@@ -264,16 +279,16 @@ class IntegrationDomain:
         return kin.conormal(self.j0, self.covector)[2] * self.ds(facets)
 
     def jets_from_initial(self, u: Jet) -> tuple[Jet, Jet]:
-        """Return the jets of the initial placement and of the displacement from there."""
+        """Return the jets of the initial placement and of the displacement from there to r0 + u."""
         if self.initial_placement is None:
             return self.j0, u
         initial = self.jet(self.initial_placement)
         return initial, self.j0 + u - initial
 
     def measure(self, density: Density) -> ufl.Measure:
-        """Return the measure of the cells or edges that a density is integrated on.
+        """Return the measure of the cells or edges on which a density is integrated.
 
-        A form takes only one measure of the same edges.
+        A form may have only one measure of the same edges.
         """
         if density.sides == 2:
             return self.dS()
@@ -282,7 +297,8 @@ class IntegrationDomain:
     def value(self, density: Density, u: Jet, *, from_initial: bool = False) -> Expr:
         """Return the value of a density at the displacement's jet u.
 
-        With `from_initial` it counts from the initial placement.
+        With `from_initial` the displacement counts from the initial placement. On interior edges
+        the density takes pairs of jets, covectors and fields, '+' first.
         """
         r0 = self.j0
         if density.sides == 2:
@@ -311,23 +327,27 @@ class IntegrationDomain:
         from_initial: bool = False,
         **attributes: Any,
     ) -> Energy:
-        """Return the energy of a density; `from_initial` as in `value`, `attributes` are those of
-        `Energy`.
+        """Return the energy of a density as a function of the displacement's jet.
+
+        `amplitude` is the name of its amplitude, `from_initial` is as in `value`; further
+        `attributes` are those of `Energy`.
         """
-        virtual, measure = density.work, self.measure(density)
+        virtual_work, measure = density.work, self.measure(density)
 
         def form_of(u: Jet) -> ufl.Form:
+            """Return the integral of the density at the displacement's jet u."""
             return self.value(density, u, from_initial=from_initial) * measure
 
         def work(u: Jet, v: Jet) -> ufl.Form:
-            assert virtual
-            return virtual(self.j0, u, v, *density.parameters) * measure
+            """Return the integral of the virtual work along the jet v, at the jet u."""
+            assert virtual_work
+            return virtual_work(self.j0, u, v, *density.parameters) * measure
 
         return Energy(
             name,
             form_of,
             amplitude,
-            work=work if virtual else None,
+            work=work if virtual_work else None,
             density=density,
             from_initial=from_initial,
             **attributes,
@@ -337,7 +357,7 @@ class IntegrationDomain:
 def surface_domain(
     r0: fem.Function, initial_placement: fem.Function | None = None
 ) -> IntegrationDomain:
-    """Return the domain of a mid-surface, a mesh of triangles."""
+    """Return the domain of a mid-surface, a mesh of triangles with the placement r0."""
     mesh_of_surface, degree = r0.function_space.mesh, r0.function_space.element.basix_element.degree
     interior_width = ufl.avg(ufl.CellVolume(mesh_of_surface)) / ufl.avg(
         ufl.FacetArea(mesh_of_surface)
@@ -359,7 +379,7 @@ def surface_domain(
 def meridian_domain(
     r0: fem.Function, initial_placement: fem.Function | None = None
 ) -> IntegrationDomain:
-    """Return the domain of a meridian, a mesh of intervals."""
+    """Return the domain of a meridian, a mesh of intervals with the placement r0 = (rho, z)."""
     mesh_of_meridian = r0.function_space.mesh
     degree = r0.function_space.element.basix_element.degree
     tangent = revolved_jet(r0).r1
@@ -385,18 +405,29 @@ def meridian_domain(
 
 
 def _tables_on_surface(V: fem.FunctionSpace, points: Array) -> Callable[[Array], Array]:
+    """Return a function from nodal values to jets on a mid-surface.
+
+    `points` (n, 2) are in the reference triangle; jets are (6, cells, n, 3), by its coordinates.
+    """
     table, nodes = ShapeTable.tabulate(V.element.basix_element, points), V.dofmap.list
     return lambda nodal: np.asarray(np.moveaxis(table.jets(nodal.reshape(-1, 3)[nodes]), 2, 0))
 
 
 def _tables_on_meridian(V: fem.FunctionSpace, points: Array) -> Callable[[Array], Array]:
-    """Jets at azimuth zero, as `revolved_jet`, by X in [0, 1]; nodal values are (U, W)."""
+    """Return a function from nodal values (U, W) to jets on a meridian, at azimuth zero.
+
+    `points` (n, 1) are in [0, 1]; jets are (6, cells, n, 3), as in `revolved_jet`, by the
+    coordinate of the reference cell and the azimuth.
+    """
     shapes, nodes = V.element.basix_element.tabulate(2, points)[..., 0], V.dofmap.list
 
     def jets_of(nodal: Array) -> Array:
+        """Return jets (6, cells, n, 3) from nodal values (U, W) of all local nodes."""
         derivatives = np.einsum("dpn,cni->dcpi", shapes, nodal.reshape(-1, 2)[nodes])
         (U, W), (Us, Ws), (Uss, Wss) = np.moveaxis(derivatives, -1, 1)
-        parts = [(U, 0, W), (Us, 0, Ws), (0, U, 0), (Uss, 0, Wss), (0, Us, 0), (-U, 0, 0)]
-        return np.array([np.stack(np.broadcast_arrays(*part), axis=-1) for part in parts])
+        jet_components = [(U, 0, W), (Us, 0, Ws), (0, U, 0), (Uss, 0, Wss), (0, Us, 0), (-U, 0, 0)]
+        return np.array(
+            [np.stack(np.broadcast_arrays(*vector), axis=-1) for vector in jet_components]
+        )
 
     return jets_of

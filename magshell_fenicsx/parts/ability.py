@@ -1,7 +1,7 @@
 """The base of parts and of all other abilities: what a section of a case adds to a problem.
 
-An ability reads its section and what is around it in the case (`Context`), and gives fields of the
-model's `Loads`, the symmetry that it preserves, its formulas, and its lines for `magshell check`.
+An ability reads its section and the rest of the case (`Context`). It gives fields of the model's
+`Loads`, the symmetry that it preserves, its formulas, and its lines for `magshell check`.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -32,7 +32,13 @@ AnyStep = TypeVar("AnyStep", bound="Step")
 
 @dataclass(frozen=True)
 class Scales:
-    """The scales of a case: R, h and E in its units; 1, h/R and 1 for a case without lengths."""
+    """The scales of a case: R, h and E in its units; 1, h/R and 1 for a case without lengths.
+
+    Attributes
+    ----------
+    nu
+        Poisson's ratio.
+    """
 
     R: float
     h: float
@@ -47,16 +53,18 @@ class Scales:
 
 @dataclass(frozen=True)
 class Context:
-    """The rest of a case around a part, which takes from this what it needs.
+    """The whole case around an ability, which reads from it what it needs.
 
     Attributes
     ----------
+    shell
+        The section of the shell.
     points
         Name -> place (3,) in the shell's length.
     sections
         Key of the case -> its section.
     steps
-        The programme.
+        The steps of the programme, in order.
     is_programme
         Whether the programme is a list of the case file, so that no step comes before it.
     solid
@@ -71,7 +79,7 @@ class Context:
     solid: bool = False
 
     def section_of(self, kind: type[Kind]) -> Kind | None:
-        """Return the section of a class; None without one."""
+        """Return the first section of the case that is of a class; None without one."""
         return next(
             (section for section in self.sections.values() if isinstance(section, kind)), None
         )
@@ -85,48 +93,55 @@ class Context:
 
     @property
     def missing_offers(self) -> "dict[Offer, str]":
-        """The offers that abilities may need and the case has not -> what to do about that."""
-        missing = dict[Offer, str]()
+        """The offers that the case lacks -> advice how to get each of them.
+
+        An offer is a property of a case that an ability may need, such as "a mid-surface".
+        """
+        advice_by_offer = dict[Offer, str]()
         for ability in self.abilities:
-            missing |= ability.withdraws(self)
+            advice_by_offer |= ability.withdraws(self)
         if self.solid:
-            missing["a mid-surface"] = "a solid has none: take model: shell"
-        return missing
+            advice_by_offer["a mid-surface"] = "a solid has none: take model: shell"
+        return advice_by_offer
 
     def needs(self, key: str, *offers: "Offer", hint: str = "") -> None:
-        """Check that the case has what a key needs.
+        """Check that the case has the offers that a key needs.
 
         Parameters
         ----------
+        key
+            Key of the case that needs them, for the message.
+        offers
+            Properties of the case, such as "a mid-surface".
         hint
-            What to do; without one, what gives back the offer.
+            Advice for the message; empty for the advice of `missing_offers`.
 
         Raises
         ------
         ValueError
-            With the first of the offers that is not there.
+            With the first of the offers that the case lacks.
         """
-        missing = self.missing_offers
+        advice_by_offer = self.missing_offers
         for offer in offers:
-            if offer in missing:
-                raise ValueError(f"{key}: needs {offer}; {hint or missing[offer]}")
+            if offer in advice_by_offer:
+                raise ValueError(f"{key}: needs {offer}; {hint or advice_by_offer[offer]}")
 
     def loads(self, kind: "type[AnyStep]") -> "dict[str, AnyStep]":
-        """Return amplitude -> its last step, of the steps of a kind."""
+        """Return amplitude -> load of its last step, of those steps whose load is of a class."""
         return {step.name: step.load for step in self.steps if isinstance(step.load, kind)}
 
     def steps_before(self, number: int) -> "Sequence[ProgrammeStep]":
-        """Return the steps of the programme before one with a number, from 1."""
+        """Return the steps of the programme before the step with a number, counted from 1."""
         return self.steps[: number - 1]
 
     def driven_before(self, number: int) -> set[str]:
-        """Return the amplitudes that steps before one have driven."""
+        """Return the amplitudes that steps before the step with a number have driven."""
         return {
             name for step in self.steps_before(number) for name in (step.name, *step.load.drives)
         }
 
     def has_modulus(self, what: str) -> None:
-        """Check that there is a modulus, which something needs.
+        """Check that the shell has a Young's modulus; `what` names the thing that needs it.
 
         Raises
         ------
@@ -137,7 +152,7 @@ class Context:
             raise ValueError(f"shell.youngs_modulus is needed for {what}")
 
     def has_point(self, key: str, name: str | None) -> None:
-        """Check that a point has a place.
+        """Check that a named point has a place in the case; None as the name needs none.
 
         Raises
         ------
@@ -149,12 +164,14 @@ class Context:
             raise ValueError(f"{key}: {name}: name it in points, with its place; there are {names}")
 
     def on_shell(self, key: str, polar: float) -> None:
-        """Check that a direction from the centre of a sphere is a degree from its edge at least.
+        """Check that a polar angle (degrees) on a sphere is at least a degree inside its edge.
+
+        Other geometries have no such edge, and are not checked.
 
         Raises
         ------
         ValueError
-            With what is allowed.
+            With the allowed angles; the message begins with `key`.
         """
         edge = self.shell.edge_polar
         if edge is not None and not 0 <= polar < edge - 1:
@@ -166,7 +183,7 @@ class Context:
 
     @property
     def scales(self) -> Scales:
-        """The scales of the case, in which there is a modulus where something needs it."""
+        """The scales of the case; to be used only where the case is known to have a modulus."""
         shell = self.shell
         assert shell.modulus is not None
         return Scales(
@@ -175,8 +192,7 @@ class Context:
 
     @property
     def time_unit(self) -> float | None:
-        """R √(ρ/E), the unit of times, in seconds where the case has units; None without
-        density."""
+        """The unit R √(ρ/E) of times, in seconds where the case has units; None without density."""
         density, modulus = self.shell.density, self.shell.youngs_modulus
         return (
             float(self.shell.reference * np.sqrt(density / modulus))
@@ -187,12 +203,12 @@ class Context:
 
 @dataclass(frozen=True)
 class Modelled:
-    """The part of a shell that is modelled.
+    """The part of a shell that is modelled, and the frame of its model.
 
     Attributes
     ----------
     outline
-        Of the shell with the imperfections that do not grow.
+        The surface with its chart, with the imperfections that do not grow.
     turn
         Azimuth of the model's frame (rad).
     mirror
@@ -200,15 +216,16 @@ class Modelled:
         plane, or on an edge across it, is shared by the halves; the loads of an edge of the other
         half are left out.
     plane
-        The same plane in the frame of the case.
+        The plane of `mirror` in the frame of the case.
     axisymmetric
         Whether the meridian is modelled.
-    deviations
-        Key of each imperfection below `shell` -> its deviation, in the model's frame.
     vertices
         Amplitude of a load at one place -> name of the vertex there.
     patch_rims
-        Name of the patch of each dimple -> whether places (n, 3) are within its rim.
+        Name of the patch of each dimple -> function that tells whether places (n, 3) are within the
+        dimple's rim.
+    deviations
+        Key of each imperfection below `shell` -> its deviation, in the model's frame.
     """
 
     outline: "Outline"
@@ -227,15 +244,20 @@ class Formulas:
 
     Attributes
     ----------
+    key
+        The key, for messages.
+    values
+        Numbers, and texts of formulas.
     minimum, maximum
         Allowed values.
     length
         R in the unit of the places.
     load
-        Whether it is a load: what is shorter than about sqrt(Rh) bends no shell then, and its
-        moments are exact on elements of any size. Strains follow all else down to its last detail.
+        Whether the values are a load. Details of a load that are shorter than about sqrt(Rh) do not
+        bend a shell, and its moments are exact on elements of any size. Strains follow all other
+        formulas down to the last detail.
     deformed
-        Whether it is of the deformed place, where nothing but the points of integration see it.
+        Whether the formulas are of the deformed place, where only quadrature points evaluate them.
     """
 
     key: str
@@ -266,14 +288,14 @@ Offer = Literal[
 
 @dataclass(frozen=True)
 class InTime:
-    """A load that may be a function of time, though no step drives it.
+    """A load that may be a function of time in a step of `kind: time`, though no step drives it.
 
     Attributes
     ----------
     name
-        In `history`.
+        Name of the load in `history`.
     refused
-        Why it may not be one here; empty if it may.
+        Why it may not be a function of time in this case; empty if it may.
     """
 
     name: str
@@ -283,17 +305,18 @@ class InTime:
 class Ability:
     """The base of what adds something to a problem, mostly a section of the case file.
 
-    By default it adds nothing. One that is no section finds itself in a case (`from_context`). All
-    stand in `ABILITIES` of `registered.py`.
+    The methods are called while a case becomes a problem; by default they add nothing. A subclass
+    that is no section finds itself in a case by `from_context`. All subclasses stand in `ABILITIES`
+    of `registered.py`.
     """
 
     @classmethod
     def from_context(cls, context: Context) -> Self | None:
-        """Return the ability of a case; None without."""
+        """Return the ability if the case has it, else None."""
         return context.section_of(cls)
 
     def refuse_unfit(self, context: Context) -> None:
-        """Check that it goes with all else in the case.
+        """Check that the ability goes with the rest of the case.
 
         Raises
         ------
@@ -302,11 +325,16 @@ class Ability:
         """
 
     def withdraws(self, context: Context) -> "dict[Offer, str]":
-        """Return what other abilities may need and a case with this one has not -> what to do."""
+        """Return the offers that a case with this ability lacks -> advice how to get them.
+
+        An offer is a property of a case that other abilities may need.
+        """
         return {}
 
     def in_time(self, context: Context, driven_amplitudes: Collection[str]) -> InTime | None:
-        """Return its load that may be a function of time; None without.
+        """Return the ability's load that may be a function of time in a step of `kind: time`.
+
+        None without such a load. A step's own load is a function of time anyway.
 
         Parameters
         ----------
@@ -316,17 +344,17 @@ class Ability:
         return None
 
     def patches(self) -> dict[str, Iterable[str]]:
-        """Return its keys with values by patch -> the names of these."""
+        """Return the ability's keys with values by patch -> the names of these patches."""
         return {}
 
     def symmetry_constraints(
         self, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
-        """Return the symmetry that it preserves of a shell."""
+        """Return the symmetry of a shell that the ability preserves; empty if it preserves all."""
         return []
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
-        """Return its formulas of the undeformed place."""
+        """Return the ability's formulas of the undeformed place."""
         return []
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
@@ -334,33 +362,35 @@ class Ability:
         return {}
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:
-        """Check that it has values at places (n, 3) over R of the undeformed shell.
+        """Check the ability's values at places (n, 3) over R of the undeformed shell.
 
         Raises
         ------
         CaseError
-            If one is not finite, or beyond all sense.
+            If a value is not finite, or absurdly large.
         """
 
     def warning(self, context: Context, places: Array) -> str | None:
-        """Return what is unphysical in it at these places; None if nothing is."""
+        """Return a warning about unphysical values at places (n, 3) over R; None without."""
         return None
 
     def numbers(self, context: Context) -> list[str]:
-        """Return lines of `magshell check` with its numbers on the undeformed shell."""
+        """Return lines of `magshell check` with the ability's numbers on the undeformed shell."""
         return []
 
     def units(self, context: Context, units: CaseSizes) -> CaseSizes:
-        """Return the sizes of units, with those that it gives."""
+        """Return sizes of units, completed by those that the ability defines."""
         return units
 
 
 @dataclass(frozen=True)
 class KeyAbility(Ability, Generic[Kind]):
-    """An ability whose key has a list or a mapping, which is not empty.
+    """An ability whose key in the case has a list or a mapping; it exists if that is not empty.
 
     Attributes
     ----------
+    key
+        Name of the key.
     sections
         The value of the key.
     """
@@ -403,7 +433,7 @@ class Part(Section, Ability):
         )
 
     def terms(self, scales: Scales) -> Sequence[OwnTerm]:
-        """Return the energies, with the values of their amplitudes."""
+        """Return the energies of the part, each with the value of its amplitude in these scales."""
         raise NotImplementedError
 
     def account(self, scales: Scales) -> str:

@@ -77,6 +77,7 @@ class Foundation(Part):
         return self
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
+        """Return the formula of the factor; empty without one."""
         return (
             [Formulas("foundation.factor", [self.factor], 0.0, MAX_FACTOR, 1.0)]
             if self.factor
@@ -84,14 +85,22 @@ class Foundation(Part):
         )
 
     def terms(self, scales: Scales) -> list[OwnTerm]:
-        k, springs = self._dimensionless(scales), list[OwnTerm]()
+        """Return the energies of the springs that are given, along the normal and in the surface.
+
+        Their amplitudes are the stiffnesses over E h/R².
+        """
+        stiffnesses, energies = self._dimensionless(scales), list[OwnTerm]()
         factor = (FormulaParameter(self.factor, "foundation.factor"),) if self.factor else (1.0,)
-        if "k" in k:
+        if "k" in stiffnesses:
             observed = {"foundation_force": reaction}
-            springs.append(OwnTerm("foundation", energy, (scales.force, *factor), k["k"], observed))
-        if "k_t" in k:
-            springs.append(OwnTerm("foundation_tangential", tangential_energy, factor, k["k_t"]))
-        return springs
+            energies.append(
+                OwnTerm("foundation", energy, (scales.force, *factor), stiffnesses["k"], observed)
+            )
+        if "k_t" in stiffnesses:
+            energies.append(
+                OwnTerm("foundation_tangential", tangential_energy, factor, stiffnesses["k_t"])
+            )
+        return energies
 
     def account(self, scales: Scales) -> str:
         stiffnesses = ", ".join(
@@ -100,6 +109,7 @@ class Foundation(Part):
         return f"Winkler foundation, {stiffnesses}{', times a formula' if self.factor else ''}"
 
     def _dimensionless(self, scales: Scales) -> dict[str, float]:
+        """Return the stiffnesses that are given, k and k_t by name, over E h/R²."""
         stiffnesses = {"k": self.stiffness, "k_t": self.tangential}
         return {
             name: k * scales.R**2 / (scales.E * scales.h)
@@ -109,15 +119,19 @@ class Foundation(Part):
 
 
 def energy(r0: Jet, u: Jet, force: "Expr", factor: "Expr | float" = 1.0) -> "Expr":
-    """Return the energy density for k = 1."""
+    """Return the energy density k w²/2 of the foundation for k = 1, with w = -u . n0.
+
+    The arguments are those of an `OwnTerm`: jets (maps with derivatives) of placement and
+    displacement, then parameters. `force` is not used here.
+    """
     return factor * ufl.dot(u.r, kin.normal(r0)) ** 2 / 2
 
 
 def reaction(r0: Jet, u: Jet, force: "Expr", factor: "Expr | float" = 1.0) -> "Expr":
-    """Return the density of the reaction for k = 1, over the unit of the force."""
+    """Return the density -u . n0 of the reaction for k = 1, over the unit of the force."""
     return -factor * ufl.dot(u.r, kin.normal(r0)) / force
 
 
 def tangential_energy(r0: Jet, u: Jet, factor: "Expr | float" = 1.0) -> "Expr":
-    """Return the energy density for k_t = 1."""
+    """Return the energy density k_t |u_t|²/2 of springs in the surface for k_t = 1."""
     return factor * (ufl.dot(u.r, u.r) - ufl.dot(u.r, kin.normal(r0)) ** 2) / 2

@@ -28,7 +28,7 @@ ThicknessRatio = Callable[[Array], Memo[Array]]
 
 
 class GrownSurface(Protocol):
-    """A natural shape, of which the volume of the shell is known."""
+    """A natural shape whose volume is known at each place of the shell."""
 
     @property
     def stretch(self) -> SettableNumber | None:
@@ -58,9 +58,19 @@ class GrownSurface(Protocol):
 
 
 def thickness_ratio(r0: Jet, u: Jet, natural: Forms | None = None, thins: Expr | int = 1) -> Expr:
-    """Return the deformed thickness over the undeformed one.
+    """Return the deformed thickness over the undeformed one, as a UFL expression.
 
-    Where `thins` is 1 it is the undeformed, or natural, area over the deformed one; elsewhere 1.
+    A jet is a map with its derivatives at a point.
+
+    Parameters
+    ----------
+    r0, u
+        Jets of the undeformed placement and of the displacement.
+    natural
+        The natural shape at the point; None without.
+    thins
+        1 where the shell keeps its volume: the ratio is the undeformed, or natural, area over the
+        deformed one, times the natural thickness. 0 where the thickness stays: the ratio is 1.
     """
     stretch = kin.area_ratio(r0) / kin.area_ratio(r0 + u)
     stretch = stretch if natural is None else stretch * natural.area * natural.thickness
@@ -74,22 +84,36 @@ def thickness_ratio_at_points(
 
     Parameters
     ----------
+    domain
+        The surface over which integrals run.
     thins
         (cells, 1) 1 in the cells that get thinner, or 1 for all.
+
+    Returns
+    -------
+    ThicknessRatio
+        Function of places in the reference cell. Its result is computed again where the
+        displacement or the natural shape has changed.
     """
     r0, V = domain.r0, u.function_space
     natural_values = natural.values if natural else None
 
     def ratio_at(points: Array) -> Memo[Array]:
+        """Return the thickness ratio at places (places, 2) of the reference cell.
+
+        It is a memo: a value that is computed again where displacement or natural shape have
+        changed.
+        """
         jets_of = domain.tables(V, points)
 
         def values() -> Array:
-            first = jets_of(r0.x.array)[1:3]
+            """Return the ratio (cells * places,) at the present displacement."""
+            tangents = jets_of(r0.x.array)[1:3]
             area0, area = (
                 np.linalg.norm(np.cross(*a), axis=-1)
-                for a in (first, first + jets_of(u.x.array)[1:3])
+                for a in (tangents, tangents + jets_of(u.x.array)[1:3])
             )
-            factor = natural.volume(first, points) if natural and natural_values else 1.0
+            factor = natural.volume(tangents, points) if natural and natural_values else 1.0
             return np.asarray(1 + thins * (factor * area0 / area - 1)).ravel()
 
         return Memo(values, lambda: (r0.x.array, u.x.array, *(natural_values or ())))
@@ -98,9 +122,10 @@ def thickness_ratio_at_points(
 
 
 def penalty(s: Array, k: float, soft_penetration: float) -> tuple[Array, Array, Array]:
-    """Return psi of penetrations s with its first and second derivative.
+    """Return the penalty energy psi per area of penetrations s, with both derivatives.
 
-    psi'' grows from 0 to k over the penetration `soft_penetration`, and is continuous.
+    psi'' grows linearly from 0 to k over the penetration `soft_penetration`, and is then constant.
+    Without penetration (s <= 0) all are zero. The three arrays have the shape of s.
     """
     t = np.maximum(s, 0.0)
     is_full = t > soft_penetration
@@ -117,10 +142,16 @@ def penalty(s: Array, k: float, soft_penetration: float) -> tuple[Array, Array, 
 def expanded_penalty(
     s: Array, s0: Array, k: float, soft_penetration: float, *, with_third_order: bool = False
 ) -> tuple[Array, Array, Array]:
-    """Return the Taylor polynomial of `penalty` about penetrations s0, with its derivatives.
+    """Return the Taylor polynomial of the penalty energy about s0, with both derivatives.
 
-    It is of second order, or of third. Differences over a part of `soft_penetration` are better by
-    that of second order; the derivative of the second derivative needs the third.
+    The energy psi(s) is that of `penalty`. The polynomial is of second order, or of third
+    `with_third_order`. Differences over a part of `soft_penetration` are better with the second
+    order; the derivative of the second derivative needs the third.
+
+    Returns
+    -------
+    tuple
+        psi, psi' and psi'' at the penetrations s, of the shape of s.
     """
     value, first, second = penalty(s0, k, soft_penetration)
     step = s - s0
@@ -138,7 +169,8 @@ def expanded_penalty(
 def mean_pressure(s0: Array, s1: Array, k: float, soft_penetration: float) -> tuple[Array, Array]:
     """Return (psi(s1) - psi(s0))/(s1 - s0) and its derivative by s1.
 
-    Simpson's rule where psi'' has no kink between both, for which it is exact.
+    It is the pressure over a step of penetration from s0 to s1 that conserves energy. Simpson's
+    rule gives it where psi'' has no kink between both: the rule is then exact.
     """
     (v0, p0, _), (v1, p1, k1) = penalty(s0, k, soft_penetration), penalty(s1, k, soft_penetration)
     _, p_middle, k_middle = penalty((s0 + s1) / 2, k, soft_penetration)

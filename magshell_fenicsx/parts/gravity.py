@@ -89,5 +89,8 @@ class GravityStep(BodyForceStep):
 
 
 def weight_energy(r0: Jet, u: Jet, direction: "Expr") -> "Expr":
-    """Return the energy density for ρ g R/E = 1, zero where nothing has moved."""
+    """Return the density -u . g of the weight's energy for ρ g R/E = 1; zero without displacement.
+
+    `r0` and `u` are jets (maps with derivatives), `direction` is the unit vector g.
+    """
     return -ufl.dot(u.r, direction)

@@ -53,6 +53,7 @@ class JointSection(Section):
 
     @model_validator(mode="after")
     def _of_a_spring(self) -> Self:
+        """Check that a spring has a stiffness, and other joints neither stiffness nor angle."""
         if (self.stiffness is not None) != (self.kind == "spring"):
             raise ValueError(
                 "stiffness belongs to kind: spring, and must be given there; the kind is "
@@ -68,18 +69,18 @@ Joints = Annotated[list[JointSection], Field(max_length=100)]
 
 @dataclass(frozen=True)
 class Joint:
-    """A joint in a model.
+    """A joint of two edges in a model.
 
     Attributes
     ----------
     edges
-        Names of both.
+        Names of both edges.
     rigid
-        Whether the edge is as one within a shell; else it is a spring.
+        Whether the edge is as one within a shell; else it is a spring or a hinge.
     stiffness
         Moment per length and radian over E h R; 0 of a hinge.
     angle
-        At which the spring rests (rad); None for that of the placement.
+        Angle at which the spring rests (rad), from flat; None for that of the placement.
     """
 
     edges: tuple[str, str]
@@ -94,8 +95,14 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
     key = "joints"
 
     def refuse_unfit(self, context: Context) -> None:
-        """Check that the edges are of several shells, each joined once, and that all else goes with
-        joints.
+        """Check the joints of a case.
+
+        Their edges must be of several shells, each joined once. Springs must not be too stiff.
+
+        Raises
+        ------
+        ValueError
+            With the key and what is allowed.
         """
         shells = context.sections.get("shells")
         if not shells:
@@ -130,7 +137,7 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
     def symmetry_constraints(
         self, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
-        """Return the planes that cross each joint: its edges are their own mirror images."""
+        """Return the planes that cross each joint: those that map each of its edges onto itself."""
         names = [name for section in self.sections for name in section.edges]
         return [
             SymmetryConstraint(
@@ -139,6 +146,7 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
         ]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
+        """Return the joints as the model's `Loads` have them, with stiffnesses over E h R."""
         scales = context.scales if any(section.stiffness for section in self.sections) else None
         joints = tuple(
             Joint(
@@ -153,11 +161,19 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
 
 
 def _refuse_too_stiff(number: int, section: JointSection, context: Context) -> None:
-    """Check that a spring is not stiffer than rounding allows beside the softer shell."""
+    """Refuse a spring that is too stiff for rounding beside the softer of its two shells.
+
+    `number` is the position of the joint in `joints`, from 0.
+
+    Raises
+    ------
+    ValueError
+        With the largest stiffness that is allowed.
+    """
     shells, least_stiffness = context.sections["shells"], inf
     for edge in section.edges:
-        owners = [name for name in shells if edge == name or edge.startswith(f"{name}_")]
-        for shell in (shells[name].shell for name in sorted(owners, key=len)[-1:]):
+        shells_of_edge = [name for name in shells if edge == name or edge.startswith(f"{name}_")]
+        for shell in (shells[name].shell for name in sorted(shells_of_edge, key=len)[-1:]):
             thickness = shell.reference / shell.R_over_h
             least_stiffness = min(
                 least_stiffness,
@@ -175,11 +191,12 @@ def _refuse_too_stiff(number: int, section: JointSection, context: Context) -> N
 
 
 def account(context: Context, loads: "Loads") -> Account:
-    """Return which edges are joined."""
+    """Return the lines of `magshell check` on joints: which edges are joined, and how."""
     return Account([_words(joint) for joint in loads.joints])
 
 
 def _words(joint: Joint) -> str:
+    """Return which edges a joint joins, and how."""
     kind = "rigidly" if joint.rigid else "by a hinge"
     if joint.stiffness:
         kind = f"by a spring, stiffness over E h R {joint.stiffness:.4g}"
@@ -231,14 +248,17 @@ class CreaseObservables(Observables):
 
 @dataclass(frozen=True)
 class Creases:
-    """The edges between cells at which springs and hinges are.
+    """The edges between cells at which there are springs and hinges, as data of the densities.
 
     Attributes
     ----------
     marks
-        (n,) in each cell: of each joint 1 beside its one edge, -1 beside the other, 0 elsewhere.
-    stiffness, angle, has_angle
-        (n,) of each joint: the angle at which the spring rests where the last is 1, else 0 and
+        (n,) in each cell, for n joints: 1 beside the joint's first edge, -1 beside the second, else
+        0.
+    stiffness
+        (n,) moments per length and radian over E h R; 0 of a hinge.
+    angle, has_angle
+        (n,) angles (rad) at which springs rest, where `has_angle` is 1. Where it is 0, the angle is
         that of the placement.
     """
 
@@ -251,7 +271,15 @@ class Creases:
     def of_joints(
         cls, joints: Sequence[Joint], midsurface: "Midsurface | Meridian"
     ) -> "Creases | None":
-        """Return the creases of joints; None if all are rigid."""
+        """Return the creases of joints on the cells of a mesh; None if all joints are rigid.
+
+        Parameters
+        ----------
+        joints
+            The joints of the model.
+        midsurface
+            The mesh of the surface or the meridian, with the sides of each joint in its cells.
+        """
         import numpy as np
         from dolfinx import fem
 
@@ -280,16 +308,21 @@ class Creases:
 
     @property
     def grow(self) -> bool:
-        """Whether an angle grows."""
+        """Whether the rest angle of a spring grows with the amplitude of creases."""
         return bool(self.has_angle.value.any())
 
     def replace_at_joints(self, density: "Density", factor: "fem.Constant") -> "Density":
         """Return the density of edges between cells, with springs in its place at joints.
 
+        The energy of a spring is (k/2) (theta - theta_0)^2 per undeformed length, with the angle
+        theta between the normals.
+
         Parameters
         ----------
+        density
+            Energy density on edges between two cells.
         factor
-            How far the angles at which springs rest have grown.
+            Amplitude by which the rest angles have grown, from the placement (0) to their own (1).
         """
         import ufl
 
@@ -299,9 +332,14 @@ class Creases:
         count, grow = self.marks.ufl_shape[0], self.grow
 
         def with_springs(*arguments: Any, **options: Any) -> Any:
-            *of_edges, (plus, minus), k, angle, has_angle, growth = arguments
-            r0, u, m = of_edges[:3]
-            within_shell, springs, is_joint = density.function(*of_edges, **options), 0, 0
+            """Return the density at an edge, with springs at the joints.
+
+            The last five arguments are the marks on both sides of the edge, the three constants of
+            the creases and the growth of the rest angles; all others are those of the density.
+            """
+            *edge_arguments, (plus, minus), k, angle, has_angle, growth = arguments
+            r0, u, m = edge_arguments[:3]
+            within_shell, springs, is_joint = density.function(*edge_arguments, **options), 0, 0
             conormals = zip(r0, m, strict=True)
             stretch = sum(kin.conormal(jet, covector)[2] for jet, covector in conormals) / 2
             undeformed = fold_angle(r0[0], r0[1], m[0])
@@ -309,12 +347,17 @@ class Creases:
             for i in range(count):
                 product = plus[i] * minus[i]
                 at_joint = product * (product - 1) / 2  # 1 between its edges, 0 elsewhere
-                s0, c0 = undeformed
+                sine_at_rest, cosine_at_rest = undeformed
                 if grow:
-                    of_placement = ufl.atan2(undeformed[0], undeformed[1])
-                    rest = of_placement + growth * has_angle[i] * (angle[i] - of_placement)
-                    s0, c0 = ufl.sin(rest), ufl.cos(rest)
-                rotation = ufl.atan2(sine * c0 - cosine * s0, cosine * c0 + sine * s0)
+                    angle_of_placement = ufl.atan2(undeformed[0], undeformed[1])
+                    rest_angle = angle_of_placement + growth * has_angle[i] * (
+                        angle[i] - angle_of_placement
+                    )
+                    sine_at_rest, cosine_at_rest = ufl.sin(rest_angle), ufl.cos(rest_angle)
+                rotation = ufl.atan2(
+                    sine * cosine_at_rest - cosine * sine_at_rest,
+                    cosine * cosine_at_rest + sine * sine_at_rest,
+                )
                 springs += at_joint * k[i] / 2 * rotation**2 * stretch
                 is_joint += at_joint
             return (1 - is_joint) * within_shell + springs

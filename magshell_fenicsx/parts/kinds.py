@@ -28,7 +28,10 @@ REGISTERED: dict[str, tuple[str, ...]] = {
 
 
 def section_of(package: str, kind: str) -> type[Section]:
-    """Return the section of a kind: the one class in its file with this value of the key `kind`."""
+    """Return the section class of a kind in a package of kinds, such as "bodies".
+
+    It is the one class in the file of the kind with this value of the key `kind`.
+    """
     module = import_module(f"{__package__}.{package}.{kind}")
     module_members = (
         member
@@ -47,6 +50,7 @@ def section_of(package: str, kind: str) -> type[Section]:
 
 
 def _any_of(package: str) -> Any:
+    """Return the union of the sections of all kinds of a package, chosen by the key `kind`."""
     sections = tuple(section_of(package, kind) for kind in REGISTERED[package])
     return Annotated[Union[sections], ChosenByKey("kind")]  # noqa: UP007
 
@@ -79,6 +83,7 @@ class ShellKeys(LawKeys):
 
     @model_validator(mode="after")
     def _laminate_fits(self) -> Self:
+        """Refuse a laminate with a law of rubber."""
         if self.laminate and self.law != "koiter":
             raise ValueError(
                 f"laminate: needs law: koiter: its strains are small; here the law is {self.law}"

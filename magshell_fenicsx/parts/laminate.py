@@ -57,6 +57,7 @@ class PlySection(Section):
     @model_validator(mode="wrap")
     @classmethod
     def _units(cls, data: Any, handler: ModelWrapValidatorHandler[Self]) -> Self:
+        """Validate a ply, and note whether its moduli were given with units."""
         section = handler(data)
         if isinstance(data, dict):
             section._with_units = frozenset(
@@ -66,6 +67,7 @@ class PlySection(Section):
 
     @model_validator(mode="after")
     def _positive(self) -> Self:
+        """Check that every strain costs energy: the stiffness must be positive definite."""
         if self.nu12**2 * self.E2 >= self.E1:
             raise ValueError(
                 f"nu12: {self.nu12:g}: allowed is nu12^2 < E1/E2 = {self.E1 / self.E2:.4g}: else "
@@ -75,18 +77,21 @@ class PlySection(Section):
 
     @property
     def stiffness(self) -> Array:
-        """Q (3, 3) with S = Q (E_11, E_22, 2 E_12) in the directions of `along` and across it."""
+        """Stiffness Q (3, 3) with S = Q (E_11, E_22, 2 E_12), in the axes along and across `along`.
+
+        S are the stresses of plane stress; Q has the unit of the moduli.
+        """
         nu21 = self.nu12 * self.E2 / self.E1
-        in_ply_axes = np.array(
+        Q_in_ply_axes = np.array(
             [[self.E1, nu21 * self.E1, 0], [nu21 * self.E1, self.E2, 0], [0, 0, 0]]
         ) / (1 - self.nu12 * nu21)
-        in_ply_axes[2, 2] = self.G12
+        Q_in_ply_axes[2, 2] = self.G12
         c, s = np.cos(np.radians(self.angle)), np.sin(np.radians(self.angle))
         c, s = (0.0 if abs(v) < 1e-15 else float(v) for v in (c, s))  # 90 degrees are exact
-        strain = np.array(
+        strain_transformation = np.array(
             [[c * c, s * s, c * s], [s * s, c * c, -c * s], [-2 * c * s, 2 * c * s, c * c - s * s]]
         )
-        return np.asarray(strain.T @ in_ply_axes @ strain)
+        return np.asarray(strain_transformation.T @ Q_in_ply_axes @ strain_transformation)
 
 
 class LaminateSection(Section):
@@ -108,6 +113,7 @@ class LaminateSection(Section):
 
     @model_validator(mode="after")
     def _fractions_add_up(self) -> Self:
+        """Check the plies together: fractions, units of moduli, and the direction `along`."""
         if abs(sum(ply.fraction for ply in self.plies) - 1) > 1e-6:
             raise ValueError("plies: their fractions must add up to 1")
         if len(frozenset[bool]().union(*(ply._with_units for ply in self.plies))) > 1:
@@ -123,13 +129,14 @@ class LaminateSection(Section):
 
     @property
     def twists(self) -> bool:
-        """Whether a stretch or a bend along or across `along` shears or twists the shell."""
+        """Whether stretching or bending along or across `along` also shears or twists the shell."""
         return bool(np.any(self.matrices(1.0)[:, TWISTING_ENTRIES]))
 
     @property
     def isotropic(self) -> bool:
-        """Whether all directions are alike."""
+        """Whether the laminate is equally stiff in all directions."""
         matrices = self.matrices(1.0)
+        # zero if A11 = A22 and (A11 - A12)/2 = A66, and likewise for B and D
         differences = np.stack(
             [
                 matrices[:, 0] - matrices[:, 2],
@@ -141,33 +148,47 @@ class LaminateSection(Section):
         )
 
     def matrices(self, E: float) -> Array:
-        """Return A, B and D (3, 6) over E h, E h² and E h³, as 11, 12, 22, 16, 26, 66.
+        """Return the stiffnesses A, B and D of the laminate in units of E h, E h² and E h³.
 
-        B is that of the strain E + z k.
+        B has the sign of the strain E + z k.
+
+        Parameters
+        ----------
+        E
+            Young's modulus of the units, in the unit of the plies' moduli.
+
+        Returns
+        -------
+        Array
+            (3, 6): A, B and D, each with the entries 11, 12, 22, 16, 26, 66.
         """
         fractions = np.array([ply.fraction for ply in self.plies])
-        ends = np.concatenate([[0.0], np.cumsum(fractions) / fractions.sum()]) - 0.5
+        heights = np.concatenate([[0.0], np.cumsum(fractions) / fractions.sum()]) - 0.5
         Q = np.array([ply.stiffness[VOIGT_INDICES] for ply in self.plies]) / E
-        stiffnesses = np.array([np.diff(ends**n) @ Q / n for n in (1, 2, 3)])
-        sizes = np.abs(Q).max() / np.array([1, 4, 12])[:, None]
-        return np.where(np.abs(stiffnesses) <= STIFFNESS_TOLERANCE * sizes, 0.0, stiffnesses)
+        stiffnesses = np.array([np.diff(heights**n) @ Q / n for n in (1, 2, 3)])
+        largest_values = np.abs(Q).max() / np.array([1, 4, 12])[:, None]
+        return np.where(
+            np.abs(stiffnesses) <= STIFFNESS_TOLERANCE * largest_values, 0.0, stiffnesses
+        )
 
     def direction(self, geometry: str) -> Array | None:
-        """Return the unit vector (3,) along whose part in the surface the angle 0 is.
+        """Return the unit vector (3,) whose part in the surface has the angle 0.
 
-        None for the meridians.
+        None stands for the meridians.
+
+        `geometry` is that of the shell, on which the default depends.
         """
         if self.along == MERIDIAN or (self.along is None and geometry not in FLAT):
             return None
         return unit(np.array([1.0, 0.0, 0.0] if self.along is None else self.along))
 
     def refuse_unfit_sizes(self, E: float) -> None:
-        """Check that moduli are of sizes that numbers can have beside Young's modulus.
+        """Check that the plies' moduli are not absurdly small or large against Young's modulus E.
 
         Raises
         ------
         ValueError
-            If one is not.
+            With the key of the first such modulus.
         """
         for i, ply in enumerate(self.plies):
             for key in ("E1", "E2", "G12"):
@@ -179,7 +200,10 @@ class LaminateSection(Section):
 
 
 def laminate_of(shell: Any, turn: float) -> "Laminate | None":
-    """Return the laminate of a shell in a frame turned about e3 (rad); None without plies."""
+    """Return the laminate of a shell for its model; None without plies.
+
+    `turn` is the angle about e3 (rad) of the model's frame.
+    """
     from magshell_fenicsx.models.shell.laminate import Laminate  # the solver takes long to import
 
     section: LaminateSection | None = shell.laminate
@@ -203,8 +227,15 @@ class ShellLaminate(Ability):
         return cls(context.shell.laminate) if context.shell.laminate else None
 
     def refuse_unfit(self, context: Context) -> None:
-        """Check that moduli and youngs_modulus have units alike, and that mirror planes mirror the
-        plies.
+        """Check that the laminate goes with the shell.
+
+        Moduli and youngs_modulus must both have units, or none. A laminate that twists needs the
+        whole shell, since no plane mirrors it.
+
+        Raises
+        ------
+        ValueError
+            With the key and what is allowed.
         """
         section = self.section
         if section.with_units == isnan(case_sizes(context.shell).E):
@@ -229,7 +260,7 @@ class ShellLaminate(Ability):
     def symmetry_constraints(
         self, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
-        """Return all symmetry of isotropic plies, else that of the directions if nothing twists."""
+        """Return the symmetry that the plies preserve; all symmetry if they are isotropic."""
         return (
             []
             if self.section.isotropic
@@ -238,7 +269,11 @@ class ShellLaminate(Ability):
 
 
 def _laminate_symmetry(section: LaminateSection, geometry: str) -> SymmetryConstraint:
-    """Return the symmetry that the directions of the plies preserve."""
+    """Return the symmetry that an anisotropic laminate preserves on a geometry.
+
+    No plane mirrors a laminate that twists. Other laminates are mirrored by planes that keep the
+    direction of the angle 0; they are axisymmetric if this is along the meridians.
+    """
     direction = section.direction(geometry)
     reason = None
     if section.twists:
@@ -251,6 +286,7 @@ def _laminate_symmetry(section: LaminateSection, geometry: str) -> SymmetryConst
             "the angle 0 of the plies is not along the meridians: give laminate.along: meridian"
         )
 
+    # planes through e3 along and across the direction may be planes of symmetry
     azimuths = (
         ()
         if direction is None
@@ -266,7 +302,7 @@ def _laminate_symmetry(section: LaminateSection, geometry: str) -> SymmetryConst
 
 
 def laminate_account(section: LaminateSection, shell: Any) -> str:
-    """Return the line of `magshell check` on a laminate."""
+    """Return the line of `magshell check` on a laminate: plies and main stiffnesses."""
     A, B, D = section.matrices(shell.youngs_modulus or 1.0)
     angles = "/".join(f"{ply.angle:g}" for ply in section.plies[:12]) + (
         "/..." if len(section.plies) > 12 else ""

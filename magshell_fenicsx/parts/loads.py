@@ -1,4 +1,4 @@
-"""All loads of a shell: what the parts of a problem add up to, dimensionless."""
+"""All loads of a shell, dimensionless: the sum of what the parts of a problem contribute."""
 
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
@@ -34,23 +34,33 @@ class Loads:
 
     Attributes
     ----------
+    pressure
+        Whether there is a live pressure.
     pressed_sides
         Patches that a live pressure acts on: 1 from outside, -1 from inside; empty: on all from
         outside.
     forces, dead
         Amplitude -> the force, or the dead loads that grow together.
+    magnetic
+        The magnetisation in an applied field.
     user_terms
         User-defined energies.
+    natural
+        The natural shape.
+    moves
+        Prescribed motions of supports.
+    contacts
+        Rigid bodies that may touch the shell.
     growing_imperfections
         Amplitude -> imperfections that grow.
     remanence
         The magnetisation where no field is applied: it loads nothing, and is drawn.
     sensors
-        Places where its magnetic field is read.
+        Places where the shell's magnetic field is read.
     field_maps
-        Grids on which it is computed.
+        Grids on which the shell's magnetic field is computed.
     interaction
-        How strongly its magnetised parts act on each other; None if they do not.
+        How strongly the shell's magnetised parts act on each other; None if they do not.
     pairs
         The pairs that may touch: the shell itself, or parts of it.
     joints
@@ -81,7 +91,7 @@ class Loads:
 
     @property
     def displaced(self) -> str | None:
-        """The amplitude whose displacement is the column w_over_h; None if that is the pole's."""
+        """The amplitude whose displacement is the column w_over_h; None if it is the pole's."""
         return next(iter((*self.forces, *self.dead)), None)
 
 
@@ -96,8 +106,8 @@ def potentials(loads: Iterable[DeadLoad]) -> list[OwnTerm]:
 
 
 def forces(loads: Iterable[DeadLoad]) -> list[PointForce | EdgeForce | AreaForce]:
-    """Return the forces among dead loads: each does the work of its size times a displacement.
+    """Return the forces among dead loads.
 
-    The displacement is along the force.
+    Each does the work of its size times the displacement along it.
     """
     return [load for load in loads if isinstance(load, PointForce | EdgeForce | AreaForce)]

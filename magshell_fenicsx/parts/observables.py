@@ -26,10 +26,12 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class ModelView:
-    """A model, and the units in which it is reported.
+    """A model, and the units and the frame in which it is reported.
 
     Attributes
     ----------
+    model
+        The model of the shell.
     length
         R in the case's unit.
     modulus
@@ -37,7 +39,7 @@ class ModelView:
     mirror, azimuth
         Plane of the half that is modelled, None for all; and azimuth of the model's frame (rad).
     reactions
-        Whether those of all supports are reported.
+        Whether reactions of all supports are reported.
     sense
         Sign of the case's field.
     """
@@ -62,25 +64,29 @@ class ModelView:
 
     @property
     def force(self) -> float:
-        """E h R in the case's unit."""
+        """The unit E h R of forces, in the case's unit."""
         return self.modulus * self.h * self.length**2
 
     def potential(self, state: "State", name: str) -> float:
-        """Return Pi_i(u) of an amplitude, of what is modelled."""
+        """Return Pi_i(u) of the amplitude `name` of the modelled part of the shell."""
         return self.model.system.potential(state.u, state.mu, name)
 
 
 @dataclass(frozen=True)
 class Slope:
-    """A column of a state with its derivatives.
+    """A column at a state, with its derivatives.
 
     Attributes
     ----------
-    by_u, by_mu
-        By the displacement, zero at supports, and by amplitudes where it contains them itself.
+    value
+        The column.
+    by_u
+        Derivative by the displacement, zero at supports.
+    by_mu
+        Amplitude -> explicit derivative by it.
     field, by_field
-        A field of the terms, and the column's own derivatives by its values (cells, nodes,
-        components) in own cells.
+        A field of the terms, and the column's explicit derivatives by its values (cells, nodes,
+        components) in this rank's own cells; None without.
     """
 
     value: float
@@ -96,12 +102,14 @@ class MapGrid:
 
     Attributes
     ----------
+    name
+        Name of the grid.
     corner, sides
-        (3,) where it begins, and (2, 3) or (3, 3) its sides, perpendicular to each other; over R.
+        (3,) where the grid begins, and (2, 3) or (3, 3) its perpendicular sides; over R.
     points
-        How many along each side.
+        Number of points along each side.
     unit
-        Of the values.
+        Unit of the values.
     words
         Meaning of the values.
     values
@@ -118,7 +126,7 @@ class MapGrid:
 
     @property
     def places(self) -> Array:
-        """The places (n, 3) of its points, over R."""
+        """The places (n, 3) of the points over R, along the first side first."""
         coordinates = np.meshgrid(
             *(np.linspace(0.0, 1.0, n) for n in self.points[::-1]), indexing="ij"
         )
@@ -129,14 +137,16 @@ class MapGrid:
 class Observables:
     """The base of what a part observes of a state; by default nothing.
 
+    A run calls the methods to name its columns at the begin, and to fill them at each point.
+
     Attributes
     ----------
     quantities
-        Its columns, where they are not those of every run; see `Quantity.each`.
-    varied
-        Its amplitudes with a curve of their own.
+        The part's columns, where they are not those of every run; see `Quantity.each`.
+    curve_amplitudes
+        The part's amplitudes with a curve of their own.
     before_points
-        Whether its columns come before those of named points.
+        Whether the part's columns come before those of named points.
     """
 
     quantities: ClassVar[tuple[Quantity, ...]] = ()
@@ -147,68 +157,82 @@ class Observables:
         register_for_all_cases(cls.quantities, cls.curve_amplitudes)
 
     def amplitudes(self, loads: "Loads") -> Sequence[str]:
-        """Return the amplitudes that are its columns."""
+        """Return the part's amplitudes that are columns of path.csv."""
         return ()
 
     def free_amplitudes(self, loads: "Loads") -> Sequence[str]:
-        """Return further amplitudes, which are columns themselves and begin at zero."""
+        """Return further amplitudes of the part, which are columns and begin at zero."""
         return ()
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
-        """Check that the surface has the patches that it names.
+        """Check that the surface has the patches that the part names.
 
         Raises
         ------
         MeshError
-            With the name.
+            With the name of a missing patch.
         """
 
     def conjugates(self, loads: "Loads") -> dict[str, str]:
-        """Return amplitude -> column of its conjugate, besides those of every run."""
+        """Return amplitude -> column of its conjugate, but for amplitudes of every run."""
         return {}
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
-        """Return columns besides those of every run; reactions of `supports` are reported."""
+        """Return the part's columns besides those of every run.
+
+        `supports` are the names of the supports whose reactions are reported.
+        """
         return (*self.amplitudes(loads), *self.conjugates(loads).values())
 
     def moments(self, loads: "Loads") -> Sequence[str]:
-        """Return the columns that are moments where others of the kind are forces."""
+        """Return the columns that are moments, while others of the same kind are forces."""
         return ()
 
     def motions(self, loads: "Loads") -> dict[str, tuple[bool, float]]:
-        """Return amplitudes that are motions: whether each turns, and its way at one (over R, or
-        rad).
+        """Return the amplitudes that are motions, each with its way at an amplitude of one.
+
+        Returns
+        -------
+        dict
+            Amplitude -> whether it turns alone, and the way: an angle (rad), or else a length over
+            R.
         """
         return {}
 
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
-        """Return column -> value."""
+        """Return column -> value of the part at a state."""
         return {}
 
     def grids(self, loads: "Loads") -> Sequence[str]:
-        """Return the names of the grids in space on which it observes a field."""
+        """Return the names of the grids in space on which the part observes a field."""
         return ()
 
     def on_grids(self, view: ModelView, state: "State") -> Sequence[MapGrid]:
-        """Return these grids with the fields there; collective."""
+        """Return the grids of the part with the fields at a state; collective."""
         return ()
 
     def differentiable(self, loads: "Loads") -> Sequence[str]:
-        """Return the columns that have a `slope`."""
+        """Return the part's columns that have a `slope`."""
         return ()
 
     def slope(self, view: ModelView, state: "State", column: str) -> Slope | None:
-        """Return a column with its derivatives; None if it is another part's. Collective."""
+        """Return a column at a state with its derivatives; collective.
+
+        None if the column belongs to another part.
+        """
         return None
 
     def left_out(self, view: ModelView) -> Sequence[str]:
-        """Return what the model lacks of it, for people."""
+        """Return phrases about the physics of the part that the model lacks."""
         return ()
 
     def summary(self, view: ModelView, state: "State") -> dict[str, Any]:
-        """Return what summary.json says of the end of a path; collective."""
+        """Return the part's entries of summary.json about the end of a path; collective."""
         return {}
 
     def conjugate_unit(self, view: ModelView, name: str) -> float | None:
-        """Return -dPi/dmu of one unit of an amplitude's conjugate; None if it is another part's."""
+        """Return -dPi/dmu of one unit of the conjugate of the amplitude `name`.
+
+        None if the amplitude belongs to another part.
+        """
         return None

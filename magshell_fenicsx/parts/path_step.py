@@ -66,7 +66,9 @@ class PathStep(Step):
     @model_validator(mode="before")
     @classmethod
     def _control_of_the_target(cls, data: Any) -> Any:
-        """Reach a target that is a load by load control, where the default prescribes its
+        """Choose the control of a step from its target, if the case gives none.
+
+        A load as a target is reached by load control, where the default control prescribes its
         conjugate.
         """
         default = cls.model_fields["control"].default
@@ -80,7 +82,10 @@ class PathStep(Step):
 
     @model_validator(mode="after")
     def _target_fits_control(self) -> Self:
-        """Allow one target that fits the control with `until: target`, none elsewhere."""
+        """Check that `until: target` has one target that fits the control, and other ends none.
+
+        Exceptions are a bound beside `until: limit`, and the target of a branch that is followed.
+        """
         targets, prescribed = self._given_targets, self.prescribed
         fitting = [
             key for key, (quantity, _) in self.targets.items() if prescribed in ("arc", quantity)
@@ -125,7 +130,15 @@ class PathStep(Step):
         return self
 
     def _refuse_unfit_bound(self, targets: list[str], fitting: list[str]) -> None:
-        """Check that a target is the end of a path on which the first instability is looked for."""
+        """Check the target beside `until: limit`: it must be the end of the path.
+
+        Parameters
+        ----------
+        targets
+            The keys of targets that the case gives.
+        fitting
+            The keys of targets that fit the control.
+        """
         if "until" not in self.model_fields_set:
             raise ValueError(
                 f"{targets[0]} is a target: it goes with until: target; or write until: limit, "
@@ -139,6 +152,7 @@ class PathStep(Step):
 
     @classmethod
     def level(cls, text: str, context: Context) -> float:
+        """Return a value of a history with a unit, converted as a target of the load."""
         for key in (key for key, target in cls.targets.items() if target.quantity == "load"):
             annotation = cls.model_fields[key].annotation
             if is_over_unit(annotation):
@@ -159,22 +173,27 @@ class PathStep(Step):
 
     @property
     def _given_targets(self) -> dict[str, float]:
+        """Mapping: key of each target that the case gives -> its value, in the unit of the key."""
         return {key: value for key in self.targets if (value := getattr(self, key)) is not None}
 
     @property
     def _end(self) -> float | None:
-        """The target if no key gives one."""
+        """The target that counts if no key gives one; None without."""
         return None
 
     @property
     def prescribed(self) -> Control:
-        """The quantity that is prescribed step by step, in the words of the solver."""
+        """The quantity that the solver prescribes step by step: load, conjugate or arc length."""
         if self.control == self.conjugate_control:
             return "conjugate"
         return "load" if self.control == "load" else "arc"
 
     @property
     def target(self) -> tuple[Target, float] | None:
+        """The target at which the path ends, and its value in the unit of its key; None without.
+
+        A target beside `until: limit` is none, see `limit_target`.
+        """
         if self.limit_target:
             return None
         for key, value in self._given_targets.items():
@@ -193,26 +212,34 @@ class PathStep(Step):
         )
 
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
-        """Return the change of the amplitude in the first step, by default one of equal parts.
+        """Return the change of the amplitude in the first step of a path.
+
+        By default the way to the target has equal parts.
 
         Parameters
         ----------
         change
-            From the begin to the target, whose sign the first one has; without a target 1.
+            Change from the begin to the target, which has the sign of the first change; without a
+            target the size of the load.
+        load_start
+            The amplitude where the step begins.
         by_load
-            Whether it is a change of the amplitude.
+            Whether `change` is one of the amplitude; else of the conjugate.
         """
         return change / self.points
 
     def step(self, change: float | None, load_start: LoadStart) -> float | None:
-        """Return the first step of a prescribed conjugate; None: it follows from `first_change`."""
+        """Return the first step of a prescribed conjugate; None if it follows from `first_change`.
+
+        `change` is that of the conjugate from the begin to the target; None without a target.
+        """
         return None
 
     def drive(self, load_start: LoadStart) -> Drive:
         """Return how the step drives its amplitude from its begin.
 
-        Targets are equal parts of the way: from zero if the amplitude is driven for the first time,
-        without those that earlier steps have passed.
+        The targets divide the way into equal parts. The way begins at zero if the amplitude is
+        driven for the first time; targets that earlier steps have passed are left out.
         """
         goal = self.target or self.limit_target
         quantity: Prescribed = goal[0].quantity if goal else "load"
@@ -227,13 +254,22 @@ class PathStep(Step):
             targets = [t for t in targets if (t - begin_value) * change > 0]
         if self.until == "zero":
             targets = [0.0]
-        first, step = (
+        first_change, first_step = (
             self.first_change(change, load_start, by_load=by_load),
             self.step(None if goal is None else change, load_start),
         )
-        return Drive(self.prescribed, quantity, end, targets, first, self.scale(load_start), step)
+        return Drive(
+            self.prescribed,
+            quantity,
+            end,
+            targets,
+            first_change,
+            self.scale(load_start),
+            first_step,
+        )
 
     def course(self, step_start: StepStart) -> StepCourse:
+        """Return how the step follows its path from the state where it begins."""
         until = "target" if self.until == "zero" else self.until
         steps = self.points if until == "points" else None
         return StepCourse(
@@ -241,7 +277,7 @@ class PathStep(Step):
         )
 
     def load_start(self, step_start: StepStart) -> LoadStart:
-        """Return its amplitude where it begins."""
+        """Return the value and the conjugate of the step's amplitude where the step begins."""
         return step_start.load_start()
 
     @property
@@ -259,11 +295,14 @@ class PathStep(Step):
         )
 
     def begin(self, step_start: float) -> float:
-        """Return where the equal parts of the first way to a target begin."""
+        """Return where the equal parts of the first way to a target begin, by default at zero.
+
+        `step_start` is the value of the quantity with the target where the step begins.
+        """
         return 0.0
 
     def scale(self, load_start: LoadStart) -> float:
-        """Return an amplitude that counts as of order one in the arc length."""
+        """Return a value of the amplitude that counts as of order one in the arc length."""
         return 1.0
 
 
@@ -314,11 +353,15 @@ class FactorStep(LoadStep):
 
     @classmethod
     def asked_for(cls, context: Context) -> bool:
-        """Return whether the case asks for the growth."""
+        """Return whether the case asks for the growth by a section or a key of it."""
         raise NotImplementedError
 
     @classmethod
     def steps_before_load(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
+        """Return the step that lets the factor grow to 1 before the only load of a case.
+
+        Empty if the load drives the factor itself, or the case does not ask for it.
+        """
         is_driven = loading is not None and cls.amplitude in (loading.amplitude, *loading.drives)
         if is_driven or not cls.asked_for(context):
             return []
@@ -328,6 +371,10 @@ class FactorStep(LoadStep):
         return [(cls.section, step)]
 
     def drive(self, load_start: LoadStart) -> Drive:
+        """Return how the factor grows.
+
+        Before the load it grows by arc length, with a first step of half the way.
+        """
         size = load_start.size
         return (
             Drive("arc", "load", size, [size], size / 2, size)
@@ -336,15 +383,27 @@ class FactorStep(LoadStep):
         )
 
     def course(self, step_start: StepStart) -> StepCourse:
+        """Return the course of the step; before the load, it forbids an instability on the way."""
         course = super().course(step_start)
         if not self._alone:
             return course
 
         def forbidden(mu: Mapping[str, float], what: str) -> str:
+            """Return the message about an instability, at amplitudes `mu`, with its name."""
             return self.unstable_alone(mu[self.amplitude], course, what)
 
         return replace(course, until="limit", forbidden=forbidden, label=self.label)
 
     def unstable_alone(self, value: float, course: StepCourse, what: str) -> str:
-        """Return the message about an instability before the load, at a value of the amplitude."""
+        """Return the message about an instability during the growth before the load.
+
+        Parameters
+        ----------
+        value
+            The amplitude at the instability.
+        course
+            The course of the step.
+        what
+            Name of the instability.
+        """
         raise NotImplementedError

@@ -93,14 +93,17 @@ ACCOUNTS = (  # modules here with a function `account`, in the order of `magshel
 class Origin:
     """The places where the keys of a case were written, and its data.
 
-    Equal cases may come from different files.
+    Origins do not count when cases are compared: equal cases may come from different files.
 
     Attributes
     ----------
+    place
+        Location (keys that lead to a value) -> place in the file; None without a file.
     data
-        Of `Source`; None without one.
+        Plain data of the case, as of `Source`; None without a file.
     context
-        With which these are validated: their folder and the files that were read.
+        Context with which the data are validated: the folder of the case and the files that were
+        read.
     """
 
     place: Callable[[tuple[str | int, ...]], str] | None = field(default=None, compare=False)
@@ -115,7 +118,7 @@ class WithOwnTerms(Section):
     _origin: Origin = PrivateAttr(default=Origin())
 
     def written_as(self, origin: Origin) -> Self:
-        """Return the case with the places of its keys, for messages that it does not make."""
+        """Set the origin of the case, for messages that others make, and return the case."""
         self._origin = origin
         return self
 
@@ -130,10 +133,10 @@ class WithOwnTerms(Section):
         return Path(self._origin.place(())).name if self._origin.place else ""
 
     def with_place(self, message: str) -> str:
-        """Return a message that begins with a key of the case, with the place of this key before
-        it.
+        """Return a message that begins with a key of the case, after the place of the key.
 
-        A name after the key, as that of a patch, is looked for below it.
+        A name after the key, such as that of a patch, is looked up below the key. Other messages
+        are returned unchanged.
         """
         match = re.match(r"([a-z]\w*(?:\.\w+)*): (?:([\w.]+): )?", message)
         if (
@@ -147,26 +150,23 @@ class WithOwnTerms(Section):
 
     @property
     def own_terms(self) -> tuple[OwnTerm, ...]:
-        """The user-defined energies, which all that is made of the case has."""
+        """The user-defined energies, which every problem and scene of the case has."""
         return self._own_terms
 
     def with_terms(self, terms: Sequence[OwnTerm]) -> Self:
-        """Return a copy of the case with user-defined energies.
-
-        `run`, `Scene` and all else that takes a case take it.
-        """
+        """Return a copy of the case with user-defined energies, to be used as any other case."""
         copied = self.model_copy()
         copied._own_terms = tuple(terms)
         return copied
 
     @property
     def term_digests(self) -> dict[str, str | None]:
-        """Hashes of the energies, by which a run is recognised that is resumed."""
+        """Hashes of the user-defined energies, by which a resumed run is recognised."""
         return {f"terms.{term.name}": term.digest for term in self._own_terms}
 
 
 def step_class(name: str) -> type[Step]:
-    """Return the class of the steps with a kind, or an amplitude, of this name."""
+    """Return the class of the steps of a kind, or of those that drive an amplitude of this name."""
     if name in STEPS:
         return STEPS[name]
     return next(
@@ -175,23 +175,23 @@ def step_class(name: str) -> type[Step]:
 
 
 def parts_of(context: Context) -> dict[str, Part]:
-    """Return the registered parts that a problem has, by key."""
+    """Return the registered parts that a problem has, by the keys of their sections."""
     return {key: part for key in PART_CLASSES if (part := context.sections.get(key)) is not None}
 
 
 def abilities_of(context: Context) -> list[Ability]:
-    """Return all abilities that a problem has."""
+    """Return all abilities that a problem has: the registered parts first, then the others."""
     listed = (ability.from_context(context) for ability in ABILITY_CLASSES)
     return [*parts_of(context).values(), *(ability for ability in listed if ability is not None)]
 
 
 def accounts(context: Context, loads: "Loads") -> list[Account]:
-    """Return the lines of `magshell check` on all abilities of a model."""
+    """Return the lines of `magshell check` on all abilities of a model, in a fixed order."""
     return [import_module(f"{__package__}.{module}").account(context, loads) for module in ACCOUNTS]
 
 
 def _class_at(path: str) -> Any:
-    """Return the class at a path below this package."""
+    """Return the class at a path "module.Class" below this package."""
     module, _, name = path.rpartition(".")
     return getattr(import_module(f"{__package__}.{module}"), name)
 

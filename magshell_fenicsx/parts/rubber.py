@@ -31,6 +31,7 @@ class LawKeys(Section):
 
     @model_validator(mode="after")
     def _law_fits(self) -> Self:
+        """Check that keys of a law go with this law alone, and that rubber is incompressible."""
         if (self.mooney is not None) != (self.law == "mooney-rivlin"):
             raise ValueError(
                 "mooney: C01/C10 belongs to law: mooney-rivlin, and only to it; here the law is "
@@ -56,7 +57,11 @@ class LawKeys(Section):
 
     @property
     def rubber(self) -> Rubberlike | None:
-        """C01/(C10 + C01); of Ogden's law all mu over E, and all alpha; None of Koiter's law."""
+        """Numbers of a law of rubber; None of Koiter's law.
+
+        C01/(C10 + C01) of neo-Hookean and Mooney-Rivlin rubber; of Ogden's law all mu over E, and
+        all alpha.
+        """
         if self.mu and self.alpha:
             young_ratio = (
                 3 / 2 * sum(mu * alpha for mu, alpha in zip(self.mu, self.alpha, strict=True))
@@ -74,17 +79,17 @@ class RubberMaterial(Ability):
 
     @classmethod
     def from_context(cls, context: Context) -> "RubberMaterial | None":
-        """Return the first of several shells that is of rubber."""
+        """Return the law of the first shell of rubber in a case; None without rubber."""
         laws = (law for law in laws_of(context) if law not in ("koiter", "laminate"))
         return next((cls(law) for law in laws), None)
 
     def refuse_unfit(self, context: Context) -> None:
-        """Check that Ogden's law is that of a shell."""
+        """Check that Ogden's law is that of a shell, by a ValueError: a solid cannot have it."""
         if self.law == "ogden":
             context.needs("law: ogden", "a mid-surface")
 
     def withdraws(self, context: Context) -> dict[Offer, str]:
-        """Return that rubber keeps its volume, so that its thickness changes."""
+        """Return that the thickness changes, since rubber keeps its volume, and how to avoid it."""
         return {
             "a thickness that does not change": (
                 f"shell.law: {self.law} makes the shell thinner: take koiter"
@@ -99,7 +104,7 @@ def laws_of(context: Context) -> list[str]:
 
 
 def law_account(rubber: Rubberlike | None) -> str:
-    """Return the line of `magshell check` on a law, see `LawKeys.rubber`."""
+    """Return the line of `magshell check` on a law, given by its numbers as of `LawKeys.rubber`."""
     if rubber is None:
         return "membrane and bending energy"
     if isinstance(rubber, tuple):

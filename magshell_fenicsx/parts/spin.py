@@ -24,7 +24,7 @@ SQUARED = Unit("E/(ρ R²)", "1/s²", "per_s2", "1/s²", lambda g: g.E / (g.rho 
 
 
 def _of_angles(value: Any) -> Any:
-    """Refuse hertz, which would be read as radians per second."""
+    """Return a speed unchanged; refuse hertz, which pint would read as radians per second."""
     if isinstance(value, str) and "z" in value.lower():
         raise ValueError(f"{value}: give rpm or rad/s, which say what turns")
     return value
@@ -78,5 +78,10 @@ class SpinStep(BodyForceStep):
 
 
 def energy(r0: Jet, u: Jet) -> "Expr":
-    """Return the energy density for ρ ω² R²/E = 1, zero where nothing has moved."""
+    """Return the energy density of the centrifugal force for ρ ω² R²/E = 1.
+
+    It is zero without displacement.
+
+    It is (|ρ0|² - |ρ|²)/2 with the distances ρ0 and ρ from e3 before and after the displacement.
+    """
     return -sum(u.r[i] * (r0.r[i] + u.r[i] / 2) for i in range(2))

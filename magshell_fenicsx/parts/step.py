@@ -91,7 +91,7 @@ class Step(Section):
 
     @property
     def place(self) -> Any:
-        """The place or direction that distinguishes two loads of the same kind."""
+        """The place or direction that distinguishes two loads of the same kind; None without."""
         return None
 
     @property
@@ -101,22 +101,22 @@ class Step(Section):
 
     @property
     def limit_target(self) -> tuple[Target, float] | None:
-        """The latest end of the path to the first instability, as `target`; None without."""
+        """The latest end of a path to the first instability, as `target` is given; None without."""
         return None
 
     @property
     def ends(self) -> Until:
-        """The event at which it ends, as a path has it."""
+        """The event at which the step ends, in the words of a path's `until`."""
         return "target"
 
     @property
     def rests(self) -> bool:
-        """Whether it ends in equilibrium."""
+        """Whether the step ends in equilibrium."""
         return True
 
     @property
     def drives(self) -> tuple[str, ...]:
-        """The amplitudes of other steps that it drives too."""
+        """The amplitudes of other steps that this step drives too."""
         return ()
 
     @property
@@ -126,26 +126,28 @@ class Step(Section):
 
     @property
     def branch_points(self) -> int:
-        """The number of steps in each direction of a branch; 0 if none is followed."""
+        """Number of steps in each direction of a branch; 0 if no branch is followed."""
         return 0
 
     @property
     def follows_branch(self) -> bool:
-        """Whether it goes on along the branch at the bifurcation that ends it."""
+        """Whether the path goes on along the branch at the bifurcation that ends the step."""
         return False
 
     @property
     def wants_sensitivities(self) -> bool:
-        """Whether the load at its fold is derived by the numbers of the case."""
+        """Whether derivatives of the load at the fold by numbers of the case are requested."""
         return False
 
     def size(self, context: Context) -> float:
-        """Return the amplitude at a target of one."""
+        """Return the amplitude at a target of one unit of the target's key."""
         return 1.0
 
     @classmethod
     def level(cls, text: str, context: Context) -> float:
-        """Return a value of a history with a unit as a number, as a target of the load would be.
+        """Return a value of a history, given as text with a unit, in the unit of the target.
+
+        A history gives a load as a function of time.
 
         Raises
         ------
@@ -155,50 +157,56 @@ class Step(Section):
         raise ValueError("its values have no unit: give a number")
 
     def of_history(self, value: float) -> float:
-        """Return the amplitude at a value of a history, which is as a target."""
+        """Return the amplitude at a value of a history, which has the unit of the step's target."""
         return value
 
     def in_history(self, amplitude: float) -> float:
-        """Return the value of a history at an amplitude."""
+        """Return the value of a history, in the unit of the step's target, at an amplitude."""
         return amplitude
 
     def course(self, step_start: StepStart) -> StepCourse:
-        """Return how the step goes on from its begin."""
+        """Return how the step goes on from the state where it begins."""
         raise NotImplementedError
 
     def curves(self, step_start: StepStart) -> tuple[Curves, float] | None:
-        """Return the `curves` of its course, from any state of the step."""
+        """Return the amplitudes that are functions of the step's own, from any state of the step.
+
+        None without such functions; see `StepCourse.curves`.
+        """
         return None
 
     def expected_end(
         self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float
     ) -> ExpectedEnd | None:
-        """Return its end, if its target does not say it."""
+        """Return the end of the step in words, for the status line of a run.
+
+        None if the target determines the end. `turn` is the azimuth of the model's frame (rad).
+        """
         return None
 
     def changes(self, name: str, mu: Iterable[str]) -> set[str]:
-        """Return the amplitudes among all that it changes as it is given; `name` is its own."""
+        """Return those of the amplitudes `mu` that the step changes; `name` is that of its own."""
         return {name}
 
     def by_conjugate(self, *, at_target: bool) -> bool:
-        """Return whether the conjugate is prescribed at its points, or at its target."""
+        """Return whether the conjugate is prescribed at the step's points, or at its target."""
         return False
 
     def on_perfect(self, *, last: bool) -> "Step | None":
-        """Return the step on the shell without imperfections; None without.
+        """Return the step on the shell without imperfections; None if it has no meaning there.
 
-        The last one goes to the first instability.
+        `last` is whether the step is the last one, which then goes to the first instability.
         """
         return self
 
     @property
     def held_conjugate(self) -> bool:
-        """Whether other steps may hold its conjugate."""
+        """Whether other steps may hold the conjugate of the step's amplitude."""
         return bool(self.conjugate)
 
     @property
     def released_by(self) -> SnapSection | None:
-        """The section on how the shell is released at its end; None if it is not."""
+        """The section on how the shell is released at the end of the step; None if it is not."""
         return None
 
     @classmethod
@@ -207,19 +215,27 @@ class Step(Section):
     ) -> list[tuple[str, "Step"]]:
         """Return the steps of this kind that come before the only load of a case.
 
-        Each has the key that asks for it.
+        Parameters
+        ----------
+        loading
+            The only load; None without.
+
+        Returns
+        -------
+        list of tuple
+            The key of the case that asks for the step, and the step.
         """
         return []
 
     def name_in(self, context: Context, loads: Sequence["Step"]) -> str | None:
-        """Return the name of its amplitude beside all loads of a case.
+        """Return the name of the step's amplitude beside all loads of a case.
 
-        None: `amplitude`, with a number from the second on.
+        None stands for `amplitude`, with a number from the second load of the kind on.
         """
         return None
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
-        """Check that the case has what the step needs.
+        """Check that the case has what the step needs; `step` is this step in the programme.
 
         Raises
         ------
@@ -228,49 +244,52 @@ class Step(Section):
         """
 
     def terms(self, step: ProgrammeStep, context: Context) -> list[OwnTerm]:
-        """Return energies with its amplitude, from nothing but their densities; see `OwnTerm`."""
+        """Return energies with the step's amplitude, given by densities alone; see `OwnTerm`."""
         return []
 
     def multiplies(self, step: ProgrammeStep, context: Context) -> list[str]:
-        """Return keys below `shell` of the imperfections that it multiplies."""
+        """Return keys below `shell` of the imperfections that the step's amplitude multiplies."""
         return []
 
     def account(self, step: ProgrammeStep, context: Context) -> str:
-        """Return its line of `magshell check`, if nothing else says it."""
+        """Return the step's line of `magshell check`; empty if other lines say everything."""
         return ""
 
     def warning(self, step: ProgrammeStep, outline: "Outline", length: float) -> str | None:
-        """Return a warning with the key, where a different load is often meant; None without.
+        """Return a warning, with the key, if a different load is often meant; None without.
 
-        Places of the outline times `length` are those of formulas.
+        Places of the outline (over R) times `length` are the places of formulas.
         """
         return None
 
     def symmetry_constraints(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
-        """Return the symmetry that it preserves of a shell."""
+        """Return the symmetry of a shell that the step preserves; empty if it preserves all."""
         return []
 
     def place_on(self, step: ProgrammeStep, context: Context, outline: "Outline") -> Array | None:
-        """Return the one place (3,) over R where it is, in the frame of the case; None without.
+        """Return the one place (3,) over R where the load acts, in the case's frame; None without.
 
         Raises
         ------
         CaseError
-            If it does not say where it is on this geometry.
+            If the step does not say where the place is on this geometry.
         """
         return None
 
     def chart_of(self, place: Array, outline: "Outline", turn: float, *, half: bool) -> Array:
-        """Return its place in the chart of a frame turned about e3 (rad)."""
+        """Return the chart of the load's place (3,), in a frame turned about e3 by `turn` (rad).
+
+        With `half`, the chart is on the modelled half.
+        """
         chart = outline.inverse(rotation(turn) @ place)
         return outline.on_half(chart) if half else chart
 
     def refuse_unfit_place(
         self, step: ProgrammeStep, context: Context, outline: "Outline", at: Array
     ) -> None:
-        """Check that there is room for it around its place in the chart.
+        """Check that there is room for the load around its place in the chart.
 
         Raises
         ------
@@ -279,18 +298,26 @@ class Step(Section):
         """
 
     def named_points(self) -> list[str]:
-        """Return the named points at which it is concentrated."""
+        """Return the named points at which the load is concentrated."""
         return []
 
     @classmethod
     def mesh_features(
         cls, loads: Sequence[Self], place: Array, sizing: "SizingContext"
     ) -> list[Feature]:
-        """Return small elements around a place in the chart with loads of this kind."""
+        """Return small elements around a place in the chart with loads of this class.
+
+        Parameters
+        ----------
+        loads
+            The loads at the place.
+        place
+            The place (2,) in the chart.
+        """
         return []
 
     def growth(self, sizing: "SizingContext") -> float:
-        """Return how fast elements may grow away from small ones."""
+        """Return how fast elements may grow away from small ones: size per distance."""
         return 0.4
 
     def rim(self, sizing: "SizingContext") -> float:
@@ -298,16 +325,16 @@ class Step(Section):
         return 1.4
 
     def largest(self, sizing: "SizingContext") -> float | None:
-        """Return the largest size of elements on a curved disc, over R; None: as without it."""
+        """Return the largest element size on a curved disc, over R; None for the usual one."""
         return None
 
     def formulas(self, key: str, context: Context) -> Iterable[Formulas]:
-        """Return its formulas of the undeformed place."""
+        """Return the step's formulas of the undeformed place; `key` is that of the step."""
         return []
 
     @classmethod
     def implied(cls) -> dict[str, Any]:
-        """Return `adds` where another step holds this amplitude or drives it in time."""
+        """Return fields of `Loads`, as `adds`, if another step holds or drives this amplitude."""
         return {}
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:

@@ -1,5 +1,7 @@
-"""How a step is driven, as data: what it holds and how it ends, where it begins, what it prescribes
-and how it goes on.
+"""How a step of a programme is driven, as data.
+
+The data say what the step holds, where it begins, what it prescribes, how it goes on and ends. An
+amplitude mu is a load parameter; its conjugate -dPi/dmu is the displacement on which it does work.
 """
 
 from collections.abc import Callable, Mapping
@@ -108,7 +110,7 @@ class SnapSection(Section):
 
 
 class Target(NamedTuple):
-    """A quantity that the value of a key prescribes, with its column of path.csv."""
+    """A quantity that the value of a key prescribes, and its column of path.csv."""
 
     quantity: Prescribed
     column: str
@@ -121,9 +123,9 @@ class LoadStart:
     Attributes
     ----------
     value, conjugate
-        mu, and -dPi/dmu.
+        The amplitude mu, and its conjugate -dPi/dmu.
     unit
-        -dPi/dmu of one unit of the key that prescribes it.
+        The conjugate -dPi/dmu of one unit of the key that prescribes it.
     is_driven
         Whether an earlier step has driven the amplitude.
     size
@@ -146,6 +148,8 @@ class Drive:
 
     Attributes
     ----------
+    control
+        The quantity that is prescribed step by step: mu, its conjugate, or the arc length.
     quantity, end
         The quantity with a target, mu or -dPi/dmu, and the target; None without.
     targets
@@ -153,9 +157,9 @@ class Drive:
     first
         Change of the amplitude in the first step.
     scale
-        See `continuation.path.Path`.
+        Value of the amplitude of order one, see `continuation.path.Path`.
     step
-        The first step of a prescribed conjugate; None: it follows from `first`.
+        The first step of a prescribed conjugate; None if it follows from `first`.
     """
 
     control: Control
@@ -169,18 +173,18 @@ class Drive:
 
 @dataclass(frozen=True)
 class ProgrammeStep:
-    """A step of a programme.
+    """A step of a programme: a load with its number and the name of its amplitude.
 
     Attributes
     ----------
     number
-        From 1.
+        Number of the step, from 1.
     name
-        Name of its amplitude; a second force or list of dead loads has a number, such as "force_2".
+        Name of the amplitude; a second force or list of dead loads has a number, such as "force_2".
     key
-        Its place in the case file.
+        Place of the step in the case file, as a key.
     load
-        Its section.
+        Section of the step.
     """
 
     number: int
@@ -190,10 +194,12 @@ class ProgrammeStep:
 
     @property
     def kind(self) -> str:
+        """The kind of the step, such as "pressure"."""
         return str(getattr(self.load, "kind", ""))
 
     @property
     def until(self) -> Until:
+        """The event at which the step ends."""
         return self.load.ends
 
 
@@ -203,6 +209,10 @@ class StepStart:
 
     Attributes
     ----------
+    step
+        The step.
+    context
+        The case.
     loads
         All that loads the model.
     turn
@@ -210,9 +220,9 @@ class StepStart:
     h
         Thickness over R.
     mu
-        The amplitudes.
+        The amplitudes by name.
     potential
-        Amplitude -> Pi_i(u).
+        Amplitude -> Pi_i(u), whose product with mu_i is the amplitude's part of the energy.
     unit
         Amplitude -> -dPi/dmu of one unit of the key that prescribes it.
     open
@@ -231,13 +241,14 @@ class StepStart:
 
     @property
     def is_driven(self) -> bool:
-        """Whether an earlier step has driven the amplitude."""
+        """Whether an earlier step has driven the amplitude of this step."""
         return any(
-            self.step.name == other.name for other in self.context.steps_before(self.step.number)
+            self.step.name == earlier_step.name
+            for earlier_step in self.context.steps_before(self.step.number)
         )
 
     def load_start(self) -> LoadStart:
-        """Return the amplitude of the step at its begin."""
+        """Return the value and the conjugate of the step's amplitude at the begin of the step."""
         name = self.step.name
         size = self.step.load.size(self.context)
         return LoadStart(
@@ -251,22 +262,24 @@ class StepCourse:
 
     Attributes
     ----------
+    drive
+        How the step drives its amplitude.
     until
-        The end of the path.
+        The event at which the path ends.
     steps
-        The largest number of steps; None: the path's own.
+        The largest number of steps; None for that of the path.
     curves
-        Amplitudes that are functions of the step's own, and its value; None where the model has it
-        itself.
+        Amplitudes that are functions of the step's own, and its value; None where the model has
+        these functions itself.
     finer
-        Returns the lengths of steps of a path, of those that follow from the first one.
+        Function of a path's options of step lengths that returns finer ones; None to keep them.
     forbidden
-        Returns what is said of an instability that must not be on the way, by its amplitudes and
-        its name; None if it may.
+        Function of the amplitudes at an instability and of its name: the message about an
+        instability that must not be on the way. None if any may be.
     at_once
-        Whether that ends the step, or it goes on to its end first.
+        Whether such an instability ends the step at once; else the step goes on to its end first.
     label
-        Of points that are no instabilities, in place of the path's own.
+        Label of points that are no instabilities; empty for the path's own.
     impossible
         Why there is no such path; empty if there is one.
     """
@@ -284,12 +297,14 @@ class StepCourse:
 
 @dataclass(frozen=True)
 class ExpectedEnd:
-    """The end of a step in words, for those who wait for it.
+    """The end of a step in words, for the status line of a run.
 
     Attributes
     ----------
+    words
+        The event at which the step ends.
     end
-        Value of the column of its amplitude; None if it ends at another event.
+        Value of the column of the step's amplitude; None if it ends at another event.
     steps
         Number of steps after which it ends; None if it ends otherwise.
     """

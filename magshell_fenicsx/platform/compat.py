@@ -52,11 +52,12 @@ UFCX.cdef(_UFCX_DECLARATIONS.replace("_Complex", ""))
 
 @cache
 def _form_options() -> dict[str, Any]:
+    """Return FFCx's options for kernels in double precision."""
     return dict(ffcx.get_options({"scalar_type": np.float64}))
 
 
 def form_signature(form: ufl.Form) -> str:
-    """Return the name of all that the code of a form depends on."""
+    """Return a name that depends on everything that the code of a form depends on."""
     return str(naming.compute_signature([form], str(sorted(_form_options().items()))))
 
 
@@ -80,9 +81,9 @@ class FormKernels:
     Attributes
     ----------
     ufcx
-        The form's structure in C.
+        The form's structure in C, as FFCx defines it.
     library
-        The shared library that it is in.
+        The shared library that holds the structure; it must stay loaded.
     """
 
     ufcx: Any
@@ -100,14 +101,17 @@ class FormKernels:
         return UFCX
 
     def order_fields(self, fields: Sequence[Field]) -> list[Field]:
-        """Return those of a form's fields that the kernels take, in their order."""
+        """Return the fields of a form that its kernels take, in the kernels' order.
+
+        `fields` are all coefficients of the form, in UFL's order.
+        """
         positions = self.ufcx.original_coefficient_positions
         return [fields[positions[i]] for i in range(self.ufcx.num_coefficients)]
 
     def subdomain_ids(self, kind: Any) -> list[int]:
-        """Return the ids of the subdomains that integrals of a kind are over.
+        """Return the ids of the subdomains of a form's integrals of a kind, such as cells.
 
-        Integrals over the whole mesh have none.
+        Integrals over the whole mesh have no id.
         """
         first, last = (self.ufcx.form_integral_offsets[int(kind.value) + i] for i in (0, 1))
         ids = [self.ufcx.form_integral_ids[i] for i in range(first, last)]
@@ -127,18 +131,20 @@ def bind_form(
     Parameters
     ----------
     spaces
-        Of its arguments.
+        Function spaces of the form's arguments.
     fields, constants
-        Its coefficients and constants, in the order of the kernels.
+        Coefficients and constants of the form, in the order of the kernels.
     tags
-        By the kind of integral, such as "exterior_facet".
+        Kind of integral, such as "exterior_facet" -> subdomains; None for integrals without.
     domain
         The mesh in C++.
     """
-    tags_by_kind = {getattr(fem.IntegralType, name): of_kind for name, of_kind in tags.items()}
+    tags_by_kind = {
+        getattr(fem.IntegralType, name): tags_of_kind for name, tags_of_kind in tags.items()
+    }
     integration_domains = {
-        kind: get_integration_domains(kind, of_kind, kernels.subdomain_ids(kind))
-        for kind, of_kind in tags_by_kind.items()
+        kind: get_integration_domains(kind, tags_of_kind, kernels.subdomain_ids(kind))
+        for kind, tags_of_kind in tags_by_kind.items()
     }
     address = int(UFCX.cast("uintptr_t", UFCX.addressof(kernels.ufcx)))
     inputs = (*(_cpp_objects(group) for group in (spaces, fields, constants)), integration_domains)
@@ -152,14 +158,15 @@ def bind_form(
 
 
 def _cpp_objects(objects: Sequence[Any]) -> list[Any]:
+    """Return the C++ objects that dolfinx objects wrap."""
     return [wrapper._cpp_object for wrapper in objects]
 
 
 def shared_facet_partitioner() -> Any:
-    """Return the partitioner for `create_mesh` that gives each rank one layer of ghosts.
+    """Return the partitioner for `create_mesh` that gives each rank one layer of ghost cells.
 
-    It divides the same cells in the same way each time: scenes on one mesh with other numbers of
-    the case give each other what touches by the numbers of cells and nodes.
+    It divides equal meshes in the same way each time. Scenes on one mesh with other numbers of the
+    case rely on this: they pass on contacts by the numbers of cells and nodes.
     """
     os.environ["SCOTCH_PTHREAD_NUMBER"] = "1"  # with threads it divides in several ways
     mode = mesh.GhostMode.shared_facet
@@ -176,7 +183,7 @@ def interpolation_points(V: fem.FunctionSpace) -> NDArray[np.float64]:
 
 
 def geometry_dofs(domain: mesh.Mesh) -> NDArray[np.int32]:
-    """Return the rows of `geometry.x` at each cell's nodes, (cells, nodes)."""
+    """Return the rows (cells, nodes) of `geometry.x` at the nodes of each cell."""
     # A list since dolfinx 0.11, where `dofmap` is deprecated.
     dofmaps = getattr(domain.geometry, "dofmaps", None)
     return np.asarray(dofmaps[0] if isinstance(dofmaps, list) else domain.geometry.dofmap)
@@ -194,7 +201,7 @@ def original_cells(domain: mesh.Mesh) -> NDArray[np.int64]:
 
 
 def tags_belong_to(tags: mesh.MeshTags, domain: mesh.Mesh) -> bool:
-    """Return whether tags belong to a mesh."""
+    """Return whether mesh tags have been made for a mesh: whether both have the same topology."""
     # Some versions wrap topologies.
     topologies = tags.topology, domain.topology
     of_tags, of_mesh = (getattr(topology, "_cpp_object", topology) for topology in topologies)
@@ -202,14 +209,20 @@ def tags_belong_to(tags: mesh.MeshTags, domain: mesh.Mesh) -> bool:
 
 
 def add_matrix(K: PETSc.Mat, form: fem.Form, clamped: list[fem.DirichletBC]) -> None:
-    """Add a bilinear form to a matrix, skipping the rows and columns of `clamped`."""
+    """Add the matrix of a bilinear form to a matrix, without the rows and columns of `clamped`.
+
+    `finish_matrix` must follow, to communicate the entries.
+    """
     cpp = form._cpp_object
     constants, coefficients = pack_constants(cpp), pack_coefficients(cpp)
     _assemble_matrix(K, cpp, constants, coefficients, _cpp_objects(clamped))
 
 
 def finish_matrix(K: PETSc.Mat, V: fem.FunctionSpace, clamped: list[fem.DirichletBC]) -> None:
-    """Communicate the entries and put ones on the diagonal of `clamped`."""
+    """Communicate the entries of a matrix, and put ones on the diagonal of `clamped`.
+
+    Collective.
+    """
     K.assemblyBegin(PETSc.Mat.AssemblyType.FLUSH)
     K.assemblyEnd(PETSc.Mat.AssemblyType.FLUSH)
     insert_diagonal(K, V._cpp_object, _cpp_objects(clamped), 1.0)

@@ -1,12 +1,12 @@
 """The C compiler, and shared libraries of C: compiled once, in parallel, and cached on disk.
 
-The compiler is any that Python can call: that of CC, that which built Python, gcc, clang, or Zig's,
-which PyPI has.
+The compiler is the first that Python can call: that of CC, that which built Python, gcc, clang, or
+Zig's, which PyPI has.
 
 Of several processes that ask for a library one compiles it. A process holds the lock of a library
-only while it generates its code and a compiler runs, and waits for none meanwhile: whoever waits
-for another one's library waits for no more than that. So ranks share the work without a message:
-each takes what no other one has.
+only while it generates the code and a compiler runs, and it waits for no other lock meanwhile. So
+whoever waits for a library waits for one compilation at most. Ranks share the work without a
+message: each takes a library that no other has taken.
 """
 
 import fcntl
@@ -52,24 +52,24 @@ COMPILER_CHECKED = "magshell_compiler_checked"  # name in a cache for which a co
 
 
 class NoCompiler(Unusable):
-    """No C compiler can compile kernels."""
+    """Error that no C compiler can compile kernels; the message has the reason."""
 
 
 def c_compiler() -> tuple[str, ...]:
-    """Return the command of the C compiler.
+    """Return the command of the C compiler with its options.
 
     Raises
     ------
     NoCompiler
-        If there is none.
+        If there is no compiler.
     """
-    if user_command := os.environ.get("CC"):
+    if CC_value := os.environ.get("CC"):
         try:
-            command = tuple(shlex.split(user_command))
+            command = tuple(shlex.split(CC_value))
         except ValueError:  # a quotation without its end
             command = ()
         if not command or not shutil.which(command[0]):
-            raise NoCompiler(f"CC={user_command}: there is no such compiler; {HINT}")
+            raise NoCompiler(f"CC={CC_value}: there is no such compiler; {HINT}")
         return command
     for name in (sysconfig.get_config_var("CC"), *USUAL_COMPILERS):
         command = tuple(shlex.split(name or ""))
@@ -82,21 +82,21 @@ def c_compiler() -> tuple[str, ...]:
 
 @cache
 def is_gnu(compiler: tuple[str, ...]) -> bool:
-    """Return whether a compiler is GCC itself; Clang defines its macros too."""
+    """Return whether a compiler is GCC itself, and not Clang, which defines GCC's macros too."""
     command = [*compiler, "-dM", "-E", "-x", "c", os.devnull]
     macros = _run(command).stdout
     return "__GNUC__" in macros and "__clang__" not in macros
 
 
 def check_compiler() -> None:
-    """Refuse a compiler that cannot compile kernels, before any is compiled.
+    """Refuse a compiler that cannot compile kernels, before any kernel is compiled.
 
-    A cache for which a compiler has worked is not checked again.
+    The check is skipped where the cache has a note that a compiler has worked.
 
     Raises
     ------
     NoCompiler
-        With the compiler's first error, or if there is none.
+        With the compiler's first error, or if there is no compiler.
     """
     if load_cached(COMPILER_CHECKED) is None:
         refuse_unusable()
@@ -131,18 +131,18 @@ class Library:
     Parameters
     ----------
     name
-        Determines it, but for the options.
+        Text that determines the library, apart from the options.
     source
-        Returns its code in C; called if it must be compiled.
+        Function that returns the code in C; called only if the library must be compiled.
     options
-        For any compiler.
+        Options for any compiler.
     gnu_options
-        Further ones for GCC itself.
+        Further options for GCC itself.
 
     Attributes
     ----------
     file
-        Name of its file.
+        Name of the library's file in the cache.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class Library:
 
     @property
     def is_compiled(self) -> bool:
-        """Whether its file can be loaded.
+        """Whether the library's file can be loaded.
 
         Raises
         ------
@@ -183,7 +183,7 @@ class Library:
         return compilation if compilation and not compilation.done() else None
 
     def start(self) -> None:
-        """Start its compilation, unless it is compiled or another process compiles it.
+        """Start the compilation, unless the library is compiled or another process compiles it.
 
         Raises
         ------
@@ -200,18 +200,19 @@ class Library:
                 self._release_lock()
 
     def path(self) -> Path:
-        """Return its file; compile it, or wait for another process that does, if need be."""
+        """Return the library's file; if need be, compile it or wait for a process that does."""
         compile_libraries([self])
         assert self._path
         return self._path
 
     def cancel(self) -> None:
-        """Cancel its compilation if no compiler runs yet."""
+        """Cancel the compilation if no compiler runs yet, and release the lock."""
         if self._compilation and self._compilation.cancel():
             self._compilation = None
             self._release_lock()
 
     def _compile(self, source: str) -> Path:
+        """Compile the code in a thread, return the library's file, and release the lock."""
         try:
             options, file = self._options, cache_folder() / self.file
             if self._gnu_options and is_gnu(c_compiler()):
@@ -222,9 +223,10 @@ class Library:
             self._release_lock()
 
     def _take_lock(self) -> bool:
-        """Lock out other processes; return False if one has the lock.
+        """Lock out other processes; return False if another process has the lock.
 
-        Where files cannot be locked, return True.
+        Where files cannot be locked, return True: then several processes may compile the same
+        library.
         """
         folder = cache_folder()
         with written_into(folder):
@@ -240,6 +242,7 @@ class Library:
         return True
 
     def _release_lock(self) -> None:
+        """Close the lock file, which unlocks it, and delete it."""
         assert self._lock
         self._lock.close()
         Path(self._lock.name).unlink(missing_ok=True)
@@ -250,18 +253,20 @@ def compile_libraries(
 ) -> None:
     """Compile libraries in their order, several in parallel, and return when all are compiled.
 
-    While compilers run, the code of one more is generated; no more than that, so that other ranks
+    While compilers run, the code of one further library is generated; no more, so that other ranks
     find work.
 
     Parameters
     ----------
+    libraries
+        The libraries; those that another process compiles are waited for.
     tell
-        Called again and again with the number of those that are compiled.
+        Called repeatedly with the number of libraries that are compiled.
 
     Raises
     ------
     NoCompiler
-        If there is none.
+        If there is no compiler.
     RuntimeError
         If the folder of the kernels cannot be written.
     CalledProcessError
@@ -286,13 +291,14 @@ def compile_libraries(
 
 
 def _running(libraries: Iterable[Library]) -> list["Future[Path]"]:
+    """Return the compilations of libraries that this process runs or has queued."""
     compilations = [library.running_compilation for library in libraries]
     return [compilation for compilation in compilations if compilation]
 
 
 @cache
 def cores() -> int:
-    """Return how many compilers this process runs at once: ranks share the cores that they see."""
+    """Return how many compilers this process runs at once: its share of the visible cores."""
     if hasattr(os, "sched_getaffinity"):
         visible = len(os.sched_getaffinity(0))
     else:
@@ -311,7 +317,7 @@ os.register_at_fork(after_in_child=_pool.cache_clear)  # a child process has no 
 
 @cache
 def processor_options() -> tuple[str, ...]:
-    """Return compiler options for the vectors that this processor has."""
+    """Return compiler options for the vector instructions of this processor; none but on x86."""
     if platform.machine() != "x86_64":
         return ()
     with suppress(OSError):
@@ -327,8 +333,8 @@ def _compiler_run(
 ) -> subprocess.CompletedProcess[str]:
     """Compile a file of C and link its library; return the process that failed, or the last one.
 
-    They are linked apart and without options: with -ffast-math older compilers link code that
-    flushes denormal numbers of the whole process to zero as the library is loaded.
+    Linking is a step of its own, without options. With -ffast-math, older compilers link code that
+    flushes denormal numbers of the whole process to zero when the library is loaded.
     """
     to_object = [*compiler, *options, "-fPIC", "-c", str(code), "-o", f"{code}.o"]
     to_library = [*compiler, "-shared", f"{code}.o", "-o", str(library), "-lm"]
@@ -341,13 +347,22 @@ def _compiler_run(
 
 
 def _run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    """Run a command and return its exit code and output as text."""
     return subprocess.run(command, capture_output=True, text=True, errors="replace", check=False)
 
 
 def _compile(source: str, options: tuple[str, ...], file: Path) -> None:
     """Compile a library in a scratch folder, then move it: others find it complete or not at all.
 
-    This process has its lock, so it removes scratch folders that killed processes have left.
+    This process must hold the library's lock. It therefore removes scratch folders that killed
+    processes have left.
+
+    Raises
+    ------
+    RuntimeError
+        If the folder of the kernels cannot be written.
+    NoCompiler, CalledProcessError
+        If the compiler fails for any code, or for this code.
     """
     compiler = c_compiler()
     for abandoned in file.parent.glob(f"{file.stem}????????/"):
@@ -372,7 +387,7 @@ def _compile(source: str, options: tuple[str, ...], file: Path) -> None:
 
 @contextmanager
 def written_into(folder: Path) -> Iterator[None]:
-    """Turn an error of the disk within `with` into one that names the cache."""
+    """Turn an error of the disk within `with` into a RuntimeError that names the cache folder."""
     try:
         yield
     except OSError as e:

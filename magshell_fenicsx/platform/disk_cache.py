@@ -1,8 +1,7 @@
 """A cache on disk for compiled kernels, and for other results that are the same for every run.
 
-What is in it is executed. So files are only taken from folders, and are only files, that the user
-or root owns and nobody else may change. Where the usual folder is none of these, a private one
-takes its place.
+Its files are executed. So only folders and files count that the user or root owns and nobody else
+may change. Where the usual folder is not of this kind, a private one takes its place.
 """
 
 import grp
@@ -17,28 +16,28 @@ from pathlib import Path
 
 
 class UnsafeCache(RuntimeError):
-    """No folder for kernels can be written by the user alone."""
+    """Error that no folder for kernels can be written by the user alone."""
 
 
 def cache_folder() -> Path:
-    """Return the folder of the compiled kernels, to which new ones go.
+    """Return the folder of compiled kernels to which new ones are written.
 
     Raises
     ------
     UnsafeCache
-        If none can be made that nobody else may write.
+        If there is no folder that only the user may write, and none can be made.
     """
     return _cache_folders(_usual_folder())[0]
 
 
 def cached_file(name: str) -> Path | None:
-    """Return a trusted file of this name in the user's cache or a shared one; None without."""
+    """Return a trusted file of this name in the user's cache or in a shared one; None without."""
     folders = dict.fromkeys([cache_folder(), *_cache_folders(_usual_folder())])
     return next((folder / name for folder in folders if is_trusted(folder / name)), None)
 
 
 def is_trusted(file: Path) -> bool:
-    """Return whether there is such a file, of the user or root, that nobody else may change."""
+    """Return whether a file exists, belongs to the user or root, and nobody else may change it."""
     try:
         status = file.stat()
     except OSError:
@@ -49,7 +48,7 @@ def is_trusted(file: Path) -> bool:
 def load_cached(name: str) -> bytes | None:
     """Return the content that is cached under a name; None without.
 
-    The name depends on all that the content depends on.
+    The name must depend on everything that the content depends on.
     """
     file = cached_file(name)
     try:
@@ -63,8 +62,8 @@ def save_cached(name: str, content: bytes) -> None:
     folder = cache_folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        number, scratch = tempfile.mkstemp(dir=folder, prefix=name)
-        with os.fdopen(number, "wb") as stream:
+        descriptor, scratch = tempfile.mkstemp(dir=folder, prefix=name)
+        with os.fdopen(descriptor, "wb") as stream:
             stream.write(content)
         Path(scratch).replace(folder / name)  # atomic: other processes may read it
     except OSError:
@@ -84,9 +83,10 @@ def _usual_folder() -> Path:
 
 @cache
 def _cache_folders(usual: Path) -> tuple[Path, ...]:
-    """Return the folder that new kernels go to, and the usual one if it is only read.
+    """Return the trusted folders of the cache, the one for new kernels first.
 
-    The usual folder may be trusted but not writable, such as that of a container image.
+    The second one, if any, is the usual folder. It may be trusted but not writable, as in a
+    container image.
     """
     readable = (usual,) if usual.is_dir() and _is_private(usual) else ()
     for folder in _candidate_folders(usual):
@@ -104,7 +104,7 @@ def _cache_folders(usual: Path) -> tuple[Path, ...]:
 
 
 def _candidate_folders(usual: Path) -> Iterator[Path]:
-    """Iterate over the usual folder, one within it, and private ones elsewhere."""
+    """Iterate over folders for new kernels: the usual one, one in it, and private ones."""
     user = os.getuid()
     yield usual
     yield usual / f"user_{user}"
@@ -123,22 +123,23 @@ def _is_private(folder: Path) -> bool:
 
 
 def _protects_content(status: os.stat_result) -> bool:
-    """Return whether others cannot move a folder of ours out of this one.
+    """Return whether others cannot move our folders out of the folder with this status.
 
-    In a sticky folder they cannot.
+    They cannot if they may not write to it, or if it is sticky.
     """
     owned = status.st_uid in (0, os.getuid(), *_unmapped_users())
     return owned and (bool(status.st_mode & stat.S_ISVTX) or not _writable_by_others(status))
 
 
 def _writable_by_others(status: os.stat_result) -> bool:
+    """Return whether users other than the owner may write to a file or folder."""
     by_group = status.st_mode & stat.S_IWGRP and not _is_private_group(status.st_gid)
     return bool(status.st_mode & stat.S_IWOTH or by_group)
 
 
 @cache
 def _is_private_group(number: int) -> bool:
-    """Return whether a group has the user alone, as many systems make one for each user."""
+    """Return whether the user is a group's only member; many systems make such groups."""
     try:
         group, user = grp.getgrgid(number), pwd.getpwuid(os.getuid())
     except KeyError:
@@ -148,7 +149,10 @@ def _is_private_group(number: int) -> bool:
 
 @cache
 def _unmapped_users() -> tuple[int, ...]:
-    """Return the number that root seems to have where a container has only this user."""
+    """Return the number that root seems to have in a container with this user alone.
+
+    Empty where root is itself, or the number is not known.
+    """
     try:
         lines = Path("/proc/self/uid_map").read_text(encoding="utf-8").splitlines()
         if any(line.split()[0] == "0" for line in lines):

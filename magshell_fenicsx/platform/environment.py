@@ -1,6 +1,6 @@
 """The environment of a run: versions, the BLAS of PETSc, memory, and a hash of the code.
 
-Results of other code are not reused.
+Results that other code has computed are not reused.
 """
 
 import hashlib
@@ -37,9 +37,10 @@ def versions() -> dict[str, str]:
 
 
 def fast_blas() -> str | None:
-    """Return the name of the optimised BLAS in this process; None for the reference BLAS.
+    """Return the name of the optimised BLAS that this process has loaded.
 
-    With the reference BLAS a factorisation takes seven times as long.
+    None for the reference BLAS, with which a factorisation takes seven times as long. "unknown"
+    where the system does not tell.
     """
     try:
         loaded = Path("/proc/self/maps").read_text(encoding="utf-8")
@@ -50,9 +51,9 @@ def fast_blas() -> str | None:
 
 
 def machine_fingerprint() -> dict[str, Any]:
-    """Return processor, usable cores, memory, BLAS and versions.
+    """Return processor, usable cores, memory (GB), BLAS and versions of this machine.
 
-    Times are comparable if all of these are equal.
+    Times of two machines are comparable if all of these are equal.
     """
     memory_kb = int(_first_group(Path("/proc/meminfo"), r"^MemTotal:\s*(\d+) kB$") or 0)
     return {
@@ -72,15 +73,20 @@ def describe_machine(machine: dict[str, Any]) -> str:
 
 
 def _first_group(file: Path, pattern: str) -> str:
-    """Return the first group of a pattern in a file of the kernel; "" without a match."""
+    """Return the first group of a regular expression in a kernel's file; empty without match."""
     match = re.search(pattern, file.read_text(encoding="utf-8"), re.MULTILINE)
     return match[1] if match else ""
 
 
 def available_memory(root: Path = Path("/")) -> float:
-    """Return the bytes of memory that new processes may still use; inf if unknown.
+    """Return the bytes of memory that new processes may still use; infinite if unknown.
 
-    Limits are those of the machine, of the control groups and of `ulimit -v`.
+    It is the least that the machine, the control groups and `ulimit -v` leave, or MAGSHELL_MEMORY.
+
+    Parameters
+    ----------
+    root
+        Root of the file system with /proc and /sys.
 
     Raises
     ------
@@ -99,6 +105,7 @@ def available_memory(root: Path = Path("/")) -> float:
 
 
 def _positive(text: str) -> float:
+    """Return a positive number from text; raise a ValueError if it is none."""
     value = float(text)
     if not value > 0:
         raise ValueError(text)
@@ -106,15 +113,16 @@ def _positive(text: str) -> float:
 
 
 def _machine_memory(root: Path) -> Iterator[float]:
+    """Iterate over the bytes that the machine has available: one number, or none if unknown."""
     for line in _text(root / "proc/meminfo").splitlines():
         if line.startswith("MemAvailable:"):
             yield 1024.0 * int(line.split()[1])
 
 
 def _control_group_memory(root: Path) -> Iterator[float]:
-    """Iterate over the memory that control groups leave, up to the outermost group.
+    """Iterate over the bytes that control groups leave, from the innermost to the outermost group.
 
-    Control groups may be of version 2 or 1.
+    Control groups may be of version 2, or of version 1, whose lines in /proc name controllers.
     """
     for line in _text(root / "proc/self/cgroup").splitlines():
         _, controllers, group_path = line.split(":", 2)
@@ -144,6 +152,7 @@ def _reclaimable(group: Path) -> int:
 
 
 def _process_memory(root: Path) -> Iterator[float]:
+    """Iterate over the bytes that `ulimit -v` leaves to this process; none without a limit."""
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
     pages = _text(root / "proc/self/statm").split()
     if limit != resource.RLIM_INFINITY and pages:
@@ -151,6 +160,7 @@ def _process_memory(root: Path) -> Iterator[float]:
 
 
 def _text(file: Path) -> str:
+    """Return the text of a file; empty if it cannot be read."""
     try:
         return file.read_text(encoding="utf-8")
     except OSError:
@@ -158,9 +168,9 @@ def _text(file: Path) -> str:
 
 
 def source_version(folder: Path) -> str:
-    """Return the version and a hash of a package's files, comments included.
+    """Return the version and a hash of the source files in a folder, as `code_version` does.
 
-    It is independent of where the package is installed.
+    Comments count; the place of the folder does not.
     """
     digest, root = hashlib.sha256(), str(folder)
     files = [f"{inner}/{name}" for inner, _, names in os.walk(root) for name in names]

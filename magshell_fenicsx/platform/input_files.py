@@ -1,10 +1,8 @@
 """Files that a case names: each is read once, as a whole, and only up to a limited size.
 
-The size that a packed file declares is checked before it is unpacked.
-
 A case may come from somebody else. A file that it names may be a device or a pipe, may unpack to a
-million times its size, or may change while it is read; a message then says so before memory or time
-is spent.
+million times its size, or may change while it is read. A message then says so before memory or time
+is spent. The size that a packed file declares is checked before the file is unpacked.
 """
 
 import hashlib
@@ -46,12 +44,13 @@ LEGACY_ARRAY = re.compile(rb"^[ \t]*\S+[ \t]+(\d+)[ \t]+(\d+)[ \t]+[a-z_]+[ \t]*
 
 
 def read_bounded(file: Path, max_bytes: int = MAX_FILE_BYTES) -> bytes:
-    """Return the content of a regular file, as long as it is when it is opened.
+    """Return the content of a regular file, of the length that it has when it is opened.
 
     Raises
     ------
     OSError
-        If it cannot be read, is a folder, a device or a pipe, or has more bytes than `max_bytes`.
+        If the file cannot be read, is a folder, a device or a pipe, or has more than `max_bytes`
+        bytes.
     """
     with open_regular(file) as stream:
         size = os.fstat(stream.fileno()).st_size
@@ -66,17 +65,17 @@ def open_regular(file: Path) -> BinaryIO:
     Raises
     ------
     OSError
-        If it cannot be read, is a folder, a device or a pipe.
+        If the file cannot be read, or is a folder, a device or a pipe.
     """
     try:
         _refuse_special(file, file.stat().st_mode)
         # Without waiting for a writer.
-        number = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        descriptor = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except ValueError:
         raise OSError(EINVAL, "its name has a zero byte", str(file)) from None
-    stream = os.fdopen(number, "rb")
+    stream = os.fdopen(descriptor, "rb")
     try:
-        _refuse_special(file, os.fstat(number).st_mode)
+        _refuse_special(file, os.fstat(descriptor).st_mode)
     except OSError:
         stream.close()
         raise
@@ -84,6 +83,7 @@ def open_regular(file: Path) -> BinaryIO:
 
 
 def _refuse_special(file: Path, mode: int) -> None:
+    """Raise an OSError if the mode of a file is that of a folder, a device or a pipe."""
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(EISDIR, os.strerror(EISDIR), str(file))
     if not stat.S_ISREG(mode):
@@ -91,12 +91,14 @@ def _refuse_special(file: Path, mode: int) -> None:
 
 
 class Files:
-    """Contents of files, each as it was when it was first read.
+    """Store of the contents of files, each as it was when it was first read.
 
-    A case and all copies of it have one of these, and on several ranks what rank 0 has read.
+    A case and all copies of it share one store. On several ranks it has what rank 0 has read.
 
     Attributes
     ----------
+    contents
+        File -> its content, or the error of reading it.
     shared
         Whether all ranks have the same contents.
     given
@@ -104,7 +106,10 @@ class Files:
     """
 
     def __eq__(self, other: object) -> bool:
-        """Cases with the same keys are equal; contents are compared by their digests."""
+        """Return True for any other store: contents are compared by their digests.
+
+        So cases with equal keys are equal.
+        """
         return isinstance(other, Files)
 
     __hash__ = object.__hash__
@@ -116,15 +121,16 @@ class Files:
         self._digests: dict[Path, str] = {}
 
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        """Return this store itself: copies of a case share it."""
         return self
 
     def content(self, file: Path) -> bytes:
-        """Return the content of a file.
+        """Return the content of a file, which is read at the first call.
 
         Raises
         ------
         OSError
-            See `read_bounded`; the same each time.
+            If the file cannot be read, see `read_bounded`; the same at each call.
         """
         if file not in self.contents:
             try:
@@ -149,22 +155,22 @@ class Files:
 
 
 def table_text(content: bytes) -> str:
-    """Return the text of a table.
+    """Return the text of a table from the bytes of its file.
 
     Raises
     ------
     ValueError
-        If one of its lines is longer than any row of numbers.
+        If a line is longer than any row of numbers.
     """
     text = io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", errors="replace").read()
-    for number, line in enumerate(io.StringIO(text), 1):
+    for line_number, line in enumerate(io.StringIO(text), 1):
         if len(line) > MAX_LINE_LENGTH:
-            raise ValueError(f"line {number} has more than {MAX_LINE_LENGTH} characters")
+            raise ValueError(f"line {line_number} has more than {MAX_LINE_LENGTH} characters")
     return text
 
 
 def npz_arrays(content: bytes) -> dict[str, NDArray[np.float64]]:
-    """Return the arrays of numbers in an .npz file.
+    """Return the arrays of numbers in the content of an .npz file, by name.
 
     Raises
     ------
@@ -183,29 +189,30 @@ def npz_arrays(content: bytes) -> dict[str, NDArray[np.float64]]:
 
 
 def _declared_bytes(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
-    """Return the bytes of an array as floats, from its header alone.
+    """Return the bytes that an array in an archive takes as floats, from its header alone.
 
-    They are at least those that the archive declares.
+    The result is at least the size that the archive declares for the array.
     """
     format_of_numpy: Any = np.lib.format
     with archive.open(member) as stream:
         version = format_of_numpy.read_magic(stream)
         if version == (1, 0):
-            shape, _, kind = format_of_numpy.read_array_header_1_0(stream)
+            shape, _, dtype = format_of_numpy.read_array_header_1_0(stream)
         else:
-            shape, _, kind = format_of_numpy.read_array_header_2_0(stream)
-    return max(member.file_size, prod(map(int, shape)) * max(int(kind.itemsize), 8))
+            shape, _, dtype = format_of_numpy.read_array_header_2_0(stream)
+    return max(member.file_size, prod(map(int, shape)) * max(int(dtype.itemsize), 8))
 
 
 def read_vtk(content: bytes, suffix: str) -> "pyvista.DataSet":
-    """Return the data set that VTK reads from a file.
+    """Return the data set in the content of a file, as VTK reads it.
 
-    Messages of VTK about damaged files are not printed.
+    VTK's own messages about damaged files are suppressed. `suffix` is that of the file's name.
 
     Raises
     ------
     ValueError
-        If it declares more numbers than `MAX_UNPACKED_BYTES` bytes hold, or VTK cannot read it.
+        If the file declares more numbers than `MAX_UNPACKED_BYTES` bytes hold, or VTK cannot read
+        it.
     """
     if (size := _vtk_declared_bytes(content)) > MAX_UNPACKED_BYTES:
         raise ValueError(
@@ -232,7 +239,10 @@ def read_vtk(content: bytes, suffix: str) -> "pyvista.DataSet":
 
 
 def _vtk_declared_bytes(content: bytes) -> int:
-    """Return the bytes of points and arrays that the headers in a VTK file declare."""
+    """Return the bytes of points and arrays that the headers in a VTK file declare.
+
+    It is an upper estimate for XML files: each array counts as long as the longest.
+    """
     if b"<VTKFile" not in content[:4096]:
         counts = [prod(map(int, numbers)) for numbers in LEGACY_GRID.findall(content)]
         counts += [int(numbers) for numbers in LEGACY.findall(content)]

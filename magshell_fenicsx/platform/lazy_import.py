@@ -6,7 +6,7 @@ from typing import Any
 
 
 def lazy_import(name: str) -> Any:
-    """Return a package that is imported when one of its attributes is first read."""
+    """Return a package that is only imported when one of its attributes is first read."""
     if name in sys.modules:
         return sys.modules[name]
     spec = find_spec(name)

@@ -34,8 +34,10 @@ def load_native(
 
     Parameters
     ----------
+    source
+        The first C file.
     declarations
-        Of their functions.
+        Declarations of the files' functions, for cffi.
     further_sources
         Files that are compiled together with the first one, after it.
 

@@ -1,7 +1,7 @@
 """Packages that no pip dependency names: dolfinx, PETSc and MPI, from PyPI or the system.
 
-PyPI's wheel of dolfinx and PETSc links the MPI library that `mpi4py.MPI` has loaded, wherever that
-is; it finds none itself. So MPI comes first, whatever asks for dolfinx.
+PyPI's wheel of dolfinx and PETSc links the MPI library that `mpi4py.MPI` has loaded, and finds none
+itself. So MPI must be imported before dolfinx, whichever module asks for dolfinx.
 """
 
 import sys
@@ -27,23 +27,23 @@ class Unusable(RuntimeError):
 
 
 class MpiFirst(MetaPathFinder):
-    """Imports MPI where dolfinx, PETSc or SLEPc is first asked for; finds nothing itself."""
+    """Import hook that imports MPI before dolfinx, PETSc or SLEPc; it finds no package itself."""
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> None:
-        """Find nothing."""
+        """Import MPI if the package needs it, and find nothing, so that other finders go on."""
         if fullname in MPI_PACKAGES:
             sys.meta_path.remove(self)
             import mpi4py.MPI  # noqa: F401
 
 
 def load_mpi_first() -> None:
-    """Let MPI be imported before dolfinx; takes no time until then."""
+    """Install the hook that imports MPI before dolfinx; this itself imports nothing."""
     if not MPI_PACKAGES & sys.modules.keys():
         sys.meta_path.insert(0, MpiFirst())
 
 
 def import_gmsh() -> Any:
-    """Return the package gmsh.
+    """Import gmsh and return it.
 
     Raises
     ------
@@ -61,7 +61,10 @@ def import_gmsh() -> Any:
 
 
 def install_hint(e: ImportError) -> str | None:
-    """Return what to do about a failed import; None if it is of none of these packages."""
+    """Return a message about how to install the package whose import failed.
+
+    None if the package is none of `EXTERNAL_PACKAGES`.
+    """
     package = (e.name or "").partition(".")[0]
     return (
         f"{package} cannot be imported ({e}): {INSTALL_WAYS}"

@@ -35,7 +35,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class SerialComm:
-    """A communicator of one process, before it needs MPI."""
+    """A communicator of one process, which stands for MPI's as long as MPI is not needed."""
 
     rank: int = 0
     size: int = 1
@@ -44,7 +44,8 @@ class SerialComm:
 def world() -> Any:
     """Return the communicator of all ranks.
 
-    A process that no launcher started gets a `SerialComm` until MPI is imported, which takes 0.1 s.
+    A process that no launcher started gets a `SerialComm` until MPI is imported: the import takes
+    0.1 s.
     """
     if not LAUNCHER_VARIABLES & os.environ.keys() and "mpi4py.MPI" not in sys.modules:
         return SerialComm()
@@ -84,9 +85,9 @@ class Usage:
 
 @cache
 def mpirun_path() -> str | None:
-    """Return the path of the launcher of ranks; None without.
+    """Return the path of the launcher of ranks; None if there is none.
 
-    One in the folder of this Python, where PyPI's MPI has it, is preferred to that of the system.
+    A launcher in the folder of this Python, where PyPI's MPI puts it, is preferred to the system's.
     """
     python_folder = Path(sys.executable).parent
     folders = f"{python_folder}{os.pathsep}{os.environ.get('PATH', os.defpath)}"
@@ -95,9 +96,9 @@ def mpirun_path() -> str | None:
 
 @cache
 def mpirun_command(ranks: int) -> tuple[str, ...]:
-    """Return the command that starts so many ranks, even if there are fewer cores.
+    """Return the command that starts a number of ranks, even if there are fewer cores.
 
-    Open MPI needs an option for that.
+    Open MPI needs an option for more ranks than cores.
     """
     launcher = mpirun_path() or "mpirun"
     version = subprocess.run(
@@ -113,10 +114,14 @@ def measure(
     ranks: int = 1,
     environment: Mapping[str, str] | None = None,
 ) -> Usage:
-    """Run `python3 -m MODULE ARGUMENT...` and wait for it; one thread per rank.
+    """Run `python3 -m MODULE ARGUMENT...`, wait for its end, and return the resources that it used.
+
+    Each rank has one thread.
 
     Parameters
     ----------
+    module, arguments
+        Name of the module, and its arguments.
     ranks
         Number of ranks; mpirun starts more than one.
     environment
@@ -164,6 +169,11 @@ def measure(
 
 
 def main() -> None:
+    """Run a module as `python3 -m` does, and write the peak memory (kB) of this process.
+
+    The arguments of the command line are a folder, the module and its arguments. The file is
+    peak.PROCESS in the folder.
+    """
     folder, module, *arguments = sys.argv[1:]
     sys.argv = [module, *arguments]
     try:
@@ -182,6 +192,8 @@ if __name__ == "__main__":
 def on_first_rank(comm: "MPI.Comm", do: Callable[[], Result]) -> Result:
     """Call `do` on rank 0 and return its result on every rank; collective.
 
+    The result must be picklable if there are several ranks.
+
     Raises
     ------
     Exception
@@ -189,29 +201,29 @@ def on_first_rank(comm: "MPI.Comm", do: Callable[[], Result]) -> Result:
     """
     if comm.size == 1:
         return do()
-    sent, failure = b"", None
+    pickled, failure = b"", None
     if comm.rank == 0:
         try:
-            sent = pickle.dumps((do(), None))
+            pickled = pickle.dumps((do(), None))
         except Exception as e:
-            failure, sent = e, _pickled(e)
-    sent = comm.bcast(sent)
+            failure, pickled = e, _pickled(e)
+    pickled = comm.bcast(pickled)
     if failure:
         raise failure  # with its traceback
     result: Result
-    result, failure = pickle.loads(sent)
+    result, failure = pickle.loads(pickled)
     if failure:
         raise failure
     return result
 
 
 def raise_on_all_ranks(comm: "MPI.Comm", do: Callable[[], object]) -> None:
-    """Call `do` on every rank; collective.
+    """Call `do` on every rank, and raise on all ranks if it raises on one; collective.
 
     Raises
     ------
     Exception
-        On every rank, the exception of the first rank where `do` raises one; there its own.
+        On a rank where `do` fails its own exception; on the others that of the first such rank.
     """
     failure = None
     try:
@@ -220,13 +232,15 @@ def raise_on_all_ranks(comm: "MPI.Comm", do: Callable[[], object]) -> None:
         if comm.size == 1:
             raise
         failure = e
-    for sent in comm.allgather(_pickled(failure) if failure else b"") if comm.size > 1 else ():
-        if sent:
-            raise failure or pickle.loads(sent)[1]
+    for pickled_error in (
+        comm.allgather(_pickled(failure) if failure else b"") if comm.size > 1 else ()
+    ):
+        if pickled_error:
+            raise failure or pickle.loads(pickled_error)[1]
 
 
 def _pickled(e: Exception) -> bytes:
-    """Return an error for the other ranks: the same one if it can be pickled."""
+    """Return an error as bytes for other ranks: itself, or its text as a RuntimeError."""
     try:
         sent = pickle.dumps((None, e))
         pickle.loads(sent)

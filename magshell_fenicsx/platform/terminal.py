@@ -34,7 +34,7 @@ def print_line(line: str) -> None:
 def write(text: str) -> None:
     """Write to standard output at once.
 
-    If that fails, as on a full disk, say so once, and go on without it.
+    If writing fails, as on a full disk, warn once on standard error, and write nothing any more.
     """
     try:
         print(text, end="", flush=True)
@@ -56,20 +56,20 @@ def write(text: str) -> None:
 def open_standard_streams() -> None:
     """Open those of the descriptors 0 to 2 that the parent process has closed.
 
-    Otherwise files would take their numbers.
+    Otherwise the next files that are opened would take these numbers.
     """
-    for number, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
+    for descriptor, name, mode in ((0, "stdin", "r"), (1, "stdout", "w"), (2, "stderr", "w")):
         try:
-            os.fstat(number)
+            os.fstat(descriptor)
         except OSError:
             os.open(os.devnull, os.O_RDWR)  # takes the lowest free number, which is this
-            setattr(sys, name, os.fdopen(number, mode, closefd=False))
+            setattr(sys, name, os.fdopen(descriptor, mode, closefd=False))
 
 
 def is_plain_output(ranks: int) -> bool:
-    """Return whether no line can be rewritten.
+    """Return whether lines of standard output cannot be rewritten.
 
-    Standard output is then no terminal, or there are several ranks.
+    That is so if standard output is no terminal, or if there are several ranks.
     """
     return (
         ranks > 1
@@ -81,28 +81,36 @@ def is_plain_output(ranks: int) -> bool:
 
 @contextmanager
 def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say]]:
-    """Yield two functions: the first prints a line, the second rewrites the status line.
+    """Yield two functions of a line: one prints it, the other shows it as the status line.
 
-    If standard output is no terminal, or there are several ranks, the second prints a line where
-    STATUS_SECONDS have passed without one, and again after as many more. The status line is erased
-    after `with`, and also when SIGTERM ends the process.
+    In plain output the second one prints a line only after STATUS_SECONDS without one, and again
+    after as many more. The status line is erased after `with`, and when SIGTERM ends the process.
+
+    Parameters
+    ----------
+    ranks
+        Number of ranks.
+    say
+        Function that prints a line in plain output.
     """
     if is_plain_output(ranks):
         yield from _plain_output(say)
         return
-    foot = ""
+    status_line = ""
 
     def stay(line: str) -> None:
-        write(f"{ERASE_LINE}{line}\n{foot}")
+        write(f"{ERASE_LINE}{line}\n{status_line}")
 
     def rewrite(line: str) -> None:
-        nonlocal foot
-        foot = fit_to_columns(
+        """Show a line of parts, separated by two spaces, as far as it fits, as the status line."""
+        nonlocal status_line
+        status_line = fit_to_columns(
             line.split("  "), max(0, shutil.get_terminal_size().columns - RESERVED_COLUMNS)
         )
-        write(f"{ERASE_LINE}{foot}")
+        write(f"{ERASE_LINE}{status_line}")
 
     def end(number: int, frame: FrameType | None) -> None:
+        """Erase the status line, and let the earlier handler of the signal end the process."""
         os.write(sys.stdout.fileno(), ERASE_LINE.encode())  # the stream may be in use
         signal.signal(number, previous_handler)
         signal.raise_signal(number)
@@ -116,9 +124,9 @@ def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say]]:
 
 
 def _plain_output(say: Say) -> Iterator[tuple[Say, Say]]:
-    """Yield two functions that print lines, the second of them seldom.
+    """Yield two functions of a line of text: the first prints it, the second prints it seldom.
 
-    The last status is repeated while nothing else is printed.
+    The second is for statuses. A thread repeats the last status while nothing else is printed.
     """
     last, status = time.monotonic(), ("", 0.0)
     lock, ended = threading.Lock(), threading.Event()
@@ -130,12 +138,14 @@ def _plain_output(say: Say) -> Iterator[tuple[Say, Say]]:
             say(line)
 
     def seldom(line: str) -> None:
+        """Note a status, and print it if no line was printed for STATUS_SECONDS."""
         nonlocal status
         status = line, (time_now := time.monotonic())
         if time_now - last >= STATUS_SECONDS:
             stay(line)
 
     def repeat() -> None:
+        """Print the last status again and again while nothing else is printed, until the end."""
         with suppress(BrokenPipeError):  # which ends the program where it prints next
             while not ended.wait(POLL_FRACTION * STATUS_SECONDS):
                 (line, status_time), time_now = status, time.monotonic()
@@ -152,7 +162,7 @@ def _plain_output(say: Say) -> Iterator[tuple[Say, Say]]:
 
 
 def fit_to_columns(parts: Sequence[str], columns: int) -> str:
-    """Return the first parts of a line that fit, two spaces between them.
+    """Return the first parts of a line that fit into a width, two spaces between them.
 
     Only a first part that is too long is cut.
 
@@ -161,9 +171,9 @@ def fit_to_columns(parts: Sequence[str], columns: int) -> str:
     >>> fit_to_columns(["5 points", "w/h 14 -> 20", "1:50, about 0:30 left", "du/h 0.1"], 50)
     '5 points  w/h 14 -> 20  1:50, about 0:30 left'
     """
-    first, *others = parts
+    first, *further_parts = parts
     line = first[:columns]
-    for part in others:
+    for part in further_parts:
         if len(line) + 2 + len(part) > columns:
             break
         line += f"  {part}"

@@ -20,7 +20,11 @@ from magshell_fenicsx.quantities.registry import IN_TIME, OF_EVERY_RUN, Sizes
 
 
 def sizes_in_units(problem: Problem) -> Sizes:
-    """Return the sizes of the case's units, with those of prescribed motions."""
+    """Return the sizes of the units of a case, by which columns of path.csv are given in units.
+
+    Prescribed motions have sizes of their own: the way in mm, or the angle in degrees, at a factor
+    1.
+    """
     moments = {column for registered in OBSERVABLES for column in registered.moments(problem.loads)}
     sizes = sizes_of(problem.context, moments)
     if sizes.case is None or isnan(sizes.case.R):
@@ -36,41 +40,52 @@ def sizes_in_units(problem: Problem) -> Sizes:
 
 
 def own_amplitudes(loads: Loads) -> dict[str, float]:
-    """Return amplitudes with columns of their own name, with their initial values.
+    """Return the amplitudes that have columns of their own name -> their initial values.
 
-    They are those of parts, of the user's energies, and of their parameters.
+    They are those of parts, of user-defined energies, and of the parameters of these.
     """
-    of_parts = {
+    amplitudes_of_parts = {
         name: 0.0 for registered in OBSERVABLES for name in registered.free_amplitudes(loads)
     }
     terms = [term for term in loads.user_terms if term.density]
     return (
-        of_parts
+        amplitudes_of_parts
         | {term.name: term.value for term in terms}
         | {p.name: p.value for term in terms for p in term.free_parameters}
     )
 
 
 def extra_columns(problem: Problem) -> tuple[str, ...]:
-    """Return the columns of a row besides those of every run; the case's units come last."""
+    """Return the columns of path.csv besides those of every run; those in units come last.
+
+    The order is that of the file: parts, named points, amplitudes, observed integrals, further
+    parts, time.
+    """
     loads = problem.loads
-    of_points = [f"{point}_u{axis}" for point in problem.context.points for axis in "xyz"]
+    columns_of_points = [f"{point}_u{axis}" for point in problem.context.points for axis in "xyz"]
     observed = [column for term in loads.user_terms for column in term.observed]
-    reported = problem.supports if problem.reactions else ()
+    reported_supports = problem.supports if problem.reactions else ()
     before_points, after_points = list[str](), list[str]()
     for registered in OBSERVABLES:
         columns = before_points if registered.before_points else after_points
-        columns += registered.columns(loads, reported)
+        columns += registered.columns(loads, reported_supports)
     is_in_time = any(step.load.in_time or step.load.released_by for step in problem.programme)
-    of_time = [q.name for q in IN_TIME] if is_in_time else []
+    columns_in_time = [q.name for q in IN_TIME] if is_in_time else []
     amplitudes = own_amplitudes(loads)
-    extra = (*before_points, *of_points, *amplitudes, *observed, *after_points, *of_time)
-    of_every_run = [q.name for q in OF_EVERY_RUN]
-    return (*extra, *sizes_in_units(problem).columns((*of_every_run, *extra)))
+    own_columns = (
+        *before_points,
+        *columns_of_points,
+        *amplitudes,
+        *observed,
+        *after_points,
+        *columns_in_time,
+    )
+    standard_columns = [q.name for q in OF_EVERY_RUN]
+    return (*own_columns, *sizes_in_units(problem).columns((*standard_columns, *own_columns)))
 
 
 def refuse_duplicate_names(problem: Problem) -> None:
-    """Refuse a problem in which two columns of a run, or two amplitudes, have the same name.
+    """Refuse a problem in which two columns of path.csv, or two amplitudes, have the same name.
 
     Raises
     ------
@@ -78,20 +93,22 @@ def refuse_duplicate_names(problem: Problem) -> None:
         With the name and the key that gives it.
     """
     loads = problem.loads
-    of_parts = [name for registered in OBSERVABLES for name in registered.amplitudes(loads)]
-    amplitudes = [*own_amplitudes(loads), *of_parts]
+    amplitudes_of_parts = [
+        name for registered in OBSERVABLES for name in registered.amplitudes(loads)
+    ]
+    amplitudes = [*own_amplitudes(loads), *amplitudes_of_parts]
     columns = [*(q.name for q in OF_EVERY_RUN), *extra_columns(problem)]
-    for names, what in ((amplitudes, "amplitude"), (columns, "column of path.csv")):
+    for names, kind_of_name in ((amplitudes, "amplitude"), (columns, "column of path.csv")):
         duplicate = next((name for name in names if names.count(name) > 1), None)
         if duplicate is not None:
             raise CaseError(
                 f"{_key_of_name(problem, duplicate)}: {duplicate}: "
-                f"another {what} of this case has this name; choose another"
+                f"another {kind_of_name} of this case has this name; choose another"
             )
 
 
 def _key_of_name(problem: Problem, name: str) -> str:
-    """Return the key of the case that gives a name."""
+    """Return the key of the case that gives a name of a column or amplitude, or "names"."""
     for step in problem.programme:
         if getattr(step.load, "name", None) == name:
             return f"{step.key}.name"
@@ -102,7 +119,7 @@ def _key_of_name(problem: Problem, name: str) -> str:
 
 
 def sizes_of(context: Context, moments: Collection[str] = ()) -> Sizes:
-    """Return the sizes of what a case gives with units.
+    """Return the sizes of the units of a case, as the shell and other sections determine them.
 
     Parameters
     ----------

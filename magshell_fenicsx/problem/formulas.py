@@ -1,9 +1,9 @@
 """Formulas of a case at undeformed places: their bounds, and the element sizes that resolve them.
 
 A formula may vary within narrow parts of the surface. Squares of the chart are divided until
-polynomials resolve the formula in each, which gives the element sizes there; places that samples
-may miss come from an adaptive division of the surface. After meshing, `unresolved_formulas` says
-what the cells miss. Lengths are over R.
+polynomials resolve the formula in each, which gives the element sizes there. An adaptive division
+of the surface finds places that samples may miss. After meshing, `unresolved_formulas` reports what
+the cells miss. Lengths are over R.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -97,7 +97,10 @@ class PlacedFormulas:
 
 
 def case_formulas(context: Context) -> list[PlacedFormulas]:
-    """Return the formulas of thickness, remanence, dead loads and natural shape."""
+    """Return the formulas of the thickness, of abilities such as magnetism, and of steps' loads.
+
+    Keys with numbers alone are left out.
+    """
     key_formulas = list[PlacedFormulas]()
     for spec in _specs(context):
         texts = tuple(value for value in spec.values if isinstance(value, str))
@@ -108,6 +111,11 @@ def case_formulas(context: Context) -> list[PlacedFormulas]:
 
 
 def _specs(context: Context) -> Iterator[Formulas]:
+    """Iterate over the keys of a case that take formulas, with their values and allowed bounds.
+
+    These are the thickness factor, the keys of each ability (a section that adds something to the
+    problem), and those of the load of each step.
+    """
     factor = context.shell.thickness_factor
     if isinstance(factor, str):
         yield Formulas(THICKNESS, [factor], MIN_THICKNESS_FACTOR, MAX_THICKNESS_FACTOR, 1.0)
@@ -118,12 +126,17 @@ def _specs(context: Context) -> Iterator[Formulas]:
 
 
 def refuse_unfit_formulas(formulas: Sequence[PlacedFormulas], x: Array) -> None:
-    """Refuse formulas with values out of bounds at places (n, 3) over R of the undeformed shell.
+    """Refuse formulas with values out of bounds, or not finite, on the undeformed shell.
+
+    Parameters
+    ----------
+    x
+        Places (n, 3) over R, in the frame of the case.
 
     Raises
     ------
     CaseError
-        With the first place where one is not finite or out of bounds.
+        With the first such place of the first such formula.
     """
     for key_formulas in formulas:
         spec, values = key_formulas.spec, key_formulas.values_at(x)
@@ -141,17 +154,19 @@ def refuse_unfit_formulas(formulas: Sequence[PlacedFormulas], x: Array) -> None:
 def refined_squares(
     places: Callable[[Array], Array], outline: Outline, sizes: Sizes, min_size: float
 ) -> SquaresFeature | None:
-    """Return squares of the chart in which elements must be small.
+    """Return squares of the chart in which elements must be small, with the element size in each.
 
-    Squares are divided until the elements that they need are no smaller than they, or as small as
+    A square is divided in four until it is no larger than the elements that it needs, or than
     `min_size`. None if no square needs small elements, or if the chart is a mesh file's.
 
     Parameters
     ----------
     places
         Chart (n, 2) -> places (n, 3) over R in the frame of the case.
+    outline
+        The surface with its chart, whose extent the squares cover.
     sizes
-        Element sizes that squares need.
+        Samples of squares -> element size over R that each square needs; see `Sizes`.
     min_size
         Least side of a square, over R.
     """
@@ -162,35 +177,37 @@ def refined_squares(
     least_side = float(np.sqrt(np.prod(high - low) / MAX_FIRST_SQUARES))
     first_side = side = max(min(FIRST_SIDE, *(high - low)), least_side)
     counts = [ceil((b - a) / side - 1e-9) for a, b in zip(low, high, strict=True)]
-    t = [a + side * (np.arange(n) + 0.5) for a, n in zip(low, counts, strict=True)]
-    centres: Array = np.stack(np.meshgrid(*t, indexing="ij"), axis=-1).reshape(-1, 2)
-    refined = list[tuple[Array, Array, Array]]()  # centres, sides and element sizes
+    centres_along_axes = [a + side * (np.arange(n) + 0.5) for a, n in zip(low, counts, strict=True)]
+    centres: Array = np.stack(np.meshgrid(*centres_along_axes, indexing="ij"), axis=-1).reshape(
+        -1, 2
+    )
+    groups = list[tuple[Array, Array, Array]]()  # centres, sides and element sizes
     while len(centres) and len(centres) <= MAX_SQUARES:
         chart = centres[:, None] + side * LOCAL
         on_chart = within_chart(shape, chart)
         has_samples = on_chart.any(axis=1)
         centres, chart, on_chart = centres[has_samples], chart[has_samples], on_chart[has_samples]
         x = places(chart.reshape(-1, 2)).reshape(*chart.shape[:2], 3)
-        size = sizes(x, on_chart, side)
-        divided = (size < side) & (side > min_size)
-        bounded_size = np.maximum(size, min_size)
-        needed = ~divided & (bounded_size < first_side)
-        sides = np.full(int(needed.sum()), side)
-        refined.append((centres[needed], sides, bounded_size[needed]))
+        needed_size = sizes(x, on_chart, side)
+        divided = (needed_size < side) & (side > min_size)
+        bounded_size = np.maximum(needed_size, min_size)
+        is_refined = ~divided & (bounded_size < first_side)
+        sides = np.full(int(is_refined.sum()), side)
+        groups.append((centres[is_refined], sides, bounded_size[is_refined]))
         side /= 2
         offsets = side / 2 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
         centres = (centres[divided][:, None] + offsets).reshape(-1, 2)
     if len(centres):  # so many that they all get the least size that can be paid for
         sides = np.full(len(centres), side)
-        refined.append((centres, sides, np.full(len(centres), max(side, min_size))))
-    if not sum(len(sides) for _, sides, _ in refined):
+        groups.append((centres, sides, np.full(len(centres), max(side, min_size))))
+    if not sum(len(sides) for _, sides, _ in groups):
         return None
-    all_centres, all_sides, all_sizes = (np.concatenate(v) for v in zip(*refined, strict=True))
+    all_centres, all_sides, all_sizes = (np.concatenate(v) for v in zip(*groups, strict=True))
     return SquaresFeature(all_centres, all_sides / 2, all_sizes)
 
 
 def extent(shape: PlaneShape | Grid) -> tuple[Array, Array]:
-    """Return the lower and upper corner (2,) of a chart."""
+    """Return the lower and the upper corner, (2,) each, of the box around a chart."""
     if isinstance(shape, Grid):
         return np.array(shape.low), np.array(shape.high)
     if isinstance(shape, StripShape):
@@ -199,7 +216,7 @@ def extent(shape: PlaneShape | Grid) -> tuple[Array, Array]:
 
 
 def within_chart(shape: PlaneShape | Grid, chart: Array) -> Masks:
-    """Return whether points (..., 2) belong to a chart."""
+    """Return whether points (..., 2) belong to a chart: a disc, or the box of another shape."""
     if isinstance(shape, DiscShape):
         return np.asarray(np.hypot(chart[..., 0], chart[..., 1]) <= shape.reach)
     low, high = extent(shape)
@@ -207,10 +224,15 @@ def within_chart(shape: PlaneShape | Grid, chart: Array) -> Masks:
 
 
 def adaptive_cells(formulas: FormulaGroup, outline: Outline) -> RefinedParts:
-    """Return a division of the perfect surface so fine that places in each cell show the formulas.
+    """Return a division of the perfect surface so fine that samples in each cell show the formulas.
 
-    The cells divide triangles of the chart, of a disc those of a square that is mapped onto it, or
-    of a mesh file. Places are in the frame of the case.
+    It divides the triangles of a mesh file, or triangles that cover the chart. Those of a disc
+    cover a square that is mapped onto the disc. Places are over R, in the frame of the case.
+
+    Returns
+    -------
+    RefinedParts
+        The undivided cells, each with area, centre, size and the variance of the formulas in it.
     """
     shape = outline.chart(None, ANY_GRADING)
     if isinstance(shape, MeshFile):
@@ -221,6 +243,7 @@ def adaptive_cells(formulas: FormulaGroup, outline: Outline) -> RefinedParts:
         radius = shape.reach if isinstance(shape, DiscShape) else None
 
         def embedding(x: Array) -> Array:
+            """Return the places (n, 3) of points (n, 2) of the chart, or of a disc's square."""
             # the square is mapped onto the disc
             on_disc = x * np.sqrt(1 - (x[:, ::-1] / radius) ** 2 / 2) if radius else x
             return outline.perfect(on_disc)
@@ -228,6 +251,11 @@ def adaptive_cells(formulas: FormulaGroup, outline: Outline) -> RefinedParts:
     lattice = Lattice.make(basix.CellType.triangle, CELL_SAMPLES)
 
     def places_and_areas(parts: SubCells) -> tuple[Array, Array]:
+        """Return places (parts, samples, 3) of parts of triangles, and their areas (parts,).
+
+        The corners of a part come first among its samples; the area is of the flat triangle.
+        """
+        # samples of each part in the reference triangle, mapped into the part's triangle
         X = parts.rule(lattice.places, np.ones(len(lattice.places)))[0]
         corners = triangles[parts.cell]
         x = corners[:, None, 0] + np.matmul(X, corners[:, 1:] - corners[:, :1])
@@ -236,15 +264,19 @@ def adaptive_cells(formulas: FormulaGroup, outline: Outline) -> RefinedParts:
         return x, area
 
     reference = SubCells(np.zeros(1, np.int64), np.zeros((1, 2)), np.ones((1, 2)))
-    first = reference.in_each_cell(np.arange(len(triangles)))
-    return refine_where_hidden(formulas, first, places_and_areas, lattice, len(triangles))
+    undivided = reference.in_each_cell(np.arange(len(triangles)))
+    return refine_where_hidden(formulas, undivided, places_and_areas, lattice, len(triangles))
 
 
 def _chart_triangles(shape: PlaneShape | Grid) -> Array:
-    """Return corners (m, 3, 2) of triangles that cover the bounds of a chart."""
+    """Return corners (m, 3, 2) of triangles that cover the box around a chart.
+
+    Each rectangle of a grid with sides of at most `FIRST_SIDE` is cut into two triangles.
+    """
     low, high = extent(shape)
     t = [np.linspace(a, b, ceil((b - a) / FIRST_SIDE) + 1) for a, b in zip(low, high, strict=True)]
     corners = np.stack(np.meshgrid(*t, indexing="ij"), axis=-1)
+    # the four corners of each rectangle: views of the grid of corners, shifted along its axes
     a, b, c, d = (corners[i : i - 1 or None, j : j - 1 or None] for i in (0, 1) for j in (0, 1))
     return np.concatenate(
         [np.stack(three, axis=-2).reshape(-1, 3, 2) for three in ((a, b, c), (d, c, b))]
@@ -252,7 +284,16 @@ def _chart_triangles(shape: PlaneShape | Grid) -> Array:
 
 
 def narrow_places(leaves: Sequence[RefinedParts]) -> Array:
-    """Return places (n, 3) at which formulas have values that samples may miss."""
+    """Return places (n, 3) over R at which formulas have values that samples may miss.
+
+    These are the centres of small adaptive cells: of each division those with the largest share of
+    the variance, and some of the others.
+
+    Parameters
+    ----------
+    leaves
+        Divisions of the surface for each key with formulas, see `adaptive_cells`.
+    """
     places: list[Array] = [np.zeros((0, 3))]
     for cells in leaves:
         narrow_cells = np.flatnonzero(cells.size < NARROW_SIZE)
@@ -266,29 +307,38 @@ def narrow_places(leaves: Sequence[RefinedParts]) -> Array:
 
 
 def polynomial_sizes(values: Callable[[Array], Array], leaves: RefinedParts | None = None) -> Sizes:
-    """Return the sizes of elements that resolve a formula.
+    """Return a function for the sizes of elements that resolve formulas on squares of the chart.
 
-    They are half the squares in which polynomials miss most of it, else the squares. What samples
-    of a square do not have and the adaptive cells in it have is missed too.
+    A square is resolved where polynomials of degree `DEGREE` fit the samples. The needed size is
+    half the side of a square that is not resolved, and the side of one that is. Resolved squares
+    together miss at most `VARIANCE_TOLERANCE` of the variance. Variance counts as missed, too, if
+    adaptive cells in a square show it and its samples do not.
 
     Parameters
     ----------
     values
         Places (n, 3) -> values (n, formulas).
     leaves
-        See `adaptive_cells`; None where there is nothing between samples.
+        Division of the surface that shows the formulas, see `adaptive_cells`; None where nothing is
+        hidden between samples.
     """
     variance: float = 0.0
     variance_of_leaves: float = float(leaves.area @ leaves.variance) if leaves else 0.0
     mean: Array | None = None
 
     def sizes(x: Array, on_chart: Masks, side: float) -> Array:
+        """Return the sizes (squares,) that samples `x` (squares, n, 3) of equal squares need.
+
+        `on_chart` is whether each sample lies on the chart. Mean and variance go on to the next
+        call, with smaller squares.
+        """
         nonlocal variance, mean
         f = values(x.reshape(-1, 3)).reshape(*x.shape[:2], -1)
         is_valid = on_chart & np.isfinite(f).all(axis=-1)
         mean = f[is_valid].mean(axis=0) if mean is None else mean
         f = np.where(is_valid[..., None], f - mean, 0.0)
         missed = f - BASIS @ (BASIS.T @ f)
+        # squares with invalid samples: the basis is orthonormal only on the valid ones by a new QR
         for i in np.flatnonzero(~is_valid.all(axis=1)):
             Q = np.linalg.qr(BASIS[is_valid[i]])[0]
             missed[i], g = 0.0, f[i][is_valid[i]]
@@ -303,6 +353,7 @@ def polynomial_sizes(values: Callable[[Array], Array], leaves: RefinedParts | No
             sampled = area * (f**2).sum(axis=(1, 2))
             unsampled = _unsampled_variance(leaves, middle, side, sampled)
             missed_variance = np.maximum(missed_variance, unsampled)
+        # the squares that miss least are resolved, as long as their sum is within the tolerance
         order = np.argsort(missed_variance)
         is_resolved = np.empty(len(f), dtype=bool)
         is_resolved[order] = np.cumsum(missed_variance[order]) <= VARIANCE_TOLERANCE * variance
@@ -312,23 +363,27 @@ def polynomial_sizes(values: Callable[[Array], Array], leaves: RefinedParts | No
 
 
 def _unsampled_variance(leaves: RefinedParts, middle: Array, side: float, sampled: Array) -> Array:
-    """Return the integral (squares,) of the square of a formula that the samples do not show.
+    """Return the integrals (squares,) of f^2 that adaptive cells show and samples miss.
 
-    Zero in squares whose samples have half of it.
+    It is zero in squares whose samples show at least the share `SAMPLED_SHARE`.
 
     Parameters
     ----------
+    leaves
+        Adaptive cells, of which those smaller than a square count to the square nearest to them.
     middle
         (squares, 3) centres.
+    side
+        Side of the squares, over R.
     sampled
         (squares,) the integral by the samples.
     """
     tree = scipy.spatial.cKDTree(middle)
     distance, square = tree.query(leaves.centre, distance_upper_bound=side)
     in_square = np.isfinite(distance) & (leaves.size < side)
-    of_leaves = (leaves.area * leaves.variance)[in_square]
-    total = np.bincount(square[in_square], of_leaves, len(middle))
-    return np.where(sampled < SAMPLED_SHARE * total, total, 0.0)
+    integral_of_leaves = (leaves.area * leaves.variance)[in_square]
+    integral = np.bincount(square[in_square], integral_of_leaves, len(middle))
+    return np.where(sampled < SAMPLED_SHARE * integral, integral, 0.0)
 
 
 def formula_refinements(
@@ -338,14 +393,15 @@ def formula_refinements(
     turn: float,
     h: float,
 ) -> list[SquaresFeature]:
-    """Return where formulas need small elements.
+    """Return the squares of the chart in which the formulas of keys need small elements.
 
     Parameters
     ----------
     leaves_of_formulas
-        For each the division that shows it, see `adaptive_cells`; None if squares do.
+        For each key the division that shows its formulas, see `adaptive_cells`; None if the samples
+        of squares suffice.
     outline
-        With imperfections that do not grow.
+        The surface, with imperfections that do not grow.
     turn
         Angle about e3 of the frame of the chart (rad).
     h
@@ -356,13 +412,13 @@ def formula_refinements(
     def places(chart: Array) -> Array:
         return outline.embedding(chart) @ Q
 
-    refined = list[SquaresFeature]()
+    features = list[SquaresFeature]()
     for key_formulas, leaves in zip(formulas, leaves_of_formulas, strict=True):
         sizes = polynomial_sizes(key_formulas.values_at, leaves)
         min_size = LOAD_SIZE * sqrt(h) if key_formulas.spec.load else MIN_SQUARE * h
         if squares := refined_squares(places, outline, sizes, min_size):
-            refined.append(squares)
-    return refined
+            features.append(squares)
+    return features
 
 
 def imperfection_refinements(
@@ -370,8 +426,12 @@ def imperfection_refinements(
 ) -> tuple[list[SquaresFeature], float]:
     """Return where imperfections without a centre need small elements.
 
+    Small squares pay for an imperfection if they need less than half the elements of an even mesh.
+
     Parameters
     ----------
+    perfect
+        The surface without imperfections.
     turn
         Angle about e3 of the frame of the chart (rad).
     h
@@ -380,9 +440,9 @@ def imperfection_refinements(
     Returns
     -------
     squares
-        Of imperfections that are local.
+        Squares with element sizes, of imperfections that are local.
     size
-        Element size everywhere that resolves the others.
+        Element size over R that resolves the others everywhere; infinite without others.
     """
     Q, size_everywhere, local = rotation(turn), inf, list[SquaresFeature]()
     shape = perfect.chart(None, ANY_GRADING)
@@ -399,9 +459,9 @@ def imperfection_refinements(
             continue
         assert not isinstance(shape, MeshFile)  # it has no squares
         low, high = extent(shape)
-        count_of_equal = PER_AREA * float(np.prod(high - low)) / squares.size**2
-        count = squares.cells(float(np.linalg.norm(high - low)) / 2)
-        if count < GRADED_MESH_GAIN * count_of_equal:
+        cells_of_equal_size = PER_AREA * float(np.prod(high - low)) / squares.size**2
+        graded_cells = squares.cells(float(np.linalg.norm(high - low)) / 2)
+        if graded_cells < GRADED_MESH_GAIN * cells_of_equal_size:
             local.append(squares)
         else:
             size_everywhere = min(size_everywhere, squares.size)
@@ -409,16 +469,21 @@ def imperfection_refinements(
 
 
 def _least_sizes(size_at: Callable[[Array], Array]) -> Sizes:
-    """Return the least of the sizes that places (n, 3) of a square need.
+    """Return a function for the least of the element sizes that the places in a square need.
 
-    A quarter of the samples is evaluated.
+    One of four samples of a square is evaluated.
+
+    Parameters
+    ----------
+    size_at
+        Places (n, 3) -> element sizes (n,), over R.
     """
 
     def sizes(x: Array, on_chart: Masks, side: float) -> Array:
         some_places = x.reshape(-1, SAMPLES, SAMPLES, 3)[:, ::2, ::2]
         some_on_chart = on_chart.reshape(-1, SAMPLES, SAMPLES)[:, ::2, ::2]
-        needed = size_at(some_places.reshape(-1, 3)).reshape(some_places.shape[:-1])
-        return np.asarray(np.where(some_on_chart, needed, inf).min(axis=(1, 2)))
+        needed_sizes = size_at(some_places.reshape(-1, 3)).reshape(some_places.shape[:-1])
+        return np.asarray(np.where(some_on_chart, needed_sizes, inf).min(axis=(1, 2)))
 
     return sizes
 
@@ -426,10 +491,12 @@ def _least_sizes(size_at: Callable[[Array], Array]) -> Sizes:
 def unresolved_formulas(
     formulas: Sequence[PlacedFormulas], cells: CellGeometry, turn: float, h: float
 ) -> list[str]:
-    """Return messages about what the cells miss of formulas; collective.
+    """Return messages about what the cells of a mesh miss of formulas; collective.
 
     Parameters
     ----------
+    cells
+        The cells of this rank, with their undeformed places over R.
     turn
         Angle about e3 of the frame of the cells (rad).
     h
@@ -444,7 +511,11 @@ def unresolved_formulas(
 def _unresolved_formula(
     key_formulas: PlacedFormulas, cells: CellGeometry, Q: Array, h: float
 ) -> list[str]:
-    """Return messages about one key, see `unresolved_formulas`."""
+    """Return messages about what the cells miss of the formulas of one key; collective.
+
+    `Q` (3, 3) turns places of the cells' frame into that of the case; `h` is the thickness over R.
+    The messages name errors of the integral, of the stiffness, or of the integral of the square.
+    """
     spec, element, messages = key_formulas.spec, cells.element, list[str]()
 
     def values(x: Array, n: Array) -> Array:
@@ -494,12 +565,12 @@ def _unresolved_formula(
 def _stiffness_error(
     values: Callable[[Array, Array], Array], cells: CellGeometry, nodal: Array
 ) -> float:
-    """Return the error of the stiffness t^3 or the compliance 1/t^3 of the cells; collective.
+    """Return the relative error of the integrated stiffness t^3 or compliance 1/t^3; collective.
 
-    It is over the exact value of all cells. Parts of a shell that carry side by side add their
-    stiffness, those in a row their compliance. That of a cell is what polynomial curvatures of its
-    degree less two show under a constant moment. The squares of moments may be equal everywhere or
-    fall to zero along an axis, as those of a cantilever: the largest difference counts.
+    Parts of a shell that carry side by side add their stiffness, those in a row their compliance.
+    The compliance of a cell is what its curvatures show under a constant moment. The curvatures are
+    polynomials of the cell's degree less two. The squares of moments may be equal everywhere, or
+    fall to zero along an axis as in a cantilever: the largest error of these weights counts.
 
     Parameters
     ----------
@@ -507,21 +578,27 @@ def _stiffness_error(
         Places and normals -> exact thickness factors.
     nodal
         (cells, nodes, 1) thickness factors of the cells.
+
+    Returns
+    -------
+    float
+        The error over the exact value, both summed over all cells.
     """
     X, w = (v.reshape(-1, *v.shape[2:]) for v in sampling_points(cells))
     x, normals, area = cells.evaluate(X)
-    kind, degree = cells.element.cell_type, max(cells.element.degree - 2, 0)
+    cell_type, degree = cells.element.cell_type, max(cells.element.degree - 2, 0)
     curvatures = basix.create_element(
-        basix.ElementFamily.P, kind, degree, basix.LagrangeVariant.legendre, discontinuous=True
+        basix.ElementFamily.P, cell_type, degree, basix.LagrangeVariant.legendre, discontinuous=True
     )
     phi, weight = curvatures.tabulate(0, X)[0, :, :, 0], (area * w)[..., None]
     t, p = values(x, normals), np.matmul(cells.element.tabulate(0, X)[0, :, :, 0], nodal)
+    # minimum of the bending energy: compliance = m A^-1 m, with the stiffness A of the curvatures
     moment = np.einsum("cq,qi->ci", area * w, phi)
     A = np.einsum("cq,cq,qi,qj->cij", area * w, p[..., 0] ** 3, phi, phi, optimize=True)
     compliance = np.einsum("ci,ci->c", moment, np.linalg.solve(A, moment[..., None])[..., 0])
     stiffness = (weight * p**3).sum(axis=(1, 2))
-    exact = np.stack([(weight * t**n).sum(axis=(1, 2)) for n in (3, -3)], axis=1)
-    error = np.abs(exact - np.stack([stiffness, compliance], axis=1))
+    exact_values = np.stack([(weight * t**n).sum(axis=(1, 2)) for n in (3, -3)], axis=1)
+    error = np.abs(exact_values - np.stack([stiffness, compliance], axis=1))
     middle = x.mean(axis=1)
     low = np.min(cells.comm.allgather(x.min(axis=(0, 1), initial=inf)), axis=0)
     high = np.max(cells.comm.allgather(x.max(axis=(0, 1), initial=-inf)), axis=0)
@@ -530,18 +607,23 @@ def _stiffness_error(
     moments = [np.ones((len(x), 1)), (1 + position) ** 2, (1 - position) ** 2]
     squared_moments = np.concatenate(moments, axis=1)
     error_integral, exact_integral = (
-        cells.sum_over_ranks(v[..., None] * squared_moments[:, None]) for v in (error, exact)
+        cells.sum_over_ranks(v[..., None] * squared_moments[:, None]) for v in (error, exact_values)
     )
     return float((error_integral / exact_integral).max())
 
 
 def cells_of_patch(patch: PatchMesh, degree: int) -> CellGeometry:
-    """Return the cells of a triangulation, with the places of a model of that degree."""
+    """Return the cells of a triangulation, with places as polynomials; on this rank alone.
+
+    The polynomials have the given degree. They equal the patch's embedding at the nodes of each
+    cell.
+    """
     element = basix.create_element(
         basix.ElementFamily.P, basix.CellType.triangle, degree, basix.LagrangeVariant.gll_warped
     )
     corners = patch.nodes[patch.cells[:, :3]]
     X = element.points
+    # chart (cells, nodes, 2 or 3): the affine map of each triangle at the element's nodes
     chart = corners[:, :1] + np.einsum("qk,ckd->cqd", X, corners[:, 1:] - corners[:, :1])
     places = patch.embedding(chart.reshape(-1, chart.shape[-1])).reshape(*chart.shape[:2], 3)
     return CellGeometry(element, places, len(places), MPI.COMM_SELF)

@@ -51,7 +51,7 @@ class MemoryEstimate:
         ranks: int = 1,
         local_ranks: int = 1,
     ) -> "MemoryEstimate":
-        """Estimate the memory for a number of unknowns.
+        """Estimate the memory that the ranks on one machine need for a number of unknowns.
 
         Parameters
         ----------
@@ -63,13 +63,13 @@ class MemoryEstimate:
         if context.solid:
             bytes_per_unknown = BYTES_PER_UNKNOWN_OF_SOLID
         else:
-            of_highest = BYTES_PER_UNKNOWN[max(BYTES_PER_UNKNOWN)]
-            bytes_per_unknown = BYTES_PER_UNKNOWN.get(degree_of(context), of_highest)
-        of_model = bytes_per_unknown * unknowns * log(max(unknowns, 2.0)) * local_ranks / ranks
-        min_bytes = BYTES_PER_PROCESS * local_ranks + of_model * (
+            bytes_of_highest_degree = BYTES_PER_UNKNOWN[max(BYTES_PER_UNKNOWN)]
+            bytes_per_unknown = BYTES_PER_UNKNOWN.get(degree_of(context), bytes_of_highest_degree)
+        model_bytes = bytes_per_unknown * unknowns * log(max(unknowns, 2.0)) * local_ranks / ranks
+        min_bytes = BYTES_PER_PROCESS * local_ranks + model_bytes * (
             1 + SYMMETRY_BREAKING_SHARE * half
         )
-        return cls(unknowns, min_bytes, min_bytes + INDEFINITE_SHARE * of_model)
+        return cls(unknowns, min_bytes, min_bytes + INDEFINITE_SHARE * model_bytes)
 
     def words(self, free_bytes: float) -> str:
         """Return the estimate beside the free memory (bytes) as text."""
@@ -80,10 +80,10 @@ class MemoryEstimate:
 
 
 def unknowns_of(context: Context, cells: float) -> float:
-    """Estimate the unknowns of a number of triangles before they are made.
+    """Return the estimated number of unknowns of a mesh with a number of triangles.
 
-    Of degree k one brings 3 k^2/2. The body over it brings three hexahedra of degree 2 in each
-    layer.
+    A triangle of degree k adds 3 k^2/2 unknowns. In a solid it adds three hexahedra of degree 2 in
+    each layer.
     """
     if context.solid:
         return cells * (UNKNOWNS_PER_SOLID_LAYER * (2 * len(layer_bounds(context)) - 1))
@@ -101,40 +101,40 @@ def refuse_beyond_memory(problem: Problem, ranks: int = 1, local_ranks: int = 1)
     Returns
     -------
     warning
-        About a model that may be too large past an instability; None of others.
+        Message about a model that may be too large past an instability; None if it is small enough.
 
     Raises
     ------
     CaseError
-        If even the least memory that it takes is not there.
+        If less memory is free than the problem needs at least.
     """
     try:
         free_bytes = available_memory()
     except ValueError as e:
         raise CaseError(str(e)) from None
-    needed = MemoryEstimate.for_unknowns(
+    estimate = MemoryEstimate.for_unknowns(
         problem.context,
         problem.unknowns,
         half=problem.is_half,
         ranks=ranks,
         local_ranks=local_ranks,
     )
-    if problem.axisymmetric or needed.max_bytes <= free_bytes:
+    if problem.axisymmetric or estimate.max_bytes <= free_bytes:
         return None
-    if needed.min_bytes <= free_bytes:
+    if estimate.min_bytes <= free_bytes:
         return (
-            f"mesh: about {needed.unknowns:.2g} unknowns take {needed.words(free_bytes)}: "
+            f"mesh: about {estimate.unknowns:.2g} unknowns take {estimate.words(free_bytes)}: "
             "past an instability that may be too little"
         )
     shell, degree = problem.context.shell, degree_of(problem.context)
-    how = f"lower mesh.refinement ({problem.mesh.refinement:g}) or mesh.degree ({degree})"
+    remedy = f"lower mesh.refinement ({problem.mesh.refinement:g}) or mesh.degree ({degree})"
     if isinstance(shell, MeshSurface):
-        how = f"take a coarser mesh file, or a lower mesh.degree ({degree})"
+        remedy = f"take a coarser mesh file, or a lower mesh.degree ({degree})"
     hint = ""
     if not problem.is_half:
         hint = "; where shell, fields and loads have a mirror plane, symmetry: half halves it"
     raise CaseError(
-        f"mesh: about {needed.unknowns:.2g} unknowns at radius/thickness {shell.R_over_h:g} take "
-        f"{needed.words(free_bytes)}: {how}{hint}; ranks on several machines share it; "
+        f"mesh: about {estimate.unknowns:.2g} unknowns at radius/thickness {shell.R_over_h:g} take "
+        f"{estimate.words(free_bytes)}: {remedy}{hint}; ranks on several machines share it; "
         "MAGSHELL_MEMORY=GB in the environment says what to count on in place of what is free"
     )

@@ -57,7 +57,13 @@ class MeshSection(Section):
         return self
 
     def refuse_unfit_solid(self, *, mesh_file: bool) -> None:
-        """Refuse what a solid does not have; `mesh_file`: whether its elements are a file's."""
+        """Refuse keys that a solid does not have; `mesh_file` is whether its elements are a file's.
+
+        Raises
+        ------
+        ValueError
+            With the first such key.
+        """
         for key in self.model_fields_set & {"degree", "penalty"}:
             if key != "degree" or self.degree != SOLID_DEGREE:
                 remedy = "a file with smaller elements" if mesh_file else "mesh.refinement"
@@ -78,7 +84,13 @@ class SolidSection(Section):
     """κ/μ, in place of ν = 0.5 and only there"""
 
     def refuse_unfit(self, poisson_ratio: float) -> None:
-        """Refuse a compressibility beside a ratio that says all."""
+        """Refuse a compressibility beside a Poisson's ratio other than 0.5, which determines it.
+
+        Raises
+        ------
+        ValueError
+            If both are given.
+        """
         if "bulk_to_shear" in self.model_fields_set and poisson_ratio != 0.5:
             raise ValueError(
                 "solid.bulk_to_shear: takes the place of shell.poisson_ratio: 0.5; here that is "
@@ -87,12 +99,12 @@ class SolidSection(Section):
 
 
 def mesh_section(context: Context) -> MeshSection:
-    """Return the elements that a case requests."""
+    """Return the section of the elements of a case, or its default."""
     return context.section_of(MeshSection) or MeshSection()
 
 
 def degree_of(context: Context) -> int:
-    """Return the degree of the displacement."""
+    """Return the polynomial degree of the displacement in a case."""
     return SOLID_DEGREE if context.solid else mesh_section(context).degree
 
 
@@ -100,7 +112,7 @@ class Refined(Protocol):
     """A part of a case that needs small elements somewhere."""
 
     def features(self, outline: "Outline", sizing: SizingContext, growth: float) -> list[Feature]:
-        """Return where elements are small, with sizes that grow by `growth` per distance."""
+        """Return small elements in the chart, with sizes that grow by `growth` per distance."""
 
 
 def grading(
@@ -114,20 +126,22 @@ def grading(
     *,
     local: bool = False,
 ) -> Grading:
-    """Return element sizes for errors of 1e-4 in k_d and 1e-3 in F at degree 4.
+    """Return element sizes over R for errors of 1e-4 in k_d and 1e-3 in F at degree 4.
 
     A size that the case gives is the same everywhere, and so is that of a mesh file.
 
     Parameters
     ----------
+    outline
+        The surface with its chart.
     h
         Thickness over R.
     refined, largest
         Parts that need small elements somewhere, and the largest size that resolves the others.
     loaded
-        The concentrated loads.
+        Places in the chart with concentrated loads, and the loads there.
     varying
-        Where formulas vary.
+        Small elements where formulas vary.
     local
         Whether the shell has local imperfections.
     """
@@ -142,9 +156,9 @@ def grading(
     for part in refined:
         features += part.features(outline, sizing, growth)
     for place, loads in loaded:
-        for kind in {type(load): None for load in loads}:
-            features += kind.mesh_features(
-                [load for load in loads if type(load) is kind], place, sizing
+        for load_class in {type(load): None for load in loads}:
+            features += load_class.mesh_features(
+                [load for load in loads if type(load) is load_class], place, sizing
             )
     features += varying
     return Grading(
@@ -153,7 +167,7 @@ def grading(
 
 
 def _largest_size(context: Context, outline: "Outline", sizing: SizingContext) -> float:
-    """Return the element size where nothing needs smaller ones."""
+    """Return the element size over R where nothing needs smaller elements, before refinement."""
     if outline.grid:
         return min(UNIFORM_SIZE * sqrt(sizing.h), MAX_SIZE)
     if not outline.disc or context.shell.geometry == "disc":
@@ -164,11 +178,15 @@ def _largest_size(context: Context, outline: "Outline", sizing: SizingContext) -
 
 
 def _growth(context: Context, sizing: SizingContext) -> float:
+    """Return the largest growth of the element size per distance that all loads allow."""
     return max((step.load.growth(sizing) for step in context.steps), default=GROWTH)
 
 
 def _edge_features(context: Context, outline: "Outline", sizing: SizingContext) -> list[Feature]:
-    """Return smaller elements along held edges of a grid, and along the rim of a curved disc."""
+    """Return small elements along held edges of a grid, or along the rim of a curved disc.
+
+    Flat shapes and discs have none.
+    """
     h, growth = sizing.h, _growth(context, sizing)
     if grid := outline.grid:
         boundary = context.section_of(BoundarySection)

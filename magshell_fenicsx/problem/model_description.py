@@ -19,16 +19,16 @@ MAX_LISTED_IMPERFECTIONS = 6  # of more only the kinds are told
 def describe_model(
     context: Context, loads: Loads, model: str, mirror: Mirror | None, rims: int
 ) -> tuple[list[str], list[str]]:
-    """Return phrases for what a model includes, and for what it leaves out.
+    """Return phrases for what a model includes, and phrases for what it leaves out.
 
     Parameters
     ----------
     model
         "meridian", "half shell", ...
     mirror
-        Symmetry plane of a half, or the sector.
+        Symmetry plane of a half, or the sector; None if all is modelled.
     rims
-        Number of different rims besides the pole's.
+        Number of different rims of dimples besides the pole's.
     """
     body = solid_body_of(context)
     included = [model, _body_text(body) if body else _law_text(context)]
@@ -48,15 +48,15 @@ def describe_model(
         else:
             left_out.append(part.absent)
     if model == "meridian":
-        with_contact = ""
+        contact_words = ""
         if loads.pairs:
-            with_contact = "; where shells touch, not those that come and go between two"
-        left_out.append(f"waves around the axis (they are looked for at each point{with_contact})")
+            contact_words = "; where shells touch, not those that come and go between two"
+        left_out.append(f"waves around the axis (they are looked for at each point{contact_words})")
     if isinstance(mirror, Sector):
-        begin = degrees(mirror.azimuth) + 0.0
+        first_azimuth = degrees(mirror.azimuth) + 0.0
         left_out.append(
             f"the other {mirror.copies - 1} sectors: mirror planes through e3 at azimuths "
-            f"{begin:.5g} and {begin + degrees(mirror.angle):.5g} degrees "
+            f"{first_azimuth:.5g} and {first_azimuth + degrees(mirror.angle):.5g} degrees "
             "(modes that they exclude are counted, not located)"
         )
     elif mirror:
@@ -71,7 +71,10 @@ def describe_model(
 
 
 def _imperfections_text(context: Context, rims: int) -> str:
-    """Return a phrase about each of a few imperfections; of many about how many of each kind."""
+    """Return a phrase about each of a few imperfections, or about the number of each kind.
+
+    `rims` is the number of different rims of dimples, of which a mesh can follow `MAX_RIMS`.
+    """
     sections = context.sections["imperfections"].values()
     words = [section.account() for section in sections]
     if len(words) > MAX_LISTED_IMPERFECTIONS:
@@ -86,7 +89,7 @@ def _imperfections_text(context: Context, rims: int) -> str:
 
 
 def _law_text(context: Context) -> str:
-    """Return a phrase about the laws of a shell."""
+    """Return a phrase about the law of a shell, or the laws of several."""
     laminate, laws = context.shell.laminate, laws_of(context)
     if {*laws} - {context.shell.law}:
         return f"membrane and bending energy, each of its own law: {', '.join(laws)}"

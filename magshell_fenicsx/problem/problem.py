@@ -54,12 +54,12 @@ CELLS_OF_CONTACT = 3  # of a meridian, over the size of a body's contact
 
 @dataclass(frozen=True)
 class SolidBody:
-    """The material of a solid, and its elements through the thickness.
+    """The material of a solid, and the bounds of its elements through the thickness.
 
     Attributes
     ----------
     layer_bounds
-        Where the elements begin and end, from 0 inside to 1 outside.
+        Heights at which the elements begin and end, from 0 inside to 1 outside.
     """
 
     material: MooneyRivlin
@@ -67,46 +67,51 @@ class SolidBody:
 
 
 def solid_body_of(context: Context) -> SolidBody | None:
-    """Return the solid of a case; None of a shell."""
+    """Return the material and the elements of the solid of a case; None if the case is a shell.
+
+    A `Context` holds the sections of a case: shell, places, programme.
+    """
     if not context.solid:
         return None
-    shell, ratio = context.shell, _solid_section(context).bulk_to_shear
-    share = shell.rubber or 0.0
-    assert isinstance(share, float)  # Ogden's law needs a mid-surface
+    shell, bulk_to_shear = context.shell, _solid_section(context).bulk_to_shear
+    second_share = shell.rubber or 0.0
+    assert isinstance(second_share, float)  # Ogden's law needs a mid-surface
     return SolidBody(
-        MooneyRivlin.from_poisson_ratio(shell.poisson_ratio, ratio, share), layer_bounds(context)
+        MooneyRivlin.from_poisson_ratio(shell.poisson_ratio, bulk_to_shear, second_share),
+        layer_bounds(context),
     )
 
 
 def layer_bounds(context: Context) -> list[float]:
-    """Return where the elements through the thickness begin and end, from 0 inside to 1 outside.
+    """Return the heights at which elements through the thickness begin and end, from 0 to 1.
 
-    Magnetised layers end where elements do, and so does the inner half then: nodes lie in the
-    middle.
+    0 is the inner face, 1 the outer one. Elements end where magnetised layers do, and at the
+    mid-surface, where nodes then lie. Without such layers all elements are equally thick.
     """
-    count, magnetic = _solid_section(context).layers, context.section_of(MagneticSection)
+    element_count, magnetic = _solid_section(context).layers, context.section_of(MagneticSection)
     remanent = magnetic and magnetic.remanent
     magnetised = (remanent and remanent.layers) or []
     if not magnetised:
-        return [n / count for n in range(count + 1)]
-    tops = [
+        return [n / element_count for n in range(element_count + 1)]
+    layer_tops = [
         sum(layer.fraction for layer in magnetised[: n + 1]) for n in range(len(magnetised) - 1)
     ]
-    inner = {MIDSURFACE_HEIGHT, *(round(top, HEIGHT_DIGITS) for top in tops)}
+    inner_bounds = {MIDSURFACE_HEIGHT, *(round(top, HEIGHT_DIGITS) for top in layer_tops)}
     bounds = [0.0]
-    for low, high in pairwise([0.0, *sorted(inner), 1.0]):
-        parts = max(ceil((high - low) * count - COUNT_TOLERANCE), 1)
-        bounds += [low + (high - low) * (n + 1) / parts for n in range(parts)]
+    for low, high in pairwise([0.0, *sorted(inner_bounds), 1.0]):
+        elements = max(ceil((high - low) * element_count - COUNT_TOLERANCE), 1)
+        bounds += [low + (high - low) * (n + 1) / elements for n in range(elements)]
     return bounds
 
 
 def _solid_section(context: Context) -> SolidSection:
+    """Return the section `solid` of a case, or its default."""
     return context.section_of(SolidSection) or SolidSection()
 
 
 @dataclass(frozen=True)
 class Document:
-    """The document that a problem was made of; a run writes it, and is known by it.
+    """The document that a problem was made of; a run writes it, and is recognised by it.
 
     Attributes
     ----------
@@ -115,9 +120,10 @@ class Document:
     name
         Name of the file.
     outside
-        Hashes of what is solved besides `data`, such as files; None for one that cannot be read.
+        Name -> hash of what results depend on besides `data`, such as files; None for a file that
+        cannot be read.
     with_place
-        Message that begins with a key -> the same with the place of the key before it.
+        Function that puts the place in the file before a message that begins with a key.
     """
 
     data: Mapping[str, Any] = field(default_factory=dict)
@@ -128,16 +134,16 @@ class Document:
 
 @dataclass(frozen=True)
 class PendingModes:
-    """The modes of the perfect shell that are imperfections of a problem and not yet computed.
+    """Modes of the perfect shell that will be imperfections of a problem, not yet computed.
 
     Attributes
     ----------
     count
         Number of modes that are needed.
     perfect
-        Makes the problem of the perfect shell.
+        Function that makes the problem of the perfect shell.
     with_modes
-        Modes -> the problem that has them.
+        Function that makes, from the computed modes, the problem that has them as imperfections.
     """
 
     count: int
@@ -146,6 +152,7 @@ class PendingModes:
 
 
 def _needs_inertia_alone(step: ProgrammeStep) -> bool:
+    """Return whether a step is a motion of a shell that may be free of supports."""
     return step.load.motion is not None and step.load.motion.needs_inertia_alone
 
 
@@ -156,13 +163,15 @@ class Problem:
     Attributes
     ----------
     context
-        What parts know: the shell, the named places in the shell's length, the programme.
+        The case, as parts know it: the shell, named places in the shell's length, the programme.
     mesh
         The elements that are requested.
     body
         Material and elements of a solid; None of a shell.
-    material, loads, conditions
-        Of the shell, and name of an edge or a point -> its support.
+    material, loads
+        Material of the shell, and all loads.
+    conditions
+        Name of an edge, a point or a patch -> its support.
     meridian
         The meridian that is modelled instead of the surface; None if the surface is modelled.
     mirror
@@ -174,22 +183,22 @@ class Problem:
         "pole" is the one whose displacement is reported: the pole, the disc's centre, the strip's
         tip.
     included, left_out
-        Phrases for what the model has and lacks.
+        Phrases about the physics that the model includes, and leaves out.
     normal
-        Chart -> outward unit normals of the perfect surface, of one that has a chart.
+        Chart -> outward unit normals of the perfect surface; None for a surface without a chart.
     turns
         Whether all parts are axisymmetric, whatever is modelled.
     thickness
-        What multiplies the thickness; None for 1.
+        Factor of the thickness that varies; None for 1.
     length
         R in the unit of results: metres of a case with units, else the unit of its lengths.
     body_contacts
-        For each body the size of its contact, and how far from its first contact it presses; over
-        R.
+        For each body the size of its contact, and the distance from the first contact within which
+        the body presses; over R.
     supports, reactions
         Names of supports, and whether their reactions are reported.
     warnings
-        What is unphysical, or often meant in another way.
+        Messages about what is unphysical, or often meant in another way.
     within
         Name of the patch of each dimple -> whether places (n, 3) are within its rim.
     lambda_m
@@ -205,9 +214,10 @@ class Problem:
     pending_modes
         The modes of the perfect shell, which must be computed first; None without.
     document
-        The document of the problem.
+        The document that the problem was made of.
     remade
-        Values by keys -> the problem of the case with these; see `with_values`.
+        Function of values by keys that makes the problem of the case with these; see `with_values`.
+        None without a case.
     """
 
     context: Context
@@ -277,9 +287,9 @@ class Problem:
 
     @property
     def outward(self) -> Embedding | None:
-        """Nodes of the mesh, or charts of the meridian -> normals of the perfect shell.
+        """Nodes of the mesh, or charts of the meridian -> outward normals of the perfect shell.
 
-        None if they are not known.
+        None if the normals are not known.
         """
         if self.meridian:
             return self.meridian.normal
@@ -297,12 +307,12 @@ class Problem:
 
     @property
     def at_rest(self) -> bool:
-        """Whether only frequencies of an unloaded shell are requested: it need not be held."""
+        """Whether only frequencies of an unloaded shell are requested: it needs no supports."""
         return not self.programme and self.frequencies is not None
 
     @property
     def moves_freely(self) -> bool:
-        """Whether the shell only moves in time, so that it need not be held.
+        """Whether the shell only moves in time, so that it needs no supports.
 
         Inertia then resists its rigid motions.
         """
@@ -311,8 +321,10 @@ class Problem:
 
     @property
     def support_hint(self) -> str:
-        """The step of a load that acts before a motion which needs no support, for a message; empty
-        where there is none.
+        """Advice for a message about a shell that is not held; empty where it does not help.
+
+        It helps where static steps need supports and a motion needs none: the load of the static
+        step may act within the motion instead.
         """
         if self.moves_freely or not any(map(_needs_inertia_alone, self.programme)):
             return ""
@@ -323,16 +335,16 @@ class Problem:
 
     @property
     def imperfections(self) -> Mapping[str, ImperfectionSection]:
-        """Key of each imperfection below `shell` -> its section."""
+        """Mapping: key of each imperfection below `shell` -> its section."""
         return self.context.sections.get("imperfections") or {}
 
     def with_values(self, values: Mapping[str, Any]) -> "Problem":
-        """Return the problem of the case with other values, such as {"mesh.degree": 3}.
+        """Return the problem of the case with other values at keys, such as {"mesh.degree": 3}.
 
         Raises
         ------
         CaseError
-            If the problem has no case, or a value is not allowed.
+            If the problem was made without a case, or a value is not allowed.
         """
         if self.remade is None:
             raise CaseError(
@@ -342,12 +354,13 @@ class Problem:
         return self.remade(values)
 
     def triangulated(self) -> PatchMesh:
-        """Return the triangulation; call it on one rank only.
+        """Return the triangulation of the modelled surface, after checks; call it on one rank only.
 
         Raises
         ------
         MeshError
-            If it cannot carry a shell, or lacks what the problem names.
+            If a triangle is too flat, or the mesh lacks an edge, a point or a patch that the
+            problem names.
         """
         patch = self._triangulation()
         refuse_unfit(patch, self.conditions, self.loads, self.thickness)
@@ -357,18 +370,21 @@ class Problem:
         return patch
 
     def flat_triangle(self, patch: PatchMesh) -> str:
-        """Return where a triangle is too flat for the penalty, and what helps; empty if none is."""
+        """Return a message about a triangle that is too flat for the penalty; empty if none is."""
         return flat_triangle(patch, *self._penalty_and_unit)
 
     @property
     def _file_of_shell(self) -> MeshFile | None:
-        """The mesh file of the one shell; None without."""
+        """The mesh file of a shell that consists of one file; None for other surfaces."""
         file = self.mesh_file
         return file if file and not file.in_memory else None
 
     @property
     def _penalty_and_unit(self) -> tuple[float, float, float, str]:
-        """The penalty, that of the degree by default, R in the unit of messages, and the unit."""
+        """The penalty, the default penalty of the degree, R in a unit, and this unit in words.
+
+        The unit is that of messages: R, or the coordinates of the shell's mesh file.
+        """
         default = default_penalty(self.mesh.degree)
         length, unit = 1.0, "over R"
         if self._file_of_shell:
@@ -376,9 +392,10 @@ class Problem:
         return self.mesh.penalty or default, default, length, unit
 
     def _triangulated_by_gmsh(self, shape: PlaneShape) -> PatchMesh:
-        """Return the mesh of a shape by gmsh.
+        """Return the mesh of a plane shape by gmsh; on one rank.
 
-        That of a sector is symmetric, so that crests and troughs of waves have equal elements.
+        The mesh of a sector of a disc is symmetric about the middle plane of the sector: gmsh
+        meshes one half of it. So crests and troughs of waves have equal elements.
         """
         if not (isinstance(self.mirror, Sector) and isinstance(shape, DiscShape)):
             return triangulate(shape, self.size, self.points, self.embedding)
@@ -393,7 +410,11 @@ class Problem:
         return replace(double_sector(half, self.mirror.angle), points=dict(self.points))
 
     def _triangulation(self) -> PatchMesh:
-        """Return the triangulation of the half, the sector or the whole, not yet checked."""
+        """Return the triangulation of the half, the sector or the whole surface, unchecked.
+
+        It comes from a mesh file, a given mesh, a grid or gmsh; a grid or a rimmed grid is cut at
+        the mirror plane.
+        """
         if isinstance(self.shape, MeshFile):
             held_edges = [
                 name
@@ -409,15 +430,17 @@ class Problem:
         else:
             patch = self._triangulated_by_gmsh(self.shape)
         # other shapes are made as halves, and the chart of a sector is narrower
+        # whether the mesh has both sides of the mirror plane, so that it must be cut
         is_complete = isinstance(self.shape, Grid | RimmedGrid)
         is_complete = is_complete and not isinstance(self.mirror, Sector)
         return cut(patch, self.mirror) if self.mirror and is_complete else patch
 
 
 def meridian_vertices(problem: Problem) -> NDArray[np.float64]:
-    """Return the vertices (n,) of the meridian's mesh, in its chart.
+    """Return the vertices (n,) of the meridian's mesh as chart parameters, in increasing order.
 
-    Those of several shells stand one after the other.
+    Elements are graded: small near edges, jumps of curvature and contacts with bodies. The vertices
+    of several shells stand one shell after the other.
     """
     meridian = problem.meridian
     assert meridian
@@ -427,11 +450,13 @@ def meridian_vertices(problem: Problem) -> NDArray[np.float64]:
         return _vertices_of_shells(problem, meridian)
     has_pole = meridian.names[0] is None
     h = problem.material.h / meridian.curvature
-    reach = max((distance for _, distance in problem.body_contacts), default=0.0)
-    reach = meridian.length if problem.loads.pairs else reach  # shells may meet anywhere
+    contact_reach = max((distance for _, distance in problem.body_contacts), default=0.0)
+    contact_reach = (
+        meridian.length if problem.loads.pairs else contact_reach
+    )  # shells may meet anywhere
     contact_cells = None
-    if reach:
-        contact_cells = reach if has_pole else meridian.length, CONTACT_CELL_SIZE * sqrt(h)
+    if contact_reach:
+        contact_cells = contact_reach if has_pole else meridian.length, CONTACT_CELL_SIZE * sqrt(h)
     return graded_vertices(
         meridian.length,
         meridian.curvature_jumps,
@@ -445,12 +470,15 @@ def meridian_vertices(problem: Problem) -> NDArray[np.float64]:
 
 
 def _vertices_of_shells(problem: Problem, meridian: MeridianChart) -> NDArray[np.float64]:
-    """Return the vertices (n,) of the meridians of several shells; joined ones share one."""
-    vertices, end = list[NDArray[np.float64]](), -inf
+    """Return the vertices (n,) of the meridians of several shells, one after the other.
+
+    Where two shells are joined, the vertex that both have stands once.
+    """
+    vertices, last_vertex = list[NDArray[np.float64]](), -inf
     for shell in meridian.shell_meridians:
         touches_shells = any(pair.has(shell.name) for pair in problem.loads.pairs)
         anywhere = [(inf, shell.length)] if touches_shells else []
-        of_shell = shell.vertices([*problem.body_contacts, *anywhere])
-        vertices.append(of_shell[of_shell > end])
-        end = float(of_shell[-1])
+        shell_vertices = shell.vertices([*problem.body_contacts, *anywhere])
+        vertices.append(shell_vertices[shell_vertices > last_vertex])
+        last_vertex = float(shell_vertices[-1])
     return np.concatenate(vertices)

@@ -109,6 +109,7 @@ class OutputSection(Section):
     @field_validator("ranges")
     @classmethod
     def _ranges_are_known(cls, ranges: dict[str, list[float]]) -> dict[str, list[float]]:
+        """Check that ranges are those of fields with colours, with the smaller value first."""
         for name, (low, high) in ranges.items():
             if name not in COLOURED_FIELDS:
                 raise ValueError(

@@ -25,7 +25,7 @@ MIN_AMPLITUDE, MAX_AMPLITUDE = 1e-12, 1e9
 
 
 def surface_terms(context: Context, user_terms: Sequence[OwnTerm]) -> tuple[OwnTerm, ...]:
-    """Return the terms of parts and of steps, then the user's.
+    """Return the energies that follow from densities: those of parts, of steps, and of the user.
 
     Raises
     ------
@@ -51,7 +51,7 @@ def surface_terms(context: Context, user_terms: Sequence[OwnTerm]) -> tuple[OwnT
 
 
 def _refuse_taken_names(terms: Sequence[OwnTerm]) -> None:
-    """Refuse a name of an energy, of what it reports or of its parameters that is taken."""
+    """Refuse energies, reported integrals and parameters whose names are taken, by a CaseError."""
     names = list[str]()
     for term in terms:
         names += [term.name, *term.observed] if term.density else [*term.observed]
@@ -62,7 +62,10 @@ def _refuse_taken_names(terms: Sequence[OwnTerm]) -> None:
 
 
 def _refuse_unfit_for_solid(terms: Sequence[OwnTerm]) -> None:
-    """Refuse energies of edges, and those that depend on second derivatives."""
+    """Refuse terms that a solid cannot have, by a CaseError.
+
+    These are energies of edges, and those that depend on second derivatives of the placement.
+    """
     for term in terms:
         if term.on is not None:
             raise CaseError(
@@ -81,12 +84,17 @@ def _refuse_unfit_for_solid(terms: Sequence[OwnTerm]) -> None:
 def refuse_unfit(
     patch: PatchMesh, conditions: Mapping[str, Condition], loads: Loads, thickness: Thickness | None
 ) -> None:
-    """Refuse a triangulation without an edge, a point or a patch that the problem names.
+    """Refuse a triangulation that lacks an edge, a point or a patch that the problem names.
+
+    Parameters
+    ----------
+    conditions
+        Name of an edge, a point or a patch -> its support.
 
     Raises
     ------
     MeshError
-        With the name.
+        With the missing name.
     """
     refuse_unknown(patch.edges, patch.points, patch.patches, conditions, loads)
     _refuse_ambiguous(patch.edges, patch.points, conditions)
@@ -102,12 +110,19 @@ def refuse_unfit_ends(
     conditions: Mapping[str, Condition],
     loads: Loads,
 ) -> None:
-    """Refuse a meridian without an end or a point that the problem names.
+    """Refuse a meridian that lacks an end or a point that the problem names.
+
+    Parameters
+    ----------
+    ends, points
+        Names that the meridian has.
+    conditions
+        Name of an end or a point -> its support.
 
     Raises
     ------
     MeshError
-        With the name.
+        With the missing name.
     """
     refuse_unknown(ends, points, [], conditions, loads)
     _refuse_ambiguous(ends, points, conditions)
@@ -116,7 +131,7 @@ def refuse_unfit_ends(
 def _refuse_ambiguous(
     edges: Collection[str], points: Collection[str], conditions: Mapping[str, Condition]
 ) -> None:
-    """Refuse the support of a name that an edge and a point have."""
+    """Refuse the support of a name that both an edge and a point have, by a MeshError."""
     for name, condition in conditions.items():
         if isinstance(condition, HeldComponents) and name in edges and name in points:
             raise MeshError(f"boundary.{name}: is an edge and a point; give the point another name")
@@ -125,12 +140,14 @@ def _refuse_ambiguous(
 def open_edges(
     patch: PatchMesh, conditions: Mapping[str, Condition], patch_names: Collection[str] = ()
 ) -> tuple[str, ...]:
-    """Return the edges at which a live pressure has no potential.
+    """Return the names of the edges at which a live pressure has no potential.
 
     Parameters
     ----------
+    conditions
+        Name of an edge -> its support.
     patch_names
-        Patches that the pressure acts on; all of the surface without.
+        Patches that the pressure acts on; empty if it acts on the whole surface.
     """
     pairs_of_edges = {name: as_set(pairs) for name, pairs in patch.edges.items()}
     if patch_names:

@@ -32,6 +32,8 @@ class CaseSizes:
 
     Attributes
     ----------
+    nu, R_over_h
+        Poisson's ratio, and the radius over the thickness.
     R, E, rho
         Radius (m), Young's modulus (Pa) and density (kg/m³).
     applied, strength
@@ -56,13 +58,14 @@ class CaseSizes:
 
     @property
     def force(self) -> float:
-        """2πD/R (N)."""
+        """The unit 2πD/R of forces (N), with the bending stiffness D = E h³/(12(1 - ν²))."""
         return pi * self.E * self.h**3 / (6 * (1 - self.nu**2) * self.R)
 
     @property
     def in_si(self) -> float:
-        """1 in a case whose lengths and modulus have units, else nan: the size of numbers that are
-        in SI already.
+        """1 in a case whose lengths and modulus have units, else nan.
+
+        It is the size of numbers that are in SI already.
         """
         return 1.0 + 0.0 * self.R * self.E
 
@@ -74,22 +77,23 @@ class Unit:
     Attributes
     ----------
     key
-        Its name, and the unit as a formula such as "E h R²" unless `formula` says another.
+        Name of the unit, and the unit as a formula such as "E h R²" unless `formula` gives another.
     si
         The unit in SI.
     ending, shown
-        The unit in which a case with units has a column of its own: the ending of its name, and the
-        unit in words.
+        The unit in which a case with units has a column of its own: the ending of the column's
+        name, and the unit in words. Both are empty if there is no such column.
     size
-        What one of the number is in that unit; nan if the case lacks what it needs.
+        Function of the sizes of a case: the value in that unit of a number 1; nan if the case lacks
+        what it needs.
     text
         The unit of `size` in pint's words, into which a text with a unit is converted; empty if no
         text is. A column in another unit than that of a target has a `Unit` of its own.
     needs
-        What a case must have for such a text.
+        What a case must have to convert a text, for messages.
     words, symbol
-        Of the column in that unit, if they are not those of the quantity; a quantity without a
-        symbol gets none.
+        Words and symbol of the column in that unit, if they are not those of the quantity; a
+        quantity without a symbol gets none.
     """
 
     key: str
@@ -105,7 +109,7 @@ class Unit:
 
     @property
     def formula_text(self) -> str:
-        """The unit as a formula."""
+        """The unit as a formula, such as "E h R²"; empty if it has none."""
         return self.key if self.formula is None else self.formula
 
 
@@ -190,6 +194,7 @@ def plain_text(text: str) -> str:
 
 
 def _tex(text: str) -> str:
+    """Return text with Greek letters and powers as TeX writes them."""
     text = re.sub("[\u0391-\u03c9]", lambda greek: rf"\{_letter(greek[0])} ", text)
     return re.sub("[²³⁴]", lambda power: f"^{power[0].translate(SUPERSCRIPTS)}", text)
 
@@ -208,7 +213,7 @@ def format_number(value: float, form: str) -> str:
 
 @dataclass(frozen=True)
 class Quantity:
-    """A quantity: a column of path.csv.
+    """A quantity observed along a path: a column of path.csv.
 
     Attributes
     ----------
@@ -218,22 +223,24 @@ class Quantity:
         Name for axes and headings.
     meaning
         Definition in one sentence.
+    kind
+        Kind of quantity, such as "load" or "energy".
     symbol
         For example "λ_m": Greek letters and powers in Unicode, an index after "_"; empty if there
         is no symbol.
     units
-        What one of the number is, the first of them unless the case shows another; empty for a pure
+        Units of the number, the first of them unless the case shows another; empty for a pure
         number.
     note
         Distinguishes quantities with the same symbol; follows the words or the symbol.
     sign
-        Sign of its value on an axis.
+        Sign of the value on an axis.
     stem
-        Its name without a unit, before the endings of columns in units; by default the name without
-        "_over_h".
+        Name without a unit, to which the endings of columns in units are added; by default the name
+        without "_over_h".
     each
-        Whether there may be several, of which each has a column of its own: NAME_OF_COLUMN, an
-        underscore, its name.
+        Whether there may be several such quantities, each with a column of its own, such as
+        approach_ball: the name of this one, an underscore, the name of a body.
     """
 
     name: str
@@ -254,12 +261,12 @@ class Quantity:
 
     @property
     def si(self) -> str:
-        """The unit in SI."""
+        """The unit in SI; empty for a pure number."""
         return self.units[0].si if self.units else ""
 
     @property
     def ascii_symbol(self) -> str:
-        """The symbol for a terminal.
+        """The symbol for a terminal, or the words if there is none.
 
         Examples
         --------
@@ -299,7 +306,7 @@ class Quantity:
 
     @property
     def label(self) -> str:
-        """The label of an axis."""
+        """The label of an axis: words, symbol in TeX, and unit."""
         words = f"{self.words} {self.note}".strip()
         if self.symbol:
             unit = f"  ({self.shown_unit})" if self.shown_unit else ""
@@ -307,28 +314,35 @@ class Quantity:
         return f"{words}  ({self.unit})" if self.unit else words
 
     def on_axis(self, row: Mapping[str, float | int | str]) -> float:
-        """Return its value in a row of path.csv, with the sign of the axis."""
+        """Return the quantity's value in a row of path.csv, with the sign of the axis."""
         return self.sign * float(row[self.name])
 
     @property
     def scale(self) -> str:
-        """The key of its unit; of a number without one the kind, also of the factor of a motion."""
+        """The key of the unit, by which quantities share an axis.
+
+        It is the kind for a pure number, and for the factor of a motion, which has units of its
+        own.
+        """
         return self.units[0].key if self.units and self.units[0] is not DISTANCE else self.kind
 
     def for_name(self, name: str) -> "Quantity":
-        """Return the column of one of several, by its name."""
+        """Return the column of one of several such quantities, by a name such as a body's."""
         return replace(self, name=f"{self.name}_{name}", words=f"{self.words} {name}", note="")
 
     def in_unit(self, unit: Unit) -> "Quantity":
-        """Return the column in the unit that is displayed for one of its units."""
+        """Return the column in the unit that a case shows for one of this quantity's units.
+
+        For example w_mm, in mm, for w_over_h with the unit h.
+        """
         stem = self.stem or self.name.replace("_over_h", "")
         symbol = re.split("[ /]", self.symbol)[0]
         words = self.words if unit.words is None else unit.words
         if unit.symbol is not None and symbol:
             symbol = unit.symbol
-        displayed = Unit(unit.shown, unit.shown)
+        shown_unit = Unit(unit.shown, unit.shown)
         name = f"{stem}_{unit.ending}"
-        return replace(self, name=name, words=words, symbol=symbol, units=(displayed,))
+        return replace(self, name=name, words=words, symbol=symbol, units=(shown_unit,))
 
     @cached_property
     def in_units(self) -> tuple["Quantity", ...]:
@@ -353,16 +367,16 @@ class Amplitude:
     name
         Name in the column `amplitude`.
     column
-        Column of its value.
+        Column of the parameter's value.
     conjugate
-        Column of the displacement on the other axis of its curve; proportional to -Pi if its
-        meaning says so.
+        Column of the displacement on the other axis of the parameter's curve; proportional to -Pi
+        if its meaning says so.
     place
-        Location of that displacement.
+        Location of that displacement, in words.
     sideways
-        Whether the curve has its value on the x axis, and what is conjugate on the y axis.
+        Whether the curve has the value on the x axis, and the conjugate on the y axis.
     each
-        Whether there may be several, whose columns have their names at the end.
+        Whether there may be several such parameters, whose columns have their names at the end.
     """
 
     name: str

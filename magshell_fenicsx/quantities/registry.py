@@ -37,10 +37,12 @@ OWN_MODES = ("", "symmetric", "asymmetric")
 
 
 def _energy(name: str, words: str, meaning: str, symbol: str = "") -> Quantity:
+    """Return the column of an energy over E h R²."""
     return Quantity(name, words, meaning, "energy", symbol, (ENERGY,))
 
 
 def _w(name: str, note: str, meaning: str) -> Quantity:
+    """Return the column of a displacement over h; `note` tells it from others."""
     return Quantity(name, "displacement", meaning, "displacement", "w/h", (THICKNESS,), note=note)
 
 
@@ -225,7 +227,7 @@ RESERVED_NAMES = {*AMPLITUDES, *INTERNAL}
 
 
 def register(quantities: Iterable[Quantity], amplitudes: Iterable[Amplitude] = ()) -> None:
-    """Add the columns and amplitudes of a part."""
+    """Add the columns and amplitudes of a part of the program to the registry."""
     QUANTITIES.update({q.name: q for q in quantities})
     AMPLITUDES.update({a.name: a for a in amplitudes})
 
@@ -233,7 +235,10 @@ def register(quantities: Iterable[Quantity], amplitudes: Iterable[Amplitude] = (
 def register_for_all_cases(
     quantities: Iterable[Quantity], amplitudes: Iterable[Amplitude] = ()
 ) -> None:
-    """Add columns and amplitudes of every case; user-defined energies cannot have their names."""
+    """Add columns and amplitudes that every case may have.
+
+    User-defined energies and factors cannot have their names.
+    """
     quantities, amplitudes = [*quantities], [*amplitudes]
     register(quantities, amplitudes)
     RESERVED_NAMES.update(column.name for q in quantities for column in (q, *q.in_units))
@@ -244,20 +249,22 @@ register_for_all_cases(QUANTITIES.values())
 
 
 def units_in_use() -> tuple[Unit, ...]:
-    """Return the units of all columns, those of supports and points too."""
+    """Return the units of all columns, each once, also of those of supports and named points."""
     columns = (*QUANTITIES.values(), *map(quantity, ("_ux", "_fx", "_mx")))
     return tuple(dict.fromkeys(unit for q in columns for unit in q.units))
 
 
 def endings() -> dict[str, str]:
-    """Return a mapping: ending of a column in units -> the unit in words."""
+    """Return a mapping: ending of the name of a column in units -> the unit in words."""
     return {unit.ending: unit.shown for unit in units_in_use() if unit.ending}
 
 
 def quantity(name: str) -> Quantity:
-    """Return the quantity of a column.
+    """Return the quantity of a column of path.csv, also of one that is not registered.
 
-    A named point's displacement or a user-defined amplitude has its own name.
+    Not registered are the columns of a second load ("force_2"), of its displacement
+    ("w_force_2_over_h"), of one of several bodies, of the displacement or reaction of a named place
+    ("rim_ux"), and of a user-defined amplitude, which has its own name.
     """
     if name in QUANTITIES:
         return QUANTITIES[name]
@@ -275,15 +282,18 @@ def quantity(name: str) -> Quantity:
             f"at {conjugate[1].replace('_', ' ')}",
             f"Displacement conjugate to {conjugate[1]}, as w_over_h.",
         )
-    numbered = re.fullmatch(r"(\w+)_(\d+)", name)  # the amplitude of a second step of a kind
-    first = QUANTITIES.get(numbered[1]) if numbered else None
-    if numbered and first and first.kind == "load":
-        return replace(first, name=name, words=f"{first.words} {numbered[2]}", symbol="")
-    if several := [
+    numbered_name = re.fullmatch(r"(\w+)_(\d+)", name)  # the amplitude of a second step of a kind
+    first_of_kind = QUANTITIES.get(numbered_name[1]) if numbered_name else None
+    if numbered_name and first_of_kind and first_of_kind.kind == "load":
+        return replace(
+            first_of_kind, name=name, words=f"{first_of_kind.words} {numbered_name[2]}", symbol=""
+        )
+    if families := [
         q for q in QUANTITIES.values() if q.each and re.match(rf"{q.name}_[A-Za-z]", name)
     ]:
-        longest = max(several, key=lambda q: len(q.name))
+        longest = max(families, key=lambda q: len(q.name))
         return longest.for_name(name.removeprefix(f"{longest.name}_"))
+    # of a named point or support: the displacement (u), reaction (f) or moment (m) along an axis
     kinds: dict[str, tuple[Kind, Unit]] = {
         "u": ("place", PLACE),
         "f": ("reaction", REACTION),
@@ -297,42 +307,51 @@ def quantity(name: str) -> Quantity:
 
 
 def shown_quantity(name: str, columns: Collection[str]) -> Quantity:
-    """Return the quantity of a column, in the case's units if one of the columns has these."""
+    """Return the quantity of a column, in the case's units if `columns` has one in these.
+
+    Parameters
+    ----------
+    name
+        Name of the dimensionless column.
+    columns
+        Names of the columns that there are, for example a row of path.csv.
+    """
     dimensionless = quantity(name)
-    in_units = (q for q in dimensionless.in_units if q.name in columns)
-    return next(in_units, dimensionless)
+    columns_in_units = (q for q in dimensionless.in_units if q.name in columns)
+    return next(columns_in_units, dimensionless)
 
 
 def amplitude(name: str) -> Amplitude:
-    """Return the amplitude with a name; a user-defined one has a column of the same name.
+    """Return the amplitude of a name: a load parameter that a path varies, with its columns.
 
-    A second force or list of dead loads has its own columns: force_2 and w_force_2_over_h.
+    A second force or list of dead loads has its own columns: force_2 and w_force_2_over_h. A
+    user-defined amplitude has a column of its own name.
     """
     if further_load := re.fullmatch(r"(force|load)_\d+", name):
         return Amplitude(name, name, f"w_{name}_over_h", AMPLITUDES[further_load[1]].place)
     if name in AMPLITUDES:
         return AMPLITUDES[name]
-    for several in AMPLITUDES.values():
-        if several.each and name.startswith(f"{several.name}_"):
-            suffix = name.removeprefix(several.name)
-            column, conjugate = several.column + suffix, several.conjugate + suffix
-            return replace(several, name=name, column=column, conjugate=conjugate)
+    for family in AMPLITUDES.values():
+        if family.each and name.startswith(f"{family.name}_"):
+            suffix = name.removeprefix(family.name)
+            column, conjugate = family.column + suffix, family.conjugate + suffix
+            return replace(family, name=name, column=column, conjugate=conjugate)
     return Amplitude(name, name)
 
 
 def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
     """Return the quantities on the x and y axis of an amplitude's curve.
 
-    They are its conjugate displacement and its value.
-
-    An angle, the time and the factor of a motion are on the x axis, and the displacement or the
-    reaction on the y axis.
+    They are its conjugate displacement and its value. An angle, the time and the factor of a motion
+    are on the x axis, and the displacement or the reaction is on the y axis.
 
     Parameters
     ----------
+    name
+        Name of the amplitude.
     row
-        The columns that there are: where w_over_h belongs to another load, this one has a column of
-        its own.
+        Names of the columns that there are. Where w_over_h belongs to another load, this load has a
+        column of its own; and the reaction of a motion may have one.
     """
     reactions = sorted(q.name for q in QUANTITIES.values() if q.each and q.kind == "reaction")
     if name in AMPLITUDES:
@@ -375,15 +394,16 @@ class Sizes:
 
     @property
     def field(self) -> str:
-        """The unit of the field: mT, or % of the sources."""
+        """The unit of the applied field: mT, or % of the strength of its sources."""
         return (STRENGTH if self._size(STRENGTH) else FIELD).shown
 
     def _size(self, unit: Unit) -> float | None:
+        """Return the size of a unit in this case; None if the case lacks it."""
         size = unit.size(self.case) if self.case and unit.ending else nan
         return None if isnan(size) else size
 
     def unit(self, name: str) -> Unit | None:
-        """Return the unit of a column in this case; None if it has none."""
+        """Return the unit of the column `name` in this case; None if it has none."""
         if name in self.distances:
             return self.distances[name][0]
         units = [unit for unit in quantity(name).units if self._size(unit) is not None]
@@ -392,16 +412,16 @@ class Sizes:
         return next(iter(units), None)
 
     def column(self, name: str) -> Quantity | None:
-        """Return the column in units of a dimensionless one; None if there is none."""
+        """Return the column in units of the dimensionless column `name`; None if there is none."""
         unit = self.unit(name)
         return quantity(name).in_unit(unit) if unit else None
 
     def columns(self, names: Iterable[str]) -> tuple[str, ...]:
-        """Return the names of the columns in units of some columns."""
+        """Return the names of the columns in units that dimensionless columns have in this case."""
         return tuple(in_unit.name for name in names if (in_unit := self.column(name)))
 
     def values(self, row: Mapping[str, float | int | str]) -> dict[str, float]:
-        """Return the values of a row in units, by the names of their columns."""
+        """Return the values of a row in the case's units, by the names of their columns."""
         values = {}
         for name in row:
             if unit := self.unit(name):
@@ -410,7 +430,7 @@ class Sizes:
         return values
 
     def size(self, name: str) -> float:
-        """Return the size of one of a column in its unit; one without a unit."""
+        """Return the size, in the case's unit, of a 1 in the column `name`; 1 without a unit."""
         if name in self.distances:
             return self.distances[name][1]
         unit = self.unit(name)

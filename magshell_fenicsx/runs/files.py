@@ -60,9 +60,12 @@ COMPARED_COLUMNS = ("p_over_pc", "lambda_m", "force", "w_over_h", "w_pole_over_h
 
 
 class AlreadyComplete(Exception):
-    """Signal that there is nothing to resume.
+    """Signal that a run to be resumed is complete.
 
-    `summary` is the summary.json of the finished run.
+    Attributes
+    ----------
+    summary
+        The content of summary.json of the finished run.
     """
 
     def __init__(self, summary: dict[str, Any]) -> None:
@@ -78,7 +81,7 @@ def open_folder(
 ) -> None:
     """Check that a folder can take a new run, or that the run in it can be resumed; collective.
 
-    Nothing in it is changed.
+    Nothing in the folder is changed.
 
     Parameters
     ----------
@@ -94,13 +97,15 @@ def open_folder(
     Raises
     ------
     CaseError
-        If the folder cannot be written, has files that no run has written, a run of another case
-        file, an interrupted one or a damaged one; or no run of this case to resume.
+        If the folder cannot be written, or has files that no run has written. For a new run without
+        `overwrite`: if the folder has a run of another case file, an interrupted or a damaged one.
+        To resume: if it has no run of this case.
     AlreadyComplete
         If the run to be resumed is complete.
     """
 
     def check(folder: Path) -> None:
+        """Check, on rank 0, that the folder can be written and its run may be touched."""
         refuse_unwritten(folder)
         for part in (folder, folder / "fields"):  # before the first file is removed
             if part.exists() and not os.access(part, os.W_OK | os.X_OK, effective_ids=True):
@@ -115,9 +120,9 @@ def open_folder(
 
 
 def _refuse_other_case(out: Path, document: Document) -> None:
-    """Refuse to replace a run of another case file.
+    """Refuse to replace a run of another case file, by a CaseError.
 
-    A run replaces one of the same case, and one of the same file with other values.
+    A run may replace one of an equal case, and one of a file of the same name with other values.
     """
     try:
         identity = identity_of_run(out, document)
@@ -133,14 +138,14 @@ def _refuse_other_case(out: Path, document: Document) -> None:
 
 
 def identity_of_run(out: Path, document: Document) -> dict[str, Any]:
-    """Return what the run in a folder depends on, see `checkpoint.identity`.
+    """Return what the run in a folder depends on: case, files, sources; see `checkpoint.identity`.
 
     Empty without checkpoint and summary.json.
 
     Raises
     ------
     Damaged
-        If it cannot be read.
+        If the checkpoint or summary.json cannot be read.
     """
     if is_replacement_unfinished(out):  # what is left of the earlier run is no run
         return checkpoint.identity_in(out / NEW_CHECKPOINT) or {}
@@ -152,9 +157,9 @@ def identity_of_run(out: Path, document: Document) -> dict[str, Any]:
 
 
 def _refuse_interrupted(out: Path) -> None:
-    """Refuse to replace a run that can be continued.
+    """Refuse to replace a run that can be continued, by a CaseError.
 
-    A run that has ended, also where its solver could not go on, may be repeated.
+    A run that has ended may be repeated, also one whose solver could not go on.
     """
     if is_replacement_unfinished(out):
         return
@@ -177,7 +182,15 @@ def _refuse_interrupted(out: Path) -> None:
 
 
 def _check_resumable(out: Path, document: Document) -> None:
-    """Check that the run in a folder can be resumed."""
+    """Check that the run in a folder is of this case and can be resumed.
+
+    Raises
+    ------
+    CaseError
+        If there is no such run.
+    AlreadyComplete
+        If the run is complete.
+    """
     file = out / checkpoint.NAME
     if is_replacement_unfinished(out):
         raise CaseError(
@@ -193,11 +206,19 @@ def _check_resumable(out: Path, document: Document) -> None:
 
 
 def _check_complete(out: Path, summary: dict[str, Any], document: Document) -> None:
-    """Check that a finished run is of this case and that all of its files are there."""
-    saved = {"version": summary["versions"]["magshell_fenicsx"]}
+    """Check that a finished run is of this case, and that all of its files are there.
+
+    Raises
+    ------
+    CaseError
+        If the run is of another case or of other sources.
+    Damaged
+        If a file is missing or cut off.
+    """
+    saved_identity = {"version": summary["versions"]["magshell_fenicsx"]}
     keys = "case", "sources", *document.outside
-    saved |= {key: summary[key] for key in keys if key in summary}
-    checkpoint.refuse_other_case(saved, document, out)
+    saved_identity |= {key: summary[key] for key in keys if key in summary}
+    checkpoint.refuse_other_case(saved_identity, document, out)
     try:
         points = len(read_run(out)[1])
     except FileNotFoundError as e:
@@ -216,6 +237,10 @@ class RunFiles:
 
     Parameters
     ----------
+    folder
+        Folder of the run, prepared by `open_folder`.
+    scene
+        The model of the problem with its solver.
     empty_checkpoint
         The content of an empty checkpoint, as the case and its files were before the scene was
         built.
@@ -259,12 +284,13 @@ class RunFiles:
             self.elapsed = float(self._rows[-1]["wall_s"]) if self._rows else 0.0
 
     def begin(self, *, continues: bool = False) -> None:
-        """Make room for the files of the run, which has its first point, and open them.
+        """Prepare the folder and open the files of the run, once its first point is computed.
 
         Parameters
         ----------
         continues
-            Keep the path of an interrupted run, and only delete what the end of a run writes.
+            Whether to keep the path of an interrupted run, and delete only what the end of a run
+            writes. Otherwise an earlier run is removed.
         """
         access_disk(self._comm, self._remove_end_of_run if continues else self._make_room)
         self.complete_points, self._rows = access_disk(self._comm, self._open)
@@ -273,21 +299,25 @@ class RunFiles:
         )
 
     def _make_room(self) -> None:
-        """Replace an earlier run by an empty checkpoint.
+        """Replace an earlier run by an empty checkpoint; on rank 0.
 
-        Whenever this is killed, what is there is known as a run's.
+        The order of the steps matters: whenever the process is killed, the files that are left are
+        recognised as those of a run.
         """
         folder, file = self._folder, self._folder / checkpoint.NAME
-        new, earlier = folder / NEW_CHECKPOINT, files_of_runs(folder) - {NEW_CHECKPOINT}
-        write_whole(new, self._empty_checkpoint)  # a full disk stops here
-        remove(folder, earlier - {SUMMARY, file.name})
+        new_checkpoint, earlier_files = (
+            folder / NEW_CHECKPOINT,
+            files_of_runs(folder) - {NEW_CHECKPOINT},
+        )
+        write_whole(new_checkpoint, self._empty_checkpoint)  # a full disk stops here
+        remove(folder, earlier_files - {SUMMARY, file.name})
         if self._mesh:
             write_whole(folder / MESH, self._mesh)
-        new.replace(file)
-        remove(folder, earlier & {SUMMARY})
+        new_checkpoint.replace(file)
+        remove(folder, earlier_files & {SUMMARY})
 
     def _remove_end_of_run(self) -> None:
-        """Delete what the end of an interrupted run has written."""
+        """Delete the files that the end of an interrupted run has written; on rank 0."""
         files = files_of_runs(self._folder)
         files = {name for name in files if not name.startswith("fields/")}
         remove(self._folder, files - set(FILES_OF_PATH))
@@ -295,7 +325,15 @@ class RunFiles:
             write_whole(self._folder / MESH, self._mesh)
 
     def _open(self) -> tuple[int, list[dict[str, str]]]:
-        """Open the files; return the number of complete points and the rows of an earlier run."""
+        """Open path.csv and the series of fields; on rank 0.
+
+        Returns
+        -------
+        complete_points
+            Number of points of an interrupted run with both a row and fields on disk.
+        rows
+            Rows of path.csv that the interrupted run has written; empty for a new run.
+        """
         identity = checkpoint.identity_in(self._folder / checkpoint.NAME) or {}
         self._origin = {
             key: value for key, value in identity.items() if key not in ("case", "version")
@@ -309,10 +347,10 @@ class RunFiles:
         self._R = case_sizes(problem.context.shell).R
         shell_data = ShellData(problem.material.h, problem.material.nu, mirror, self._R)
         magnetic = problem.loads.magnetic
-        moves = problem.loads.contacts or (magnetic and magnetic.driven)
+        outlines_move = problem.loads.contacts or (magnetic and magnetic.driven)
         outlines_file = ""
         if outlines(problem.loads, self._scene.unloaded().mu, shell_data.h):
-            outlines_file = FILE_OF_POINT if moves else FILE_OF_ALL_POINTS
+            outlines_file = FILE_OF_POINT if outlines_move else FILE_OF_ALL_POINTS
         grids = [grid for observables in OBSERVABLES for grid in observables.grids(problem.loads)]
         rows = self._table.complete_rows
         self._fields = FieldSeries(self._folder / "fields", shell_data, outlines_file, rows, grids)
@@ -320,12 +358,19 @@ class RunFiles:
         return min(len(rows), self._fields.complete_points), rows
 
     def write(self, row: Row, state: State, scene: Scene) -> None:
-        """Write a point, unless an interrupted run has written it.
+        """Write a point's row and fields, unless an interrupted run has written both.
+
+        Parameters
+        ----------
+        row
+            The point's row of path.csv.
+        state
+            Displacement and amplitudes of the point, in the model of `scene`.
 
         Raises
         ------
         CaseError
-            If the point differs from the one of the interrupted run.
+            If the point differs from that of the interrupted run.
         """
         number = int(row["point"])
         if number < len(self._rows):
@@ -340,13 +385,16 @@ class RunFiles:
         ]
 
         def write() -> None:
+            """Write the row, the grids and the fields of the whole or modelled shell; on rank 0."""
             assert surface is not None
             problem = scene.problem
-            place = problem.loads, state.mu, problem.material.h
+            loads_and_state = problem.loads, state.mu, problem.material.h
             shell = surface
             if mirror and (isinstance(mirror, Sector) or self._has_whole_shell):
                 shell = completed_by_symmetry(surface, mirror)
-            shell = replace(shell, outlines=outlines(*place), solids=solids(*place))
+            shell = replace(
+                shell, outlines=outlines(*loads_and_state), solids=solids(*loads_and_state)
+            )
             self._table.write(row)
             grid_contents = {grid.name: grid_content(grid, self._R) for grid in grids}
             self._fields.write(number, rotated_surface(shell, problem.azimuth), row, grid_contents)
@@ -354,7 +402,7 @@ class RunFiles:
         access_disk(self._comm, write)
 
     def write_summary(self, content: dict[str, Any]) -> None:
-        """Write summary.json."""
+        """Write summary.json, with a verdict in words under the key `says`."""
 
         def write() -> None:  # names the mesh file and the sources as they were at the start
             data = json.loads(json.dumps({**content, **self._origin}))
@@ -364,8 +412,10 @@ class RunFiles:
         access_disk(self._comm, write)
 
     def close(self, complete: bool) -> None:
-        """Close the files, and write the manifest; at the end of a complete run, delete the
-        checkpoint.
+        """Close the files and write the manifest; delete the checkpoint of a complete run.
+
+        The manifest lists the files that a later run may replace. `complete` is whether the run has
+        come to its end, so that nothing is left to resume.
         """
         assert self.journal
         access_disk(self._comm, lambda: self._table.close())
@@ -382,7 +432,13 @@ class RunFiles:
 
 
 def _check_equal(row: Row, stored: dict[str, str]) -> None:
-    """Check that a recomputed point equals the one in path.csv; CaseError if not."""
+    """Check that the row of a recomputed point equals the stored one, within tolerances.
+
+    Raises
+    ------
+    CaseError
+        If the label or a number differs.
+    """
     is_equal = row["label"] == stored["label"] and all(
         math.isclose(
             float(row[key]),

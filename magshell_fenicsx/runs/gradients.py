@@ -40,12 +40,14 @@ Array = NDArray[np.float64]
 
 
 def refuse_unknown(scene: Scene) -> None:
-    """Check before a run that its gradients can be computed.
+    """Check, before the run of a scene, that the requested gradients can be computed.
+
+    A scene is the model of a problem with its solver.
 
     Raises
     ------
     CaseError
-        If a result or a parameter is none of this case.
+        If the case has no such result or parameter.
     """
     section, start = scene.problem.gradients, scene.unloaded()
     if section is None:
@@ -55,9 +57,10 @@ def refuse_unknown(scene: Scene) -> None:
 
 
 def gradients_after(result: Result, folder: Path | None, say: Say) -> None:
-    """Compute the requested gradients of a run; collective.
+    """Compute the requested gradients of a run, and print them; collective.
 
-    They are added to `result.gradients`, and with a folder fields/gradients_*.vtu are written.
+    They are added to `result.gradients`. With a folder, fields/gradients_*.vtu are written as well.
+    A warning names a gradient that cannot be computed.
 
     Raises
     ------
@@ -87,15 +90,27 @@ def _report(
     folder: Path | None,
     say: Say,
 ) -> None:
-    """Keep the gradients of the result `name`, by parameter; write and say them; collective."""
+    """Keep the gradients of a result in the run's result, write and print them; collective.
+
+    Parameters
+    ----------
+    name, kind
+        Name of the result, such as "knockdown", and kind of its point.
+    adjoint
+        The solved adjoint problem of the result.
+    gradients
+        Parameter -> derivative by it: a number, or a field.
+    folder
+        Folder of the run; None if nothing is written.
+    """
     scene = adjoint.scene  # that of the end, which may be of another model
-    fields, numbers = dict[str, FieldGradient](), dict[str, float]()
+    fields, slopes = dict[str, FieldGradient](), dict[str, float]()
     for parameter, gradient in gradients.items():
         if isinstance(gradient, FieldGradient):
             fields[parameter] = gradient
         else:
-            numbers[parameter] = float(gradient)
-    entries: dict[str, dict[str, Any]] = {
+            slopes[parameter] = float(gradient)
+    entry_of_field: dict[str, dict[str, Any]] = {
         parameter: {"alike": _by_uniform_change(scene, parameter, gradient)}
         for parameter, gradient in fields.items()
     }
@@ -105,31 +120,34 @@ def _report(
         if surface:
             largest = {parameter: _largest_density(surface, parameter) for parameter in fields}
         for parameter, entry in scene.comm.bcast(largest).items():
-            entries[parameter] |= entry
+            entry_of_field[parameter] |= entry
         if folder:
             write = partial(_write, gradient_file(folder, name), surface, scene)
             access_disk(scene.comm, write)
     result.gradients[name] = {
         "value": adjoint.value_in_unit,
         "kind": kind,
-        "numbers": numbers,
-        "fields": entries,
+        "numbers": slopes,
+        "fields": entry_of_field,
     }
-    for parameter, entry in entries.items():
+    for parameter, entry in entry_of_field.items():
         uniform = _words(entry["alike"], entry["most_per_area"], 6)
         place = _words(entry["at"], 1.0, 3)
         say(
             f"d {name}/d {parameter}: {uniform} for a change that is the same everywhere, "
             f"most per area at ({place})"
         )
-    for parameter, slope in numbers.items():
+    for parameter, slope in slopes.items():
         say(f"d {name}/d {parameter}: {slope:.6g}")
 
 
 def _gradients(
     adjoint: Adjoint, name: str, parameters: Sequence[str], say: Say
 ) -> dict[str, Gradient]:
-    """Return the derivatives of a result by parameter; collective. A warning names the others."""
+    """Return the derivatives of a result by each parameter; collective.
+
+    A warning names parameters by which it cannot be differentiated.
+    """
     gradients = dict[str, Gradient]()
     for parameter in parameters:
         try:
@@ -140,24 +158,26 @@ def _gradients(
 
 
 def _words(values: Sequence[float], size: float, digits: int) -> str:
-    """Return numbers as text, zero where they are rounding beside a size."""
+    """Return numbers as text with some digits; those that are rounding beside `size` are zero."""
     rounded = [value if abs(value) > ROUNDING * size else 0.0 for value in values]
     return ", ".join(f"{value:.{digits}g}" for value in rounded)
 
 
 def _write(file: Path, surface: Surface | None, scene: Scene) -> None:
-    """Write the fields of a surface."""
+    """Write a surface with its fields as a file of VTK; on rank 0."""
     assert surface
     material = scene.problem.material
     write_whole(file, vtu_content(surface, ShellData(material.h, material.nu)))
 
 
 def _adjoint(result: Result, name: str) -> tuple[str, Adjoint]:
-    """Return the kind of a result, and its adjoint: what its derivatives are contracted with.
+    """Return the kind of the point of a result, and the adjoint that gives its derivatives.
+
+    `name` is that of the result, such as "knockdown" or a column of path.csv.
 
     Raises
     ------
-    Lost
+    LostResult
         If the run has no such result.
     """
     scene, history = result.scene, result.path_history
@@ -173,18 +193,26 @@ def _adjoint(result: Result, name: str) -> tuple[str, Adjoint]:
 
 
 def _by_uniform_change(scene: Scene, parameter: str, gradient: FieldGradient) -> list[float]:
-    """Return the derivative by a uniform change of a field.
+    """Return the derivative by a change of a field that is the same everywhere.
 
-    Vectors are in the frame of the case; on a meridian along e_rho and e_z.
+    There is one number for each component. Vectors are in the frame of the case; on a meridian they
+    are along e_rho and e_z.
     """
-    total = gradient.within(np.ones(len(gradient.forces), dtype=bool))
+    uniform_derivative = gradient.within(np.ones(len(gradient.forces), dtype=bool))
     if parameter == "remanence":
-        total = total[[0, 2]] if scene.problem.meridian else total @ rotation(scene.problem.azimuth)
-    return [float(component) for component in total]
+        uniform_derivative = (
+            uniform_derivative[[0, 2]]
+            if scene.problem.meridian
+            else uniform_derivative @ rotation(scene.problem.azimuth)
+        )
+    return [float(component) for component in uniform_derivative]
 
 
 def _largest_density(surface: Surface, parameter: str) -> dict[str, Any]:
-    """Return the largest size per area of a field's gradient, and where it is."""
+    """Return the largest norm of a field's gradient per area, and the undeformed place (3,) over R.
+
+    The keys are those of summary.json: most_per_area and at.
+    """
     columns = [surface.fields[name] for name in columns_of(parameter)]
     sizes = np.linalg.norm(np.column_stack(columns), axis=1)
     place = int(np.argmax(sizes))
@@ -195,8 +223,9 @@ def _largest_density(surface: Surface, parameter: str) -> dict[str, Any]:
 
 
 def _surface(scene: Scene, adjoint: Adjoint, fields: Mapping[str, FieldGradient]) -> Surface | None:
-    """Return the whole deformed shell with the gradients per area as fields, on rank 0;
-    collective.
+    """Return the whole deformed shell with the gradients per area as fields; collective.
+
+    None on ranks other than 0. `fields` maps parameters to gradients.
     """
     model = scene.model
     gathering, densities = gatherer(model, scene.comm), dict[str, Array | None]()
@@ -215,8 +244,8 @@ def _surface(scene: Scene, adjoint: Adjoint, fields: Mapping[str, FieldGradient]
     base = gathering.gather(adjoint.state.u)
     if base is None:
         return None
-    present = {name: density for name, density in densities.items() if density is not None}
-    surface = replace(base, fields=present)
+    gathered_fields = {name: density for name, density in densities.items() if density is not None}
+    surface = replace(base, fields=gathered_fields)
     if model.multiplicity > 1:
         assert not model.axisymmetric
         surface = completed_by_symmetry(surface, model.mirror)
@@ -224,9 +253,9 @@ def _surface(scene: Scene, adjoint: Adjoint, fields: Mapping[str, FieldGradient]
 
 
 def _at_nodes(scene: Scene, gathering: Gatherer, values: Array) -> Array | None:
-    """Return vectors at the nodes of pictures, on rank 0; collective.
+    """Return vectors (n, 3) at the nodes of pictures on rank 0, None elsewhere; collective.
 
-    `values` are those at this rank's nodes.
+    `values` (nodes, 2 or 3) are the vectors at this rank's nodes of the model.
     """
     surface = gathering.gather(values.ravel()[: scene.model.system.size])
     return surface.u if surface else None

@@ -49,6 +49,13 @@ def modes_after(result: Result, folder: Path, say: Say) -> None:
 
     Collective; rank 0 writes. Call it after the run, because it overwrites the model's tangent.
 
+    Parameters
+    ----------
+    folder
+        Folder of the run.
+    say
+        Function that prints a line.
+
     Raises
     ------
     DiskError
@@ -64,7 +71,17 @@ def modes_after(result: Result, folder: Path, say: Say) -> None:
 
 @dataclass(frozen=True)
 class _ModeWriter:
-    """Writer of the modes of a run; what sees the modes of a scene is made once."""
+    """Writer of the modes of a run; the solvers of each scene are made once. Collective.
+
+    Attributes
+    ----------
+    result
+        The run; a row may have a scene (model and solver) of its own.
+    folder
+        Folder of the run.
+    say
+        Function that prints a line.
+    """
 
     result: Result
     folder: Path
@@ -75,9 +92,23 @@ class _ModeWriter:
     )
 
     def _modes_of_whole_shell(self, number: int) -> tuple[ModeSpace, ShellModes, Gatherer]:
-        """Return what sees all modes of the shell at a point, its modes, and their gatherer.
+        """Return the solvers for all modes of the shell at the point of a row.
 
-        The model of the point may exclude modes.
+        The model of the point may be reduced by symmetry, and then excludes modes.
+
+        Parameters
+        ----------
+        number
+            Number of the row.
+
+        Returns
+        -------
+        mode_space
+            The model that has all modes, and the map of states to it.
+        modes
+            The solver for modes of that model.
+        gathering
+            The gatherer of fields of that model on rank 0.
         """
         scene = self.result.scene_of(number)
         if id(scene) not in self._whole_shell_modes:
@@ -90,7 +121,7 @@ class _ModeWriter:
         return self._whole_shell_modes[id(scene)]
 
     def _modes_of(self, number: int) -> tuple[ShellModes, Gatherer]:
-        """Return the modes of the model of a point, and their gatherer."""
+        """Return the solver for modes of the model of a row, and the gatherer of its fields."""
         scene = self.result.scene_of(number)
         if id(scene) not in self._model_modes:
             self._model_modes[id(scene)] = (
@@ -100,7 +131,10 @@ class _ModeWriter:
         return self._model_modes[id(scene)]
 
     def null_vectors(self) -> None:
-        """Write the null vectors at the instabilities, and say how many waves they have."""
+        """Write the null vectors at the located instabilities, and print how many waves they have.
+
+        The places where they are largest are kept in the result.
+        """
         for number, state in self.result.singular.items():
             row, scene = self.result.rows[number], self.result.scene_of(number)
             label = "" if row["mode"] in OWN_MODES else str(row["mode"])
@@ -112,13 +146,18 @@ class _ModeWriter:
             surface = self._write(number, str(row["label"]), state, label, vector)
             if surface is not None and scene.problem.meridian is None:
                 place = surface.r0[np.argmax(np.abs(surface.fields["mode_w"]))]
-                exact = np.where(np.abs(place) < ROUNDING, 0.0, place)
-                self.result.mode_places[number] = [float(x) for x in exact * scene.problem.length]
+                rounded_place = np.where(np.abs(place) < ROUNDING, 0.0, place)
+                self.result.mode_places[number] = [
+                    float(x) for x in rounded_place * scene.problem.length
+                ]
             if surface is not None and not label and (waves := waves_around(surface)):
                 self.say(_waves_message(number, waves))
 
     def modes(self, section: StabilitySection) -> None:
-        """Write the modes of least stiffness that a section requests."""
+        """Write the modes of least stiffness that a stability section requests, and stability.csv.
+
+        Unstable modes beyond the requested number are listed in stability.csv as well.
+        """
         points = self.result.singular
         if section.at == "end":
             points = {self.result.end: self.result.last}
@@ -144,14 +183,22 @@ class _ModeWriter:
                 whole_shell, _, gathering = self._modes_of_whole_shell(number)
                 state, scene = whole_shell.state(points[number]), self.result.scene_of(number)
                 write_mode_of(scene, gathering, file, state, mode.label, mode.vector, whole_shell)
-            first = modes[0]
-            stiffness = f"{first.eigenvalue:.6g} E h/R^2  {first.label}".rstrip()
+            first_mode = modes[0]
+            stiffness = f"{first_mode.eigenvalue:.6g} E h/R^2  {first_mode.label}".rstrip()
             self.say(f"lowest stiffness at point {number}: {stiffness}")
 
     def _write(
         self, number: int, name: str, state: State, label: str, vector: Vector
     ) -> Surface | None:
-        """Write the null vector of a point and return its surface on rank 0; collective."""
+        """Write the null vector at a point, and return its surface on rank 0; collective.
+
+        Parameters
+        ----------
+        number, name
+            Number of the point's row, and the middle of the file's name, such as "fold".
+        label
+            Label of the mode; empty for a mode of the model itself.
+        """
         file = mode_file(self.folder, number, name, label)
         return write_mode_of(
             self.result.scene_of(number), self._modes_of(number)[1], file, state, label, vector
@@ -159,7 +206,7 @@ class _ModeWriter:
 
 
 def _waves_message(point: int, waves: WaveCount) -> str:
-    """Return how many waves a null vector has; a warning where its mesh does not resolve them."""
+    """Return a message about the waves of a null vector; a warning if they are not resolved."""
     m, largest = waves.number, waves.largest
     if waves.resolved:
         return f"the null vector at point {point} has {m} waves around e3"
@@ -178,18 +225,20 @@ def write_mode_of(
     vector: Vector,
     whole_shell: ModeSpace | None = None,
 ) -> Surface | None:
-    """Write a mode at a state, and return its surface on rank 0; collective.
+    """Write a mode at a state as a file of VTK, and return its surface on rank 0; collective.
 
     Parameters
     ----------
     gatherer
         Gatherer of the model that has the mode.
+    file
+        The file to write.
     state, vector
-        State and mode of that model.
+        State and mode, in the unknowns of that model.
     label
         Label of the mode, see `mode_fields.mode_surface`.
     whole_shell
-        That model, if it is not the scene's.
+        The model with all modes of the shell, if it has the mode; None if the scene's model has it.
     """
     model = whole_shell.model if whole_shell else scene.model
     surface = mode_surface(model, gatherer, state.u, label, vector, scene.problem.azimuth, state.mu)
@@ -203,9 +252,9 @@ def write_mode_of(
 
 
 def keeps_state(section: FrequenciesSection | None, point: int) -> bool:
-    """Whether the state of a point must be kept for its frequencies.
+    """Return whether the state of a point must be kept for its frequencies.
 
-    The states of the start and of the end are known anyway.
+    The states of the start and of the end are known anyway. `point` is the number of its row.
     """
     requested_points = section.at if section else ()
     return requested_points == "all" or (
@@ -214,38 +263,63 @@ def keeps_state(section: FrequenciesSection | None, point: int) -> bool:
 
 
 def symmetric_wave(model: Model) -> str:
-    """Return the wave of modes with the symmetry of a model, see `mode_fields.wave_of`."""
+    """Return the wave of modes with the symmetry of a model: "0", "symmetric" or "".
+
+    See `mode_fields.wave_of`.
+    """
     if model.axisymmetric:
         return "0"
     return "symmetric" if model.multiplicity > 1 else ""
 
 
 def contact_changes(scene: Scene, state: State, modes: Sequence[ShellMode]) -> list[float]:
-    """Return how much omega^2 of each mode changes with stiffer bodies, relative; collective.
+    """Return by how much stiffer bodies change omega^2 of each mode, relatively; collective.
 
-    The bodies in contact are four times as stiff. A mode is compared with the nearest one of the
-    same label; the change of a mode that is not there any more is 1. nan, if the shell finds no
-    such equilibrium near.
+    The bodies in contact get four times their stiffness. A mode is compared with the nearest mode
+    of the same label.
+
+    Parameters
+    ----------
+    state
+        An equilibrium with frequencies `modes`.
+
+    Returns
+    -------
+    list of float
+        The change of each mode: 0 without contact, 1 if the mode has vanished, nan if the shell
+        finds no equilibrium near.
     """
     bodies = touching_bodies(scene, state)
     if not bodies:
         return [0.0] * len(modes)
-    harder = with_stiffer_bodies(scene, state, bodies)
-    if harder is None:
+    stiffened_state = with_stiffer_bodies(scene, state, bodies)
+    if stiffened_state is None:
         return [nan] * len(modes)
     whole_shell = mode_space(scene.model)
-    shell_modes, state = ShellModes(whole_shell.model), whole_shell.state(harder)
+    shell_modes, state = ShellModes(whole_shell.model), whole_shell.state(stiffened_state)
     stiffer_modes = shell_modes.vibrations(state, len(modes) + FURTHER_MODES)
     changes = []
     for mode in modes:
-        candidates = [other for other in stiffer_modes if other.label == mode.label]
-        differences = (abs(other.eigenvalue / mode.eigenvalue - 1) for other in candidates)
+        candidates = [
+            stiffer_mode for stiffer_mode in stiffer_modes if stiffer_mode.label == mode.label
+        ]
+        differences = (
+            abs(stiffer_mode.eigenvalue / mode.eigenvalue - 1) for stiffer_mode in candidates
+        )
         changes.append(min(differences, default=1.0))
     return changes
 
 
 def _contact_warning(point: int, rank: int, mode: ShellMode, change: float) -> str:
-    """Return the warning for a mode that depends on the penalty of a contact."""
+    """Return the warning that a frequency depends on the penalty stiffness of a contact.
+
+    Parameters
+    ----------
+    point, rank
+        Number of the row, and of the frequency from 1.
+    change
+        Relative change of omega^2 with bodies four times as stiff; nan if unknown.
+    """
     effect = f"omega2 changes by {change:.2g} of it"
     if isnan(change):
         effect = "no equilibrium near to compare with"
@@ -324,7 +398,10 @@ def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
 def _states_of_frequencies(
     result: Result, section: FrequenciesSection, say: Say
 ) -> dict[int, State]:
-    """Return number -> state of the points whose frequencies are requested, ascending."""
+    """Return number of a row -> state, of the points whose frequencies are requested, ascending.
+
+    A warning names requested points that the path does not have.
+    """
     states = dict(sorted(result.states_for_frequencies.items()))
     if section.at in ("ends", "end"):
         start = {0: result.scene.unloaded()} if section.at == "ends" else {}
@@ -343,21 +420,31 @@ def _lowest_frequency(
     wave_of_symmetric: str,
     time_unit: float | None,
 ) -> str:
-    """Return words for the lowest frequency at a point, and for the rigid motions below it."""
+    """Return a line about the lowest frequency at a point, and about the rigid motions below it.
+
+    Parameters
+    ----------
+    number
+        Number of the point's row.
+    wave_of_symmetric
+        Wave of modes without a label, see `symmetric_wave`.
+    time_unit
+        Unit of time (s), for hertz; None without.
+    """
     rigid_modes = (
         [mode for mode in modes if mode.eigenvalue == 0.0] if scene.allows_rigid_motion else []
     )
     # a wave has a twin
     motions = sum(2 if mode.label.startswith("m = ") else 1 for mode in rigid_modes)
     rigid_motions = f"{motions} rigid motions, " if motions else ""
-    first = modes[min(len(rigid_modes), len(modes) - 1)]
-    frequency = hertz(first.eigenvalue, time_unit)
-    in_hertz = "" if frequency is None else f", {frequency:.6g} Hz"
-    wave = wave_of(first.label, wave_of_symmetric)
+    lowest_mode = modes[min(len(rigid_modes), len(modes) - 1)]
+    frequency = hertz(lowest_mode.eigenvalue, time_unit)
+    hertz_words = "" if frequency is None else f", {frequency:.6g} Hz"
+    wave = wave_of(lowest_mode.label, wave_of_symmetric)
     wave_words = ""
     if wave:
         wave_words = f", m = {wave}" if wave.isdigit() else f", {wave}"
     return (
         f"{rigid_motions}lowest frequency at point {number}: "
-        f"omega2 {first.eigenvalue:.6g}{in_hertz}{wave_words}"
+        f"omega2 {lowest_mode.eigenvalue:.6g}{hertz_words}{wave_words}"
     )

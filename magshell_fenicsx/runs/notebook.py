@@ -34,12 +34,17 @@ _displays: list[Popen[bytes]] = []  # the virtual displays that were started
 
 
 def surface(scene: Scene, record: Record) -> Surface | None:
-    """Return the whole deformed mid-surface as NumPy arrays: `r0`, `u`, `n0`, `w`, `cells`,
-    `fields`.
+    """Return the whole deformed mid-surface as NumPy arrays, on rank 0; collective.
 
-    Lengths are in R. The fields are membrane strains `E` and bending moments over D/R `M`, their
-    principal values `E_1`, `E_2`, `M_1`, `M_2`, and those of the magnetic field: `Br`, `Ba`,
-    `p_mag`, `f_mag`, `k`, `tau`; see `Surface`.
+    The arrays are `r0`, `u`, `n0`, `w`, `cells` and `fields`, with lengths in R. The fields are
+    membrane strains `E` and bending moments over D/R `M`, their principal values `E_1`, `E_2`,
+    `M_1`, `M_2`, and those of the magnetic field: `Br`, `Ba`, `p_mag`, `f_mag`, `k`, `tau`; see
+    `Surface`.
+
+    Parameters
+    ----------
+    record
+        A point of a history of the scene.
     """
     problem, state = scene.problem, record.point.state
     scene.refuse_foreign(state)
@@ -64,14 +69,14 @@ def polydata(scene: Scene, record: Record) -> "pyvista.PolyData | None":
 def off_screen() -> None:
     """Let pyvista draw without windows, also where there is no display.
 
-    Otherwise it ends the whole program there: VTK needs a display even for pictures in files. Where
-    `DISPLAY` names none, a virtual one is started (Xvfb, Debian's package xvfb) that lasts as long
-    as this process.
+    Without a display VTK would end the whole program, even for pictures in files. Where `DISPLAY`
+    names none, a virtual display (Xvfb, Debian's package xvfb) is started. It lasts as long as this
+    process.
 
     Raises
     ------
     RuntimeError
-        If there is no display and no Xvfb, or it does not start.
+        If there is no display and no Xvfb, or Xvfb does not start.
     """
     import pyvista
 
@@ -95,10 +100,12 @@ def off_screen() -> None:
                 "stderr": DEVNULL,
                 "start_new_session": True,
             }
-            shell = Popen(["sh", "-c", command], stdin=PIPE, pass_fds=[write_end], **options)
+            shell_process = Popen(
+                ["sh", "-c", command], stdin=PIPE, pass_fds=[write_end], **options
+            )
         finally:
             os.close(write_end)
-        _displays.append(shell)
+        _displays.append(shell_process)
         readable, _, _ = select([stream], [], [], DISPLAY_TIMEOUT)
         # the whole line: Xvfb ends if it cannot write that
         name = stream.readline().strip() if readable else ""
@@ -112,12 +119,14 @@ def picture(
     record: Record,
     of: Literal["shell", "strains", "stretches", "moments", "fields", "magnetic_loads"] = "shell",
 ) -> "Figure | None":
-    """Return one picture of a run, as in shell.png, strains.png, ...
+    """Return one picture of a point of a run, as shell.png, strains.png, ... have it.
 
-    None also if the scene has no such fields.
+    None on ranks other than 0, and if the scene has no such fields.
 
     Parameters
     ----------
+    record
+        The point.
     of
         Name of the picture.
 
@@ -137,7 +146,14 @@ def picture(
 
 
 def curve(scene: Scene, records: Sequence[Record], amplitude: str | None = None) -> "Figure":
-    """Return the curve of the path, as in curve.png; by default for the amplitude that varied last.
+    """Return the curve of a path, as in curve.png; by default for the amplitude that varied last.
+
+    Parameters
+    ----------
+    records
+        All points of the path.
+    amplitude
+        Name of the amplitude on the curve.
 
     Raises
     ------
@@ -163,7 +179,10 @@ def curve(scene: Scene, records: Sequence[Record], amplitude: str | None = None)
 
 
 def _smooth(surface: Surface, h: float) -> "pyvista.PolyData":
-    """Return flat triangles with normals; curved triangles are divided."""
+    """Return the deformed surface as flat triangles with normals; curved triangles are divided.
+
+    `h` is the thickness over R.
+    """
     import pyvista
     from vtkmodules.vtkFiltersGeometry import vtkDataSetSurfaceFilter
 
@@ -179,6 +198,6 @@ def _smooth(surface: Surface, h: float) -> "pyvista.PolyData":
 
 
 def _in_line(figure: "Figure") -> "Figure":
-    """Return the figure, which a notebook now shows without pyplot."""
+    """Return a figure after giving it the method by which a notebook shows it without pyplot."""
     figure._repr_png_ = partial(png, figure)  # type: ignore[attr-defined]
     return figure

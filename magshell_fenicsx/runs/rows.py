@@ -1,4 +1,4 @@
-"""Records of a path as rows of path.csv, and as columns."""
+"""Rows of path.csv and their columns, made from the records of a path."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -20,7 +20,10 @@ SUMMED_COLUMNS = ("time", "dissipated", "work")
 
 
 class RowMaker:
-    """Maker of the rows of one path, in the order of its records."""
+    """Maker of the rows of one path, which takes its records in their order.
+
+    A record is a point of a history with its origin; a row is a mapping of columns of path.csv.
+    """
 
     def __init__(self, scene: Scene) -> None:
         self._scene, self._count, self._field_end = scene, 0, 0.0
@@ -30,7 +33,10 @@ class RowMaker:
         self._is_programme = scene.problem.listed
 
     def row(self, record: Record, wall_s: float) -> Row:
-        """Return the next row; `wall_s` is in seconds since the start of the path. Collective."""
+        """Return the next row of path.csv for a record; collective.
+
+        `wall_s` is the time in seconds since the start of the run.
+        """
         scene = record.scene or self._scene
         point, journal = record.point, self._scene.journal
         values = journal.recorded_values(lambda: RecordedValues(scene.observe(point.state))).values
@@ -60,7 +66,11 @@ class RowMaker:
         return {**row, **self._scene.sizes.values(row)}
 
     def _in_time(self, record: Record, values: Mapping[str, float]) -> dict[str, float]:
-        """Return the columns of a motion: time and sums go on from earlier steps."""
+        """Return the columns of steps in time; empty if the path has no such steps.
+
+        Time, work and dissipated energy are sums over all steps of the programme; a record has them
+        since the begin of its step. `values` are the observed values of the record, by column.
+        """
         if "time" not in self._scene.extra_columns:
             return {}
         if record.step != self._step:
@@ -70,16 +80,21 @@ class RowMaker:
         stored_energy = (record.scene or self._scene).energy_of_shell(
             record.point.state, values["energy"]
         )
-        of_record = {name: record.clock.get(name, 0.0) for name in ("kinetic", "imbalance")}
-        return {**self._sums, **of_record, "stored": stored_energy}
+        values_of_record = {name: record.clock.get(name, 0.0) for name in ("kinetic", "imbalance")}
+        return {**self._sums, **values_of_record, "stored": stored_energy}
 
 
 def imbalances(
     programme: Iterable[ProgrammeStep], rows: Sequence[Row], length: float
 ) -> Iterator[str]:
-    """Yield warnings on steps in time that gain or lose more energy than their `balance`.
+    """Yield warnings about steps in time that gain or lose more energy than their `balance` allows.
 
-    `length` is the system's.
+    Parameters
+    ----------
+    rows
+        The rows of the path.
+    length
+        A displacement of the system that counts as of order one, over R.
     """
     for step in programme:
         max_imbalance = step.load.motion.balance if step.load.motion else BALANCE
@@ -98,7 +113,13 @@ def imbalances(
 
 
 def motion_errors(programme: Iterable[ProgrammeStep], all_rows: Sequence[Row]) -> Iterator[str]:
-    """Yield warnings on motions that have, or may have, a larger error than their tolerance."""
+    """Yield warnings about motions whose error is, or may be, larger than their tolerance.
+
+    Parameters
+    ----------
+    all_rows
+        The rows of the path, of static steps too.
+    """
     for step in programme:
         load = step.load
         motion = load.motion or load.released_by
@@ -113,11 +134,11 @@ def motion_errors(programme: Iterable[ProgrammeStep], all_rows: Sequence[Row]) -
                 f"step {step.number}: the estimated error of its motion is {error:.2g} h, "
                 f"more than tolerance: {motion.tolerance:g}; even the shortest steps leave it"
             )
-        has_own_steps = (
+        chooses_step_length = (
             load.motion and load.motion.step is None and load.motion.until != "instability"
         )
         is_unstable = any(int(row["negative_pivots"]) for row in rows)
-        if has_own_steps and motion.errors == "step" and is_unstable:
+        if chooses_step_length and motion.errors == "step" and is_unstable:
             yield (
                 f"step {step.number}: it passes unstable states, which magnify the errors of its "
                 "steps in time; errors: motion keeps those of the motion below tolerance"
@@ -125,13 +146,16 @@ def motion_errors(programme: Iterable[ProgrammeStep], all_rows: Sequence[Row]) -
 
 
 def _imbalance(row: Row, length: float) -> float:
-    """Return the energy imbalance of a row over its energies."""
+    """Return the energy imbalance of a row over the sum of its energies.
+
+    A small displacement of the system's `length` bounds the sum from below.
+    """
     energies = sum(abs(float(row[name])) for name in ("kinetic", "stored", "dissipated", "work"))
     return float(row["imbalance"]) / (energies + (MIN_ENERGY_DISPLACEMENT * length) ** 2)
 
 
 def rows(scene: Scene, records: Iterable[Record]) -> list[Row]:
-    """Return the rows of some records, with the times nan."""
+    """Return the rows of some records of a scene, with nan for the time; collective."""
     maker = RowMaker(scene)
     return [maker.row(record, np.nan) for record in records]
 
@@ -161,12 +185,12 @@ class Table(dict[str, NDArray[np.generic]]):
 
 
 def table(rows: Sequence[Row], extra: Iterable[str]) -> Table:
-    """Return the columns of rows, those of every run and extra ones."""
+    """Return the columns of rows: those that every run has, and the named extra ones."""
     return Table({name: np.array([row[name] for row in rows]) for name in (*COLUMNS, *extra)})
 
 
 def columns(scene: Scene, records: Iterable[Record]) -> Table:
-    """Return the columns of path.csv except the time, each (records,). Collective.
+    """Return the columns of path.csv except wall_s, each an array (records,). Collective.
 
     `columns(...).to_pandas()` is a frame of pandas.
     """

@@ -65,7 +65,7 @@ ROUNDING = 1e-9  # over h: a smaller displacement is printed as zero
 
 
 class Interrupted(RuntimeError):
-    """Error that the run was asked to stop; the message names the signal or the limit."""
+    """Error that a signal or the time limit has asked the run to stop; the message names which."""
 
 
 class Watch:
@@ -73,12 +73,14 @@ class Watch:
 
     Parameters
     ----------
+    comm
+        Communicator of all ranks of the run; a request on one rank stops all.
     start
         Start of the run, in seconds of `time.perf_counter`.
     limit
         Seconds after which the run stops; None sets no limit.
     signals
-        Whether `SIGNALS` are recorded. A second SIGINT is obeyed.
+        Whether `SIGNALS` are recorded, which needs the main thread. A second SIGINT is obeyed.
     """
 
     def __init__(self, comm: MPI.Comm, start: float, limit: float | None, signals: bool) -> None:
@@ -89,6 +91,7 @@ class Watch:
         self._reason: str | None = None
 
     def __enter__(self) -> Self:
+        """Let signals be recorded until the end of `with`, but for those that are ignored."""
         self._handlers_before: dict[
             signal.Signals, Callable[[int, FrameType | None], Any] | int | None
         ] = {
@@ -100,7 +103,10 @@ class Watch:
         return self
 
     def _is_ignored(self, number: signal.Signals) -> bool:
-        """Whether `nohup` has a signal ignored; PETSc would end the process."""
+        """Return whether a signal is SIGHUP and ignored already, as by `nohup`.
+
+        Such a SIGHUP stays ignored: the handler of PETSc would end the process.
+        """
         return number == signal.SIGHUP and signal.getsignal(number) is signal.SIG_IGN
 
     def __exit__(
@@ -109,16 +115,22 @@ class Watch:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        """Restore the handlers of signals that were in place before."""
         for number, handler in self._handlers_before.items():
             signal.signal(number, handler)
 
     def check(self, *, limited: bool = True) -> None:
-        """Stop if a rank has been asked to, or at the time limit if `limited`; collective.
+        """Raise `Interrupted` if a rank has a request to stop, or at the time limit; collective.
+
+        Parameters
+        ----------
+        limited
+            Whether the time limit counts as well as signals.
 
         Raises
         ------
         Interrupted
-            On every rank, if any has been asked to stop.
+            On every rank, if any rank has been asked to stop or has reached the limit.
         """
         if limited and self._limit is not None and time.perf_counter() - self._start >= self._limit:
             self._reason = self._reason or f"the time limit of {self._limit:g} s"
@@ -127,19 +139,32 @@ class Watch:
             raise Interrupted(f"interrupted by {reason}")
 
     def _note(self, number: int, frame: FrameType | None) -> None:
-        """Record a signal, after which a second SIGINT is obeyed."""
+        """Record a signal as the reason to stop; restore the earlier handler of SIGINT.
+
+        A second SIGINT therefore acts as it would without the watch.
+        """
         self._reason = signal.Signals(number).name
         if number == signal.SIGINT:
             signal.signal(number, self._handlers_before[signal.SIGINT])
 
 
 class StoppableJournal:
-    """Journal that stops the run before a new solve if the watch requests it."""
+    """Journal of solver results that stops the run before a new solve if the watch requests it.
+
+    It wraps another `SolverJournal`, to which it passes every call. All methods are collective.
+    """
 
     def __init__(self, journal: SolverJournal, watch: Watch) -> None:
         self._journal, self._watch = journal, watch
 
     def replay(self) -> Point | str | None:
+        """Return the next recorded result; None if a solve is needed and no stop is requested.
+
+        Raises
+        ------
+        Interrupted
+            If a solve is needed and a stop is requested.
+        """
         result = self._journal.replay()
         if result is None:
             self._watch.check()
@@ -155,25 +180,29 @@ class StoppableJournal:
         self._journal.begin(space)
 
     def check(self, is_known: bool) -> None:
-        """Stop the run if that is requested; the time limit does not stop a known result.
+        """Stop the run if that is requested, between two steps in time towards one result.
 
-        What a resumed run only computes again must end, or no resumed run gets on.
+        `is_known` is whether the result is already recorded. The time limit does not count then: a
+        resumed run computes known steps again, and would otherwise never get beyond them.
         """
         self._watch.check(limited=not is_known)
 
 
 @dataclass(frozen=True)
 class RunOutput:
-    """Where a run reports, and what may stop it.
+    """Where a run reports its progress, and what may stop it.
 
     Attributes
     ----------
     comm
         Communicator of all ranks.
-    say, tell
-        Print a line, and a status that the next one replaces.
+    say
+        Function that prints a line that stays; silent on ranks other than 0.
+    tell
+        Function that shows a status line, which the next status replaces; silent on ranks other
+        than 0.
     watch
-        Records requests to stop.
+        Recorder of requests to stop.
     start
         Beginning of the run, in seconds of `time.perf_counter`.
     pictures
@@ -188,7 +217,7 @@ class RunOutput:
     pictures: bool
 
     def report(self, what: str) -> None:
-        """Tell what is done, with the time."""
+        """Show an activity, such as "mesh and kernels", as the status, with the time so far."""
         self.tell(status_line(what, time.perf_counter() - self.start))
 
 
@@ -204,7 +233,16 @@ def run(  # noqa: PLR0913 - what a user gives
     time_limit: float | None = None,
     pictures: bool = True,
 ) -> Result:
-    """Run a problem; `case` of `public.run` is one form of it, see there for all parameters."""
+    """Run a problem, and write its results into a folder if one is given; collective.
+
+    A `Problem` holds everything that will be computed. See `public.run` for the parameters: its
+    `case` takes a problem as one of several forms. Without a folder `out`, nothing is written.
+
+    Raises
+    ------
+    CaseError
+        If the time limit is negative, the problem cannot be written, or the folder cannot be used.
+    """
     start = time.perf_counter()
     folder = None if out is None else user_folder(out)
     if time_limit is not None and not time_limit >= 0:
@@ -232,9 +270,12 @@ def run(  # noqa: PLR0913 - what a user gives
 
 
 def _kernel_progress(output: RunOutput, *, keeps_first: bool) -> Say:
-    """Return a function that reports how far kernels are.
+    """Return a function that reports the progress of the compilation of kernels.
 
-    If `keeps_first`, the first report is a line that stays: a pipe gets a status late.
+    Parameters
+    ----------
+    keeps_first
+        Whether the first report is printed as a line that stays, since a pipe shows statuses late.
     """
     first_reports = iter([output.say] if keeps_first else [])
 
@@ -249,7 +290,20 @@ def _print_nothing(line: str) -> None:
 
 
 def _run(problem: Problem, folder: Path | None, output: RunOutput, *, resume: bool) -> Result:
-    """Run a problem in a prepared folder; collective."""
+    """Run a problem and return its result; collective.
+
+    Parameters
+    ----------
+    folder
+        Prepared and locked folder of the run; None if nothing is written.
+    resume
+        Whether the run in the folder goes on.
+
+    Returns
+    -------
+    Result
+        Its `stopped` is the reason, if the run was interrupted or could not go on.
+    """
     comm, say = output.comm, output.say
     empty_checkpoint = b""
     if folder:
@@ -281,25 +335,29 @@ def _run(problem: Problem, folder: Path | None, output: RunOutput, *, resume: bo
             interruption = _write_results(result, files, folder, output, progress, interruption)
     if interruption:
         is_resumable = files is not None and files.journal is not None
-        hint = ""
+        resume_hint = ""
         if is_resumable:
-            hint = f"; the results so far are in {folder}/, and --resume continues from there"
-        result.stopped = f"{interruption}{hint}"
+            resume_hint = (
+                f"; the results so far are in {folder}/, and --resume continues from there"
+            )
+        result.stopped = f"{interruption}{resume_hint}"
     return result
 
 
 def _unloaded_result(problem: Problem, folder: Path | None, output: RunOutput) -> Result:
-    """Return the result before the first point, with the scene; collective.
+    """Return the result before the first point, with the scene of the problem; collective.
+
+    A scene is the model of a problem with its solver.
 
     Parameters
     ----------
     folder
-        Of the run that is resumed, which may have a mesh.
+        Folder of the run that is resumed, which may hold a chosen mesh; None for a new run.
 
     Raises
     ------
     CaseError, MeshError
-        With the place in the case.
+        With the place in the case before the message.
     """
     try:
         problem = with_modes(problem, output.comm)
@@ -325,7 +383,19 @@ def _write_results(
     progress: RunProgress,
     interruption: RuntimeError | None,
 ) -> RuntimeError | None:
-    """Write what follows the path, and return what interrupted the run, if anything did."""
+    """Write what follows the path: summary, modes, pictures and report; collective.
+
+    Parameters
+    ----------
+    interruption
+        Error that has interrupted the path; None if nothing has. Then only the summary and the
+        report are written, and the checkpoint stays.
+
+    Returns
+    -------
+    RuntimeError or None
+        The given interruption, or else the error of the disk that occurred while writing.
+    """
     pictures = output.pictures and not interruption  # an interrupted run draws none
     try:
         files.write_summary(summary(result, time.perf_counter() - output.start))
@@ -342,7 +412,10 @@ def _write_results(
 
 
 def _say_what_is_solved(scene: Scene, comm: MPI.Comm, say: Say) -> None:
-    """Say what the model includes and how large it is, and warn of what makes it slow."""
+    """Print what the model includes, its size, and warnings.
+
+    Warnings are those of the scene, and about a slow BLAS or factorisation.
+    """
     included = ", ".join(scene.problem.included)
     say(f"{included}: {scene.cells} cells, {scene.model.system.dofs} unknowns")
     for warning in (*scene.warnings, *scene.unresolved):
@@ -357,7 +430,11 @@ def _say_what_is_solved(scene: Scene, comm: MPI.Comm, say: Say) -> None:
 
 
 def _conclude(result: Result, say: Say) -> None:
-    """Compute what a complete path yields, and warn of what it lacks; collective."""
+    """Compute what follows from a complete path, and print warnings about it; collective.
+
+    Sets the error of the branch, remarks, sensitivities and the energy barrier of the result.
+    Warnings name searches without a solution, imbalances of energy and errors of motions.
+    """
     programme, length = result.scene.problem.programme, result.scene.model.system.length
     if result.adapted and result.scenes_of_rows:
         result.branch_error = _branch_error(result)
@@ -383,7 +460,10 @@ def _conclude(result: Result, say: Say) -> None:
 def _write_after_run(
     result: Result, folder: Path, comm: MPI.Comm, say: Say, pictures: bool
 ) -> None:
-    """Write modes, frequencies and gradients, and draw pictures if wanted; collective."""
+    """Write modes, frequencies and gradients, and draw pictures if wanted; collective.
+
+    The time counts as that of the output, in `result.output`.
+    """
     with result.output:
         modes_after(result, folder, say)
         frequencies_after(result, folder, say)
@@ -396,7 +476,7 @@ def _write_after_run(
 
 
 def _draw(folder: Path) -> None:
-    """Draw the pictures of the folder."""
+    """Draw the pictures of a run from the files in its folder; on one rank only."""
     from magshell_fenicsx.output.pictures.plot import draw
 
     draw(folder)
@@ -405,9 +485,27 @@ def _draw(folder: Path) -> None:
 def _mesh_for_tolerance(
     problem: Problem, folder: Path | None, comm: MPI.Comm, say: Say, report: Say
 ) -> "Adapted | None":
-    """Return the mesh for the tolerance of a case; None for the default mesh. Collective.
+    """Return the mesh that is adapted to the case's `mesh.tolerance`; collective.
 
-    It is that of an interrupted run if its folder has one.
+    A resumed run takes the mesh that is saved in its folder. Where the path goes on along a branch,
+    the result also has a mesh for that branch.
+
+    Parameters
+    ----------
+    folder
+        Folder of a resumed run; None for a new one.
+    say, report
+        Functions that print a line, and that show an activity as the status.
+
+    Returns
+    -------
+    Adapted or None
+        None without a tolerance, or if the run has no scalar result to estimate an error of.
+
+    Raises
+    ------
+    Damaged
+        If the saved mesh cannot be used.
     """
     if problem.mesh.tolerance is None:
         return None
@@ -415,17 +513,17 @@ def _mesh_for_tolerance(
     from magshell_fenicsx.simulate.adapt.choice import Adapted
     from magshell_fenicsx.simulate.adapt.tolerance import adapted
 
-    file = folder / MESH if folder else None
-    saved = b""
-    if file:
-        saved = access_disk(
-            comm, lambda: read_result(file) if file.exists() else b"", "cannot be read"
+    mesh_file = folder / MESH if folder else None
+    saved_content = b""
+    if mesh_file:
+        saved_content = access_disk(
+            comm, lambda: read_result(mesh_file) if mesh_file.exists() else b"", "cannot be read"
         )
-    if saved:
+    if saved_content:
         try:
-            return Adapted.from_json(problem, saved)
+            return Adapted.from_json(problem, saved_content)
         except (ValueError, KeyError, TypeError, IndexError) as e:
-            raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None
+            raise Damaged(f"{mesh_file}: is damaged: {type(e).__name__}: {e}") from None
     try:
         mesh = adapted(problem, comm, say, report)
     except NoResult as e:
@@ -441,10 +539,9 @@ def _mesh_for_tolerance(
 
 
 def _branch_error(result: Result) -> float | None:
-    """Return the estimated error at the end of a branch, on a mesh that was chosen for it;
-    collective.
+    """Return the estimated relative error at the end of a branch in a larger model; collective.
 
-    None without such a mesh.
+    None if no mesh was chosen for the branch, or the path has not left its first model.
     """
     assert result.adapted
     if (
@@ -462,9 +559,19 @@ def _branch_error(result: Result) -> float | None:
 
 
 def _sensitivities(result: Result) -> dict[str, float]:
-    """Return the sensitivities at the final fold, if the case requests them."""
-    scene, last = result.scene, result.rows[result.end]
-    step = scene.problem.programme[int(last["step"]) - 1] if last["label"] == "fold" else None
+    """Return the sensitivities at the final fold by name, if the case requests them; collective.
+
+    Empty if the path does not end at a fold. `simulate.sensitivity` explains their names and units.
+
+    Raises
+    ------
+    Stopped
+        If the fold cannot be located accurately enough.
+    """
+    scene, last_row = result.scene, result.rows[result.end]
+    step = (
+        scene.problem.programme[int(last_row["step"]) - 1] if last_row["label"] == "fold" else None
+    )
     if step is None or not step.load.wants_sensitivities:
         return {}
     from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
@@ -480,7 +587,10 @@ def _sensitivities(result: Result) -> dict[str, float]:
 
 
 def _barrier(result: Result) -> float | None:
-    """Return the energy barrier that the last step has passed, if it was to."""
+    """Return the energy barrier of a last step with `until: zero`, over E h R^2; collective.
+
+    It is between the states at the step's begin and end; None for other last steps.
+    """
     steps, begin = result.scene.problem.programme, result.path_history.begin
     if not steps or steps[-1].until != "zero" or begin is None:
         return None
@@ -496,7 +606,16 @@ def _follow(
     output: RunOutput,
     progress: RunProgress,
 ) -> None:
-    """Compute the path of a scene and write it point by point; collective."""
+    """Compute the path of the result's scene, and add each point to the result; collective.
+
+    Each point is also written to `files`, unless None, and printed. A point that an interrupted run
+    has written is computed again from the journal, and not printed.
+
+    Raises
+    ------
+    Stopped, NoEigenpair, Interrupted, DiskError
+        If the path ends early. The result has the points before that.
+    """
     scene, row_maker = result.scene, RowMaker(result.scene)
     for record in follow(scene, remark=result.remarks.append):
         if files and not result.rows:
@@ -529,39 +648,50 @@ def _follow(
 
 
 def _line(row: Row) -> str:
-    """Return a point in 79 columns: the varied load, displacements, and other loads."""
-    varied, load = "", "force"
+    """Return a point as one line of at most 79 columns: loads, displacements, iterations.
+
+    `row` is the point's row of path.csv.
+    """
+    varied, force_column = "", "force"
     if row["amplitude"]:
         varied = amplitude(str(row["amplitude"])).column
     # of several bodies each has its own force
     conjugate = amplitude(str(row["amplitude"])).conjugate
     if "load_factor" in row:
-        load = "load_factor"
+        force_column = "load_factor"
     elif conjugate.startswith("force_"):
-        load = conjugate
-    formats = {"lambda_m": "+.4e", "p_over_pc": ".6f", load: "9.5f"}
-    parts = [f"{row['point']:4d} {row['label']:>11}"]
+        force_column = conjugate
+    formats = {"lambda_m": "+.4e", "p_over_pc": ".6f", force_column: "9.5f"}
+    fields = [f"{row['point']:4d} {row['label']:>11}"]
     if varied:
-        parts.append(_value(varied, row, formats.get(varied, "9.5f")))
-    parts.append(_value("w_over_h", row, "8.4f"))
+        fields.append(_value(varied, row, formats.get(varied, "9.5f")))
+    fields.append(_value("w_over_h", row, "8.4f"))
     excluded = f" + {row['excluded_pivots']} excluded" if row["excluded_pivots"] else ""
     if row["negative_pivots"] or excluded:
-        parts.append(f"unstable {row['negative_pivots']}{excluded}")
-    parts += [_value(name, row, formats[name]) for name in formats if name != varied and row[name]]
+        fields.append(f"unstable {row['negative_pivots']}{excluded}")
+    fields += [_value(name, row, formats[name]) for name in formats if name != varied and row[name]]
     if row["w_pole_over_h"] != row["w_over_h"]:
-        parts.append(_value("w_pole_over_h", row, "8.4f", "pole"))
-    return fit_to_columns([*parts, f"it {row['iterations']}"], LINE_COLUMNS)
+        fields.append(_value("w_pole_over_h", row, "8.4f", "pole"))
+    return fit_to_columns([*fields, f"it {row['iterations']}"], LINE_COLUMNS)
 
 
 def _value(name: str, row: Row, form: str, words: str = "") -> str:
-    """Return symbol and value of a column.
+    """Return "symbol value" of a column of a row, such as "w/h   0.1234".
 
-    It is in the case's units with five digits if the column has any, else in the format `form`.
+    The value is in the case's units with five digits if the column has any, else in the format
+    `form`.
+
+    Parameters
+    ----------
+    name
+        Name of the column in path.csv.
+    words
+        Text in place of the symbol; empty for the symbol.
     """
-    q = shown_quantity(name, row)
-    is_zero = q.kind == "displacement" and abs(float(row[name])) < ROUNDING
-    number = 0.0 if is_zero else float(row[q.name])
+    shown = shown_quantity(name, row)
+    is_zero = shown.kind == "displacement" and abs(float(row[name])) < ROUNDING
+    number = 0.0 if is_zero else float(row[shown.name])
     value, unit = format_number(number, form), ""
-    if q.name != name:
-        value, unit = format_number(number, "9.5g"), f" {q.si}"
-    return f"{words or q.ascii_symbol} {value}{unit}"
+    if shown.name != name:
+        value, unit = format_number(number, "9.5g"), f" {shown.si}"
+    return f"{words or shown.ascii_symbol} {value}{unit}"

@@ -20,20 +20,20 @@ EVENT_WORDS = {"limit": "the first instability", "bifurcation": "the first bifur
 
 @dataclass(frozen=True)
 class PathEnd:
-    """End of a path.
+    """The event at which a step of the programme ends, by which its progress is measured.
 
     Attributes
     ----------
     column
         Column of path.csv: the load, or the quantity with a target.
     end
-        Its value at the end; None if the path ends at another event.
+        Value of the column at the end; None if the path ends at another event.
     words
-        Words for that event.
+        Words for that event, such as "the first instability".
     steps
         Number of steps after which the path ends; None if it ends otherwise.
     sizes
-        Sizes in the case's units.
+        Sizes of dimensionless numbers in the case's units.
     """
 
     column: str
@@ -48,38 +48,41 @@ class PathEnd:
         Parameters
         ----------
         first, row
-            The point where the path begins, and the present one.
+            Rows of path.csv: of the point where the path begins, and of the present one.
         steps
             Number of steps so far.
         """
         if self.steps is not None:
             return steps / self.steps
-        begin = float(first[self.column])
-        if self.end is None or self.end == begin:
+        first_value = float(first[self.column])
+        if self.end is None or self.end == first_value:
             return None
-        return (float(row[self.column]) - begin) / (self.end - begin)
+        return (float(row[self.column]) - first_value) / (self.end - first_value)
 
     def text(self, row: Row) -> str:
-        """Return the present value and the end.
+        """Return the present value and the end, in the case's units if the row has them.
 
         Examples
         --------
         >>> PathEnd("w_over_h", 20.0).text({"w_over_h": 5.0})
         'w/h 5 -> 20'
         """
-        q = shown_quantity(self.column, row)
+        shown = shown_quantity(self.column, row)
         size, unit = 1.0, ""
-        if q.name != self.column:
+        if shown.name != self.column:
             size = self.sizes.by_unit.get(quantity(self.column).scale, 1.0)
-            unit = f" {q.si}"
-        value = format_number(float(row[q.name]), ".4g")
+            unit = f" {shown.si}"
+        value = format_number(float(row[shown.name]), ".4g")
         if self.end is None:
-            return f"{q.ascii_symbol} {value}{unit} -> {self.words}"
-        return f"{q.ascii_symbol} {value} -> {self.end * size:.4g}{unit}"
+            return f"{shown.ascii_symbol} {value}{unit} -> {self.words}"
+        return f"{shown.ascii_symbol} {value} -> {self.end * size:.4g}{unit}"
 
 
 def path_end(scene: Scene, step: ProgrammeStep) -> PathEnd:
-    """Return the end of a step of the programme."""
+    """Return the event at which a step of the programme of a scene ends.
+
+    A scene is the model of a problem with its solver.
+    """
     load, varied_amplitude = step.load, amplitude(step.name)
     if planned_end := load.expected_end(
         step, scene.problem.context, scene.problem.loads, scene.problem.azimuth
@@ -98,17 +101,22 @@ def path_end(scene: Scene, step: ProgrammeStep) -> PathEnd:
         if column := observables.conjugates(scene.problem.loads).get(step.name):
             return PathEnd(column, value)
     own_column = f"w_{step.name}_over_h"
-    in_h = scene.problem.length * scene.problem.material.h if load.in_lengths else 1.0
-    return PathEnd(own_column if own_column in scene.extra_columns else target.column, value / in_h)
+    h_in_unit_of_target = (
+        scene.problem.length * scene.problem.material.h if load.in_lengths else 1.0
+    )
+    return PathEnd(
+        own_column if own_column in scene.extra_columns else target.column,
+        value / h_in_unit_of_target,
+    )
 
 
 def time_left(begin: tuple[float, float], present: tuple[float, float]) -> float | None:
-    """Return seconds to the end at the average speed so far; None if nothing or everything is done.
+    """Return the seconds to the end at the average speed so far; None if nothing or all is done.
 
     Parameters
     ----------
     begin, present
-        Completed part and time in seconds, at two points of the path.
+        Completed part (0 to 1) and time (s), at two points of the path.
 
     Examples
     --------
@@ -122,29 +130,31 @@ def time_left(begin: tuple[float, float], present: tuple[float, float]) -> float
 
 
 def clock(seconds: float) -> str:
-    """Return hours, minutes and seconds.
+    """Return a time as minutes and seconds, and hours from one hour on.
 
     Examples
     --------
     >>> clock(7.4), clock(3671)
     ('0:07', '1:01:11')
     """
-    minutes, rest = divmod(round(seconds), 60)
+    minutes, remaining_seconds = divmod(round(seconds), 60)
     if minutes >= 60:
-        return f"{minutes // 60}:{minutes % 60:02d}:{rest:02d}"
-    return f"{minutes}:{rest:02d}"
+        return f"{minutes // 60}:{minutes % 60:02d}:{remaining_seconds:02d}"
+    return f"{minutes}:{remaining_seconds:02d}"
 
 
 def status_line(what: str, seconds: float) -> str:
-    """Return the present activity, and the time so far."""
+    """Return an activity in a few words and the time so far (s), as `clock` shows it."""
     return f"{what}  {clock(seconds)}"
 
 
 class RunProgress:
-    """Reporter of the status of a run; a `continuation.point.Progress`.
+    """Reporter of the status of a run; a `continuation.point.Progress`, which path solvers call.
 
     Parameters
     ----------
+    scene
+        The model of the problem with its solver.
     report
         Function that shows a status line in place of the one before.
     start
@@ -163,12 +173,20 @@ class RunProgress:
         self._at_begin = self._at_present = (0.0, 0.0)
 
     def beginning(self, step: int) -> None:
-        """Note that a step of the programme begins at the last point; its number is from 1."""
+        """Note that the programme's step of this number, from 1, begins at the last point."""
         self._step, self._first, self._steps = step, self._row, 0
         self._at_begin = self._at_present = (0.0, self._at_present[1])
 
     def accepted(self, row: Row, *, is_known: bool) -> None:
-        """Note a new point; `is_known` if an interrupted run had found it."""
+        """Note a new point, and the completed part of its step.
+
+        Parameters
+        ----------
+        row
+            The point's row of path.csv.
+        is_known
+            Whether an interrupted run had found the point: then it does not count for the speed.
+        """
         present_time = time.perf_counter()
         self._points += 1
         if row["label"] == SOLUTION:
@@ -183,35 +201,45 @@ class RunProgress:
             self._at_begin = self._at_present
 
     def trying(self, here: Point, length: float) -> None:
-        """Report a step of a length from a point."""
+        """Report that a step begins at an accepted point, with the goal and the time that is left.
+
+        Parameters
+        ----------
+        here
+            The accepted point.
+        length
+            Length of the step in the arc length s of the path.
+        """
         now, h = time.perf_counter(), self._scene.problem.material.h
         step = float(np.abs(here.du).max(initial=0.0)) * abs(length) / h
         remaining = None if self._branched else time_left(self._at_begin, self._at_present)
-        times = clock(now - self._start)
+        time_text = clock(now - self._start)
         if remaining is not None:
             since_point = now - self._at_present[1]
-            times += f", about {clock(max(0.0, remaining - since_point))} left"
-        number = ""
+            time_text += f", about {clock(max(0.0, remaining - since_point))} left"
+        step_of_programme = ""
         if self._scene.problem.listed:
-            number = f" in step {self._step} of {len(self._path_ends)}"
+            step_of_programme = f" in step {self._step} of {len(self._path_ends)}"
         goal = ""
         if self._snaps:
             goal = "the snap"
         elif self._path_end:
             goal = self._path_end.text(self._row)
-        parts = f"{self._count}{number}", goal, times, f"du/h {step:.2g}"
+        parts = f"{self._count}{step_of_programme}", goal, time_text, f"du/h {step:.2g}"
         self._report("  ".join(part for part in parts if part))
 
     def doing(self, what: str) -> None:
-        """Report another activity."""
+        """Report an activity other than a step; `what` names it in a few words."""
         self._report(status_line(f"{self._count}  {what}", time.perf_counter() - self._start))
 
     @property
     def _count(self) -> str:
+        """The number of points so far, as text."""
         return f"{self._points} point{'s' * (self._points != 1)}"
 
     @property
     def _path_end(self) -> PathEnd | None:
+        """End of the present step of the programme; None without steps."""
         return self._path_ends[self._step - 1] if self._path_ends else None
 
     @property
@@ -227,6 +255,6 @@ class RunProgress:
 
     @property
     def _snaps(self) -> bool:
-        """Whether the step has come to its fold and the shell is released there."""
+        """Whether the step has reached its fold, where `then: snap` releases the shell."""
         released = self._row.get("label") == "fold" or self._row.get("amplitude") == "time"
         return released and getattr(self._load, "then", None) == "snap"

@@ -34,12 +34,17 @@ JUMP_BEGINS, JUMP_ENDS = 0.1, 0.9  # parts of the way of a snap, between which i
 
 
 def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
-    """Return the motions that begin at a fold and end at rest (`then: snap`).
+    """Return the motions of a path that begin at a fold and end at rest (`then: snap`).
 
-    `time` is from the release until the deflection is half way, in the unit of the column time;
-    `departure` until it has done a tenth of the way, which grows without limit as the push at the
-    fold vanishes; `jump` from there until it has done nine tenths. `overshoot` is the largest
-    deflection beyond the last, over the way; `dissipated` the energy over E h R^2.
+    Returns
+    -------
+    list of dict
+        For each snap: `point` and `rest`, the numbers of the rows where it begins and ends; times
+        in the unit of the column time; `overshoot` and `dissipated`. `time` is from the release
+        until half of the way of the deflection. `departure` is until a tenth of the way; it grows
+        without limit as the push at the fold vanishes. `jump` is from there until nine tenths.
+        `overshoot` is the largest deflection beyond the last, over the way. `dissipated` is the
+        energy over E h R^2.
     """
     motions = []
     for i, fold in enumerate(rows[:-1]):
@@ -58,11 +63,11 @@ def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
             _first_at(fraction, t[:-1], part_of_way[:-1]) - t[0]
             for fraction in (JUMP_BEGINS, 0.5, JUMP_ENDS)
         )
-        ends = {"point": fold["point"], "rest": moving[-1]["point"]}
+        rows_of_ends = {"point": fold["point"], "rest": moving[-1]["point"]}
         times = {"time": half_time, "departure": departure, "jump": end_of_jump - departure}
         motions.append(
             {
-                **ends,
+                **rows_of_ends,
                 **times,
                 "overshoot": float(part_of_way.max() - 1),
                 "dissipated": float(dissipated[-1] - dissipated[0]),
@@ -72,7 +77,7 @@ def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
 
 
 def _in_milliseconds(snap: dict[str, Any], sizes: Sizes) -> dict[str, float]:
-    """Return the times of a snap of a case with units, by key of summary.json."""
+    """Return the times of a snap in milliseconds, by key of summary.json, for a case with units."""
     return {
         f"snap_{key}_ms": 1e3 * snap[key] * sizes.size("time")
         for key in ("time", "departure", "jump")
@@ -83,6 +88,11 @@ def _first_at(fraction: float, times: Array, part_of_way: Array) -> float:
     """Return the first time at which a fraction of a way is done, by cubic interpolation.
 
     It is the last time if the fraction is not done by then.
+
+    Parameters
+    ----------
+    times, part_of_way
+        Times (n,), increasing, and the part of the way (n,) that is done at each.
     """
     if not (part_of_way >= fraction).any():  # a creeping shell is put to rest from afar
         return float(times[-1])
@@ -138,18 +148,18 @@ class Result:
     frequencies
         The natural modes, by row number; their `eigenvalue` is omega^2 rho R^2/E.
     contact_changes
-        With bodies, how much omega^2 of these modes depend on the bodies' stiffness; see
+        With bodies, the changes of omega^2 of these modes by stiffer bodies, by row number; see
         `modes.contact_changes`.
     gradients
         Gradients by result, as in summary.json.
     mode_places
-        By row number of an instability the undeformed place where its mode moves most along the
-        normal, in the shell's length; on rank 0, and not of a meridian, whose modes have rings.
+        Row number of an instability -> the undeformed place where its mode moves most along the
+        normal, in the shell's length; on rank 0. Empty for a meridian, whose modes have rings.
     last_record
         The record of `last`; None before the first.
     scenes_of_rows
-        Row number -> scene, of rows that have another one than `scene`, as of a branch that its
-        model excludes.
+        Row number -> scene, of the rows whose scene is not `scene`, as on a branch that its model
+        excludes.
     """
 
     scene: Scene
@@ -176,7 +186,7 @@ class Result:
     scenes_of_rows: dict[int, Scene] = field(default_factory=dict)
 
     def scene_of(self, row: int) -> Scene:
-        """Return the scene of a row."""
+        """Return the scene (model and solver) of the row with a number."""
         return self.scenes_of_rows.get(row, self.scene)
 
     @property
@@ -204,7 +214,10 @@ class Result:
 
     @property
     def limit_points(self) -> list[dict[str, Any]]:
-        """Located instabilities, as in summary.json."""
+        """Located instabilities, as entries of summary.json.
+
+        Each has its load, displacement and kind, and the place where its mode is largest if known.
+        """
         return [
             {
                 **self.scene.sizes.values({key: row[key] for key in _with_units(row)}),
@@ -223,7 +236,11 @@ class Result:
         ]
 
     def _mode_at(self, number: int) -> dict[str, list[float]]:
-        """Return where a mode is largest, over R or in m, and in the unit of the report."""
+        """Return the entries of summary.json about where the mode of an instability is largest.
+
+        `number` is the row of the instability. The place is over R or in metres (`mode_at`), and
+        also in the unit of the report. Empty if the place is not known.
+        """
         if number not in self.mode_places:
             return {}
         place, shell = self.mode_places[number], self.scene.problem.context.shell
@@ -247,7 +264,7 @@ class Result:
         return None
 
     def _instabilities_under(self, name: str) -> list[Row]:
-        """Return the rows of instabilities on the path itself, under an amplitude."""
+        """Return the rows of instabilities of the path itself while the amplitude `name` varied."""
         located = [row for row in self.rows if row["label"] in LOCATED]
         return [row for row in located if row["amplitude"] == name and not row["branch"]]
 
@@ -267,9 +284,12 @@ class Result:
 
 
 def summary(result: Result, total_s: float) -> dict[str, Any]:
-    """Return the content of summary.json; `total_s` is the time of the run in seconds."""
+    """Return the content of summary.json of a run; collective.
+
+    `total_s` is the time of the run in seconds.
+    """
     scene = result.scene
-    requested = result.adapted.asked if result.adapted else scene.problem
+    requested_problem = result.adapted.asked if result.adapted else scene.problem
     material, model, newton = scene.problem.material, scene.model, scene.newton
     R_over_h = 1 / material.h
     snaps_of_run = snaps(result.rows)
@@ -281,11 +301,11 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
     observed = dict[str, Any]()
     for observables in OBSERVABLES:
         observed |= observables.summary(result.scene_of(result.end).view, result.last)
-    excluded = (int(row["excluded_pivots"]) for row in result.rows)
+    excluded_pivots = (int(row["excluded_pivots"]) for row in result.rows)
     return {
-        "case": requested.document.data,
-        CASE_FILE: requested.document.name,
-        **requested.document.outside,
+        "case": requested_problem.document.data,
+        CASE_FILE: requested_problem.document.name,
+        **requested_problem.document.outside,
         "sources": code_version(),
         "dimensionless": {
             "radius_to_thickness": R_over_h,
@@ -318,7 +338,7 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
         **observed,
         "frequencies": [_frequencies_of(result, number) for number in result.frequencies],
         "solutions": solutions(result),
-        "most_excluded_pivots": max(excluded, default=0),
+        "most_excluded_pivots": max(excluded_pivots, default=0),
         "points": len(result.rows),
         "mesh": {"cells": scene.cells, "dofs": model.system.dofs, "degree": model.degree},
         **tolerance,
@@ -341,7 +361,10 @@ def summary(result: Result, total_s: float) -> dict[str, Any]:
 
 
 def _frequencies_of(result: Result, number: int) -> dict[str, Any]:
-    """Return the natural frequencies of a point, as in summary.json."""
+    """Return the natural frequencies at the point of a row, as an entry of summary.json.
+
+    `omega2` is omega^2 rho R^2/E of each mode, `hertz` its frequency in a case with units of time.
+    """
     modes, time_unit = result.frequencies[number], result.scene.problem.time_unit
     entry: dict[str, Any] = {
         "point": number,
@@ -357,7 +380,8 @@ def _frequencies_of(result: Result, number: int) -> dict[str, Any]:
 def solutions(result: Result) -> list[dict[str, Any]]:
     """Return the solutions that searches have found, as in summary.json. Collective.
 
-    The residual is over the sum of the sizes of all terms' forces.
+    Each entry has numbers of the solution's row. Its `residual` is the norm of the residual over
+    the sum of the norms of the forces of all terms.
     """
     entries = []
     for number, state in result.found.items():
@@ -367,8 +391,8 @@ def solutions(result: Result) -> list[dict[str, Any]]:
             factor_of(term.amplitude, state.mu) * system.forces(state.u, state.mu, term.name)
             for term in system.terms
         )
-        sizes = [np.sqrt(dot(system.comm, vector, vector)) for vector in (residual, *forces)]
-        keys = (
+        norms = [np.sqrt(dot(system.comm, vector, vector)) for vector in (residual, *forces)]
+        columns_with_units = (
             "p_over_pc",
             "w_over_h",
             "w_pole_over_h",
@@ -382,21 +406,27 @@ def solutions(result: Result) -> list[dict[str, Any]]:
                 "step": row["step"],
                 "solution": row["branch"],
                 "stable": not int(row["negative_pivots"]) + int(row["excluded_pivots"]),
-                **{key: row[key] for key in (*keys, "excluded_pivots", "error_over_h")},
-                **result.scene.sizes.values({key: row[key] for key in keys}),
-                "residual": sizes[0] / sum(sizes[1:]),
+                **{
+                    key: row[key]
+                    for key in (*columns_with_units, "excluded_pivots", "error_over_h")
+                },
+                **result.scene.sizes.values({key: row[key] for key in columns_with_units}),
+                "residual": norms[0] / sum(norms[1:]),
             }
         )
     return entries
 
 
 def _with_units(row: Row) -> set[str]:
-    """Return the columns of a limit point that may have units."""
+    """Return the columns of a limit point's row that may also be there in units."""
     return {amplitude(str(row["amplitude"])).column, "p_over_pc", "w_pole_over_h"}
 
 
 def in_units(result: Result) -> dict[str, float]:
-    """Return the numbers of a case with units, with these in their names; none without units."""
+    """Return numbers of a run by names that end in their units; empty without units.
+
+    The keys are those of summary.json, such as "buckling_pressure_Pa" or "barrier_mJ".
+    """
     unit_sizes, shell = result.scene.sizes.by_unit, result.scene.problem.context.shell
     numbers = {}
     if "p_c" in unit_sizes:
@@ -416,13 +446,19 @@ def in_units(result: Result) -> dict[str, float]:
 
 
 def _dimensions(shell: ShellSection | Surface) -> dict[str, Any]:
-    """Return the dimensions of the shell that the case gives, in SI or in the case's own units."""
+    """Return the dimensions of the shell that the case gives, in SI or in the case's own units.
+
+    `units` says which. Keys that the case does not give are None.
+    """
     if isinstance(shell, ShellSection):
-        lengths, in_si = {"radius": shell.radius, "thickness": shell.thickness}, True
+        lengths, is_in_si = {"radius": shell.radius, "thickness": shell.thickness}, True
     else:
-        lengths, in_si = {"radius": shell.reference, "thickness": shell.thickness}, shell.with_units
+        lengths, is_in_si = (
+            {"radius": shell.reference, "thickness": shell.thickness},
+            shell.with_units,
+        )
     return {
         **lengths,
         "youngs_modulus": shell.youngs_modulus,
-        "units": "SI" if in_si else "the case's own",
+        "units": "SI" if is_in_si else "the case's own",
     }

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 CIRCLE_POINTS = 48
 AXIS_TOLERANCE = 1e-12  # over the largest radius: a cosine of 90 degrees is not quite zero
-AREA_TOLERANCE = 1e-12  # over the largest area: triangles of less have none
+AREA_TOLERANCE = 1e-12  # over the largest area: smaller triangles count as flat
 
 
 @dataclass(frozen=True)
@@ -20,14 +20,14 @@ class Solid:
     Attributes
     ----------
     points
-        (n, 3) corners; two faces that meet in an edge have their own there.
+        (n, 3) corners; two faces that meet in an edge have separate corners there.
     triangles
         (m, 3) numbers of the corners of each triangle.
     name
         Name of the body or the source.
     poles
-        (n,) of a magnet: positive on the north pole's half, negative on the other; None or zero of
-        what is no magnet.
+        (n,) of a magnet: positive on the north pole's half, negative on the other. None or zero for
+        a body that is no magnet.
     """
 
     points: Array
@@ -40,7 +40,7 @@ class Solid:
         return replace(self, points=scale * self.points @ Q.T + t)
 
     def magnetised(self, polarization: Array, name: str) -> "Solid":
-        """Return a magnet of that name with a polarization (3,)."""
+        """Return the body as a magnet of that name with a polarization (3,)."""
         middle = (self.points.max(axis=0) + self.points.min(axis=0)) / 2
         size = np.linalg.norm(polarization) or 1.0
         poles = np.asarray((self.points - middle) @ polarization / size)
@@ -48,9 +48,10 @@ class Solid:
 
     @property
     def creases(self) -> list[Array]:
-        """Lines (2, 3) where faces end."""
+        """Lines, each with two ends (2, 3), along the edges where faces end."""
         sides = np.concatenate([self.triangles[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
         edges, count = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
+        # sides that belong to one triangle alone
         lines = [self.points[pair] for pair in edges[count == 1]]
         return [line for line in lines if np.ptp(line, axis=0).max() > 0]
 
@@ -61,7 +62,8 @@ def revolved(*profiles: Sequence[tuple[float, float]]) -> Solid:
     Parameters
     ----------
     profiles
-        Points (rho, z) of each; a profile gives a smooth face, and faces meet in edges.
+        Each is a sequence of points (rho, z). A profile gives a smooth face, and the faces of
+        several profiles meet in edges.
     """
     t = 2 * np.pi * np.arange(CIRCLE_POINTS) / CIRCLE_POINTS
     points, triangles = [], []
@@ -82,12 +84,12 @@ def revolved(*profiles: Sequence[tuple[float, float]]) -> Solid:
 
 
 def disc(radius: float) -> Solid:
-    """Return a disc normal to z."""
+    """Return a disc normal to z, about the origin."""
     return revolved([(0, 0), (radius, 0)])
 
 
 def cylinder(radius: float, height: float, hole: float = 0.0) -> Solid:
-    """Return a cylinder about z, or a ring with a hole of a radius."""
+    """Return a cylinder about z, or a ring with a hole of radius `hole`; centred at the origin."""
     low, high = -height / 2, height / 2
     faces = [
         [(hole, low), (radius, low)],
@@ -98,13 +100,13 @@ def cylinder(radius: float, height: float, hole: float = 0.0) -> Solid:
 
 
 def globe(radius: float) -> Solid:
-    """Return a sphere."""
+    """Return a sphere about the origin."""
     t = np.linspace(-np.pi / 2, np.pi / 2, CIRCLE_POINTS // 2 + 1)
     return revolved([(radius * float(np.cos(a)), radius * float(np.sin(a))) for a in t])
 
 
 def block(half: Array) -> Solid:
-    """Return a cuboid of half the sizes (3,)."""
+    """Return a cuboid about the origin; `half` (3,) are half its edges."""
     square = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
     faces = [
         np.insert(square, axis, side, axis=1) * half for axis in range(3) for side in (-1.0, 1.0)

@@ -38,8 +38,8 @@ class ShellMeridian:
     place
         Place (3,) in space -> parameter of the nearest place of the meridian, and azimuth (rad).
     vertices
-        Pairs of the size of a contact, and the distance from the pole up to which it is possible
-        -> vertices (n,) of the mesh of the meridian.
+        Function of contacts, each by its size and by the distance from the pole up to which it is
+        possible, to vertices (n,) of the meridian's mesh.
     """
 
     name: str
@@ -66,21 +66,21 @@ class MeridianChart:
     names
         Names of its ends; None for a pole, and where shells are joined.
     embedding, normal
-        Chart (n, 2), its second coordinate 0 -> the plane of e1 and e3, and the normal of the
-        perfect surface there.
+        Functions of charts (n, 2), with a second coordinate of 0, to places and normals (n, 3) in
+        the plane of e1 and e3; normals are those of the perfect surface.
     locate
         Chart (2,) of the surface -> parameter of this meridian and azimuth (rad).
     curvature
-        The largest of the meridian over 1/R, at least 1; of several that which has the most waves
-        around e3.
+        Largest curvature of the meridian over 1/R, at least 1. Of several shells, the curvature of
+        the one with the most waves around e3.
     largest
         Cell size that resolves the imperfections.
     vertices
-        (n,) vertices of its mesh, if that is given.
+        (n,) vertices of its mesh; None if the mesh is not given.
     narrow_places
         Places (n, 3) of the surface at which formulas are narrow.
     shell_meridians
-        Those of several shells; none of one.
+        Meridians of several shells; empty for one shell.
     joints
         For each joint of shells both parameters: two edges that meet have the same one.
     """
@@ -99,13 +99,16 @@ class MeridianChart:
     joints: tuple[tuple[float, float], ...] = ()
 
     def sample(self) -> Array:
-        """Return places (n, 3) along the meridian, its ends among them."""
+        """Return places (n, 3) along the meridian of each shell, the ends among them."""
         return self._places_at(
             [np.linspace(first, last, SAMPLES, dtype=np.float64) for first, last in self._intervals]
         )
 
     def interior_sample(self) -> Array:
-        """Return places (n, 3) without the ends: a formula may divide by zero on the axis."""
+        """Return places (n, 3) along the meridian without its ends.
+
+        A formula may divide by zero on the axis.
+        """
         return self._places_at(
             [
                 np.linspace(first, last, SAMPLES, dtype=np.float64)[1:-1]
@@ -114,14 +117,18 @@ class MeridianChart:
         )
 
     def locate_named(self, name: str, x: Array) -> tuple[float, float]:
-        """Return parameter and azimuth (rad) of a named place; its name begins with its shell's."""
+        """Return parameter and azimuth (rad) of a named place x.
+
+        Of several shells, the name begins with that of the shell; x is then a place (3,), else a
+        chart.
+        """
         meridians = (m for m in self.shell_meridians if name.startswith(f"{m.name}_"))
         meridian = next(meridians, None)
         return meridian.place(x) if meridian else self.locate(x)
 
     @property
     def knots(self) -> Array:
-        """Parameters (n,) at which cells end: ends and jumps of the curvature."""
+        """Sorted parameters (n,) at which cells end: ends of shells, jumps of the curvature."""
         return np.array(sorted({*np.ravel(self._intervals), *self.curvature_jumps}))
 
     def ends(self) -> dict[str, Array]:
@@ -137,6 +144,7 @@ class MeridianChart:
         return [meridian.ends for meridian in self.shell_meridians] or [(0.0, self.length)]
 
     def _places_at(self, parameters: Sequence[Array]) -> Array:
+        """Return places (n, 3) at parameters, which are given in several arrays."""
         s = np.concatenate(parameters)
         return self.embedding(np.column_stack([s, 0 * s]))
 
@@ -146,14 +154,18 @@ def scalar_is_axisymmetric(text: str, meridian: MeridianChart, length: float = 1
 
     Parameters
     ----------
+    text
+        Formula of x, y, z.
+    meridian
+        Meridian whose places are turned about e3.
     length
         R in the unit of length of the formula.
     """
     f, places = formula(text), length * meridian.interior_sample()
     narrow_places = length * meridian.narrow_places
     at_azimuth_zero = length * _at_azimuth_zero(meridian.narrow_places)[0]
-    of_angles = [f(*(places @ rotation(angle)).T)[:, None] for angle in ANGLES]
-    return _all_equal(of_angles) and _all_equal(
+    values_by_angle = [f(*(places @ rotation(angle)).T)[:, None] for angle in ANGLES]
+    return _all_equal(values_by_angle) and _all_equal(
         [f(*narrow_places.T)[:, None], f(*at_azimuth_zero.T)[:, None]]
     )
 
@@ -165,7 +177,7 @@ def vector_is_axisymmetric(
     *,
     in_space: bool = False,
 ) -> bool:
-    """Return whether a vector turns with the meridian and has no component across it.
+    """Return whether a vector field turns with the meridian and has no component across it.
 
     Parameters
     ----------
@@ -174,11 +186,12 @@ def vector_is_axisymmetric(
     length
         R in the unit of length of the formulas.
     in_space
-        Whether it is so beside the surface too, where this may move to.
+        Whether this is asked beside the surface too, up to `MAX_OFFSET` from it.
     """
     vectors, places = vector_function(components), meridian.interior_sample()
     if in_space:
         places = with_nearby_places(places) * [1.0, 0.0, 1.0]
+    # narrow places are compared with their images at azimuth zero
     at_azimuth_zero, Q = _at_azimuth_zero(meridian.narrow_places)
     rotated = np.einsum("nij,nj->ni", Q, vectors(length * meridian.narrow_places))
     return _turns_with_meridian(lambda x: vectors(length * x), places) and _all_equal(
@@ -187,7 +200,7 @@ def vector_is_axisymmetric(
 
 
 def _at_azimuth_zero(x: Array) -> tuple[Array, Array]:
-    """Return places (n, 3) turned about e3 into y = 0, and the rotations (n, 3, 3)."""
+    """Return places (n, 3) turned about e3 into y = 0, and the rotations (n, 3, 3) that do so."""
     rho, ones, zeros = np.hypot(x[:, 0], x[:, 1]), np.ones(len(x)), np.zeros(len(x))
     c, s = np.where(rho > 0, x[:, :2].T / np.where(rho > 0, rho, 1.0), [[1.0], [0.0]])
     Q = np.array([[c, s, zeros], [-s, c, zeros], [zeros, zeros, ones]])
@@ -204,7 +217,7 @@ def field_is_axisymmetric(
     field
         Places (n, 3) -> vectors (n, 3).
     smooth
-        Whether few places show it, as of the field of sources.
+        Whether the field is as smooth as that of distant sources, so that few samples suffice.
     """
     places = meridian.interior_sample()
     if smooth:
@@ -215,7 +228,10 @@ def field_is_axisymmetric(
 def _turns_with_meridian(
     field: Callable[[Array], Array], places: Array, angles: Sequence[float] = ANGLES
 ) -> bool:
-    """Return whether a field at places (n, 3) of the plane y = 0 turns with them, without e2."""
+    """Return whether a field turns with places of the plane y = 0 and has no component along e2.
+
+    `places` are (n, 3), `angles` are azimuths in radians.
+    """
     in_plane = [field(places @ Q) @ Q.T for Q in map(rotation, angles)]
     return _all_equal([*in_plane, in_plane[0] * [1.0, 0.0, 1.0]])
 
@@ -227,7 +243,7 @@ def vector_function(components: Sequence[str]) -> Callable[[Array], Array]:
 
 
 def with_nearby_places(x: Array) -> Array:
-    """Return places (n, 3) and others near them, (2 n, 3)."""
+    """Return places (2 n, 3): the given ones, then one at random near each."""
     offsets = np.random.default_rng(OFFSET_SEED).uniform(-1, 1, x.shape)
     return np.vstack([x, x + MAX_OFFSET * offsets])
 

@@ -38,7 +38,8 @@ FIRST_NODES = 50  # nodes whose images are tried before those of all
 def grid_mirrors(grid: Grid, embedding: Embedding) -> list[Mirror]:
     """Return the planes that map a grid onto itself.
 
-    The modelled half has the larger chart coordinates.
+    The modelled half of each has the larger chart coordinates. `embedding` maps charts (n, 2) to
+    places (n, 3).
     """
     low, extent = np.array(grid.low), np.subtract(grid.high, grid.low)
     t = np.linspace(0, 1, SAMPLES_PER_AXIS)
@@ -52,6 +53,7 @@ def grid_mirrors(grid: Grid, embedding: Embedding) -> list[Mirror]:
     flips = FLIPS if is_square and not any(grid.glued) else FLIPS[:2]
     for axis, (flip, sides) in enumerate(flips):
         originals, images = places(sample), places(np.column_stack(flip(*sample.T)))
+        # a plane is normal to the line between a place and its image
         differences = originals - images
         normal = differences[np.argmax(np.linalg.norm(differences, axis=1))]
         if (axis == 0 and grid.glued[0]) or not normal.any():
@@ -66,6 +68,7 @@ def grid_mirrors(grid: Grid, embedding: Embedding) -> list[Mirror]:
         if distances[1] + distances[3] < -ROUNDING:
             mirror, distances = mirror.reversed, -distances
         removed_edges = dict[str, str]()
+        # edges of the half that is not modelled, and their images
         for i, j in enumerate(sides):
             if i != j and distances[i] < 0 and not grid.glued[i // 2]:
                 removed_edges[grid.sides[i]] = grid.sides[j]
@@ -78,18 +81,18 @@ def mirror_lines(
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return the coordinates of the grid lines, of either axis, that lie in a mirror plane.
 
-    These are lines within the chart.
+    Only lines within the chart count, not its sides.
     """
     t, lines = np.linspace(0, 1, LINE_SAMPLES), []
     low, extent = np.array(grid.low), np.subtract(grid.high, grid.low)
     for axis in range(2):
         coordinates = []
-        for share in (0.25, 0.5, 0.75) if grid.glued[axis] else (0.5,):
+        for fraction in (0.25, 0.5, 0.75) if grid.glued[axis] else (0.5,):
             chart = np.empty((len(t), 2))
-            chart[:, axis], chart[:, 1 - axis] = share, t
+            chart[:, axis], chart[:, 1 - axis] = fraction, t
             distances = mirror.signed_distance(embedding(low + chart * extent))
             if np.abs(distances).max() < ROUNDING:
-                coordinates.append(float(low[axis] + share * extent[axis]))
+                coordinates.append(float(low[axis] + fraction * extent[axis]))
         lines.append(tuple(coordinates))
     return lines[0], lines[1]
 
@@ -102,8 +105,8 @@ def mesh_mirrors(patch: PatchMesh, vectors: Sequence[Array], *, loosely: bool) -
     vectors
         (3,) which the plane should contain, where the shape itself leaves a choice.
     loosely
-        Take planes too that only the shape has, as far as areas and centres show, where edges of
-        the mesh lie in them.
+        Whether planes count too that map areas and centres onto each other, but not the triangles.
+        Edges of the mesh must lie in them.
     """
     if SYMMETRY_EDGE in patch.edges:
         return []
@@ -126,13 +129,15 @@ def mesh_mirrors(patch: PatchMesh, vectors: Sequence[Array], *, loosely: bool) -
 
 
 def _rounded(offset: float) -> float:
+    """Return the offset of a plane; zero where it is rounding."""
     return 0.0 if abs(offset) < ROUNDING else offset
 
 
 def _candidate_normals(patch: PatchMesh, vectors: Sequence[Array]) -> Iterator[Array]:
     """Yield unit normals (3,) of planes that may be symmetry planes, each once.
 
-    They are normal to the vectors, along the axes of inertia, those of space, and halfway between.
+    They are normal to the vectors, along the axes of inertia, along those of space, or halfway
+    between two of these.
     """
     corners = patch.nodes[np.unique(patch.cells[:, :3])]
     principal = np.linalg.eigh(np.cov(corners.T))[1].T
@@ -142,37 +147,38 @@ def _candidate_normals(patch: PatchMesh, vectors: Sequence[Array]) -> Iterator[A
     normal_to_vectors = [np.cross(v, w) for v in vectors for w in (*axes[::-1], *vectors)]
     yielded: list[Array] = []
     for normal in (*normal_to_vectors, axes[1], axes[0], axes[2], *principal, *diagonals):
-        size = np.linalg.norm(normal)
-        if size <= ROUNDING:
+        length = np.linalg.norm(normal)
+        if length <= ROUNDING:
             continue
-        if all(abs(abs(n @ normal) - size) > ROUNDING * size for n in yielded):
-            yielded.append(normal / size)
+        if all(abs(abs(n @ normal) - length) > ROUNDING * length for n in yielded):
+            yielded.append(normal / length)
             yield yielded[-1]
 
 
 def _with_edges(mirror: Mirror, patch: PatchMesh, tree: "scipy.spatial.cKDTree") -> Mirror | None:
-    """Return the mirror with its pairs of edges.
+    """Return the mirror with its pairs of edges, or None.
 
-    None if it does not map the triangulation, whose nodes are in the tree, onto itself.
+    None if it does not map the triangulation onto itself. `tree` holds the nodes of the patch.
     """
     nodes = patch.nodes
     tolerance = ROUNDING * np.ptp(nodes, axis=0).max()
     if tree.query(mirror.image(nodes[:FIRST_NODES]))[0].max() > tolerance:
         return None
-    distance, image = tree.query(mirror.image(nodes))
+    distance, image_numbers = tree.query(mirror.image(nodes))
     if distance.max() > tolerance or np.abs(mirror.signed_distance(nodes)).max() <= tolerance:
         return None
-    twin = _image_triangles(patch.cells[:, :3], image)
+    # patches must be mapped onto themselves
+    twin = _image_triangles(patch.cells[:, :3], image_numbers)
     if twin is None or any((mask != mask[twin]).any() for mask in patch.patches.values()):
         return None
     removed_edges = {}
     for name, pairs in patch.edges.items():
-        images = (
-            other
-            for other, other_pairs in patch.edges.items()
-            if _same_pairs(image[pairs], other_pairs)
+        image_names = (
+            other_name
+            for other_name, other_pairs in patch.edges.items()
+            if _same_pairs(image_numbers[pairs], other_pairs)
         )
-        image_name = next(images, None)
+        image_name = next(image_names, None)
         if image_name is None:
             return None
         if image_name != name and mirror.signed_distance(nodes[pairs]).mean() < 0:
@@ -185,16 +191,19 @@ def _with_edges(mirror: Mirror, patch: PatchMesh, tree: "scipy.spatial.cKDTree")
 
 
 def _image_triangles(cells: Numbers, image: Numbers) -> Numbers | None:
-    """Return for each triangle (m, 3) the number of its mirror image, (m,); None if one has none.
+    """Return the number of each triangle's mirror image, (m,); None if one has no image.
 
     Parameters
     ----------
+    cells
+        (m, 3) nodes of the triangles.
     image
         (n,) number of the mirror image of each node.
     """
-    corners, images = np.sort(cells, axis=1), np.sort(image[cells], axis=1)
-    order, order_of_images = np.lexsort(corners.T), np.lexsort(images.T)
-    if (corners[order] != images[order_of_images]).any():
+    corners, image_corners = np.sort(cells, axis=1), np.sort(image[cells], axis=1)
+    # sorted triangles and sorted images are equal lists
+    order, order_of_images = np.lexsort(corners.T), np.lexsort(image_corners.T)
+    if (corners[order] != image_corners[order_of_images]).any():
         return None
     twin = np.empty(len(cells), dtype=np.int64)
     twin[order_of_images] = order
@@ -208,7 +217,7 @@ def _same_pairs(a: Numbers, b: Numbers) -> bool:
 
 
 def _has_equal_halves(mirror: Mirror, patch: PatchMesh) -> bool:
-    """Return whether the halves at a plane have one area, and centres that are mirror images."""
+    """Return whether both halves at a plane have equal areas and mirrored centres."""
     try:
         half, other_half = (_centre_and_area(cut(patch, m)) for m in (mirror, mirror.reversed))
     except MeshError:

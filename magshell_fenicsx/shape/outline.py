@@ -1,8 +1,8 @@
 """The surface of a shell as a chart and its map to space, over the reference length R.
 
 An `Outline` says what is meshed, how it is put into space, and which symmetry the surface has.
-`outline` makes that of any geometry, and `reference_shell_of` what imperfections, bodies and
-sources need of it.
+`outline` makes the outline of any geometry. `reference_shell_of` makes what imperfections, bodies
+and sources need to know of a shell.
 """
 
 from collections.abc import Callable, Sequence
@@ -70,16 +70,17 @@ class Outline:
     Attributes
     ----------
     chart
-        Symmetry plane in the model's frame or None, and element sizes (of grids) -> what is meshed.
+        Function of the symmetry plane in the model's frame (or None) and of element sizes (of
+        grids), to what is meshed.
     embedding
-        Chart -> places (n, 3), with imperfections if the surface has some.
+        Chart (n, 2) -> places (n, 3), with imperfections if the surface has some.
     normal
         Chart -> outward unit normals.
     inverse
         Place (3,) -> its chart (2,); of a mesh file the place itself.
     highest
-        Chart of the point whose displacement is reported where the case names none: a pole, a tip;
-        None: the reader of the mesh file takes the highest.
+        Chart of the point whose displacement is reported where the case names none: a pole, a tip.
+        None: the reader of the mesh file takes the highest point.
     edge
         Distance of the outer edge from the chart's origin; infinite where the chart is no disc.
     sphere
@@ -87,11 +88,12 @@ class Outline:
     round
         Whether it is closed around e3.
     mirrors
-        Its symmetry planes, but for those through e3 of what is `round`; of a mesh file for vectors
-        that a plane should contain, and whether its edges suffice (see `mesh_mirrors`).
+        Function that gives its symmetry planes, except planes through e3 of a `round` surface. Of a
+        mesh file it takes vectors that a plane should contain, and whether loose symmetry suffices
+        (see `mesh_mirrors`).
     from_pole
-        Places -> length of the meridian from the pole; None but for a pole of a surface of
-        revolution.
+        Places (n, 3) -> length (n,) of the meridian from the pole; None except for a surface of
+        revolution with a pole.
     meridian
         The meridian; None if it is closed, or the surface is none of revolution.
     extra_samples
@@ -115,9 +117,9 @@ class Outline:
     why_no_meridian: str | None = None
 
     def on_half(self, chart: Array) -> Array:
-        """Return a place of the chart (2,) on its half, from which rounding may have moved it.
+        """Return a place of the chart (2,) on its half, off which rounding may have moved it.
 
-        Grids and meshes are cut, and their places are returned as they are.
+        Places of grids and meshes are returned as they are, since these are cut.
         """
         if self.grid or isinstance(self.chart(None, ANY_GRADING), MeshFile):
             return chart
@@ -125,12 +127,12 @@ class Outline:
 
     @property
     def grid(self) -> Grid | None:
-        """The grid that is meshed; None of other charts."""
+        """The grid that is meshed; None for other charts."""
         shape = self.chart(None, ANY_GRADING)
         return shape if isinstance(shape, Grid) else None
 
     def sample(self) -> Array:
-        """Return places (n, 3) all over the surface, with its centre, edges and axes among them."""
+        """Return places (n, 3) all over the surface, its centre, edges and axes among them."""
         if self.meridian and self.meridian.shell_meridians:
             in_plane = self.meridian.sample()
             azimuths = np.linspace(0, 2 * pi, SAMPLED_AZIMUTHS)
@@ -142,16 +144,16 @@ class Outline:
         return np.vstack([self.embedding(chart), self.extra_samples])
 
     def samples_with_normals(self) -> tuple[Array, Array] | None:
-        """Return places (n, 3) all over the surface with their outward unit normals.
+        """Return places (n, 3) all over the surface with their outward unit normals (n, 3).
 
-        None of a mesh file and of several shells.
+        None for a mesh file and for several shells.
         """
         is_of_several_shells = self.meridian and self.meridian.shell_meridians
         chart = None if is_of_several_shells else self.chart_samples()
         return None if chart is None else (self.embedding(chart), self.normal(chart))
 
     def with_samples(self, places: Array) -> "Outline":
-        """Return the outline with places (n, 3) among its samples."""
+        """Return the outline with further places (n, 3) among its samples."""
         meridian = self.meridian and replace(self.meridian, narrow_places=places)
         return replace(self, extra_samples=places, meridian=meridian)
 
@@ -164,7 +166,7 @@ class Outline:
     def normal_near(self, chart: Array) -> Array:
         """Return the outward unit normal (3,) at a chart (2,).
 
-        Of a mesh file that of the node nearest to a place (3,).
+        The chart of a mesh file is a place (3,); the normal is then that of the nearest node.
         """
         shape = self.chart(None, ANY_GRADING)
         if not isinstance(shape, MeshFile):
@@ -177,7 +179,7 @@ class Outline:
         return np.asarray(node_normals(nodes[[nearest]])[0])
 
     def chart_samples(self) -> Array | None:
-        """Return charts (n, 2) all over the surface; None for a mesh file."""
+        """Return charts (n, 2) all over the surface, up to its edges; None for a mesh file."""
         shape = self.chart(None, ANY_GRADING)
         if isinstance(shape, MeshFile):
             return None
@@ -194,7 +196,10 @@ class Outline:
         return np.column_stack([x.ravel(), y.ravel()])
 
     def clip_to_chart(self, chart: Array) -> Array:
-        """Return the nearest place of the chart (2,) to one that may be outside."""
+        """Return the place of the chart (2,) nearest to one that may be outside.
+
+        The chart must not be that of a mesh file.
+        """
         shape = self.chart(None, ANY_GRADING)
         if isinstance(shape, DiscShape):
             return np.asarray(chart / max(float(np.hypot(*chart)) / self.edge, 1.0))
@@ -217,6 +222,8 @@ class Outline:
 
         Parameters
         ----------
+        deviations
+            Deviations along the normal.
         circles
             Radii around the pole at which the curvature jumps.
         largest
@@ -232,7 +239,7 @@ class Outline:
         return replace(self, embedding=embedding, meridian=meridian)
 
     def embedding_of(self, shape: Chart) -> Embedding:
-        """Return the map to space of what is meshed.
+        """Return the map to space of the chart that is meshed.
 
         Halves of several shells have charts in frames of their own.
         """
@@ -247,7 +254,10 @@ class Outline:
 
 
 def reference_shell_of(shell: Surface | ShellSection) -> ReferenceShell:
-    """Return what imperfections, bodies and sources need of a shell, without imperfections."""
+    """Return the reference shell of a case's shell, without imperfections.
+
+    Imperfections, bodies and sources are placed on it.
+    """
     perfect = outline(shell)
     factor = shell.thickness_factor
     azimuth = getattr(shell, "azimuth", None)
@@ -271,7 +281,7 @@ def reference_shell_of(shell: Surface | ShellSection) -> ReferenceShell:
 
 
 def outline(shell: Surface | ShellSection) -> Outline:
-    """Return the outline of a perfect shell."""
+    """Return the outline of a shell without imperfections."""
     if isinstance(shell, MeshSurface):
         return _mesh_outline(shell)
     if isinstance(shell, ShellSection) and shell.width is not None:
@@ -315,7 +325,7 @@ def _mesh_outline(shell: MeshSurface) -> Outline:
         try:
             patch = read_msh(replace(file, normals=False), {})
             return _with_reversed(mesh_mirrors(patch, vectors, loosely=loosely))
-        except MeshError:  # for whoever builds it to report
+        except MeshError:  # the mesh reader reports it when the mesh is built
             return []
 
     return Outline(
@@ -329,7 +339,7 @@ def _mesh_outline(shell: MeshSurface) -> Outline:
 
 
 def _multi_shell_outline(file: MeshFile, shells: MultiShellMesh) -> Outline:
-    """Return the outline of several shells that stand in place of a mesh file."""
+    """Return the outline of several shells that take the place of a mesh file."""
     meridian = shells.meridian
 
     def chart(mirror: Mirror | None, size: Grading) -> MeshFile:
@@ -337,7 +347,7 @@ def _multi_shell_outline(file: MeshFile, shells: MultiShellMesh) -> Outline:
             return replace(file, in_memory=shells.symmetric_part(mirror))
         return file
 
-    def embedding(nodes: Array) -> Array:  # the shells are meshed when it is asked for
+    def embedding(nodes: Array) -> Array:  # the first call meshes the shells
         return shells.patch.embedding(nodes)
 
     return Outline(
@@ -353,7 +363,7 @@ def _multi_shell_outline(file: MeshFile, shells: MultiShellMesh) -> Outline:
 
 
 def _strip_outline(width: float) -> Outline:
-    """Return the outline of a flat strip of length 1 along e1."""
+    """Return the outline of a flat strip of length 1 along e1; `width` is over the length."""
     tip, corner = np.array([1.0, 0.0]), np.array([0.0, -width / 2])
 
     def inverse(x: Array) -> Array:
@@ -370,7 +380,10 @@ def _strip_outline(width: float) -> Outline:
 
 
 def _sphere_outline(edge: float, edge_name: str) -> Outline:
-    """Return the outline of a part of the unit sphere, up to the polar angle of its edge (rad)."""
+    """Return the outline of a part of the unit sphere about e3, with its pole.
+
+    `edge` is the polar angle of its edge in radians.
+    """
     return _disc_outline(
         edge, edge_name, sphere_embedding, sphere_embedding, _sphere_chart, sphere=True
     )
@@ -392,8 +405,12 @@ def _disc_outline(
     ----------
     edge
         Radius of the disc.
+    embedding, normal, inverse
+        As those of `Outline`; `inverse` may lead beyond the edge.
+    sphere
+        Whether chart distances from the origin are polar angles.
     curvature
-        The largest of the meridian.
+        The largest of the meridian, over 1/R.
     """
 
     def chart(mirror: Mirror | None, size: Grading) -> Chart:
@@ -426,8 +443,12 @@ def _ring_outline(
 ) -> Outline:
     """Return the outline of a surface of revolution without a pole, or of a part of one.
 
+    Its chart is a grid: the azimuth times the largest radius, and the length along the profile.
+
     Parameters
     ----------
+    profile
+        Curve (rho, z) over R that is turned about e3.
     names
         Names of the edges where the profile begins and ends.
     """
@@ -453,6 +474,7 @@ def _ring_outline(
     def locate(chart: Array) -> tuple[float, float]:
         return profile.length - float(chart[1]), float(chart[0]) / rho
 
+    # only a surface closed around e3, with edges, has a meridian
     meridian = None
     if glued == (True, False):
         meridian = MeridianChart(
@@ -470,7 +492,10 @@ def _ring_outline(
 
 
 def _largest_curvature(profile: Profile) -> float:
-    """Return the largest curvature of a profile, at least 1; to a thousandth, not to rounding."""
+    """Return the largest curvature of a profile over 1/R, at least 1.
+
+    It is rounded to a thousandth, since it is known no better.
+    """
     s = np.linspace(0, profile.length, CURVATURE_SAMPLES, dtype=np.float64)
     changes = np.linalg.norm(np.diff(profile.tangent(s), axis=0), axis=1)
     return max(1.0, round(float(changes.max() / s[1]), CURVATURE_DIGITS))
@@ -484,7 +509,7 @@ def _grid_outline(
     highest: Array,
     meridian: MeridianChart | None = None,
 ) -> Outline:
-    """Return the outline of a surface that is charted by a rectangle."""
+    """Return the outline of a surface that is charted by a rectangle; see `Outline`."""
 
     def chart(mirror: Mirror | None, grading: Grading) -> Chart:
         size = grading.line_spacing if grading.features else grading.largest
@@ -509,12 +534,12 @@ def _grid_outline(
 
 
 def _sector_of_grid(grid: Grid, sector: Sector) -> Grid:
-    """Return the part from azimuth 0 to 180/m degrees of a grid that is closed around e3.
+    """Return the part of a grid, closed around e3, between azimuths 0 and 180/m degrees.
 
     It has at least four quadrilaterals around.
     """
     end = (grid.high[0] - grid.low[0]) / sector.copies
-    quarters = tuple(end * part for part in (0.25, 0.5, 0.75))
+    quarters = tuple(end * fraction for fraction in (0.25, 0.5, 0.75))
     sides = (SYMMETRY_EDGE, SECOND_SYMMETRY_EDGE, *grid.sides[2:])
     return replace(
         grid,
@@ -527,15 +552,19 @@ def _sector_of_grid(grid: Grid, sector: Sector) -> Grid:
 
 
 def _with_reversed(planes: Sequence[Mirror]) -> list[Mirror]:
-    """Return the planes with the half on either side modelled."""
+    """Return each plane twice: with the half on either side modelled."""
     return [half for plane in planes for half in (plane, plane.reversed)]
 
 
 def _plane_chart(x: Array) -> Array:
+    """Return the chart (2,) of a place (3,) on the plane of e1 and e2."""
     return x[:2]
 
 
 def _sphere_chart(x: Array) -> Array:
-    """Return the chart (2,) of a direction (3,) from the centre of the unit sphere."""
+    """Return the chart (2,) of a direction (3,) from the centre of the unit sphere.
+
+    It is the polar angle in radians, along the azimuth.
+    """
     rho = np.hypot(x[0], x[1])
     return np.asarray(np.arctan2(rho, x[2]) * x[:2] / rho) if rho > 0 else np.zeros(2)

@@ -30,9 +30,9 @@ Distance = Callable[[Array], Array]  # places (n, 3) over R -> distances (n,) ov
 Coordinates = Annotated[
     list[Annotated[float, or_number("metre")]], Field(min_length=3, max_length=3)
 ]
-ON_AXIS = 1e-9  # over R: distance from e3 of a place on it
+ON_AXIS = 1e-9  # over R: distance from e3 up to which a place is on it
 ON_SPHERE = 1e-6  # over R: distance of a place on the sphere from its image in the chart
-HALF_DRAWN_EXTENT = 0.5  # over R: half of what is drawn of a body without end
+HALF_DRAWN_EXTENT = 0.5  # over R: half the drawn extent of an infinite body
 CIRCLE_POINTS = 49  # of a line along a circle
 
 
@@ -47,6 +47,7 @@ class At(Direction):
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
+        """Refuse a point together with angles, with a ValueError."""
         if self.point is not None and {"polar", "azimuth"} & self.model_fields_set:
             raise ValueError("give a point, or polar and azimuth")
         return self
@@ -71,21 +72,21 @@ class ReferenceShell:
     perfect, imperfect
         The surface without imperfections, and with those that do not grow.
     R
-        What lengths of the case are over, in the case's unit.
+        Reference length that lengths of the case are divided by, in the case's unit.
     R_over_h, nu
         R over the thickness, and Poisson's ratio.
     with_units
         Whether lengths of the case are in metres.
     edge_polar
-        Of a part of a sphere the angle of its edge from e3 (degree); None of other geometries.
+        Angle of the edge of a part of a sphere from e3 (degree); None of other geometries.
     thickness_factor
-        A formula that multiplies the thickness.
+        A formula that multiplies the thickness; None for 1.
     identity
         Words and numbers that are equal for equal perfect surfaces.
     turn
-        The model's frame is turned about e3 by it (rad).
+        Angle by which the model's frame is turned about e3 (rad).
     hole_polar
-        Of a part of a sphere the angle of its hole's edge from e3 (degree); 0 without a hole.
+        Angle of the edge of a hole in a part of a sphere, from e3 (degree); 0 without a hole.
     azimuths
         First and last azimuth (degree) of a part of a surface of revolution; None all around.
     """
@@ -121,17 +122,18 @@ class ReferenceShell:
 
     @cached_property
     def _thickness_formula(self) -> Callable[..., Array] | None:
+        """The formula of the thickness factor as a function of x, y, z; None without one."""
         return formula(self.thickness_factor) if self.thickness_factor else None
 
     def half_thickness(self, x: Array) -> Array:
-        """Return half the thickness over R at places (n, 3), (n,)."""
+        """Return half the thickness over R (n,) at places x (n, 3)."""
         factor = self._thickness_formula(*x.T) if self._thickness_formula else 1.0
         return np.broadcast_to(self.h / 2 * factor, len(x))
 
 
 @dataclass(frozen=True)
 class AngularDistance:
-    """The angle (rad) of places (n, 3) from a unit vector (3,)."""
+    """The angle (rad) of places (n, 3) from a unit vector (3,); a `Distance`."""
 
     axis: Array
 
@@ -144,7 +146,7 @@ class AngularDistance:
 
 @dataclass(frozen=True)
 class StraightDistance:
-    """The distance of places (n, 3) in space from a place (3,)."""
+    """The distance of places (n, 3) in space from a place (3,); a `Distance`."""
 
     place: Array
 
@@ -153,17 +155,19 @@ class StraightDistance:
 
 
 def locate(at: At, ground: ReferenceShell, key: str) -> tuple[Array, Distance]:
-    """Return a place of the perfect surface, and the distance from it.
+    """Return a place of the perfect surface, and the function that gives distances from it.
 
-    The distance is an angle on a sphere, the length of the meridian from the pole of a surface of
-    revolution, else straight.
+    The distance is an angle on a sphere. From the pole of a surface of revolution it is the length
+    of the meridian, otherwise it is straight.
 
     Parameters
     ----------
     at
         The place in the words of the case.
+    ground
+        The shell.
     key
-        Its key, for messages.
+        Key of the place in the case file, for messages.
 
     Returns
     -------
@@ -203,7 +207,10 @@ def locate(at: At, ground: ReferenceShell, key: str) -> tuple[Array, Distance]:
 
 
 def _off_sphere_text(at: At, ground: ReferenceShell) -> str:
-    """Return why a direction from the centre is not on a part of a sphere, after the key `at`."""
+    """Return the end of a message about a direction that is not on a part of a sphere.
+
+    It follows the key `at`.
+    """
     hole, edge = ground.hole_polar, ground.edge_polar or 0.0
     if hole and "polar" not in at.model_fields_set:
         return (
@@ -220,18 +227,20 @@ def _off_sphere_text(at: At, ground: ReferenceShell) -> str:
 def refuse_off_surface(
     key: str, x: Array, outline: "Outline", R: float, *, with_units: bool
 ) -> None:
-    """Refuse a place that is not on a surface.
+    """Refuse a place that is neither on the surface nor on the one without imperfections.
 
     Parameters
     ----------
     key
-        The key of the place, for the message.
+        Key of the place in the case file, for the message.
     x
         (3,) over R.
+    outline
+        The surface.
     R
-        In the unit of the case.
+        Reference length in the unit of the case.
     with_units
-        Whether that is the metre.
+        Whether that unit is the metre.
 
     Raises
     ------
@@ -243,8 +252,8 @@ def refuse_off_surface(
     perfect = outline.perfect(chart[None])[0] if len(chart) == 2 else x
     distances = [float(np.linalg.norm(place - x)) for place in (nearest, perfect)]
     if min(distances) > SAME_PLACE_TOLERANCE:
-        size, unit = (1e3 * R, " mm") if with_units else (R, "")
-        near_place = ", ".join(f"{c * size + 0.0:.13g}{unit}" for c in np.round(nearest, 12))
+        unit_size, unit = (1e3 * R, " mm") if with_units else (R, "")
+        near_place = ", ".join(f"{c * unit_size + 0.0:.13g}{unit}" for c in np.round(nearest, 12))
         hint = "; a number without a unit is in metres here" if with_units else ""
         raise CaseError(
             f"{key}: is not on the surface; a place near it that is: [{near_place}]{hint}"
@@ -252,7 +261,10 @@ def refuse_off_surface(
 
 
 def circle_line(radius: float, z: float = 0.0, *, axes: tuple[int, int, int] = (0, 1, 2)) -> Array:
-    """Return places (n, 3) along a circle around the last of some axes."""
+    """Return places (n, 3) along a circle around the last of some axes, at the height z.
+
+    `axes` are the numbers of the first, second and last axis of the circle.
+    """
     t = np.linspace(0.0, 2 * np.pi, CIRCLE_POINTS)
     around_z = np.column_stack([radius * np.cos(t), radius * np.sin(t), np.full_like(t, z)])
     return around_z[:, np.argsort(axes)]
@@ -279,7 +291,7 @@ def box_lines(low: Array, high: Array) -> list[Array]:
 
 
 def frame_along(axis: Array) -> Array:
-    """Return two unit vectors normal to a unit vector (3,), and this, as columns."""
+    """Return a right-handed orthonormal frame (3, 3) as columns, with `axis` (3,) as the last."""
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     first = first / np.linalg.norm(first)
     return np.column_stack([first, np.cross(axis, first), axis])

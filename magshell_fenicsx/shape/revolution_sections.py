@@ -1,9 +1,9 @@
 """Sections of surfaces of revolution about e3: caps, cylinders, rings, tori and profiles.
 
-And the keys that all mid-surfaces share. Lengths are plain
-numbers of one unit that the user chooses, or all have units and are then in metres; the same holds
-for Young's modulus, so that loads and results are in the user's units or in SI. The docstrings of
-sections and of their keys are the text of docs/case.md.
+Here are also the keys that all mid-surfaces share. Lengths are plain numbers of one unit that the
+user chooses, or all have units and are then in metres. The same holds for Young's modulus, so that
+loads and results are in the user's units or in SI. The docstrings of sections and of their keys are
+the text of docs/case.md.
 """
 
 from math import pi, radians
@@ -82,34 +82,40 @@ class SurfaceSection(ShellKeys, MaterialSection):
     def _all_with_units_or_none(
         cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
     ) -> Self:
+        """Refuse a shell of which some lengths have units and others do not, with a ValueError.
+
+        Pydantic calls it with the raw `data`; `handler` makes the section of them. It also sets
+        `with_units`.
+        """
         lengths = dict[str, Any]()
         if isinstance(data, dict):
             lengths = {key: data[key] for key in MEASURES if key in data}
         measured = {
             key: value for key, value in lengths.items() if isinstance(value, str | int | float)
         }
-        kinds = {isinstance(value, str) for value in measured.values()}
+        are_texts = {isinstance(value, str) for value in measured.values()}
         all_or_none = "give every length and youngs_modulus a unit, or none of them"
-        if len(kinds) > 1:
+        if len(are_texts) > 1:
             without_unit = [key for key, value in measured.items() if not isinstance(value, str)]
             raise ValueError(f"{all_or_none}: {', '.join(without_unit)} has none")
-        cls.note_sizes(data, handler, info, with_units=kinds == {True})
+        cls.note_sizes(data, handler, info, with_units=are_texts == {True})
         section = handler(data)
         profile = getattr(section, "profile", None)
-        if kinds == {False} and [*numbers_with_units(profile, data.get("profile"), "profile")]:
+        if are_texts == {False} and [*numbers_with_units(profile, data.get("profile"), "profile")]:
             raise ValueError(f"{all_or_none}: {', '.join(measured)} has none")
         modulus = section.youngs_modulus
-        if kinds == {True} and modulus is not None and not 1 <= modulus <= 1e13:
+        if are_texts == {True} and modulus is not None and not 1 <= modulus <= 1e13:
             raise ValueError(
                 f"shell.youngs_modulus: {lengths['youngs_modulus']!r}: "
                 "allowed are 1 Pa to 1e13 Pa (MPa: megapascal, mPa: millipascal)"
             )
         if isinstance(data, dict):
-            section._with_units = kinds == {True}
+            section._with_units = are_texts == {True}
         return section
 
     @model_validator(mode="after")
     def _thin(self) -> Self:
+        """Refuse a shell that is not thin, and keys that do not fit, with a ValueError."""
         if not 3 <= self.R_over_h <= 1e6:
             raise ValueError(
                 f"the reference length is {self.R_over_h:.4g} thicknesses; "
@@ -142,6 +148,7 @@ class SurfaceSection(ShellKeys, MaterialSection):
 
     @property
     def R_over_h(self) -> float:
+        """Reference length over the thickness."""
         return self.reference / self.thickness
 
     @property
@@ -151,7 +158,7 @@ class SurfaceSection(ShellKeys, MaterialSection):
 
 
 def _refuse_azimuth(azimuth: list[float] | None) -> None:
-    """Refuse first and last azimuth (degree) that do not grow, or overlap."""
+    """Refuse first and last azimuth (degree) that do not grow, or overlap, with a ValueError."""
     first, last = azimuth or FULL_TURN
     if not 1e-3 <= last - first <= 360:
         raise ValueError(
@@ -207,6 +214,7 @@ class CapSurface(RoundSection):
 
     @model_validator(mode="after")
     def _hole_within(self) -> Self:
+        """Refuse a hole that is not within the cap, and a part of a cap without one."""
         if self.hole is not None and self.hole >= self.polar - 0.1:
             raise ValueError(f"hole: {self.hole:g}: must be smaller than polar, {self.polar:g}")
         if self.hole is None and self.azimuth is not None:
@@ -219,6 +227,7 @@ class CapSurface(RoundSection):
 
     @property
     def profile_and_edges(self) -> ProfileAndEdges:
+        """The arc from the rim to the hole, over R, and the names of its ends."""
         from magshell_fenicsx.mesh.surfaces_of_revolution import ArcProfile
 
         assert self.hole is not None
@@ -239,6 +248,7 @@ class CylinderSurface(RoundSection):
 
     @property
     def profile_and_edges(self) -> ProfileAndEdges:
+        """The line from bottom to top, over R, and the names of its ends."""
         from magshell_fenicsx.mesh.surfaces_of_revolution import StraightProfile
 
         return StraightProfile((1.0, 0.0), (1.0, self.length / self.radius)), ("bottom", "top")
@@ -256,6 +266,7 @@ class AnnulusSurface(RoundSection):
 
     @model_validator(mode="after")
     def _inner_within(self) -> Self:
+        """Refuse an inner radius that is not smaller than the radius."""
         if self.inner_radius >= self.radius:
             raise ValueError(
                 f"inner_radius: {self.inner_radius:g}: must be smaller than radius, {self.radius:g}"
@@ -264,6 +275,7 @@ class AnnulusSurface(RoundSection):
 
     @property
     def profile_and_edges(self) -> ProfileAndEdges:
+        """The line from the outer to the inner edge, over R, and the names of its ends."""
         from magshell_fenicsx.mesh.surfaces_of_revolution import StraightProfile
 
         return StraightProfile((1.0, 0.0), (self.inner_radius / self.radius, 0.0)), (
@@ -287,6 +299,7 @@ class TorusSurface(RoundSection):
 
     @model_validator(mode="after")
     def _hole_in_it(self) -> Self:
+        """Refuse a tube that reaches the axis, or angles that do not grow."""
         first, last = self.tube or FULL_TURN
         if not 1e-3 <= last - first <= 360:
             raise ValueError(
@@ -303,6 +316,7 @@ class TorusSurface(RoundSection):
 
     @property
     def profile_and_edges(self) -> ProfileAndEdges:
+        """The arc of the tube's section, over R, and the names of its ends."""
         from magshell_fenicsx.mesh.surfaces_of_revolution import ArcProfile
 
         first, last = self.tube or FULL_TURN
@@ -328,6 +342,10 @@ class ProfileSection(Section):
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
+        """Refuse a profile that is not given exactly once, or is no regular curve.
+
+        It may reach the axis only at its end, and no two neighbouring points may be the same.
+        """
         if (self.points is None) == (self.radius is None) or (self.radius is None) != (
             self.heights is None
         ):
@@ -343,7 +361,7 @@ class ProfileSection(Section):
 
     @property
     def curve(self) -> np.ndarray[Any, np.dtype[np.float64]]:
-        """Points (n, 2) that the curve goes through."""
+        """Points (n, 2) that the curve goes through, (r, z) in the case's lengths."""
         if self.points is not None:
             return np.array(self.points)
         assert self.radius is not None
@@ -371,6 +389,7 @@ class RevolutionSurface(SurfaceSection):
 
     @property
     def reference(self) -> float:
+        """Largest radius of the profile."""
         return float(self.profile.curve[:, 0].max())
 
     @property
@@ -381,6 +400,7 @@ class RevolutionSurface(SurfaceSection):
 
     @model_validator(mode="after")
     def _turns(self) -> Self:
+        """Refuse azimuths that overlap, and a part of a surface with a pole."""
         _refuse_azimuth(self.azimuth)
         if self.azimuth is not None and self.profile.curve[-1, 0] == 0:
             raise ValueError("azimuth: a part of a surface with a pole cannot be built")

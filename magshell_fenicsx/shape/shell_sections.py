@@ -73,6 +73,7 @@ class MeshSurface(FileKeys, SurfaceSection):
     @model_validator(mode="before")
     @classmethod
     def _unit_of_the_file(cls, data: Any) -> Any:
+        """Refuse a unit of the file without units of lengths, and the reverse."""
         if isinstance(data, dict) and isinstance(data.get("thickness"), str) != ("unit" in data):
             raise ValueError(
                 "unit (of the file's coordinates, such as mm) goes with lengths that have units"
@@ -163,6 +164,10 @@ class ShellSection(ShellKeys, OneShape):
     def _imperfections_with_units(
         cls, data: Any, handler: ModelWrapValidatorHandler[Self], info: ValidationInfo
     ) -> Self:
+        """Refuse radius and thickness as plain numbers; note the unit for imperfections.
+
+        Pydantic calls it with the raw `data`; `handler` makes the section of them.
+        """
         sizes = [data.get(key) for key in ("radius", "thickness")] if isinstance(data, dict) else []
         numbers = [size for size in sizes if isinstance(size, int | float) and size > 0]
         if len(numbers) == 2:
@@ -181,6 +186,7 @@ class ShellSection(ShellKeys, OneShape):
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
+        """Refuse keys that contradict each other or the geometry, with a ValueError."""
         lengths = [self.radius, self.thickness]
         if self.radius_to_thickness is not None:
             if lengths != [None, None]:
@@ -209,6 +215,7 @@ class ShellSection(ShellKeys, OneShape):
 
     @property
     def R_over_h(self) -> float:
+        """Radius over the thickness, given or computed."""
         if self.radius_to_thickness is not None:
             return self.radius_to_thickness
         assert self.radius

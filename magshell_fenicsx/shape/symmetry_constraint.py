@@ -1,8 +1,8 @@
-"""Symmetry that the parts of a case preserve; the smallest model has what all preserve.
+"""Symmetry that the parts of a case preserve; the smallest model has what all of them preserve.
 
-Each part states a `SymmetryConstraint`. `common_mirror` and `common_sector` find planes that all
-parts allow, and `why_not_axisymmetric` says what forbids the model of a meridian (docs/design.md).
-Lengths are over R.
+Each part (a load, a support, the shape) states a `SymmetryConstraint`. `common_mirror` and
+`common_sector` find planes that all parts allow. `why_not_axisymmetric` says what forbids the model
+of a meridian (docs/design.md). Lengths are over R.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -18,7 +18,7 @@ from magshell_fenicsx.mesh.mirror import ROUNDING, Mirror, Sector
 from magshell_fenicsx.mesh.patch import UserField
 from magshell_fenicsx.shape.meridian_chart import scalar_is_axisymmetric
 
-if TYPE_CHECKING:  # it reads meshes, and needs the solver for that
+if TYPE_CHECKING:  # outlines read meshes, which needs the solver
     from magshell_fenicsx.shape.outline import Outline
     from magshell_fenicsx.shape.shell_sections import ShellSection, Surface
 
@@ -50,9 +50,9 @@ class SymmetryConstraint:
         Vectors and places (3,) that a mirror plane through e3 must contain, so that they choose
         one.
     mirrors
-        Whether a plane is one of the part's symmetry.
+        Function that tells whether a plane is a symmetry of the part.
     energy
-        Name of the energy that states the constraint, if one does.
+        Name of the energy that states the constraint; "" for other parts.
     azimuths
         Azimuths (rad) of further planes through e3 that may be preserved.
     """
@@ -65,9 +65,9 @@ class SymmetryConstraint:
 
 
 def common_azimuth(vectors: Vectors) -> float | None:
-    """Return the azimuth (rad) of the plane through e3 that contains all vectors.
+    """Return the azimuth (rad) of the plane through e3 that contains all vectors (3,).
 
-    0 if every vector is along e3, None if there is no such plane.
+    It is 0 if every vector is along e3, and None if there is no such plane.
     """
     tilted_vectors = [v[:2] for v in vectors if hypot(*v[:2]) > PARALLEL]
     if not tilted_vectors:
@@ -86,8 +86,12 @@ def common_mirror(
 
     Parameters
     ----------
+    parts
+        Constraints of all parts.
+    outline
+        The surface of the shell.
     loosely
-        Of a mesh file, see `mesh_mirrors`.
+        Whether the triangles of a mesh file need not be symmetric; see `mesh_mirrors`.
     """
     if any(part.mirrors is no_plane for part in parts):
         return None
@@ -106,7 +110,10 @@ def common_mirror(
 
 
 def _planes_through_axis(parts: Sequence[SymmetryConstraint], vectors: Vectors) -> list[Mirror]:
-    """Return the planes through e3 that contain all vectors, and further ones of the parts."""
+    """Return candidates for mirror planes through e3 of a round surface.
+
+    All contain the `vectors` (3,) of the parts; some have azimuths that parts propose.
+    """
     planes = list[Mirror]()
     azimuth = common_azimuth(vectors)
     if azimuth is not None:
@@ -131,7 +138,7 @@ def common_sector(
     waves
         m.
     places
-        Named places (3,), which may choose where it begins.
+        Named places (3,), which may choose where the sector begins.
     """
     vectors = [v for part in parts for v in part.vectors]
     azimuth = common_azimuth(vectors)
@@ -154,25 +161,31 @@ def common_sector(
 
 
 def _outline_planes_through_axis(outline: "Outline", vectors: Vectors) -> list[Mirror]:
-    """Return the planes through e3 of an outline that is not round, which keep each edge."""
+    """Return the symmetry planes through e3 of an outline that is not round.
+
+    Only planes that map each edge onto itself count.
+    """
     planes = outline.mirrors(vectors, False)
     return [plane for plane in planes if plane.through_e3 and not plane.removed_edges]
 
 
 def _ends_at_symmetry_plane(outline: "Outline", sector: Sector) -> bool:
-    """Return whether the second plane of a sector is a symmetry plane of an outline too."""
+    """Return whether the second plane of a sector is a symmetry plane of the outline."""
     end = sector.azimuth + sector.angle
     planes = _outline_planes_through_axis(outline, [np.array([cos(end), sin(end), 0.0])])
     return any(sector.second_plane.is_plane_of(plane) for plane in planes)
 
 
 def why_not_axisymmetric(parts: Sequence[SymmetryConstraint]) -> str | None:
-    """Return why the model of a meridian turned about e3 is not enough; None if it is."""
+    """Return why a meridian that is turned about e3 cannot model the case; None if it can."""
     return next((part.not_axisymmetric for part in parts if part.not_axisymmetric), None)
 
 
 def energy_without_mirror(parts: Sequence[SymmetryConstraint], outline: "Outline") -> str | None:
-    """Return the name of an energy that alone keeps a case from being a half; None without one."""
+    """Return the name of an energy that alone keeps a case from being a half; None without one.
+
+    The other parts have a common mirror plane.
+    """
     plane = common_mirror([part for part in parts if not part.energy], outline, loosely=True)
     if plane is None:
         return None
@@ -186,9 +199,9 @@ def tilted(v: Array) -> bool:
 
 
 def unit(v: Array) -> Array:
-    """Return a vector (3,) over its length.
+    """Return a vector (3,) over its length; zero stays zero.
 
-    Zero stays zero, and a vector as short as 1e-200 has a direction.
+    Even a vector as short as 1e-200 has a direction.
     """
     largest = np.abs(v).max()
     if not largest:
@@ -198,7 +211,10 @@ def unit(v: Array) -> Array:
 
 
 def shape_constraint(shell: "ShellSection | Surface", outline: "Outline") -> SymmetryConstraint:
-    """Return the symmetry that the mid-surface and its thickness preserve."""
+    """Return the symmetry that the mid-surface and its thickness preserve.
+
+    Its mirrors test the thickness alone; planes of the surface come from the outline.
+    """
     factor, geometry = shell.thickness_factor, shell.geometry
 
     def mirrors(mirror: Mirror) -> bool:
@@ -219,9 +235,10 @@ def shape_constraint(shell: "ShellSection | Surface", outline: "Outline") -> Sym
 def patch_constraint(
     key: str, names: Iterable[str], shell: "ShellSection | Surface"
 ) -> SymmetryConstraint:
-    """Return the constraint of named patches: on a meridian no patch but a whole shell is known.
+    """Return the constraint of patches that a key names.
 
-    So is the message about a patch that is not there.
+    A meridian knows no patch but a whole shell. The message is the same for a patch that is not
+    there.
     """
     assembly = getattr(shell, "assembly", None)
     patch = None
@@ -235,7 +252,14 @@ def points_constraint(
 ) -> SymmetryConstraint:
     """Return the constraint that named points lie on the half that is modelled.
 
-    So does the point that is reported where none is named.
+    If no point is named, the one that is reported must lie there.
+
+    Parameters
+    ----------
+    points
+        Places in the case's unit of length.
+    R
+        Reference length in that unit.
     """
     named_places = [np.array(x) / R for x in points]
     places = named_places
@@ -243,7 +267,7 @@ def points_constraint(
         places = [outline.embedding(outline.highest[None])[0]]
 
     def mirrors(mirror: Mirror) -> bool:
-        # the chart of a round surface begins at the plane, and the reported point with it
+        # the chart of a round surface, and the reported point, begin at the plane
         if outline.round and mirror.through_e3 and not named_places:
             return True
         return all(float(mirror.signed_distance(x)) > -ROUNDING for x in places)
@@ -252,10 +276,12 @@ def points_constraint(
 
 
 def mirrors_formula(text: str, mirror: Mirror, x: Array, length: float = 1.0) -> bool:
-    """Return whether a formula is the same at places and at their images.
+    """Return whether a formula is the same at places and at their mirror images.
 
     Parameters
     ----------
+    text
+        Formula of x, y, z.
     x
         (n, 3) places over R.
     length

@@ -1,5 +1,7 @@
-"""Energies of a shell on its integration domain: each is a density, made only when a scene has
-it.
+"""Energies of a thin shell, each integrated from one density over the mid-surface or its meridian.
+
+`EnergyFactory` makes an energy only when a scene asks for it, so unused ones are never compiled.
+Lengths are over R, energies over E h R².
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -67,29 +69,41 @@ INTERIOR = "interior edges"
 
 @dataclass(frozen=True)
 class EnergyFactory:
-    """Factory of the energies of one shell, and of terms from them.
+    """Factory of the energies of one shell, and of the terms of its system.
+
+    An `Energy` is a function of the displacement's jet (value and derivatives); a `FormTerm` is its
+    form at the model's displacement u.
 
     Attributes
     ----------
+    domain
+        Mid-surface or meridian that integrals run over, with the placement.
+    u
+        Displacement over R.
+    sigma
+        Penalty of the C0 interior penalty form.
+    log
+        Log that compiles forms, with their names and compile times.
     thickness
         Factor (1,) of h; None for 1.
     natural
         The natural shape; None if it is the undeformed one.
     free_constants
-        Constants of the free parameters, by name.
+        Constants of the free parameters, by name; energies add theirs.
     has_folds
         Whether cells meet at angles that are not small.
     fields
-        Applied fields, known by values, that were made.
+        Applied fields, known by values, that were made; `magnetic` adds its own.
     held_edges
         Edges whose energies were made: those that hold the normal, and those on mirror planes.
     pressed_sides
-        Side of a live pressure in each cell, (1,): 1 from outside, -1 from inside, 0 without;
-        None for 1.
+        Side of a live pressure in each cell, (1,): 1 from outside, -1 from inside, 0 without; None
+        for 1.
     creases
         Joints with springs or hinges.
     cell_materials
-        `parameters.ShellMaterial.numbers` of each cell; None where all shells have one material.
+        `parameters.ShellMaterial.numbers` (4,) of each cell; None where all shells have one
+        material.
     saturated
         Magnetisation state of a soft material that saturates, if it was made.
     """
@@ -111,7 +125,11 @@ class EnergyFactory:
     saturated: list[PointField] = field(default_factory=list)
 
     def term(self, energy: Energy) -> FormTerm:
-        """Return an energy as a term of the model's displacement."""
+        """Return an energy as a term of the system: its form at the model's displacement u.
+
+        The term's class depends on the energy: a `FormTerm` without a density, a `ShellTerm` with
+        one, a `MomentTerm` for a moment on an edge.
+        """
         factor, u = self.domain.revolution_factor, self.domain.jet(self.u)
         form, work = factor * energy.form_of(u), None
         if energy.work:
@@ -132,36 +150,49 @@ class EnergyFactory:
         return moment
 
     def membrane(self) -> Energy:
+        """Return the energy of in-plane strain."""
         density = self._elastic_density(Density(per_area(densities.membrane), ()))
         return self.domain.energy("membrane", density, column="stretching")
 
     def prestress(self) -> Density:
-        """Return the density of the tangent's part by membrane stress; its first parameter is the
-        strain.
+        """Return the density of the geometric stiffness, the tangent's part by membrane stress.
+
+        Its first parameter is the membrane strain (3,), constant in each cell.
         """
         strain = fem.Function(fem.functionspace(self.domain.mesh, ("DG", 0, (3,))))
         return self._elastic_density(Density(per_area(densities.prestress), (strain,)))
 
     def bending(self) -> Energy:
+        """Return the energy of the change of curvature."""
         density = self._elastic_density(
             Density(per_area(densities.bending), (), parts=ALL_DERIVATIVES)
         )
         return self.domain.energy("bending", density, column="bending")
 
     def interior_edges(self) -> Energy:
+        """Return the C0 interior penalty energy of rotation jumps on edges between cells.
+
+        On edges with creases, their springs or hinges take its place. Where creases grow, their
+        rest angle is the free parameter `FOLD`.
+        """
         edge_energy = edges.fold if self.has_folds else edges.interior
         density = self._elastic_density(
             Density(edge_energy, (self._penalty,), ALL_DERIVATIVES, SECOND_DERIVATIVES, sides=2)
         )
         if self.creases:
-            zero = self._constant(0.0)
+            no_growth = self._constant(0.0)
             density = self.creases.replace_at_joints(
-                density, self.free_constants.setdefault(FOLD, zero) if self.creases.grow else zero
+                density,
+                self.free_constants.setdefault(FOLD, no_growth) if self.creases.grow else no_growth,
             )
         return self.domain.energy(INTERIOR, density, column="bending")
 
     def clamped_edges(self, name: str, facets: Facets, turn: fem.Constant | None = None) -> Energy:
-        """Energy of edges that hold the normal; `turn` is the rotation of an edge that moves."""
+        """Return the interior penalty energy of boundary edges that hold the normal.
+
+        `turn` is the rotation matrix of an edge that moves; None for a fixed edge. The edges are
+        added to `held_edges`.
+        """
         parameters = (self._penalty,) if turn is None else (self._penalty, turn)
         density = self._elastic_density(
             Density(edges.clamped, parameters, ALL_DERIVATIVES, SECOND_DERIVATIVES, facets)
@@ -170,7 +201,10 @@ class EnergyFactory:
         return self.domain.energy(name, density, column="bending")
 
     def mirror_edges(self, facets: Facets, normal: Array, name: str = "mirror edges") -> Energy:
-        """Energy of edges on a mirror plane with that normal."""
+        """Return the interior penalty energy of edges on a mirror plane.
+
+        `normal` (3,) is the plane's unit normal. The edges are added to `held_edges`.
+        """
         plane = self._constant(normal)
         density = self._elastic_density(
             Density(
@@ -181,20 +215,32 @@ class EnergyFactory:
         return self.domain.energy(name, density, column="bending")
 
     def edge_moment(self, name: str, facets: Facets, intensity: float, amplitude: str) -> Energy:
-        """Energy of a moment per length about the edge's first tangent; in E h R."""
+        """Return the energy of a moment about the edge's first tangent; collective.
+
+        `intensity` is the moment per undeformed length, in E h R, at an amplitude of one. The turn
+        of the edge is counted from a reference turn, which the term sets.
+        """
         reference_turn = self._constant(np.array([1.0, 0.0]))
         density = Density(edges.turning, (self._constant(intensity), reference_turn), facets=facets)
         length = fem.assemble_scalar(self.log.compile(f"{name} length", self.domain.length(facets)))
-        total = self.domain.revolution_factor * self._over_ranks(length)
+        total_length = self.domain.revolution_factor * self._over_ranks(length)
         return self.domain.energy(
-            name, density, amplitude, reference_turn=(reference_turn, intensity * total)
+            name, density, amplitude, reference_turn=(reference_turn, intensity * total_length)
         )
 
     def dead_energies(
         self, name: str, loads: Sequence[DeadLoad], edges_named: Mapping[str, Facets]
     ) -> list[Energy]:
-        """Energies of the moments and of the user's potentials among the dead loads of an
-        amplitude.
+        """Return the energies of an amplitude's dead moments and user potentials; collective.
+
+        Parameters
+        ----------
+        name
+            Name of the amplitude.
+        loads
+            Dead loads of the amplitude; forces among them are left out here.
+        edges_named
+            Edge name -> its facets.
         """
         energies = []
         for i, load in enumerate(moments(loads)):
@@ -204,7 +250,11 @@ class EnergyFactory:
         return energies + [self.user_energy(term, amplitude=name) for term in potentials(loads)]
 
     def antisymmetric_edges(self, facets: Facets, normal: Array) -> HessianTerm:
-        """Term of the edges on a mirror plane under antisymmetric displacements."""
+        """Return the tangent's term of edges on a mirror plane, for antisymmetric displacements.
+
+        It is the Hessian in v, at v = 0, of the edges' energy with the displacement u + v. `normal`
+        (3,) is the plane's unit normal.
+        """
         domain, parameters = self.domain, (self._penalty, self._constant(normal))
         density = self._elastic_density(
             Density(antisymmetric_edge, parameters, ALL_DERIVATIVES, facets=facets)
@@ -216,10 +266,11 @@ class EnergyFactory:
         return HessianTerm("antisymmetric edges", density, energy, v, self.log)
 
     def magnetic(self, field: Magnetisation) -> list[Energy]:
-        """Energies of the shell's magnetisation in the applied field.
+        """Return the energies of the shell's magnetisation in the applied field.
 
-        A remanence has the chosen energy, linear in the field, with the amplitude lambda_m; a soft
-        magnet has one of its own. A field in space is known at the displacement u.
+        A remanence has the chosen energy, linear in the field, with the amplitude lambda_m. A soft
+        magnet has one energy, quadratic in the field. A field in space is known by its values at
+        the displaced places; it is added to `fields`.
         """
         applied = None
         if field.in_space:
@@ -235,8 +286,10 @@ class EnergyFactory:
     def soft_magnetic(
         self, field: Magnetisation, soft_magnet: SoftMagnet, applied: AppliedField | None
     ) -> Energy:
-        """Energy of a soft-magnetic shell in the field: quadratic in its amplitudes, which are free
-        parameters.
+        """Return the energy of a soft-magnetic shell in the applied field.
+
+        It is quadratic in the amplitudes of the field, which are free parameters. `applied` is a
+        field known by its values, else None.
         """
         sheet, scale = Sheet(field), self._constant(soft_magnet.scale)
         law, *parameters = self._of_sheet(sheet, soft_magnet, applied)
@@ -247,8 +300,14 @@ class EnergyFactory:
         )
 
     def induced(self, field: Magnetisation) -> dict[str, ufl.Form]:
-        """Integrals of the polarisation over the undeformed volume of the modelled part, over h;
-        and that volume.
+        """Return the forms that give the mean induced polarisation.
+
+        Returns
+        -------
+        dict[str, ufl.Form]
+            "induced x", "induced y" and "induced z": integrals of the polarisation over the
+            undeformed volume of the modelled part, over h. "induced volume": that volume. Empty
+            without a soft material.
         """
         if field.soft is None:
             return {}
@@ -265,8 +324,10 @@ class EnergyFactory:
     def _of_sheet(
         self, sheet: Sheet, soft_magnet: SoftMagnet, applied: AppliedField | None
     ) -> list[Parameter]:
-        """Parameters of a sheet's densities: the susceptibility, or the magnetisation state where
-        it saturates; amplitudes; the vectors of the field, or its polynomial in space.
+        """Return the parameters of a sheet's densities, in the order that `Sheet` takes them.
+
+        First the susceptibility, or the magnetisation state where the material saturates. Then the
+        amplitudes, and last the vectors of the field or its polynomial in space.
         """
         chi = soft_magnet.susceptibility
         if callable(chi):
@@ -276,10 +337,12 @@ class EnergyFactory:
         else:
             law = self._constant(chi)
         amplitudes = [
-            self.free_constants.setdefault(name, self._constant(0.0)) for name in sheet.amplitudes
+            # an amplitude's constant is shared by all energies
+            self.free_constants.setdefault(name, self._constant(0.0))
+            for name in sheet.amplitudes
         ]
         if soft_magnet.saturation is not None:
-            if not self.saturated:  # energy and observed forms share it
+            if not self.saturated:  # the energy and the observed forms share the state
                 self.saturated.append(self._saturated(sheet, law, amplitudes, applied))
             law = self.saturated[0]
         vectors = map(self._constant, sheet.vectors)
@@ -293,20 +356,32 @@ class EnergyFactory:
         amplitudes: Sequence[fem.Constant],
         applied: AppliedField | None,
     ) -> PointField:
-        """Return the magnetisation state of a material that saturates, at the points of cells."""
+        """Return the magnetisation state of a saturating material at the quadrature points.
+
+        The state holds two polynomials of the energy, at u and at u = 0; see `saturation`.
+        """
         domain, followed = self.domain, (self.domain.r0, self.u)
         saturation = PointField(domain.mesh, domain.rule, 2 * SIZE)
-        jets = domain.tables(domain.r0.function_space, saturation.points)
+        jets_at_points = domain.tables(domain.r0.function_space, saturation.points)
 
         def places_and_normals() -> list[Array]:
-            r0, u = (jets(f.x.array)[:3] for f in followed)
-            areas = [np.cross(r[1], r[2]) for r in (r0 + u, r0)]
-            return [r0[0], u[0], *(m / np.linalg.norm(m, axis=-1, keepdims=True) for m in areas)]
+            r0, u = (jets_at_points(f.x.array)[:3] for f in followed)
+            # normals of the deformed and of the undeformed surface
+            area_vectors = [np.cross(r[1], r[2]) for r in (r0 + u, r0)]
+            return [
+                r0[0],
+                u[0],
+                *(m / np.linalg.norm(m, axis=-1, keepdims=True) for m in area_vectors),
+            ]
 
         return sheet.saturated(chi, amplitudes, applied, saturation, followed, places_and_normals)
 
     def remanent(self, field: Magnetisation, applied: AppliedField | None) -> list[Energy]:
-        """Energies of a remanence, linear in the applied field, with the amplitude lambda_m."""
+        """Return the energies of a remanence, linear in the applied field, with amplitude lambda_m.
+
+        A field known by its values (`applied`) has one energy. Otherwise each uniform direction of
+        the field has its own amplitude, and a field gradient one more energy.
+        """
         pattern, domain, thins = field.remanent, self.domain, self.material.law.thins_somewhere
         full = full_density(field.law, thins=thins)
         Br = pattern_field(pattern, domain.r0)[0] if callable(pattern) else self._constant(pattern)
@@ -347,16 +422,19 @@ class EnergyFactory:
         *parameters: Parameter,
         parts: tuple[str, ...] = FIRST_DERIVATIVES,
     ) -> Density:
-        """Return a density of the remanence, weighted with the thickness; where this follows
-        from F, it has the natural shape too.
+        """Return a density of the remanence, weighted with the thickness.
+
+        Where the thickness follows from the deformation, the density has the natural shape too.
         """
         density = Density(per_area(density_function), parameters, parts=parts)
         thins = self.material.law.thins_somewhere and field.law == "deformation"
         return self._with_thickness(self._thinning(density) if thins else density)
 
     def pressure(self, *, potential: bool) -> Energy:
-        """Energy of a live pressure with the amplitude p/p_c: the potential p Delta V, or virtual
-        work where it has none.
+        """Return the energy of a live pressure with the amplitude p/p_c.
+
+        With `potential` it is p Delta V. Otherwise its virtual work, that of a follower load, takes
+        the place of the gradient.
         """
         unit = self._constant(self.material.classical_pressure / self.material.h)
         swept, follower_work = (
@@ -369,16 +447,19 @@ class EnergyFactory:
         return self.domain.energy("pressure", density, "pressure", from_initial=True)
 
     def _on_pressed(self, density_function: Callable[..., Expr]) -> Callable[..., Expr]:
-        """Return the density of a pressure on the pressed cells alone, by a last parameter
-        `pressed_sides`.
+        """Return the density of a pressure on the pressed cells alone.
+
+        It takes `pressed_sides` as a further, last parameter; without pressed sides it is
+        unchanged.
         """
         if self.pressed_sides is None:
             return density_function
         return lambda *given: given[-1][0] * density_function(*given[:-1])
 
     def swept_volume(self) -> ufl.Form:
-        """Delta V/R^3 of the modelled part when its points move straight to their places, where it
-        is pressed.
+        """Return Delta V/R^3 of the modelled part, swept by the pressed cells.
+
+        Points move straight from their undeformed places to their present ones.
         """
         return self._volume_integral(
             self._on_pressed(densities.swept_volume),
@@ -386,7 +467,10 @@ class EnergyFactory:
         )
 
     def volume_change(self, origin: Array) -> ufl.Form:
-        """Delta V/R^3 of the modelled part, between it and a point of all its symmetry planes."""
+        """Return Delta V/R^3 of the modelled part, the volume between its surface and a point.
+
+        `origin` (3,) over R is that point. It lies on all symmetry planes, so they add nothing.
+        """
         return self._volume_integral(
             densities.volume, *([self._constant(origin)] if origin.any() else [])
         )
@@ -394,6 +478,7 @@ class EnergyFactory:
     def _volume_integral(
         self, density_function: Callable[..., Expr], *parameters: Expr
     ) -> ufl.Form:
+        """Return the integral over the cells of a volume's density, from the initial placement."""
         jets = self.domain.jets_from_initial(self.domain.jet(self.u))
         return (
             self.domain.revolution_factor * density_function(*jets, *parameters) * self.domain.dx()
@@ -402,7 +487,7 @@ class EnergyFactory:
     def user_energy(
         self, term: OwnTerm, facets: Facets | None = None, amplitude: str | None = None
     ) -> Energy:
-        """Energy of a user's term, or of a part's.
+        """Return the energy of a user's term, or of a part's.
 
         Parameters
         ----------
@@ -412,7 +497,7 @@ class EnergyFactory:
             Amplitude in place of the term's name.
         """
         assert term.density
-        # parts that are needed of r0 alone
+        # parts of the jet that only the placement needs
         reference_parts = tuple(part for part in term.placement_parts if part not in term.parts)
         density_function = _per_coordinates(term, term.at_point(term.density))
         parts = (*term.parts, *reference_parts)
@@ -427,7 +512,10 @@ class EnergyFactory:
         return self.domain.energy(term.name, density, amplitude or term.name, linear=term.linear)
 
     def observed(self, term: OwnTerm, facets: Facets | None = None) -> dict[str, ufl.Form]:
-        """Integrals that a term observes, by column, over the modelled part."""
+        """Return the integrals over the modelled part that a term observes, by column name.
+
+        `facets` are those of the term's edge; None for the surface.
+        """
         parameters = self._parameters(term)
         by_column = {
             column: Density(
@@ -442,8 +530,17 @@ class EnergyFactory:
         return {column: self._over_area(density) for column, density in by_column.items()}
 
     def contact(self, contact: ContactBody) -> tuple[Energy, BodyContact, dict[str, ufl.Form]]:
-        """Energy and state of the contact with a body, and integrals of the pressure and of
-        pressure times radius.
+        """Return the energy of contact with a rigid body, its state, and its integrals.
+
+        Returns
+        -------
+        energy
+            Penalty energy; the body's approach is a free parameter.
+        body_contact
+            State of the contact at quadrature points.
+        integrals
+            "pressure": form of the pressure over the area. "radius": form of pressure times
+            distance from the body's axis.
         """
         domain = self.domain
         approach = self.free_constants.setdefault(contact.amplitude, self._constant(0.0))
@@ -463,10 +560,12 @@ class EnergyFactory:
             )
         else:
             density = Density(per_area(contact_energy), parameters, ("r",), quadrature=rule)
-        of_radius = radius_density(self._constant(contact.front), self._constant(contact.direction))
+        radius_function = radius_density(
+            self._constant(contact.front), self._constant(contact.direction)
+        )
         density_functions: dict[str, Callable[..., Expr]] = {
             "pressure": contact_pressure,
-            "radius": of_radius,
+            "radius": radius_function,
         }
         by_name = {
             name: Density(per_area(density_function), parameters, quadrature=rule)
@@ -476,6 +575,7 @@ class EnergyFactory:
         return domain.energy(f"contact {contact.body}", density), body_contact, integrals
 
     def _over_area(self, density: Density) -> ufl.Form:
+        """Return the integral of a density at u over the modelled part."""
         return self.domain.revolution_factor * self.domain.integral(
             density, self.domain.jet(self.u)
         )
@@ -494,8 +594,9 @@ class EnergyFactory:
         return density if self.thickness is None else thickness_weighted(density, self.thickness)
 
     def _thinning(self, density: Density) -> Density:
-        """Return a density of a shell that thins, on the natural shape and by the law of each
-        cell.
+        """Return a density of a shell that thins, on the natural shape and by the law of each cell.
+
+        The density's function takes a keyword `thins`, the law's thickness ratio.
         """
         law, cell_materials = self.material.law, self.cell_materials
         density = grown(density, self.natural) if self.natural else density
@@ -503,10 +604,13 @@ class EnergyFactory:
             return density
 
         def thinned(*arguments: Expr, **keywords: Any) -> Expr:
-            *arguments_left, numbers = arguments
+            # the last parameter holds the material's numbers of the cell
+            *arguments_left, material_numbers = arguments
             return density.function(
                 *arguments_left,
-                thins=law.with_material(numbers[0], numbers[1], numbers[3]).thins,
+                thins=law.with_material(
+                    material_numbers[0], material_numbers[1], material_numbers[3]
+                ).thins,
                 **keywords,
             )
 
@@ -514,7 +618,7 @@ class EnergyFactory:
 
     @property
     def law_of_cells(self) -> Law:
-        """Law of each cell of this rank, for arrays (cells, n) of places in them."""
+        """Material law of this rank's cells, for arrays (cells, n) of values at places in cells."""
         materials = self.cell_materials
         return self.material.law_in(
             materials
@@ -522,22 +626,18 @@ class EnergyFactory:
         )
 
     def _mass_weighted(self, density: Density) -> Density:
-        """Return a density of the mass, weighted with thickness and density of the material where
-        they vary.
-        """
+        """Return a density per mass times thickness and mass density, where these vary."""
         density = self._with_thickness(density)
         if self.cell_materials is None:
             return density
         return thickness_weighted(density, self.cell_materials, 2)
 
     def _elastic_density(self, density: Density) -> Density:
-        """Return a density with the material's law, the thickness as it varies, and the natural
-        shape.
-        """
+        """Return an elastic density with the law, the thickness and the natural shape."""
         law = self.material.law
-        numbers = (self._constant(number) for number in law.numbers)
+        law_constants = (self._constant(number) for number in law.numbers)
         density = elastic_density(
-            density, law.with_numbers(*numbers), self.thickness, self.cell_materials
+            density, law.with_numbers(*law_constants), self.thickness, self.cell_materials
         )
         return grown(density, self.natural) if self.natural else density
 
@@ -547,8 +647,10 @@ class EnergyFactory:
 
 
 def _per_coordinates(term: OwnTerm, density_function: Callable[..., Expr]) -> Callable[..., Expr]:
-    """Return a term's density per area of the coordinates or, on an edge, per length of its
-    parameter; see `Density.function`.
+    """Return a term's density per area of the surface's coordinates.
+
+    On an edge it is per length of the edge's parameter, with the arguments of `Density.function` on
+    boundary edges.
     """
     if term.on is None:
         return per_area(density_function)

@@ -1,8 +1,8 @@
-"""Inertia: the consistent mass of a model, and what the motion of supports gives to what they hold.
+"""Inertia: the consistent mass of a model, and the inertia of supports that move.
 
-Over rho h R^4 with times over R sqrt(rho/E), so that energies are over E h R^2 as all others. With
-the displacement u + E(mu(t)), E at nodes that move, the mass is that of all nodes: M (u'' + E'')
-and M (u' + E').
+Masses are over rho h R^4 with times over R sqrt(rho/E), so that energies are over E h R^2 as all
+others. The displacement is u + E(mu(t)), with E at nodes that move with supports. So the mass is
+that of all nodes: M (u'' + E'') and M (u' + E').
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -24,7 +24,7 @@ from magshell_fenicsx.models import domains
 from magshell_fenicsx.models.shell import kinematics as kin
 from magshell_fenicsx.platform import compat
 
-if TYPE_CHECKING:  # one of them is built
+if TYPE_CHECKING:  # a run builds only one kind of model
     from magshell_fenicsx.shells.meridian import MeridianModel
     from magshell_fenicsx.shells.shell import ShellModel
     from magshell_fenicsx.shells.solid import SolidModel
@@ -33,19 +33,21 @@ Model: TypeAlias = "ShellModel | MeridianModel | SolidModel"
 
 
 def mass(model: Model) -> PETSc.Mat:
-    """Return the consistent mass of the modelled part, without rotary inertia; zero rows and
-    columns at supports.
+    """Return the consistent mass matrix of the modelled part, without rotary inertia; collective.
+
+    Rows and columns at supports are zero.
     """
     M, projection = mass_matrix(_product(model), model.system.clamped), model.system.projection
     return projection.mass(M) if projection else M
 
 
 def mass_with_supports(model: Model) -> PETSc.Mat:
-    """Return the consistent mass with the rows and columns at supports."""
+    """Return the consistent mass matrix with the rows and columns at supports; collective."""
     return mass_matrix(_product(model), [])
 
 
 def _product(model: Model) -> fem.Form:
+    """Return the compiled form of the mass."""
     factor = mass_factor(model)
     name = "mass" if factor is None else "weighted mass"
     return model.kernels.compile(
@@ -54,8 +56,9 @@ def _product(model: Model) -> fem.Form:
 
 
 def mass_factor(model: Model) -> Expr | None:
-    """Return the factor of a shell's mass per area: thickness and density; None for 1. A solid has
-    the thickness in its shape.
+    """Return the factor of a shell's mass per area: thickness times density; None for 1.
+
+    A solid has the thickness in its shape.
     """
     factors = [] if model.thickness is None else [model.thickness[0]]
     if model.cell_materials is not None:
@@ -64,16 +67,15 @@ def mass_factor(model: Model) -> Expr | None:
 
 
 def displacement_product(model: Model, factor: Expr | float) -> ufl.Form:
-    """Return the weighted integral of u . v over the undeformed mid-surface of the modelled
-    part.
-    """
+    """Return the form of the integral of factor u . v over the undeformed modelled part."""
     product = factor * ufl.dot(ufl.TrialFunction(model.V), ufl.TestFunction(model.V))
     return _integral(model, model.domain.revolution_factor * product if model.thin else product)
 
 
 def wave_product(model: "MeridianModel", factor: Expr | float) -> ufl.Form:
-    """Return the weighted integral of u . v of two waves with the coefficients (U + V, V, W); it
-    does not depend on m.
+    """Return the form of the weighted product of two waves with coefficients (U + V, V, W).
+
+    It does not depend on the wave number m.
     """
     V = model.waves.V
     cosine, sine = zip(
@@ -83,24 +85,29 @@ def wave_product(model: "MeridianModel", factor: Expr | float) -> ufl.Form:
 
 
 def mass_along(model: Model, phi: Vector, wave: int | None = None) -> FormTerm:
-    """phi . M phi as an energy; of a wave phi has the coefficients (U + V, V, W)."""
+    """Return phi . M phi as a term that depends on the placement.
+
+    `phi` holds this rank's values of a displacement. With a `wave` number they are the coefficients
+    (U + V, V, W) of that wave.
+    """
     factor = mass_factor(model)
     if wave is None:
         V, product = model.V, displacement_product(model, 1.0 if factor is None else factor)
     else:
         assert model.axisymmetric
         V, product = model.waves.V, wave_product(model, 1.0 if factor is None else factor)
-    f = fem.Function(V, name="phi")
-    f.x.array[: len(phi)] = phi
-    f.x.scatter_forward()
-    energy = ufl.replace(product, dict.fromkeys(product.arguments(), f))
+    direction = fem.Function(V, name="phi")
+    direction.x.array[: len(phi)] = phi
+    direction.x.scatter_forward()
+    energy = ufl.replace(product, dict.fromkeys(product.arguments(), direction))
     name = "mass along a displacement" if wave is None else "mass along a wave"
     return FormTerm(name, energy, model.system.u, model.kernels, linear=True)
 
 
 def _integral(model: Model, f: Expr) -> ufl.Form:
-    """Over the undeformed area, of a solid averaged over the thickness; on a meridian per
-    radian.
+    """Return the integral of f over the undeformed area, on a meridian per radian.
+
+    Of a solid it is the average over the thickness.
     """
     domain, degree = model.V.mesh, model.degree
     dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree + 2})
@@ -110,20 +117,20 @@ def _integral(model: Model, f: Expr) -> ufl.Form:
 
 
 def mass_matrix(product: fem.Form, constraints: list[fem.DirichletBC]) -> PETSc.Mat:
-    """Return the matrix of an inner product, with zero rows and columns at held degrees of freedom.
+    """Return the matrix of an inner product, with zeros in constrained rows and columns.
 
-    So held degrees of freedom have no finite eigenvalue, whatever the tangent's diagonal is there.
+    So constrained degrees of freedom have no finite eigenvalue, whatever the tangent's diagonal is
+    there. Collective.
     """
     M = fem_petsc.create_matrix(product)
-    M.setOption(
-        PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True
-    )  # the tangent has no entries of held ones
+    # the tangent has no entries in constrained rows
+    M.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)
     compat.add_matrix(M, product, constraints)
     M.assemble()
     return M
 
 
-Rates = Mapping[str, tuple[float, float]]  # of each motion: first and second derivative by time
+Rates = Mapping[str, tuple[float, float]]  # motion -> first and second derivative by time
 
 
 class SupportInertia:
@@ -131,12 +138,15 @@ class SupportInertia:
 
     Parameters
     ----------
+    system
+        System whose supports move.
     mass
         Mass matrix of all nodes, supports too.
     amplitudes_at
-        Amplitudes and their rates at a time, at a kink before or after it.
+        Function of a time and of whether it is the time just before (matters at a kink). It returns
+        the amplitudes, and for each motion its first and second derivative by time.
     first_velocity
-        The velocity of the supports before the begin; None: they were at rest.
+        Velocity of the supports before the begin; None if they were at rest.
 
     Attributes
     ----------
@@ -151,6 +161,7 @@ class SupportInertia:
         amplitudes_at: Callable[[float, bool], tuple[Amplitudes, Rates]],
         first_velocity: Vector | None = None,
     ) -> None:
+        """Take the motions of the system's supports; parameters are those of the class."""
         assert system.moving
         self._system = system
         self._moving = system.moving
@@ -161,25 +172,36 @@ class SupportInertia:
         self._x, self._y = mass.createVecs()
 
     def velocity(self, t: float, is_before: bool) -> Vector:
-        """Return the velocity of nodes that move with supports, zero elsewhere."""
+        """Return the velocity of nodes that move with supports at time t, zero elsewhere.
+
+        `is_before` takes the limit from before a kink.
+        """
         if t <= 0 and is_before:
             return np.zeros(self._system.size) if self._carried is None else self._carried
         mu, rates = self._at(t, is_before)
         return self._sum(rate * self._moving.rate(mu, name) for name, (rate, _) in rates.items())
 
     def acceleration(self, t: float, is_before: bool) -> Vector:
-        """Return the acceleration of nodes that move with supports, zero elsewhere."""
+        """Return the acceleration of nodes that move with supports at time t, zero elsewhere.
+
+        `is_before` takes the limit from before a kink.
+        """
         mu, rates = self._at(t, is_before)
-        direct = self._sum(bend * self._moving.rate(mu, name) for name, (_, bend) in rates.items())
+        # E'' = dE/dmu mu'' + d2E/dmu_a dmu_b mu_a' mu_b'
+        from_second_rates = self._sum(
+            second_rate * self._moving.rate(mu, name) for name, (_, second_rate) in rates.items()
+        )
         pairs = ((a, b, rates[a][0] * rates[b][0]) for a in rates for b in rates)
-        return direct + self._sum(product * self._moving.bend(mu, a, b) for a, b, product in pairs)
+        return from_second_rates + self._sum(
+            product * self._moving.bend(mu, a, b) for a, b, product in pairs
+        )
 
     def displacement_rate(self, mu: Amplitudes, name: str) -> Vector:
-        """dE/dmu of a motion."""
+        """Return dE/dmu (local size,) of the motion `name`."""
         return self._sum([self._moving.rate(mu, name)])
 
     def times(self, x: Vector) -> Vector:
-        """Return the mass of all nodes times a vector."""
+        """Return the mass of all nodes times a vector; collective."""
         self._x.setArray(x)
         self._mass.mult(self._x, self._y)
         return np.array(self._y.array_r)
@@ -189,5 +211,6 @@ class SupportInertia:
         return self._system.zero_at_supports(x)
 
     def _sum(self, parts: Iterable[Vector]) -> Vector:
+        """Return the sum of local vectors with ghosts, without the ghosts."""
         total = np.sum([np.zeros(len(self._system.u.x.array)), *parts], axis=0)
         return np.array(total[: self._system.size])

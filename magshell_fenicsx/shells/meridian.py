@@ -64,13 +64,12 @@ AXIAL_TOLERANCE = (
 
 @dataclass(frozen=True)
 class Probe:
-    """Interpolation in the cell of a place, whose displacement is turned to the azimuth of the
-    place.
+    """Interpolation of the displacement at a place, turned to the place's azimuth.
 
     Attributes
     ----------
     nodes, weights
-        Nodes of the cell, and its shape functions at the place.
+        Nodes of the cell that holds the place, and its shape functions there.
     turn
         (2, 3) e_rho and e_z at the azimuth of the place.
     normal
@@ -84,24 +83,30 @@ class Probe:
 
     @staticmethod
     def at_parameter(s: float, azimuth: float, r0: fem.Function) -> "Probe":
-        """Return the probe at a parameter of the meridian with the placement `r0`."""
+        """Return the probe at a parameter s of the meridian with placement `r0`.
+
+        `azimuth` is in radians.
+        """
         V = r0.function_space
         ends = V.mesh.geometry.x[compat.geometry_dofs(V.mesh), 0]
+        # the cell that s is in, or least far out of
         cell = int(np.argmin(np.maximum(ends.min(axis=1) - s, s - ends.max(axis=1))))
-        local = np.array([[(s - ends[cell, 0]) / (ends[cell, 1] - ends[cell, 0])]])
-        values, slopes = V.element.basix_element.tabulate(1, local)[:, 0, :, 0]
+        reference_place = np.array([[(s - ends[cell, 0]) / (ends[cell, 1] - ends[cell, 0])]])
+        shape_values, shape_slopes = V.element.basix_element.tabulate(1, reference_place)[
+            :, 0, :, 0
+        ]
         nodes = V.dofmap.list[cell]
         turn = np.array([[np.cos(azimuth), np.sin(azimuth), 0.0], [0.0, 0.0, 1.0]])
-        rho_s, z_s = slopes @ r0.x.array.reshape(-1, 2)[nodes]
+        rho_s, z_s = shape_slopes @ r0.x.array.reshape(-1, 2)[nodes]
         normal = np.array([-z_s, rho_s]) / np.hypot(rho_s, z_s)
-        return Probe(nodes, values, turn, normal @ turn)
+        return Probe(nodes, shape_values, turn, normal @ turn)
 
     def __call__(self, u: Vector) -> Array:
-        """Return u/R (3,) at the place."""
+        """Return u/R (3,) at the place, from the nodal values u of (U, W)."""
         return np.asarray(self.weights @ u.reshape(-1, 2)[self.nodes] @ self.turn)
 
     def rows(self, size: int) -> Array:
-        """Return the matrix (3, size) that gives u/R at the place from u."""
+        """Return the matrix (3, size) that gives u/R at the place from the vector u."""
         matrix = np.zeros((3, size // 2, 2))
         matrix[:, self.nodes] = np.einsum("n,ki->ink", self.weights, self.turn)
         return matrix.reshape(3, size)
@@ -112,6 +117,8 @@ class MeridianModel(ThinModel):
 
     Parameters
     ----------
+    meridian
+        Mesh of the meridian and its placement.
     degree
         Degree of displacement and placement, 2 to 5.
     conditions
@@ -125,7 +132,7 @@ class MeridianModel(ThinModel):
     thickness
         Factor of the thickness, the same along every meridian; None for 1.
     assembled
-        Whether to make the system; a model that serves its `numbers` alone needs none.
+        Whether to make the system; a model that only serves its `numbers` needs none.
 
     Attributes
     ----------
@@ -164,6 +171,7 @@ class MeridianModel(ThinModel):
         *,
         assembled: bool = True,
     ) -> None:
+        """Make the energies of the model and, if `assembled`, its system."""
         self.meridian, self.material, self.degree = meridian, material, degree
         self.conditions = conditions
         self.sigma = default_penalty(degree) if sigma is None else sigma
@@ -189,7 +197,10 @@ class MeridianModel(ThinModel):
             self._assemble(is_enclosed)
 
     def _in_cells(self, loads: Loads) -> Loads:
-        """Return the loads with functions and numbers of cells in place of formulas and patches."""
+        """Return the loads with functions of the mesh in place of formulas and patches.
+
+        Formulas become fields, and magnetisations of patches become values in each cell.
+        """
         formula_to_field = partial(formula_field, self.r0)
         user_terms = tuple(term.with_functions(formula_to_field) for term in loads.user_terms)
         loads = replace(loads, user_terms=user_terms)
@@ -200,7 +211,7 @@ class MeridianModel(ThinModel):
         return loads
 
     def _growing_placement(self) -> PlacementAmplitudes | None:
-        """Return the placement with amplitudes of imperfections; None if none of them grows."""
+        """Return the placement with amplitudes of growing imperfections; None if none grows."""
         shapes = {
             name: self.meridian.growth(self.V, deviations)
             for name, deviations in self.loads.growing_imperfections.items()
@@ -208,7 +219,7 @@ class MeridianModel(ThinModel):
         return PlacementAmplitudes(self.r0, shapes, self.material.h) if shapes else None
 
     def _make_factory(self) -> EnergyFactory:
-        """Return what makes the energies of this shell."""
+        """Return the factory that makes the energies of this shell."""
         meridian, loads = self.meridian, self.loads
         pressed_cells = side_field(loads.pressed_sides, meridian) if loads.pressed_sides else None
         free_constants: dict[str, fem.Constant] = {}
@@ -230,8 +241,9 @@ class MeridianModel(ThinModel):
         )
 
     def _natural_shape(self, free_constants: dict[str, fem.Constant]) -> Shape | None:
-        """Return the natural shape, None if it is the undeformed one; its amplitudes are added
-        to the constants of free parameters.
+        """Return the natural shape, the one without stress; None if it is the undeformed one.
+
+        Its amplitudes are added to `free_constants`, name -> constant, and `loads` is updated.
         """
         if not self.loads.natural:
             return None
@@ -241,7 +253,10 @@ class MeridianModel(ThinModel):
         return Shape.from_field(field, natural, free_constants)
 
     def _add_supports(self) -> dict[str, Support]:
-        """Add the energies of clamped ends and of ends on a mirror plane; return the supports."""
+        """Add the energies of clamped ends and of ends on a mirror plane to `energies`.
+
+        Returns the supports by the name of their end.
+        """
         clamped_count = list(self.conditions.values()).count("clamped")
         supports_by_end = {}
         for name, (facets, components) in self.held.by_name.items():
@@ -258,9 +273,9 @@ class MeridianModel(ThinModel):
         return supports_by_end
 
     def _add_field_and_pressure(self) -> bool:
-        """Add the energies of magnetisation and of a live pressure.
+        """Add the energies of magnetisation and of a live pressure to `energies`.
 
-        Sets `without_potential`; returns whether moving supports close all openings.
+        Sets `without_potential`; returns whether moving supports close all openings with lids.
         """
         factory, meridian, loads = self.factory, self.meridian, self.loads
         if loads.magnetic:
@@ -273,7 +288,10 @@ class MeridianModel(ThinModel):
         return enclosed(loads, free_ends, self.without_potential)
 
     def _add_forces(self) -> None:
-        """Add the energies of forces at the pole, then those of dead loads."""
+        """Add the energies of forces at the pole and of dead loads to `energies`.
+
+        Sets `load_size` and `load_sizes`.
+        """
         measures = RevolutionIntegrals(self.meridian, self.domain)
         for name, force in self.loads.forces.items():
             energy = pole_force(name, force, self.force_unit, measures, self.kernels)
@@ -286,7 +304,10 @@ class MeridianModel(ThinModel):
             self.energies += self.factory.dead_energies(name, dead, self.meridian.ends)
 
     def _assemble(self, is_enclosed: bool) -> None:
-        """Make the system; `is_enclosed` tells whether moving supports close all openings."""
+        """Make the system, contacts, T-junctions and probes of the model.
+
+        `is_enclosed` tells whether moving supports close all openings.
+        """
         factory, loads = self.factory, self.loads
         has_swept_volume = loads.pressure or is_enclosed
         volume = factory.swept_volume() if has_swept_volume else factory.volume_change(np.zeros(3))
@@ -324,7 +345,7 @@ class MeridianModel(ThinModel):
         self.normals = {name: probe.normal for name, probe in self._probe_by_point.items()}
 
     def _make_shell_contacts(self) -> "Sequence[MeridianContact]":
-        """Return the contacts of parts of the shell with each other."""
+        """Return the contacts between parts of the shell; empty without contact pairs."""
         if not self.loads.pairs:
             return []
         from magshell_fenicsx.parts.contact.meridian_contact import (
@@ -345,7 +366,7 @@ class MeridianModel(ThinModel):
         return meridian_contacts(self.loads.pairs, model)
 
     def _make_t_junctions(self) -> "list[MeridianTJunction]":
-        """Return the terms that tie ends to other shells."""
+        """Return the terms that tie ends to other shells on which they stand."""
         if all(joint_cells is not None for joint_cells in self.meridian.joints):
             return []
         from magshell_fenicsx.shells.t_junctions import meridian_t_junction_terms
@@ -353,8 +374,10 @@ class MeridianModel(ThinModel):
         return meridian_t_junction_terms(self)
 
     def numbers(self) -> dict[str, list[Array]] | None:
-        """Return all values that its terms take from the problem, by term, as views; None if a term
-        takes others too.
+        """Return all values that the terms take from the problem: term name -> arrays, as views.
+
+        None if the terms depend on more than such values, as with contact or moving supports. Then
+        the forms cannot serve another problem.
         """
         has_contacts = self.contacts or self.loads.pairs
         follows = (
@@ -366,33 +389,40 @@ class MeridianModel(ThinModel):
         )
         if follows or any(e.density is None or e.reference_turn for e in self.energies):
             return None
-        free_constants = {
-            id(constant) for constant in self.factory.free_constants.values()
-        }  # amplitudes
-        values = {"placement": [self.r0.x.array]}
+        # amplitudes are not numbers of the problem
+        free_constants = {id(constant) for constant in self.factory.free_constants.values()}
+        values_by_term = {"placement": [self.r0.x.array]}
         for e in self.energies:
             assert e.density
             parameters = [p for p in e.density.parameters if id(p) not in free_constants]
-            values[e.name] = [
+            values_by_term[e.name] = [
                 p.value if isinstance(p, fem.Constant) else p.x.array for p in parameters
             ]
-        return values
+        return values_by_term
 
     def with_numbers(
         self, model: "MeridianModel", numbers: SettableNumber, value: float
     ) -> "MeridianModel":
-        """Return this model with the numbers of another one, which all evaluations put in place by
-        that value.
+        """Return a copy of this model that has the numbers of another one.
+
+        Parameters
+        ----------
+        model
+            The other model, of which meridian and material are taken.
+        numbers
+            The setting that puts the other model's numbers into the forms, when its value is set.
+        value
+            Its value for the copy; every evaluation sets it.
         """
-        other = copy(self)
-        other.system = self.system.with_number("numbers of the case", numbers, value)
-        other.meridian, other.material = model.meridian, model.material
-        other.symmetry_breaking_modes = SymmetryBreakingWaves(
+        copied_model = copy(self)
+        copied_model.system = self.system.with_number("numbers of the case", numbers, value)
+        copied_model.meridian, copied_model.material = model.meridian, model.material
+        copied_model.symmetry_breaking_modes = SymmetryBreakingWaves(
             self.waves.for_system(
-                other.system, largest_wave_number(model.meridian, model.material.h)
+                copied_model.system, largest_wave_number(model.meridian, model.material.h)
             )
         )
-        return other
+        return copied_model
 
     @cached_property
     def symmetry_breaking_modes(self) -> SymmetryBreakingWaves:
@@ -412,9 +442,7 @@ class MeridianModel(ThinModel):
         return self.meridian.growth(self.V, deviations)
 
     def at_nodes(self, function: Embedding) -> Array:
-        """Return the values of a function of charts at the nodes of each cell, (cells, nodes,
-        ...).
-        """
+        """Return the values (cells, nodes, ...) of a function of the chart at cells' nodes."""
         s = self.V.tabulate_dof_coordinates()[:, 0]
         return np.asarray(function(np.column_stack([s, 0 * s]))[self.V.dofmap.list])
 
@@ -423,8 +451,7 @@ class MeridianModel(ThinModel):
         return np.asarray(self.V.tabulate_dof_coordinates()[:, :1])
 
     def rigid_motions(self, amplitudes: Amplitudes) -> RigidMotions:
-        """Return the rigid motions of the undeformed shell that neither supports nor springs
-        resist.
+        """Return the rigid motions of the undeformed shell that no support or spring resists.
 
         Where supports leave waves free, it compiles their kernels.
         """
@@ -442,7 +469,7 @@ class MeridianModel(ThinModel):
         )
 
     def free_motion(self, amplitudes: Amplitudes) -> str:
-        """Return a rigid motion that is left free, as a message; empty if there is none."""
+        """Return a message that names a rigid motion left free; empty if there is none."""
         motions = self.rigid_motions(amplitudes)
         if len(motions.axial):
             return NOT_HELD + "move along (0, 0, 1)"
@@ -463,7 +490,7 @@ class MeridianModel(ThinModel):
         return self._probe_by_point[point].rows(self.system.size)
 
     def _edge_pressure(self) -> EdgePressure:
-        """Return the work of a live pressure at the ends that move, along e3: on each is a lid."""
+        """Return the work along e3 of a live pressure on lids, one at each moving end."""
         ends = {name: self.meridian.parameter(name) for name in self.meridian.ends}
         lids = [
             Lid.disc(
@@ -479,7 +506,7 @@ class MeridianModel(ThinModel):
 
 
 def _with_zeros(unknowns: NDArray[np.int32], v: Vector) -> Vector:
-    """Return a vector with zeros at some unknowns."""
+    """Return a copy of a vector with zeros at some unknowns."""
     v = np.array(v)
     v[unknowns] = 0.0
     return v

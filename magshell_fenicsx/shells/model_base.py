@@ -1,5 +1,7 @@
-"""Base classes of models: the observations of a displacement, with named points, of shells and
-solids.
+"""Base classes of the models of shells and solids.
+
+A model joins a displacement, the system of its terms, and what is observed of a state: volume
+change, displacement of named points, contact pressures.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -40,41 +42,49 @@ Array = NDArray[np.float64]
 
 
 class ModelBase:
-    """Base of all models: the observations that a path is a table of. A model sets the attributes.
+    """Base of all models: the observations of states that rows of a path consist of.
+
+    A model sets the attributes in its constructor.
 
     Attributes
     ----------
     system
         System of equations that solvers take.
+    material
+        Thickness, elastic law and units of the shell.
     multiplicity
         Number of modelled parts that make the shell: 2 for a half, 2 m for a sector of 180/m
         degrees, else 1.
     u, r0
-        Displacement and placement.
+        Displacement and placement over R, in the space V.
     normals
         n0 (3,) at the named points.
-    loads, load_size, load_sizes
-        Loads; and by amplitude the sum of the sizes of dead loads over E h R, and its
-        forms, see `DeadLoads`.
+    loads
+        All that loads the model.
+    load_size, load_sizes
+        By amplitude, the sum of the sizes of its dead loads over E h R, and that sum as forms; see
+        `DeadLoads`.
+    kernels
+        Log that compiles forms.
     supports
-        Name of an edge, point or patch -> what it holds.
+        Name of an edge, point or patch -> its support.
     without_potential
-        Names of the edges at which a live pressure has none; see `openings`.
+        Names of the edges at which a live pressure has no potential; see `openings`.
     fields
-        The applied field, where it is known by its values.
+        Applied fields that are known by their values.
     observed
-        Column -> form of the modelled part that a term observes, see `OwnTerm.observed`, or that a
-        field induces.
+        Column -> form over the modelled part, of terms (see `OwnTerm.observed`) and of the
+        polarisation that a field induces.
     contacts
-        Approach of a body -> what is known of its contact, and the integrals of its pressure.
+        Approach of a body -> the state of its contact, and the integrals of its pressure.
     shell_contacts
         The contacts of parts of the shell with each other, or with itself.
     planes
         Planes of symmetry at the edges of a shell.
     growing
-        The placement, where imperfections grow.
+        The placement with amplitudes of imperfections; None if none grows.
     axes
-        The components in space of displacement and placement.
+        Axes in space of the components of displacement and placement.
     thickness
         Factor (1,) of a shell's thickness; None for 1, and for a solid, which has it in its shape.
     midsurface
@@ -116,7 +126,7 @@ class ModelBase:
 
     @property
     def mirrored_facets(self) -> Facets:
-        """Edges on the mirror planes of a half model or a sector; none of another."""
+        """Edges on the mirror planes of a half model or a sector; empty for other models."""
         return np.empty(0, dtype=np.int32)
 
     def observe(
@@ -125,10 +135,17 @@ class ModelBase:
         points: Mapping[str, Array],
         cells_at_point: Callable[[str], NDArray[np.bool_] | None] | None = None,
     ) -> None:
-        """Take the volume change's form (of the modelled part), and the named vertices' places
-        (3,).
+        """Set the form of the volume change and the named vertices that are observed; collective.
 
-        `cells_at_point` tells the cells of this rank that may have a vertex; None for all.
+        Parameters
+        ----------
+        volume
+            Form of Delta V/R^3 of the modelled part.
+        points
+            Vertex name -> place (3,) over R.
+        cells_at_point
+            Function of a vertex name to a mask of this rank's cells that may have the vertex; None
+            for all cells.
         """
         self._volume = volume
         # dofs of a vertex on the rank that owns it
@@ -139,7 +156,10 @@ class ModelBase:
         }
 
     def dead_load_term(self, name: str, dead: DeadLoads) -> LinearTerm:
-        """Return the term of the dead loads of an amplitude, except the moments."""
+        """Return the term of an amplitude's dead loads, without its moments.
+
+        Also sets `load_size` and `load_sizes` of the amplitude.
+        """
         self.load_size[name], self.load_sizes[name] = dead.size, dead.sizes
         unity, u = fem.Constant(self.V.mesh, 1.0), self.u
         forms = [
@@ -150,31 +170,33 @@ class ModelBase:
                 self.kernels,
                 name,
                 linear=True,
-                over=unity * measure if total else None,
+                over=unity * measure if is_total_given else None,
             )
-            for direction, measure, total in dead.spread
+            # a load of given total is spread over the integral of its measure
+            for direction, measure, is_total_given in dead.spread
         ]
         return LinearTerm(name, *dead.entries, self.u, name, forms)
 
     def size_terms(self, name: str) -> list[FormTerm]:
-        """Return the size of the loads of an amplitude as terms that depend on the placement."""
+        """Return the sizes of an amplitude's dead loads as terms that depend on the placement."""
         return [
             FormTerm(f"{name} size", form, self.u, self.kernels)
             for form in self.load_sizes.get(name, ())
         ]
 
     def free_motion(self, amplitudes: Amplitudes) -> str:
-        """Return a rigid motion that is left free, as a message; empty if there is none.
-        Collective.
-        """
+        """Return a message that names a rigid motion left free, else empty; collective."""
         return free_motion(self.system, self.r0, amplitudes)
 
     def zero(self) -> Vector:
-        """The undeformed displacement."""
+        """Return the undeformed displacement of this rank."""
         return np.zeros(self.system.size)
 
     def volume_change(self, u: Vector, mu: Amplitudes | None = None) -> float:
-        """Delta V/R^3 of the whole shell, whose supports move by these amplitudes."""
+        """Return Delta V/R^3 of the whole shell; collective.
+
+        `mu` are the amplitudes by which supports move; lids over moving edges then count too.
+        """
         moving = self.system.moving
         if mu and moving and moving.edge_pressure:
             lids = moving.edge_pressure.swept_volume(mu)
@@ -185,17 +207,18 @@ class ModelBase:
         )
 
     def deflection(self, u: Vector, point: str) -> float:
-        """w/R = -u . n0 at a named vertex."""
+        """Return w/R = -u . n0 at a named vertex; collective."""
         return -float(self.displacement(u, point) @ self.normals[point])
 
     def displacement(self, u: Vector, point: str) -> Array:
-        """u/R (3,) at a named vertex."""
-        share = u[self._probes[point]].reshape(-1, 3).sum(axis=0)
-        return np.asarray(self.system.comm.allreduce(share))
+        """Return u/R (3,) at a named vertex; collective."""
+        rank_part = u[self._probes[point]].reshape(-1, 3).sum(axis=0)
+        return np.asarray(self.system.comm.allreduce(rank_part))
 
     def probe(self, point: str) -> Array:
-        """Return rows (3, size), each rank its part, that give the displacement at a named vertex
-        from a vector.
+        """Return the matrix (3, local size) that maps u to the displacement of a named vertex.
+
+        Each rank has the columns of its own unknowns.
         """
         rows = np.zeros((3, self.system.size))
         dofs = np.asarray(self._probes[point]).reshape(-1, 3)
@@ -203,7 +226,10 @@ class ModelBase:
         return rows
 
     def region(self, state: State, approach: str) -> Region:
-        """Return the region where a body touches the shell."""
+        """Return the region where a body touches the shell; collective.
+
+        `approach` is the amplitude of the body's approach, the key of `contacts`.
+        """
         body_contact, forms = self.contacts[approach]
         evaluation = self.system.at_state(state)
         pressure, moment = (evaluation.integral(forms[name]) for name in ("pressure", "radius"))
@@ -211,8 +237,9 @@ class ModelBase:
         return evaluation.evaluate(lambda: body_contact.region(self.system.comm, mean_radius))
 
     def cell_pressures(self, state: State) -> Array | None:
-        """Return the pressure of all contacts in each local cell, see `BodyContact`; None without
-        contacts.
+        """Return the sum of all contact pressures in each local cell, (cells,); see `BodyContact`.
+
+        None without contacts.
         """
         if not (self.contacts or self.shell_contacts):
             return None
@@ -227,8 +254,9 @@ class ModelBase:
         return self.system.at_state(state).evaluate(pressure_of_cells)
 
     def cells_evenly_pressed(self, state: State) -> NDArray[np.bool_]:
-        """Whether the mean in each local cell is the pressure of a contact there, see
-        `BodyContact`.
+        """Return in which local cells the mean of `cell_pressures` stands for a contact's pressure.
+
+        A mask (cells,); see `BodyContact.evenly_pressed`.
         """
         body_contacts = [body_contact for body_contact, _ in self.contacts.values()]
 
@@ -240,8 +268,9 @@ class ModelBase:
         return self.system.at_state(state).evaluate(flags_of_cells)
 
     def cell_gaps(self, state: State) -> Array | None:
-        """Return the least gap over R in each local cell between parts of the shell, see
-        `SurfaceContact`; None without pairs.
+        """Return the least gap over R between parts of the shell in each local cell, (cells,).
+
+        See `SurfaceContact`; None without contact pairs.
         """
         if not self.shell_contacts:
             return None
@@ -251,21 +280,21 @@ class ModelBase:
         return np.asarray(np.min(gaps, axis=0))
 
     def loaded_deflection(self, u: Vector, name: str) -> float:
-        """w/R conjugate to a force: at its point, or averaged over its patch; of dead loads along
-        themselves.
+        """Return the w/R on which a force or the dead loads of an amplitude do work; collective.
 
-        Moments alone have none: that of the pole.
+        For a force it is the deflection at its point, or its mean over the patch; for dead loads
+        the displacement along them. Moments alone have none: then it is the deflection of the pole.
         """
-        size = self.load_size.get(name, 0.0) if name in self.loads.dead else self.force_unit
-        if not size:
+        load_unit = self.load_size.get(name, 0.0) if name in self.loads.dead else self.force_unit
+        if not load_unit:
             return self.deflection(u, "pole")
         load = next(term for term in self.system.terms if term.name == name)
         energy = self.system.at_state(State(u, {})).evaluate(load.energy)
-        return -float(self.system.comm.allreduce(energy)) / size
+        return -float(self.system.comm.allreduce(energy)) / load_unit
 
     @property
     def force_unit(self) -> float:
-        """The force F R/(2 pi D) = 1 on the modelled part, over E h R."""
+        """Force on the modelled part with F R/(2 pi D) = 1, over E h R."""
         return 2 * np.pi * self.material.bending_stiffness / self.multiplicity
 
 
@@ -282,8 +311,15 @@ class ThinModel(ModelBase):
     kernels: KernelLog
 
     def user_and_body_energies(self, edges: Mapping[str, Facets]) -> list[Energy]:
-        """Return the energies of the user's terms and of contact with bodies; sets what is observed
-        of them.
+        """Return the energies of the user's terms and of contacts with bodies; collective.
+
+        Sets `observed` (forms of the user's columns and of the induced polarisation) and
+        `contacts`.
+
+        Parameters
+        ----------
+        edges
+            Edge name -> its facets.
         """
         factory = self.factory
         terms_and_facets = [
@@ -314,16 +350,17 @@ class ThinModel(ModelBase):
         return self.factory.law_of_cells
 
     def over_area(self) -> Callable[[Expr], ufl.Form]:
-        """Return the integral over the undeformed area of the modelled part, as a function of what
-        is integrated.
-        """
+        """Return the function that integrates an expression over the undeformed area."""
         integral = self.domain.over_area()
         return lambda f: self.domain.revolution_factor * integral(f)
 
     def cells_of_fields(self) -> CellGeometry:
-        """Return the cells in which fields are given by formulas."""
+        """Return the geometry of the cells in which formulas give fields."""
         return spatial_fields.cell_geometry(self.r0)
 
     def places(self, nodes: Array) -> tuple[Array, Array]:
-        """Places and normals at some places of the reference cell, in all cells."""
+        """Return undeformed places and normals at reference points `nodes` of all cells.
+
+        Both have the shape (cells, points, 3).
+        """
         return spatial_fields.positions_and_normals(self.r0, nodes)

@@ -34,34 +34,39 @@ from magshell_fenicsx.shells.meridian import MeridianModel
 from magshell_fenicsx.shells.sector_modes import SectorModes
 
 TORSION = "torsion"  # label of vibrations around the axis, which a meridian has no displacement for
+# beginnings of labels of modes that a reduced model does not see
 SYMMETRY_BREAKING_LABELS = (
     "antisymmetric",
     "m = ",
-)  # what labels of modes begin with that a reduced model does not see
+)
 
 
 @dataclass(frozen=True)
 class ModeSpace:
-    """The model in whose space all modes of a shell are, those that break its symmetry too: of a
-    sector its half.
+    """The model whose displacements can show every mode of a shell, symmetric or not.
+
+    Of a sector it is the model of its half.
 
     Attributes
     ----------
+    model
+        That model.
     displacement
-        A displacement of the given model in this one; collective.
+        Function from a displacement of the given model to one of this model; collective.
     """
 
     model: Model
     displacement: Callable[[Vector], Vector] = lambda u: u
 
     def state(self, state: State) -> State:
-        """Return a state of the given model in this one; collective."""
+        """Return a state of the given model as a state of this one; collective."""
         return State(self.displacement(state.u), dict(state.mu))
 
 
 def mode_space(model: Model) -> ModeSpace:
-    """Return the space of all modes of a model; of a sector, kernels are compiled at the first
-    call. Collective.
+    """Return the space of all modes of a model; collective.
+
+    Of a sector, the first call compiles kernels.
     """
     modes = None if isinstance(model, MeridianModel) else model.symmetry_breaking_modes
     if isinstance(modes, SectorModes):
@@ -78,9 +83,9 @@ class ShellMode:
     label
         "" if the model sees it itself, else "antisymmetric" or "m = 7", as in `Record.mode`.
     eigenvalue
-        Over E h/R^2; negative for an unstable direction.
+        Over E h/R^2, of vibrations omega^2 rho R^2/E; negative for an unstable direction.
     vector
-        Mode in the model's space; of a wave in that of the coefficients (U + V, V, W).
+        Mode in the model's space; of a wave the coefficients (U + V, V, W).
     """
 
     label: str
@@ -90,8 +95,24 @@ class ShellMode:
 
 @dataclass(frozen=True)
 class _Family:
-    """Modes that share a tangent, what is held, and an inner product (name and form); `contains`
-    selects them.
+    """Modes that share a tangent, constraints, and an inner product.
+
+    Attributes
+    ----------
+    label
+        As of `ShellMode`.
+    tangent
+        Function from a state to its tangent.
+    product
+        Name and form of the inner product.
+    projection
+        Projection onto oblique supports; None without.
+    contains
+        Function that tells whether a mode belongs to the family.
+    rigid
+        Dimension of the kernel: rigid motions of the undeformed shell that nothing holds.
+    motions
+        Rigid motions that the family contains, where these are not all of the kernel.
     """
 
     label: str
@@ -105,14 +126,19 @@ class _Family:
     )
     motions: Sequence[
         Vector
-    ] = ()  # those of them that the family contains, where they are not all of the kernel
+    ] = ()  # rigid motions in the family, where these are not all of the kernel
 
 
 @dataclass
 class ShellModes:
     """Modes of a model at any of its states.
 
-    Overwrites the model's tangent, on which a path relies.
+    Computing them overwrites the model's tangent, on which a path relies.
+
+    Attributes
+    ----------
+    model
+        The model; of a sector, see `mode_space`.
     """
 
     model: Model
@@ -123,12 +149,19 @@ class ShellModes:
     ) -> list[ShellMode]:
         """Return the lowest modes, ascending: of every family `count`, and all that are negative.
 
-        They are those of the symmetric part, where the tangent is not symmetric.
+        They are those of the symmetric part, where the tangent is not symmetric. Waves count once,
+        though each has a twin turned by a quarter of its length. The first call compiles a mass
+        matrix and the waves' kernels.
 
-        Waves count once, though each has a twin turned by a quarter of its length. If the state is
-        the undeformed one of a `allows_rigid_motion` shell, its rigid motions are among them, with
-        an eigenvalue of exactly zero. Compiles a mass matrix when it is first called, and the
-        waves' kernels.
+        Parameters
+        ----------
+        state
+            Equilibrium whose tangent is taken.
+        count
+            Number of modes of each family.
+        allows_rigid_motion
+            Whether the state is the undeformed one of a shell that nothing holds. Its rigid motions
+            are then among the modes, with an eigenvalue of exactly zero.
 
         Raises
         ------
@@ -142,11 +175,11 @@ class ShellModes:
     def vibrations(
         self, state: State, count: int, *, allows_rigid_motion: bool = False
     ) -> list[ShellMode]:
-        """Return the `count` lowest natural modes, ascending, and all that are unstable;
-        eigenvalues are omega^2 rho R^2/E.
+        """Return the `count` lowest natural modes, ascending, and all that are unstable.
 
-        The mass is consistent, without rotary inertia, and that of the undeformed shell. On the
-        meridian vibrations around the axis are among them. Otherwise as `lowest`.
+        Eigenvalues are omega^2 rho R^2/E. The mass is consistent, without rotary inertia, and that
+        of the undeformed shell. On the meridian vibrations around the axis are among them.
+        Arguments are those of `lowest`.
 
         Raises
         ------
@@ -161,31 +194,37 @@ class ShellModes:
         return lowest[: max(count, sum(mode.eigenvalue < 0 for mode in lowest))]
 
     def _lowest(self, families: Iterable[_Family], state: State, count: int) -> list[ShellMode]:
-        of_families = []
+        """Return the lowest `count` modes of each family, ascending over all families.
+
+        Rigid motions come with an eigenvalue of zero; negative eigenvalues are all included.
+        """
+        shell_modes = []
         for family in families:
             M = mass_matrix(self._product(family), family.constraints)
             M = family.projection.mass(M) if family.projection else M
             modes = lowest_modes(symmetric_part(family.tangent(state)), M, count, family.rigid)
-            if family.contains is _turns:  # of a kernel with the motion along the axis
+            if family.contains is _turns:  # its kernel also has the motion along the axis
                 modes = modes[family.rigid :]
-            of_families += [
+            shell_modes += [
                 ShellMode(family.label, 0.0, _normalised(motion, M)) for motion in family.motions
             ]
-            of_families += [
+            shell_modes += [
                 ShellMode(family.label, m.eigenvalue, m.vector)
                 for m in modes
                 if family.contains(m.vector)
             ]
-        return sorted(of_families, key=lambda mode: mode.eigenvalue)
+        return sorted(shell_modes, key=lambda mode: mode.eigenvalue)
 
     def null_vector(self, state: State, label: str) -> Vector:
-        """Return the mode whose stiffness is nearest to zero: at a located instability the null
-        vector.
+        """Return the mode whose stiffness is nearest to zero, at an instability the null vector.
 
         Parameters
         ----------
+        state
+            State at or near an instability.
         label
-            `Record.mode` of the instability.
+            `Record.mode` of the instability, such as "m = 7"; other labels stand for the model's
+            own modes.
 
         Raises
         ------
@@ -197,6 +236,7 @@ class ShellModes:
         return null_vector(family.tangent(state))
 
     def _product(self, family: _Family) -> fem.Form:
+        """Return the compiled inner product of a family, kept by its name."""
         name, form = family.product
         if name not in self._products:
             self._products[name] = self.model.kernels.compile(name, form)
@@ -206,17 +246,23 @@ class ShellModes:
 def _families(
     model: Model, *, vibrating: bool = False, rest: State | None = None
 ) -> Iterator[_Family]:
-    """Yield the modes that the model has, then those that break its symmetry, whose kernels are
-    compiled by then.
+    """Yield the families of the model's own modes, then of those that break its symmetry.
 
-    If `vibrating`, the inner product is that of the mass, and torsion is a family of the meridian.
-    `rest` is the undeformed state of a shell that is not held, whose rigid motions are counted.
+    A family's kernels are compiled when it is yielded.
+
+    Parameters
+    ----------
+    vibrating
+        Whether the inner product is that of the mass; torsion is then a family of the meridian.
+    rest
+        Undeformed state of a shell that nothing holds, whose rigid motions are counted; else None.
     """
-    of_mass = mass_factor(model) if vibrating else None
-    factor, name = (1.0, "") if of_mass is None else (of_mass, "weighted ")
+    mass_weight = mass_factor(model) if vibrating else None
+    factor, name = (1.0, "") if mass_weight is None else (mass_weight, "weighted ")
     mass = f"{name}mass", displacement_product(model, factor)
 
     def family_of_system(label: str, system: FiniteElementSystem, rigid: int) -> _Family:
+        """Return the family of all modes of a system, of which `rigid` are rigid motions."""
         return _Family(
             label,
             lambda state: system.tangent(state.u, state.mu),
@@ -243,7 +289,8 @@ def _families(
                 waves.constraints(0),
                 wave_mass,
                 contains=_turns,
-                rigid=len(torsions) + axial_count,  # its space has the motion along e3 too
+                rigid=len(torsions)
+                + axial_count,  # the space of torsion has the motion along e3, too
                 motions=torsions,
             )
         for m in range(1, waves.largest + 1):
@@ -267,7 +314,7 @@ def _families(
 
 
 def _normalised(vector: Vector, M: PETSc.Mat) -> Vector:
-    """Return a vector, on one rank, divided so that phi . M phi = 1."""
+    """Return a vector scaled so that phi . M phi = 1; on one rank alone."""
     phi, product = M.createVecs()
     phi.setArray(vector)
     M.mult(phi, product)
@@ -275,6 +322,9 @@ def _normalised(vector: Vector, M: PETSc.Mat) -> Vector:
 
 
 def _turns(coefficients: Vector) -> bool:
-    """Whether a wave m = 0 turns around the axis; the others of m = 0 are the meridian's own."""
+    """Return whether a wave m = 0, with coefficients (P, V, W), turns around the axis.
+
+    Other waves m = 0 are displacements of the meridian itself.
+    """
     P, V, W = coefficients.reshape(-1, 3).T
     return bool(V @ V > (P - V) @ (P - V) + W @ W)

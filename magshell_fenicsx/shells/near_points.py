@@ -20,13 +20,16 @@ from magshell_fenicsx.parts.loads import Loads
 from magshell_fenicsx.shells.mass import Model
 
 Array = NDArray[np.float64]
-MIN_SHARE_AT_POINT = 0.5  # of the squared gradient of a mode that is one of a point force
+MIN_SHARE_AT_POINT = (
+    0.5  # share of the squared gradient near a point from which a mode belongs to that point
+)
 
 
 def places_of_point_forces(model: Model, loads: Loads) -> Mapping[str, Array]:
-    """Return the undeformed places over R of all point forces of a shell, by the names of points.
+    """Return the undeformed places of all point forces of a shell, by the names of points.
 
-    A solid has none: there a force is spread over a patch.
+    A place is (3,) over R, on a meridian (2,). A solid has none: there a force is spread over a
+    patch.
     """
     names = {force.point for force in loads.forces.values() if not force.patch}
     names |= {load.point for load in loads.all_dead if isinstance(load, PointForce)}
@@ -41,17 +44,18 @@ def places_of_point_forces(model: Model, loads: Loads) -> Mapping[str, Array]:
 def point_of_mode(
     model: Model, places: Mapping[str, Array], mode: Vector, waves: int | None = None
 ) -> str:
-    """Return the point within a thickness of which `MIN_SHARE_AT_POINT` of a mode is.
+    """Return the name of the point force at which a mode is concentrated; collective.
 
-    It is "" if there is none. Collective.
+    Most of its squared gradient, `MIN_SHARE_AT_POINT`, lies within a thickness of that point. The
+    name is "" if there is no such point.
 
     Parameters
     ----------
     places
         See `places_of_point_forces`.
     mode
-        This rank's part of a displacement, or the coefficients (U + V, V, W) of so many `waves`
-        around the axis.
+        This rank's part of a displacement. With `waves` it holds the coefficients (U + V, V, W) of
+        that number of waves around the axis.
     """
     x, squares = squared_gradient(model, mode, waves)
     comm = model.system.comm if not model.axisymmetric else None
@@ -60,17 +64,31 @@ def point_of_mode(
         mine = float(values.sum())
         return float(comm.allreduce(mine)) if comm else mine
 
-    whole = total(squares)
+    whole_square = total(squares)
     for name, place in places.items():
-        near = np.linalg.norm(x - place, axis=-1) < model.material.h
-        if total(squares[near]) > MIN_SHARE_AT_POINT * whole:
+        is_near = np.linalg.norm(x - place, axis=-1) < model.material.h
+        if total(squares[is_near]) > MIN_SHARE_AT_POINT * whole_square:
             return name
     return ""
 
 
 def squared_gradient(model: Model, mode: Vector, waves: int | None) -> tuple[Array, Array]:
-    """Return places (cells, points, 2 or 3) on this rank, and the squared gradient of a mode along
-    the undeformed surface there, times the area."""
+    """Return the squared gradient of a mode at quadrature points, times their area.
+
+    Parameters
+    ----------
+    mode
+        This rank's part of a displacement, or the coefficients of a wave.
+    waves
+        Wave number m around the axis; None for a displacement.
+
+    Returns
+    -------
+    places
+        (cells, points, 3) undeformed places of this rank over R; on a meridian (cells, points, 2).
+    squares
+        (cells, points) squared gradient along the undeformed surface, times area and weight.
+    """
     V, element = model.V, model.V.element.basix_element
     X, weights = basix.make_quadrature(V.mesh.basix_cell(), 2 * element.degree)
     owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
@@ -95,6 +113,7 @@ def squared_gradient(model: Model, mode: Vector, waves: int | None) -> tuple[Arr
         v = jets(np.column_stack([P - Q, Q, W]))
     m, rho, speed = waves or 0, r[0, ..., 0], np.linalg.norm(r[1], axis=-1)
     U, Q, W = np.moveaxis(v[0], -1, 0)
+    # derivatives by theta of a wave, by cos and sin
     around = (U + m * Q) ** 2 + (m * U + Q) ** 2 + (m * W) ** 2
     along = np.sum(v[1] ** 2, axis=-1)
     return r[0], (along / speed**2 + around / rho**2) * rho * speed * weights

@@ -11,13 +11,15 @@ from magshell_fenicsx.models.shell.spatial_fields import positions_and_normals
 from magshell_fenicsx.shells.meridian import MeridianModel
 
 Array = NDArray[np.float64]
-OFF_POLE = 1e-3  # of the first cell
-ENDS = np.array([[0.0], [1.0]])  # of the reference cell
+OFF_POLE = 1e-3  # distance from the pole, over the first cell
+ENDS = np.array([[0.0], [1.0]])  # ends of the reference cell
 
 
 class Revolution:
-    """Surface that a meridian sweeps: its vertices are turned into `sectors` equal angles; at a
-    pole all of them are one node.
+    """Surface that a meridian sweeps, as flat triangles.
+
+    Each vertex of the meridian is turned into `sectors` equal angles, a circle of nodes; a pole is
+    one node.
 
     Parameters
     ----------
@@ -27,6 +29,8 @@ class Revolution:
 
     Attributes
     ----------
+    order
+        Numbers of the cells, in their order along the meridian.
     ends
         (cells, 2) numbers of the circles at the ends of the cells along the meridian.
     r0, n0
@@ -36,14 +40,17 @@ class Revolution:
     """
 
     def __init__(self, model: MeridianModel, sectors: int = 96, kinks: Sequence[int] = ()) -> None:
+        """Number the circles and nodes of the swept surface; parameters are those of the class."""
         self._model, V = model, model.V
         self.order = order = model.meridian.order
         vertices = V.dofmap.list[order][:, :2]
+        # a new circle begins where cells share no vertex, and at kinks
         is_apart = vertices[1:, 0] != vertices[:-1, 1]
         is_apart[np.asarray(kinks, dtype=np.int64) - 1] = True
         begin = np.arange(len(vertices)) + np.cumsum([0, *is_apart])
         self.ends = np.column_stack([begin, begin + 1])
         self._at_ends = np.empty((2, self.ends.max() + 1), dtype=np.int64)
+        # a cell that has each circle, and at which of its ends
         self._at_ends[0, self.ends] = np.arange(len(vertices))[:, None]
         self._at_ends[1, self.ends] = np.arange(2)
         poles = model.meridian.poles
@@ -51,9 +58,8 @@ class Revolution:
         self._poles = np.asarray(np.isclose(s[:, None], poles).any(axis=1))
         theta = np.arange(sectors) * 2 * np.pi / sectors
         cos, sin, zero = np.cos(theta), np.sin(theta), 0 * theta
-        basis = np.array(
-            [[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1]]
-        )  # e_rho, e_theta, e_z
+        # e_rho, e_theta, e_z
+        basis = np.array([[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1]])
         self._basis = np.moveaxis(basis, -1, 0)
         normals = nodal_normals(model.r0)
         self.r0 = self._swept(model.r0.x.array.reshape(-1, 2))
@@ -61,43 +67,45 @@ class Revolution:
         self.cells = self._triangles(sectors)
 
     def displacement(self, u: Vector) -> Array:
-        """The displacement of the nodes, (n, 3) over R."""
+        """Return the displacement (n, 3) of the nodes over R from a meridian's unknowns."""
         return self._swept(u.reshape(-1, 2))
 
     def jets(self, f: fem.Function) -> Array:
-        """Return the jets (6, cells, 2, 3) of a field at the ends of all cells, along (e_rho,
-        e_theta, e_z).
+        """Return the jets (6, cells, 2, 3) of a field at both ends of all cells.
 
-        At the pole, where the surface has no second direction, a little off it.
+        Jets are the value and the first and second derivatives, along (e_rho, e_theta, e_z). At a
+        pole the surface has no second direction, so the jet there is taken a little off it.
         """
         values = self._derivatives(f, np.array([[0.0], [1.0], [OFF_POLE], [1 - OFF_POLE]]))
         at_pole = self._poles[self.ends][..., None]
         return _revolved(np.where(at_pole, values[:, :, 2:], values[:, :, :2]))
 
     def inner_jets(self, f: fem.Function, points: Array) -> Array:
-        """Return jets (6, cells, q, 3) at reference points (q, 1) inside all cells, as `jets`."""
+        """Return the jets (6, cells, q, 3) of a field at reference points (q, 1); see `jets`."""
         return _revolved(self._derivatives(f, points))
 
     def scalars(self, f: fem.Function, points: Array = ENDS) -> Array:
-        """Return the values (cells, q) of a field (1,) at the ends of all cells, or other reference
-        points (q, 1).
-        """
+        """Return the values (cells, q) of a field (1,) at reference points (q, 1) of all cells."""
         return self._derivatives(f, points)[0, :, :, 0]
 
     def vertices(self, V: fem.FunctionSpace) -> NDArray[np.int64]:
-        """Return the nodes of a space on the meridian at all circles."""
+        """Return for each circle the node of the space on the meridian that sweeps it."""
         cells, ends = self._at_ends
         return np.asarray(V.dofmap.list[self.order[cells], ends], dtype=np.int64)
 
     def at_nodes(self, circles: Array) -> Array:
-        """Values (n, ...) at the nodes, of those (circles, sectors, ...) on all circles."""
+        """Return values (n, ...) at the nodes from values (circles, sectors, ...) on all circles.
+
+        A pole takes the value of its first sector.
+        """
         is_node = np.ones(circles.shape[:2], dtype=bool)
         is_node[self._poles, 1:] = False
         return np.asarray(circles[is_node])
 
     def _derivatives(self, f: fem.Function, points: Array) -> Array:
-        """Return values, first and second derivatives (3, cells, q, components) at reference points
-        (q, 1).
+        """Return values and two derivatives of a field at reference points (q, 1) of all cells.
+
+        The shape is (3, cells, q, components), in the order of cells along the meridian.
         """
         V = f.function_space
         cells, bs = V.dofmap.list, V.dofmap.bs
@@ -107,7 +115,7 @@ class Revolution:
         )
 
     def on_parallels(self, ends: Array, weight: Array) -> Array:
-        """Values at the nodes, of those at the ends of all cells.
+        """Return values (n, ...) at the nodes from values at the ends of all cells.
 
         Parameters
         ----------
@@ -115,7 +123,7 @@ class Revolution:
             Scalars (cells, 2), vectors (cells, 2, 3) or tensors (cells, 2, 3, 3) along (e_rho,
             e_theta, e_z).
         weight
-            (cells, 2) of a cell's value in the mean over the two that meet.
+            (cells, 2) weight of a cell's value in the mean over the two cells that meet.
         """
         means = self._means(ends, weight)
         circles = np.repeat(means[:, None], len(self._basis), axis=1)
@@ -127,8 +135,9 @@ class Revolution:
         return self.at_nodes(circles)
 
     def _means(self, ends: Array, weight: Array) -> Array:
-        """Return the weighted mean of the cells that meet at each circle, of values (cells, 2, ...)
-        at their ends.
+        """Return the weighted mean, at each circle, of the cells that meet there: (circles, ...).
+
+        `ends` are values (cells, 2, ...) at their ends, `weight` is (cells, 2).
         """
         weight = weight.reshape(*weight.shape, *(1,) * (ends.ndim - 2))
 
@@ -140,9 +149,7 @@ class Revolution:
         return np.asarray(sums(weight * ends) / sums(weight))
 
     def _swept(self, nodal: Array) -> Array:
-        """Return vectors at the poles and on the circles from (rho, z) components at the meridian's
-        nodes.
-        """
+        """Return vectors (n, 3) at the nodes from (rho, z) components at the meridian's nodes."""
         components = nodal[self.vertices(self._model.V)]
         components = np.where(self._poles[:, None], components * [0.0, 1.0], components)[:, None]
         return self.at_nodes(
@@ -150,23 +157,29 @@ class Revolution:
         )
 
     def _triangles(self, sectors: int) -> NDArray[np.int64]:
-        """Two for each cell and sector; one beside a pole."""
+        """Return the node numbers (m, 3) of the triangles.
+
+        There are two for each cell and sector, one beside a pole.
+        """
+        # number of the first node of each circle
         first = np.cumsum([0, *np.where(self._poles, 1, sectors)])
         sector = np.arange(sectors)
         ring = np.where(self._poles[:, None], 0, sector) + first[:-1, None]
         (a, c), (b, d) = (
-            np.moveaxis(numbers[self.ends], 1, 0) for numbers in (ring, np.roll(ring, -1, axis=1))
+            np.moveaxis(nodes_of_circles[self.ends], 1, 0)
+            for nodes_of_circles in (ring, np.roll(ring, -1, axis=1))
         )
-        begins, ends = (~self._poles[numbers] for numbers in self.ends.T)
+        begins, ends = (~self._poles[nodes_of_circles] for nodes_of_circles in self.ends.T)
         bands = [(ends, (a, c, d)), (begins, (a, d, b))]
         return np.concatenate(
-            [np.stack(corners, axis=-1)[which].reshape(-1, 3) for which, corners in bands]
+            [np.stack(corners, axis=-1)[is_kept].reshape(-1, 3) for is_kept, corners in bands]
         )
 
 
 def _revolved(values: Array) -> Array:
-    """Jets (6, cells, q, 3) along (e_rho, e_theta, e_z) from derivatives (3, cells, q, 2) along the
-    meridian.
+    """Return jets (6, cells, q, 3) of an axisymmetric field along (e_rho, e_theta, e_z).
+
+    `values` are its value and derivatives (3, cells, q, 2) along the meridian.
     """
     (U, W), (Us, Ws), (Uss, Wss) = np.moveaxis(values, -1, 1)
     o = np.zeros_like(U)
@@ -175,7 +188,7 @@ def _revolved(values: Array) -> Array:
 
 
 def nodal_normals(r0: fem.Function) -> Array:
-    """Unit normals (nodes, 3) at the azimuth 0, averaged over the cells that meet."""
+    """Return unit normals (nodes, 3) at the azimuth 0, averaged over the cells that meet."""
     normals = np.zeros((len(r0.x.array) // 2, 3))
     np.add.at(normals, r0.function_space.dofmap.list, positions_and_normals(r0)[1])
     return np.asarray(normals / np.linalg.norm(normals, axis=1)[:, None])

@@ -28,24 +28,28 @@ if TYPE_CHECKING:
     from magshell_fenicsx.shells.shell import ShellModel
 
 Array = NDArray[np.float64]
-AXISYMMETRY_TOLERANCE = 1e-3  # in lengths: a state that differs less around e3 is axisymmetric
+AXISYMMETRY_TOLERANCE = (
+    1e-3  # over the system's length: states that vary less around e3 are axisymmetric
+)
 
 
 class SectorModes:
     """Counts of the unstable modes that break a sector's symmetry.
+
+    They are counted on the model of a half, which the copies of the sector make.
 
     Parameters
     ----------
     model
         Model of the sector.
     as_half
-        The same shell on the mid-surface of a half.
+        Function of the mid-surface of a half that makes the model of the same shell on it.
     """
 
     families: Sequence[
         ModeFamily
-    ] = ()  # they are counted and not located: the turned shape is always neutral
-    tangents = None  # nor are changes of these located
+    ] = ()  # modes are counted but not located: the turned shape is always neutral
+    tangents = None  # changes of the counts are not located either
 
     def __init__(self, model: "ShellModel", as_half: "Callable[[Midsurface], ShellModel]") -> None:
         self._model, self._as_half = model, as_half
@@ -53,7 +57,7 @@ class SectorModes:
 
     @cached_property
     def half_model(self) -> "ShellModel":
-        """Model of the half, whose tangents are counted."""
+        """Model of the half, whose tangents are counted; the first access is collective."""
         sector, patch = self._model.mirror, self._model.midsurface.patch
         assert isinstance(sector, Sector)
         self._folding = unfolding_of(sector, patch)
@@ -65,6 +69,7 @@ class SectorModes:
         )
         comm, chart = self._model.system.comm, half.chart()
         nodes = np.concatenate(comm.allgather(self._model.chart()))
+        # node of the sector and rotation that give the displacement of each node of the half
         self._numbers = scipy.spatial.cKDTree(nodes).query(self._folding.to_sector(chart))[1]
         self._turns = np.array([self._folding.turn(k) for k in range(sector.waves)])[
             self._folding.copies(chart)
@@ -72,7 +77,7 @@ class SectorModes:
         return half
 
     def unfold(self, u: Vector) -> Vector:
-        """Return a displacement of the sector as that of the half; collective."""
+        """Return a sector's displacement on this rank as that of the half; collective."""
         half, system = self.half_model, self._model.system
         sector_values = np.concatenate(system.comm.allgather(u[: system.size].reshape(-1, 3)))
         return np.asarray(
@@ -82,8 +87,10 @@ class SectorModes:
         )
 
     def counts(self, state: State) -> Sequence[int]:
-        """Return the number of unstable modes of the half that the sector cannot have, and of those
-        that are antisymmetric to the half.
+        """Return two numbers of unstable modes at a state of the sector; collective.
+
+        First the modes that are symmetric to the half but that the sector cannot have, then the
+        modes antisymmetric to the half.
         """
         half, state_of_half = self.half_model, State(self.unfold(state.u), dict(state.mu))
         self._own.factor(self._model.system.tangent(state.u, state.mu))
@@ -92,22 +99,23 @@ class SectorModes:
         symmetric = self._others.negative_pivots - sector_pivots
         modes = half.symmetry_breaking_modes
         assert isinstance(modes, AntisymmetricModes)
+        # the neutral turn of the whole shape is left out of the count
         factors = modes.factor_at(state_of_half)
         antisymmetric = factors.negative_pivots
         turning = self._turning(state_of_half)
-        if (
-            turning is not None and dot(half.system.comm, turning, factors.solve(turning)) < 0
-        ):  # of the tangent on the complement of t
+        # inertia of the tangent on the complement of the turn
+        if turning is not None and dot(half.system.comm, turning, factors.solve(turning)) < 0:
             antisymmetric -= 1
         return [max(symmetric, 0), antisymmetric]
 
     def is_unstable(self, state: State) -> bool:
-        """Whether such a mode is unstable."""
+        """Return whether a mode that breaks the sector's symmetry is unstable; collective."""
         return any(self.counts(state))
 
     def _turning(self, state: State) -> Vector | None:
-        """e3 x u - du/dtheta, by which the shape turns about e3 on an axisymmetric shell; None
-        without any.
+        """Return e3 x u - du/dtheta, by which the buckled shape turns about e3; collective.
+
+        None where the shell or its loads are not axisymmetric, or the state is axisymmetric itself.
         """
         half = self.half_model
         system = self.half_model.system
@@ -118,15 +126,18 @@ class SectorModes:
         u, r0 = system.with_ghosts(state.u, state.mu).reshape(-1, 3), half.r0.x.array.reshape(-1, 3)
         dofs, element = V.dofmap.list, V.element.basix_element
         table = element.tabulate(1, element.points)[1:, :, :, 0]
-        a, du = (np.einsum("dqk,nki->nqdi", table, f[dofs]) for f in (r0, u))
+        tangents, du = (np.einsum("dqk,nki->nqdi", table, f[dofs]) for f in (r0, u))
         rotation = np.cross([0.0, 0.0, 1.0], r0[dofs])
-        metric = np.einsum("nqdi,nqei->nqde", a, a)
-        c = np.linalg.solve(metric, np.einsum("nqdi,nqi->nqd", a, rotation)[..., None])[..., 0]
-        by_angle = np.einsum("nqd,nqdi->nqi", c, du)
-        total = np.zeros_like(u)
+        # du/dtheta: the chart's derivatives along e3 x r0
+        metric = np.einsum("nqdi,nqei->nqde", tangents, tangents)
+        components = np.linalg.solve(
+            metric, np.einsum("nqdi,nqi->nqd", tangents, rotation)[..., None]
+        )[..., 0]
+        by_angle = np.einsum("nqd,nqdi->nqi", components, du)
+        sums = np.zeros_like(u)
         count = np.zeros(len(u))
-        np.add.at(total, dofs, by_angle)
+        np.add.at(sums, dofs, by_angle)
         np.add.at(count, dofs, 1.0)
-        t = np.cross([0.0, 0.0, 1.0], u) - total / np.maximum(count, 1.0)[:, None]
-        t = modes.system.zero_at_supports(t.ravel()[: system.size])
-        return t if max_abs(system.comm, t) > AXISYMMETRY_TOLERANCE * system.length else None
+        turn = np.cross([0.0, 0.0, 1.0], u) - sums / np.maximum(count, 1.0)[:, None]
+        turn = modes.system.zero_at_supports(turn.ravel()[: system.size])
+        return turn if max_abs(system.comm, turn) > AXISYMMETRY_TOLERANCE * system.length else None

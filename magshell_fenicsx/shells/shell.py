@@ -88,23 +88,28 @@ if TYPE_CHECKING:
 
 
 class ShellModel(ThinModel):
-    """A Koiter shell on a mid-surface.
+    """A Koiter shell on a mid-surface. Construction is collective and compiles kernels.
 
     Parameters
     ----------
     midsurface
         Mesh and placement.
+    material
+        Thickness and elastic law.
     degree
         Degree of displacement and placement, 2 to 5.
     conditions
         Edge name -> condition; edges that are not named are free. A vertex can be held too, and a
-        patch clamped or held: then all of it.
+        patch, all of it, clamped or held.
+    loads
+        All loads with their amplitudes.
     sigma
         Penalty of the C0 interior penalty form; None takes `default_penalty`.
     thickness
         Factor of the thickness; None for 1.
     mirror
-        The plane of the edge with the condition "symmetry", of a half model; both of a sector.
+        The plane of the edge with the condition "symmetry", of a half model; both planes of a
+        sector.
 
     Raises
     ------
@@ -116,6 +121,8 @@ class ShellModel(ThinModel):
     ----------
     system, multiplicity, normals, loads, load_size, supports
         See `ModelBase`.
+    factory
+        Factory that made the energies.
     kernels
         Names and compile time of the forms in use.
     thickness
@@ -125,7 +132,7 @@ class ShellModel(ThinModel):
     mirror
         Planes of a half model or a sector.
     turns
-        Whether its material and all its loads are axisymmetric; who makes the model may set it.
+        Whether its material and all its loads are axisymmetric; whoever makes the model may set it.
     """
 
     thin: Literal[True] = True
@@ -223,19 +230,20 @@ class ShellModel(ThinModel):
             midsurface.cells_of_point,
         )
         if interaction is not None:
-            interaction.refuse_near()  # now that all is there which it reads
+            interaction.refuse_near()  # reads the finished model
 
     def _refuse_normal_plies(self) -> None:
-        """Refuse plies whose direction is normal to the surface of their shell."""
+        """Refuse plies whose direction is normal to the surface of their shell; collective."""
         for shell, laminate in self.material.laminate_by_shell.items():
             cells = self.midsurface.patches[shell] if shell else slice(None)
             normals = positions_and_normals(self.r0)[1][cells]
             laminate.refuse_normal(normals, self.midsurface.mesh.comm)
 
     def _with_functions(self, loads: Loads, cells: CellGeometry) -> Loads:
-        """Return the loads with functions on the mesh in place of fields and formulas.
+        """Return the loads with functions on the mesh in place of user fields and formulas.
 
-        They are the user's fields of magnetisation, and the parameters of terms.
+        User fields give magnetisations, formulas give parameters of terms. `cells` is the geometry
+        in which fields are projected onto polynomials.
         """
         for name in ("magnetic", "remanence"):
             magnetisation = getattr(loads, name)
@@ -258,7 +266,7 @@ class ShellModel(ThinModel):
                 put_in_plane(self.r0, self.midsurface.edges[name])
 
     def _growing_placement(self) -> PlacementAmplitudes | None:
-        """Return the placement with amplitudes of imperfections; None if none of them grows."""
+        """Return the placement with amplitudes of growing imperfections; None if none grows."""
         shapes = {
             name: self.midsurface.growth(self.V, deviations)
             for name, deviations in self.loads.growing_imperfections.items()
@@ -268,16 +276,16 @@ class ShellModel(ThinModel):
     def _thickness_field(
         self, thickness: Thickness | None, cells: CellGeometry
     ) -> fem.Function | None:
-        """Return h(x)/h; None for 1."""
+        """Return h(x)/h as a function (1,) on the mesh; None for 1."""
         if thickness is None:
             return None
         if thickness.user_field:
-            values = user_field_polynomials(thickness.user_field, self.midsurface, cells)
-            thickness = replace(thickness, polynomials=values)
+            polynomials = user_field_polynomials(thickness.user_field, self.midsurface, cells)
+            thickness = replace(thickness, polynomials=polynomials)
         return thickness_field(thickness, self.r0, self.midsurface.patches)
 
     def _make_factory(self, cells: CellGeometry) -> EnergyFactory:
-        """Return what makes the energies of this shell."""
+        """Return the factory that makes the energies of this shell."""
         midsurface, loads = self.midsurface, self.loads
         free_constants: dict[str, fem.Constant] = {}
         natural_shape = self._natural_shape(cells, free_constants)
@@ -305,8 +313,9 @@ class ShellModel(ThinModel):
     def _natural_shape(
         self, cells: CellGeometry, free_constants: dict[str, fem.Constant]
     ) -> Shape | None:
-        """Return the natural shape, None if it is the undeformed one; its amplitudes are added
-        to the constants of free parameters.
+        """Return the natural shape, the one without stress; None if it is the undeformed one.
+
+        Its amplitudes are added to `free_constants`, name -> constant, and `loads` is updated.
         """
         if not self.loads.natural:
             return None
@@ -319,9 +328,14 @@ class ShellModel(ThinModel):
         return Shape.from_field(natural_field(natural, cells, self.V), natural, free_constants)
 
     def _find_openings(self) -> tuple[Mapping[str, NDArray[np.int32]], bool]:
-        """Return the edges where the pressed surface ends, and whether moving supports close it.
+        """Find the edges where the pressed surface ends; collective. Sets `without_potential`.
 
-        Sets `without_potential`.
+        Returns
+        -------
+        opening_edges
+            Edge name -> its facets with a pressed cell.
+        is_enclosed
+            Whether moving supports close all openings with lids.
         """
         edges, pressed_cells = self.midsurface.edges, self.factory.pressed_sides
         opening_edges = pressed_parts(edges, pressed_cells) if pressed_cells else edges
@@ -329,7 +343,11 @@ class ShellModel(ThinModel):
         return opening_edges, enclosed(self.loads, free_edges, self.without_potential)
 
     def _volume_form(self, origin: NDArray[np.float64] | None, *, is_enclosed: bool) -> ufl.Form:
-        """Return Delta V/R^3 of the modelled part; `origin` lies on all its symmetry planes."""
+        """Return the form of Delta V/R^3 of the modelled part.
+
+        `origin` (3,) over R lies on all its symmetry planes; None stands for zero. Under a live
+        pressure, or if lids close the shell, the volume is the one that the surface sweeps.
+        """
         if self.loads.pressure or is_enclosed:
             return self.factory.swept_volume()
         return self.factory.volume_change(np.zeros(3) if origin is None else origin)
@@ -344,16 +362,16 @@ class ShellModel(ThinModel):
         return terms
 
     def _interaction_term(self) -> "InteractionTerm | None":
-        """Return the term by which magnetised parts act on each other; None if they do not."""
+        """Return the term of magnetic interaction between parts of the shell; None without."""
         if not self.loads.interaction:
             return None
-        # few shells have one
+        # imported late: few shells have an interaction
         from magshell_fenicsx.parts.magnetism.interacting import InteractionTerm
 
         return InteractionTerm(self, self.u, self.loads.interaction)
 
     def _force_terms(self) -> list[Term]:
-        """Return the terms of forces at points, then those of dead loads."""
+        """Return the terms of forces at points, then those of all dead loads; collective."""
         loads = self.loads
         terms: list[Term] = [self._force(name, force) for name, force in loads.forces.items()]
         if not loads.dead:
@@ -367,7 +385,7 @@ class ShellModel(ThinModel):
         return terms
 
     def _make_shell_contacts(self) -> "Sequence[SurfaceContact]":
-        """Return the contacts of parts of the shell with each other."""
+        """Return the contacts between parts of the shell, as terms; empty without contact pairs."""
         if not self.loads.pairs:
             return ()
         from magshell_fenicsx.parts.contact.model_surface import ModelSurface, surface_contacts
@@ -389,7 +407,7 @@ class ShellModel(ThinModel):
         return surface_contacts(self.loads.pairs, surface)
 
     def _t_junction_terms(self) -> Sequence[Term]:
-        """Return the terms that tie edges to other shells."""
+        """Return the terms that tie edges to other shells on which they stand; collective."""
         if not (self.loads.joints or self.midsurface.t_junctions):
             return ()
         from magshell_fenicsx.shells.t_junctions import t_junction_terms
@@ -401,7 +419,15 @@ class ShellModel(ThinModel):
         opening_edges: Mapping[str, NDArray[np.int32]],
         origin: NDArray[np.float64] | None,
     ) -> EdgePressure:
-        """Return the work of a live pressure on lids at the edges that move."""
+        """Return the work of a live pressure on the lids at moving edges.
+
+        Parameters
+        ----------
+        opening_edges
+            Edge name -> its facets; see `_find_openings`.
+        origin
+            Point (3,) over R on all symmetry planes, or None.
+        """
         pressed_cells, loads = self.factory.pressed_sides, self.loads
         in_planes = {
             name
@@ -420,7 +446,10 @@ class ShellModel(ThinModel):
     def _make_system(
         self, terms: Sequence[Term], constraints: list[Constraint]
     ) -> FiniteElementSystem:
-        """Return the system of all terms, with tangents and residuals from points."""
+        """Return the system of all terms under constraints.
+
+        Tangents and residuals come from densities at points where terms have densities.
+        """
         moving_cells = None
         if self.moving:
             cells = self.moving.cells
@@ -454,7 +483,10 @@ class ShellModel(ThinModel):
     def _point_residual(
         self, terms: Sequence[PointTerm], *, one_by_one: bool = False
     ) -> FastResidual:
-        """Return the residual of terms from their densities at points."""
+        """Return the residual that evaluates the densities of terms at quadrature points.
+
+        `one_by_one` keeps the residual of each term apart.
+        """
         return FastResidual(
             self.r0, self.u, self.degree, terms, self.kernels, one_by_one=one_by_one
         )
@@ -462,7 +494,7 @@ class ShellModel(ThinModel):
     def _free_parameters(
         self, terms: Sequence[Term], density_terms: Sequence[ShellTerm], residual: FastResidual
     ) -> dict[str, FreeParameter]:
-        """Return the parameters that vary, by name."""
+        """Return the parameters of energies that may vary, by name."""
         factory = self.factory
         residuals_one_by_one = partial(self._point_residual, one_by_one=True)
         parameters: dict[str, FreeParameter] = {
@@ -476,7 +508,7 @@ class ShellModel(ThinModel):
         return parameters
 
     def _facets_on_mirror(self) -> NDArray[np.int32]:
-        """Return the facets of all edges with the condition "symmetry"."""
+        """Return the local facets (n,) of all edges with the condition "symmetry", sorted."""
         edges = self.midsurface.edges
         facets = [
             edges[name]
@@ -489,9 +521,9 @@ class ShellModel(ThinModel):
 
     @cached_property
     def symmetry_breaking_modes(self) -> AntisymmetricModes | SectorModes | None:
-        """Modes that a half model or a sector cannot have; None for a whole one.
+        """Modes that break the symmetry of a half model or a sector; None for a whole shell.
 
-        Compiles kernels.
+        The first access compiles kernels and is collective.
         """
         if self.multiplicity == 1:
             return None
@@ -503,7 +535,8 @@ class ShellModel(ThinModel):
             for direction in self.mirror.in_plane_vectors
         ]
         integrals = self._hessians + hessian_integrals(self.r0, self.degree, [edges], self.kernels)
-        fast = FastTangent(self.u, integrals, constraints)
+        fast_tangent = FastTangent(self.u, integrals, constraints)
+        # terms with the tangents of antisymmetric displacements
         terms = [edges if t is self._mirror_term else t for t in self.system.terms]
         terms = [t.antisymmetric() if hasattr(t, "antisymmetric") else t for t in terms]
         system = self.system
@@ -514,14 +547,17 @@ class ShellModel(ThinModel):
                 constraints,
                 self._pattern_term,
                 system.length,
-                fast,
+                fast_tangent,
                 system.gradients,
                 SystemVariables(system.parameters, self.moving, system.history),
             )
         )
 
     def _as_half(self, midsurface: Midsurface) -> "ShellModel":
-        """Return this shell on the mid-surface of a half."""
+        """Return the model of half of this shell, from which the sector is a part.
+
+        `midsurface` is that of the half.
+        """
         material, degree, conditions, loads, sigma, thickness = self._arguments
         conditions = {name: c for name, c in conditions.items() if name != SECOND_SYMMETRY_EDGE}
         plane = Mirror.through_axis(self.mirror.azimuth)
@@ -529,37 +565,41 @@ class ShellModel(ThinModel):
 
     @property
     def mirrored_facets(self) -> NDArray[np.int32]:
+        """Facets on the mirror planes; see `ModelBase`."""
         return self._mirrored_facets
 
     def growth(self, deviations: Sequence[Deviation]) -> fem.Function:
-        """Return the change of the placement by further deviations."""
+        """Return the change of the placement, over R, by further deviations from the surface."""
         return self.midsurface.growth(self.V, deviations)
 
     def at_nodes(self, function: Embedding) -> NDArray[np.float64]:
-        """Return the values of a function of the triangulation's nodes at the nodes of each cell,
-        (cells, nodes, ...).
+        """Return the values (cells, nodes, ...) of a function at the nodes of each cell.
+
+        The function is that of the triangulation's nodes, such as an embedding.
         """
         return self.midsurface.evaluate(self.V.element.basix_element.points, function)
 
     def chart(self) -> NDArray[np.float64]:
-        """Coordinates (n, 2) of this rank's nodes in the chart, of a mesh file positions (n, 3)."""
+        """Return coordinates (n, 2) of this rank's nodes in the chart.
+
+        The surface of a mesh file has no chart: positions (n, 3) take its place.
+        """
         return self._at_nodes(self.midsurface.chart_coordinates(self.V))
 
     def chart_by_shell(self) -> NDArray[np.float64]:
-        """Return the coordinates of this rank's nodes in the charts of their shells, see
-        `chart`.
-        """
+        """Return coordinates of this rank's nodes, each in the chart of its shell; see `chart`."""
         return self._at_nodes(self.midsurface.chart_coordinates_by_shell(self.V))
 
     def _at_nodes(self, cells: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return one row per owned node from values (cells, nodes, components) in cells."""
         nodes, index_map = self.V.dofmap.list, self.V.dofmap.index_map
         coordinates = np.full((index_map.size_local + index_map.num_ghosts, cells.shape[2]), np.inf)
-        np.minimum.at(
-            coordinates, nodes, cells
-        )  # the first of the two positions of a node on a seam
+        # a node on a seam has two positions: take the first
+        np.minimum.at(coordinates, nodes, cells)
         return coordinates[: index_map.size_local]
 
     def _force(self, name: str, force: Force) -> LinearTerm:
+        """Return the term of a force along the inward normal, at a point or over a patch."""
         x, inward = self.midsurface.points[force.point], -self.normals[force.point]
         cells_at_point = self.midsurface.cells_of_point(force.point)
         if force.patch:
@@ -578,7 +618,7 @@ def _cell_count(midsurface: Midsurface) -> int:
 
 
 def _magnetisation_by_cell(loads: Loads, midsurface: Midsurface) -> Loads:
-    """Return the loads with magnetisations in each cell in place of those of patches."""
+    """Return the loads with magnetisations given cell by cell in place of patch by patch."""
     for name in ("magnetic", "remanence"):
         if magnetisation := getattr(loads, name):
             in_cells = magnetisation.on_cells(midsurface.patches, _cell_count(midsurface))

@@ -1,5 +1,4 @@
-"""Supports and mirror planes of a shell: constraints of its displacement, and energies of its
-edges.
+"""Supports and mirror planes of a shell: displacement constraints and energies of edges.
 
 Edges, patches and points have conditions by name. An edge that is clamped, or that lies on a mirror
 plane, has an energy too, since a C0 displacement alone does not hold its normal.
@@ -26,7 +25,7 @@ ALL_COMPONENTS = (0, 1, 2)
 
 
 class ShellSupports:
-    """Supports of a shell on a mid-surface. Collective.
+    """Supports of a shell on a mid-surface. Construction is collective.
 
     Parameters
     ----------
@@ -39,7 +38,9 @@ class ShellSupports:
     laminates
         Shell -> its plies; the name is empty where there is one shell.
     loads
-        What moves supports.
+        Loads, which may move supports.
+    factory
+        Factory that makes the energies of edges.
 
     Raises
     ------
@@ -72,6 +73,7 @@ class ShellSupports:
         loads: Loads,
         factory: EnergyFactory,
     ) -> None:
+        """Make all constraints and edge energies; parameters are those of the class."""
         self._r0, self._V, self._midsurface = r0, r0.function_space, midsurface
         self._laminates, self._loads, self._factory = laminates, loads, factory
         self._clamped = [
@@ -87,6 +89,7 @@ class ShellSupports:
         self.by_name: dict[str, Support] = {}
         for name, plane in mirror_planes.items():
             self._add_mirror_plane(name, plane)
+        # supports on the shell's own planes come last in `by_name`
         on_planes: dict[str, Support] = {}
         for name, condition in conditions.items():
             if condition in ("free", "symmetry"):
@@ -98,7 +101,7 @@ class ShellSupports:
         self.by_name |= on_planes
 
     def _add_mirror_plane(self, name: str, plane: Mirror) -> None:
-        """Add the symmetry plane of an edge of the modelled part."""
+        """Add the symmetry plane of an edge of the modelled part: energy and constraint."""
         self.planes.append(plane)
         facets = self._midsurface.edges[name]
         edge = "mirror edges" if name == SYMMETRY_EDGE else f"{name} mirror edges"
@@ -108,8 +111,14 @@ class ShellSupports:
         self.mirror_constraints.append(support_along(self._V, 1, facets, plane.normal))
 
     def _add_plane_of_shell(self, name: str) -> Support:
-        """Add the plane of an edge, a symmetry of the shell as it is described; return its
-        support.
+        """Add the plane of an edge with the condition "plane", and return its support.
+
+        The plane is a symmetry of the shell itself.
+
+        Raises
+        ------
+        MeshError
+            If the plane does not mirror the plies of the shell.
         """
         facets = self._midsurface.edges[name]
         plane = plane_of(self._r0, facets, name)
@@ -127,7 +136,7 @@ class ShellSupports:
         return Support.from_conditions(edge_constraints, edge, kind="plane")
 
     def _laminates_at(self, edge: str) -> list[Laminate]:
-        """Return the plies of the shell that has an edge."""
+        """Return the laminates of the shell that has an edge; empty without plies."""
         return [
             laminate
             for shell, laminate in self._laminates.items()
@@ -135,7 +144,10 @@ class ShellSupports:
         ]
 
     def _add_support(self, name: str, condition: Condition) -> Support:
-        """Add the support of an edge, a patch or a point, and the energy of a clamped edge."""
+        """Add the support of an edge, patch or point, and return it.
+
+        A clamped edge also gets an energy that holds its normal.
+        """
         if isinstance(condition, HeldComponents):
             components = condition.components
         else:
@@ -153,7 +165,10 @@ class ShellSupports:
         return Support.from_conditions(constraints, edge, turn, kind=kind)
 
     def _constraints_of(self, name: str, components: tuple[int, ...]) -> list[fem.DirichletBC]:
-        """Return the constraints of some components on an edge, on a patch or at a point."""
+        """Return the constraints of displacement components on an edge, on a patch or at a point.
+
+        `components` are numbers 0 to 2 of the axes.
+        """
         midsurface = self._midsurface
         if name in midsurface.edges:
             return held_on(self._V, 1, midsurface.edges[name], components)

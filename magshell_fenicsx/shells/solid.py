@@ -64,6 +64,10 @@ class SolidModel(ModelBase):
 
     Parameters
     ----------
+    body
+        Mesh of the body with its named faces.
+    law
+        Elastic law of the solid.
     conditions
         Conditions as in `ShellModel`: a whole face is clamped or in a mirror plane, else its middle
         line is held.
@@ -90,7 +94,7 @@ class SolidModel(ModelBase):
 
     thin: Literal[False] = False
     axisymmetric: Literal[False] = False
-    cell_materials: None = None  # of one material
+    cell_materials: None = None  # a solid has one material
     degree = 2
     sigma = None
 
@@ -103,6 +107,7 @@ class SolidModel(ModelBase):
         loads: Loads,
         mirror: Mirror = Y0_PLANE,
     ) -> None:
+        """Make the terms of the body and its system; parameters are those of the class."""
         magnetic, remanence = (
             field and _in_cells(field, body) for field in (loads.magnetic, loads.remanence)
         )
@@ -147,7 +152,7 @@ class SolidModel(ModelBase):
         self.observe(self.kernels.compile("volume energy", volume), body.points)
 
     def _formula_field(self, parameter: FormulaParameter) -> fem.Function:
-        """Return a formula's field of shape (1,)."""
+        """Return a formula of the undeformed place as a field (1,) in the body."""
         pattern = Components([parameter.of_place])
         return field_in_body(pattern, self.V, name="factor", key=parameter.key, size=1)
 
@@ -161,7 +166,7 @@ class SolidModel(ModelBase):
         )
 
     def _make_factory(self) -> TermFactory:
-        """Return what makes the terms of this body."""
+        """Return the factory of the terms of this body."""
         free_constants: dict[str, fem.Constant] = {}
         grown: Callable[[SolidDensity], SolidDensity] = unchanged
         if self.loads.natural:
@@ -179,7 +184,7 @@ class SolidModel(ModelBase):
         )
 
     def _field_and_pressure_terms(self) -> list[Term]:
-        """Return the terms of magnetisation and of a live pressure."""
+        """Return the terms of magnetisation in an applied field and of a live pressure."""
         terms: list[Term] = []
         if self.loads.magnetic:
             terms += self.factory.magnetic(self.loads.magnetic)
@@ -189,7 +194,10 @@ class SolidModel(ModelBase):
         return terms
 
     def _observed_forms(self) -> dict[str, fem.Form]:
-        """Return the forms that the user's terms observe, and those of an induced magnetisation."""
+        """Return the forms that the user's terms observe and those of an induced magnetisation.
+
+        They are compiled, by name.
+        """
         factory, kernels = self.factory, self.kernels
         observed = kernels.compile_all(factory.observed(term) for term in self.loads.user_terms)
         if self.loads.magnetic:
@@ -197,7 +205,7 @@ class SolidModel(ModelBase):
         return observed
 
     def _force_terms(self) -> list[Term]:
-        """Return the terms of forces on patches, then those of dead loads."""
+        """Return the terms of forces on patches, then those of all dead loads; collective."""
         terms: list[Term] = []
         for name, force in self.loads.forces.items():
             dofs, shares = outer_patch(self.body, self.V, force.point, force.patch, self.kernels)
@@ -218,7 +226,15 @@ class SolidModel(ModelBase):
     def _edge_pressure(
         self, ends: Mapping[str, NDArray[np.int32]], origin: Array | None
     ) -> EdgePressure:
-        """Return the work of a live pressure on lids at the ends that move."""
+        """Return the work of a live pressure on lids at the ends that move.
+
+        Parameters
+        ----------
+        ends
+            Name of an end -> its facets.
+        origin
+            Point (3,) over R on all symmetry planes, or None.
+        """
         hinged = self._hinged
         in_planes = {name for name, condition in self._conditions.items() if condition in MIRRORS}
         curves = {
@@ -231,8 +247,9 @@ class SolidModel(ModelBase):
 
     @cached_property
     def symmetry_breaking_modes(self) -> AntisymmetricModes | None:
-        """Modes that a half model cannot have: they move freely across the mirror plane and not in
-        it; None for a whole one.
+        """Modes that a half model cannot have; None for a whole shell.
+
+        They move freely across the mirror plane and not within it.
         """
         if self.multiplicity == 1:
             return None
@@ -241,38 +258,44 @@ class SolidModel(ModelBase):
         )
 
     def over_area(self) -> Callable[[Expr], ufl.Form]:
-        """Return the integral over the undeformed volume of the modelled part, as a function of
-        what is integrated.
-        """
+        """Return the function that integrates an expression over the body's undeformed volume."""
         return lambda f: f * ufl.dx(domain=self.V.mesh)
 
     def cells_of_fields(self) -> CellGeometry:
-        """Return the cells in which fields are given by formulas."""
+        """Return the geometry of the cells in which formulas give fields."""
         return body_cell_geometry(self.V)
 
     def places(self, nodes: Array) -> tuple[Array, Array]:
-        """Return the nodes of every cell, whatever `nodes` are, and the normals of the surface at
-        their height.
+        """Return the nodes (cells, n, 3) of every cell, and normals of the surface at their height.
+
+        `nodes` is not used here; it belongs to the interface of `ThinModel`.
         """
         return body_positions_and_normals(self.V)
 
     def chart(self) -> Array:
-        """Coordinates (n, 3) of this rank's nodes: the chart's and the height in the thickness."""
+        """Return coordinates (n, 3) of this rank's nodes: the chart's, then the height.
+
+        The height runs through the thickness from 0 inside to 1 outside.
+        """
         coordinates = self.body.at_nodes(
             self.V, np.column_stack([self.body.chart, self.body.heights])
         )
         return np.asarray(coordinates[: self.V.dofmap.index_map.size_local])
 
     def _rim(self, facets: NDArray[np.int32], height: float) -> EdgeCurve:
-        """Return the curve that ends the pressed surface on the faces of an end, at a height over
-        the thickness.
+        """Return the curve at the end of the pressed surface, on the facets of one end.
+
+        `height` is its place in the thickness: 1 is the outer face.
         """
-        links = self.body.mesh.topology.connectivity(2, 3)
-        low, high = self.body.layer_bounds[links.array[links.offsets[facets]]].T
+        cells_of_facets = self.body.mesh.topology.connectivity(2, 3)
+        # bounds in the thickness of the cell behind each facet
+        low, high = self.body.layer_bounds[cells_of_facets.array[cells_of_facets.offsets[facets]]].T
         has_height = (low < height - ROUNDING) & (height < high + ROUNDING)
-        part = (height - low[has_height]) / (high - low)[has_height]
+        fraction_of_cell = (height - low[has_height]) / (high - low)[has_height]
         return EdgeCurve.from_facets(
-            self.V, facets[has_height], level_sides(float(part[0]) if len(part) else 1.0)
+            self.V,
+            facets[has_height],
+            level_sides(float(fraction_of_cell[0]) if len(fraction_of_cell) else 1.0),
         )
 
     @property
@@ -280,6 +303,7 @@ class SolidModel(ModelBase):
         return np.asarray(np.concatenate([np.empty(0, dtype=np.int32), *self._faces]))
 
     def _held_on_mirror(self, directions: Iterable[Array]) -> list[Constraint]:
+        """Return constraints along some directions (3,) on all faces of the mirror plane."""
         return [
             support_along(self.V, 2, facets, direction)
             for facets in self._faces
@@ -287,13 +311,14 @@ class SolidModel(ModelBase):
         ]
 
     def _system(self, constraints: list[Constraint]) -> FiniteElementSystem:
+        """Return the system of all terms under some constraints."""
         moving_cells, factory, motion = None, self.factory, self._moving
         if motion:
             moving_cells = (
                 motion.cells,
                 body_hessian_integrals(self.body, self.r0, self._terms, self.kernels, motion.cells),
             )
-        fast = FastTangent(self.u, self._hessians, constraints, moving_cells)
+        fast_tangent = FastTangent(self.u, self._hessians, constraints, moving_cells)
         parameters: dict[str, FreeParameter] = {
             **make_parameters(factory.free_constants, self._terms, self.u, self.kernels)
         }
@@ -305,14 +330,13 @@ class SolidModel(ModelBase):
             constraints,
             self._pattern,
             self.material.h,
-            fast,
+            fast_tangent,
             variables=SystemVariables(parameters, motion),
         )
 
 
 def _in_cells(field: Magnetisation, body: BodyMesh) -> Magnetisation:
-    """Return the magnetisation with a vector for each cell, where it is given by patches or by
-    layers.
+    """Return a magnetisation with a vector for each cell, in place of patches or layers.
 
     Raises
     ------
@@ -326,8 +350,10 @@ def _in_cells(field: Magnetisation, body: BodyMesh) -> Magnetisation:
 
 
 def _layered(layers: Sequence[tuple[float, Array]], body: BodyMesh) -> ByPatch:
-    """Layers from the inner face outwards: fractions of the thickness, which end where cells do,
-    and vectors.
+    """Return the field of layers through the thickness, a vector for each cell.
+
+    `layers` are fractions of the thickness and vectors (3,), from the inner face outwards;
+    fractions end where cells do.
     """
     ends = np.cumsum([fraction for fraction, _ in layers])
     middle = body.layer_bounds.mean(axis=1)
@@ -335,12 +361,16 @@ def _layered(layers: Sequence[tuple[float, Array]], body: BodyMesh) -> ByPatch:
 
 
 def grown_in_body(density: SolidDensity, shape: Shape) -> SolidDensity:
-    """Return a density on a natural shape, from one that takes a `growth`."""
+    """Return a density on a natural shape, from a density with a keyword `growth`.
+
+    The natural shape's parameters follow those of the density.
+    """
 
     def grown(*arguments: Expr) -> Expr:
-        count = len(arguments) - len(shape.parameters)
+        density_argument_count = len(arguments) - len(shape.parameters)
         return density.function(
-            *arguments[:count], growth=growth_in_body(shape, *arguments[count:])
+            *arguments[:density_argument_count],
+            growth=growth_in_body(shape, *arguments[density_argument_count:]),
         )
 
     return replace(density, function=grown, parameters=(*density.parameters, *shape.parameters))

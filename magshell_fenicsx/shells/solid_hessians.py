@@ -51,8 +51,10 @@ class BodyHessianIntegral:
         Cells of this rank.
     rule
         Quadrature on the reference cell, or on a face of it.
+    terms
+        Terms with one region: body, outer face or end.
     facet
-        The number of this face.
+        Number of the face in the reference cell; None for the body.
     """
 
     coupling: Sequence[EntityBatch] = ()
@@ -66,11 +68,16 @@ class BodyHessianIntegral:
         log: KernelLog,
         facet: int | None = None,
     ) -> None:
+        """Divide the cells into batches and compile the terms' Hessians."""
         V = X.function_space
         self._dofs = V.dofmap.list
-        size = max(MAX_BATCH_POINTS // len(rule.weights), 1)
-        parts = [cells[i : i + size] for i in range(0, len(cells), size)]
-        self._batches = [EntityBatch((part,), rule, np.empty((len(part), 0))) for part in parts]
+        cells_per_batch = max(MAX_BATCH_POINTS // len(rule.weights), 1)
+        cell_groups = [
+            cells[i : i + cells_per_batch] for i in range(0, len(cells), cells_per_batch)
+        ]
+        self._batches = [
+            EntityBatch((group,), rule, np.empty((len(group), 0))) for group in cell_groups
+        ]
         self._points = PointStorage(max([1, *(batch.size for batch in self._batches)]))
         region = terms[0].density.region
         self._geometry = [
@@ -82,6 +89,7 @@ class BodyHessianIntegral:
         self._varying: dict[str, list[tuple[fem.Function, Memo[list[Array]]]]] = {}
         for term in terms:
             pairs = BlockPairs(tuple(combinations_with_replacement(term.density.parts, 2)))
+            # a virtual work is differentiated by its test function, at zero
             z = self._points.field(3 * JET_PARTS) if term.density.work else self._u
             W = self._density(term, z)
             self._pairs[term.name] = pairs
@@ -101,20 +109,23 @@ class BodyHessianIntegral:
         element_matrices: Array,
         couple: Callable[[int, Array], None],
     ) -> None:
-        """Add the terms' element matrices to `element_matrices`; see
-        `models.shell.element_hessians.HessianIntegral.add`.
+        """Add factor times the terms' element matrices to `element_matrices`.
+
+        Arguments are those of `models.shell.element_hessians.HessianIntegral.add`.
         """
         names = [name for name in self._hessians if factors.get(name)]
         for name in names:
             for _, values in self._varying[name]:
                 values.renew()
-        for number, (batch, geometry) in enumerate(zip(self._batches, self._geometry, strict=True)):
+        for batch_number, (batch, geometry) in enumerate(
+            zip(self._batches, self._geometry, strict=True)
+        ):
             fill(self._u, self._jets(batch, u))
             fill(self._g, geometry)
             blocks = HessianBlocks(batch, self._coupled)
             for name in names:
                 for target, values in self._varying[name]:
-                    fill(target, values.latest[number])
+                    fill(target, values.latest[batch_number])
                 blocks.add(
                     self._points.evaluate(self._hessians[name], batch.size),
                     factors[name],
@@ -123,12 +134,14 @@ class BodyHessianIntegral:
             element_matrices[batch.cells[0]] += self._contraction.within_side(blocks, 0)
 
     def _jets(self, batch: EntityBatch, field: Array) -> Array:
-        """Return the jets (cells, points, 4, 3) of a field."""
+        """Return a field's value and reference derivatives at a batch, (cells, points, 4, 3)."""
         return batch.rule.tables[0].jets(field.reshape(-1, 3)[self._dofs[batch.cells[0]]])
 
     def _density(self, term: SolidTerm, v: fem.Function) -> Any:
-        """Return a function of u; of a virtual work one of u and v, whose Hessian in v is the
-        symmetric part of its derivative.
+        """Return a term's density times the area or volume ratio, as an expression of point fields.
+
+        Of a virtual work it is a function of u and v, whose Hessian in v is the symmetric part of
+        the work's derivative.
         """
         density, g, z = term.density, self._g, self._u
         at_points, varying = parameters_at(self._points, density.parameters, 1)
@@ -148,6 +161,7 @@ class BodyHessianIntegral:
             return hessian_density(
                 function(*(vector(f, 3 * part) for f in (g, z) for part in range(3)), *parameters)
             )
+        # du/dX from the derivatives by reference coordinates
         by_reference = ufl.as_matrix(
             [[z[3 * part + c] for part in range(1, JET_PARTS)] for c in range(3)]
         )
@@ -166,34 +180,38 @@ def body_hessian_integrals(
     log: KernelLog,
     cell_mask: NDArray[np.bool_] | None = None,
 ) -> list[BodyHessianIntegral]:
-    """Return the integrals of terms' Hessians, one for each quadrature, on all or some local cells.
-    Collective.
+    """Return the integrals of all nonlinear terms' Hessians, one for each quadrature; collective.
+
+    `cell_mask` selects local cells; None for all.
     """
     V = X.function_space
     nonlinear = [t for t in terms if isinstance(t, SolidTerm) and not t.linear]
     integrals = []
     for degree in sorted({t.density.degree for t in nonlinear if t.density.region == "body"}):
-        points, w = basix.make_quadrature(basix.CellType.hexahedron, degree)
+        points, weights = basix.make_quadrature(basix.CellType.hexahedron, degree)
         cells = np.arange(V.mesh.topology.index_map(3).size_local, dtype=np.int32)
         counted_cells = cells if cell_mask is None else cells[cell_mask[cells]]
-        of_degree = [
+        terms_of_degree = [
             t for t in nonlinear if t.density.region == "body" and t.density.degree == degree
         ]
-        integrals.append(BodyHessianIntegral(X, counted_cells, _rule(V, points, w), of_degree, log))
+        integrals.append(
+            BodyHessianIntegral(X, counted_cells, _rule(V, points, weights), terms_of_degree, log)
+        )
     for term in nonlinear:
         if term.density.region == "body":
             continue
-        cells_at_facets, numbers = _cells_at(body, term.density.facets)
-        points, w = term.density.rule
-        for facet in np.flatnonzero(V.mesh.comm.allreduce(np.bincount(numbers, minlength=6))):
-            rule = _rule(V, _on_facet(points, facet), w)
-            at_facet = cells_at_facets[numbers == facet]
+        cells_at_facets, facet_numbers = _cells_at(body, term.density.facets)
+        points, weights = term.density.rule
+        for facet in np.flatnonzero(V.mesh.comm.allreduce(np.bincount(facet_numbers, minlength=6))):
+            rule = _rule(V, _on_facet(points, facet), weights)
+            at_facet = cells_at_facets[facet_numbers == facet]
             counted_cells = at_facet if cell_mask is None else at_facet[cell_mask[at_facet]]
             integrals.append(BodyHessianIntegral(X, counted_cells, rule, [term], log, facet))
     return integrals
 
 
 def _rule(V: fem.FunctionSpace, points: Array, weights: Array) -> EntityRule:
+    """Return a quadrature rule with the tabulated shape functions of a space."""
     table = ShapeTable(
         np.ascontiguousarray(V.element.basix_element.tabulate(1, points)[..., 0].transpose(1, 0, 2))
     )
@@ -201,6 +219,7 @@ def _rule(V: fem.FunctionSpace, points: Array, weights: Array) -> EntityRule:
 
 
 def _on_facet(points: Array, facet: int) -> Array:
+    """Return points (n, 2) of the reference facet as places (n, 3) in the reference cell."""
     corners = basix.geometry(basix.CellType.hexahedron)[
         basix.topology(basix.CellType.hexahedron)[2][facet]
     ]
@@ -210,31 +229,33 @@ def _on_facet(points: Array, facet: int) -> Array:
 def _cells_at(
     body: BodyMesh, facets: NDArray[np.int32]
 ) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Return the owned cells with one of these facets, and its number in each."""
+    """Return the owned cells behind some facets, and the facet's number in each cell."""
     topology = body.mesh.topology
-    links = topology.connectivity(2, 3)
-    cells = links.array[links.offsets[facets]]
-    numbers = np.argmax(
+    cells_of_facets = topology.connectivity(2, 3)
+    cells = cells_of_facets.array[cells_of_facets.offsets[facets]]
+    facet_numbers = np.argmax(
         topology.connectivity(3, 2).array.reshape(-1, 6)[cells] == facets[:, None], axis=1
     )
     owned = cells < topology.index_map(3).size_local
-    return np.asarray(cells[owned], dtype=np.int32), numbers[owned]
+    return np.asarray(cells[owned], dtype=np.int32), facet_numbers[owned]
 
 
 def _geometry(jets: Array, region: str, facet: int | None) -> Array:
-    """Return the geometry (points, SIZES[region]) from the placement's jets; dX/dxi and n and t by
-    rows.
+    """Return the geometry (points, SIZES[region]) at points from the placement's jets.
+
+    See `SIZES` for its numbers; dX/dxi inverted is stored by rows.
     """
     flat = jets.reshape(-1, JET_PARTS, 3)
     if region == "outer":
         return flat.reshape(-1, SIZES[region])
     G = flat[:, 1:].transpose(0, 2, 1)  # columns are the derivatives
-    inverse, size = np.linalg.inv(G), np.linalg.det(G)
+    inverse, volume_ratio = np.linalg.inv(G), np.linalg.det(G)
     if facet is None:
-        return np.column_stack([flat[:, 0], inverse.reshape(-1, 9), size])
+        return np.column_stack([flat[:, 0], inverse.reshape(-1, 9), volume_ratio])
+    # area ratio by Nanson's formula; n along the thickness, t along the edge
     outward = basix.cell.facet_outward_normals(basix.CellType.hexahedron)[facet] @ inverse
     n, t = flat[:, 3], np.cross(flat[:, 3], outward)
     unit = [v / np.linalg.norm(v, axis=1)[:, None] for v in (n, t)]
     return np.column_stack(
-        [flat[:, 0], inverse.reshape(-1, 9), size * np.linalg.norm(outward, axis=1), *unit]
+        [flat[:, 0], inverse.reshape(-1, 9), volume_ratio * np.linalg.norm(outward, axis=1), *unit]
     )

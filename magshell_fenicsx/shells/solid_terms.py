@@ -1,4 +1,8 @@
-"""Terms of a solid from its densities: each is compiled once, and only when a scene has it."""
+"""Terms of a solid, each integrated from one density over a body or its faces.
+
+`TermFactory` makes a term only when a scene asks for it; its kernel is compiled once. Lengths are
+over R, energies over E h R².
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -34,11 +38,12 @@ from magshell_fenicsx.parts.magnetism.saturation import SIZE
 from magshell_fenicsx.parts.magnetism.soft_magnet import TERM, Sheet, SoftMagnet
 
 REDUCED_QUADRATURE_DEGREE = 3  # quadrature degree: two points in each direction
+# parts of a displacement's jet: value, reference derivatives
 VALUE, GRADIENT, ON_FACE = (
     (0,),
     (1, 2, 3),
     (0, 1, 2),
-)  # parts of a displacement's jet: value, reference derivatives
+)
 Array = NDArray[np.float64]
 Facets = NDArray[np.int32]
 HEIGHT_TOLERANCE = 1e-9
@@ -46,7 +51,7 @@ HEIGHT_TOLERANCE = 1e-9
 
 @dataclass(frozen=True)
 class SolidDensity:
-    """The one source of a term's form and of its point Hessians.
+    """A density of a solid: the one source of a term's form and of its Hessians at points.
 
     Attributes
     ----------
@@ -57,13 +62,16 @@ class SolidDensity:
     parameters
         Numbers, or fields of vectors.
     parts
-        The parts of the displacement's jet that it depends on.
+        Parts of the displacement's jet that it depends on: 0 the value, 1 to 3 the reference
+        derivatives.
     degree
         Degree of the quadrature.
+    region
+        Where it is integrated: the body, its outer face, or ends.
     facets
-        Facets that it is integrated on.
+        Local facets that it is integrated on, of faces.
     upper
-        Whether it is integrated on the outer half of these alone.
+        Whether it is integrated on the outer half of these facets alone.
     work
         Virtual work of a load without potential, on faces; it takes v before the parameters.
     """
@@ -87,15 +95,15 @@ class SolidDensity:
 
 
 class SolidTerm(DensityTerm[SolidDensity]):
-    """A term of a solid."""
+    """A term of a solid, with a `SolidDensity`."""
 
 
 class EndMoment(AngleTerm, SolidTerm):
-    """A moment on an end."""
+    """A moment on an end of a solid, whose work is counted by the turned angle."""
 
 
 def unchanged(density: SolidDensity) -> SolidDensity:
-    """Return the density: the body grows nowhere."""
+    """Return the density as it is: the default of a body that grows nowhere."""
     return density
 
 
@@ -105,6 +113,14 @@ class TermFactory:
 
     Attributes
     ----------
+    body
+        Mesh of the body with its named faces.
+    u
+        Displacement over R.
+    h
+        Thickness over R.
+    log
+        Log that compiles forms, with their names and compile times.
     hinged
         Ends whose middle line alone is held.
     grown
@@ -129,29 +145,32 @@ class TermFactory:
     saturated: list[PointField] = field(default_factory=list)
 
     def distortions(self) -> list[SolidTerm]:
-        """Return the terms of distortion, without change of volume; a neo-Hookean body has one."""
-        shear, share = self.material.shear, self.material.share
+        """Return the terms of distortion without change of volume (Mooney and Rivlin's law).
+
+        A neo-Hookean body has one term, others a second one of areal distortion.
+        """
+        shear, areal_share = self.material.shear, self.material.share
         densities_and_shares = {
-            "distortion": (body_densities.distortion, 1 - share),
-            "areal distortion": (body_densities.areal_distortion, share),
+            "distortion": (body_densities.distortion, 1 - areal_share),
+            "areal distortion": (body_densities.areal_distortion, areal_share),
         }
         return [
             self._bulk(
                 name,
-                self.grown(SolidDensity(density, self._constants(part * shear, self.h))),
+                self.grown(SolidDensity(density, self._constants(share_of_shear * shear, self.h))),
                 group="distortion",
             )
-            for name, (density, part) in densities_and_shares.items()
-            if part or name == "distortion"
+            for name, (density, share_of_shear) in densities_and_shares.items()
+            if share_of_shear or name == "distortion"
         ]
 
     def compression(self) -> SolidTerm:
-        """Return the term of volume change, with two quadrature points in each direction: more
-        constraints on J would lock the element.
+        """Return the term of volume change, kappa/2 (J - 1)^2, with reduced quadrature.
 
-        The same as a discontinuous trilinear pressure, eliminated (Malkus and Hughes, Comput.
-        Methods Appl. Mech. Eng. 15, 1978), so the tangent is that of displacements alone and its
-        inertia tells stability.
+        Two points in each direction: more constraints on J would lock the element. It is the same
+        as a discontinuous trilinear pressure, eliminated (Malkus and Hughes, Comput. Methods Appl.
+        Mech. Eng. 15, 1978). So the tangent is that of displacements alone and its inertia tells
+        stability.
         """
         parameters = self._constants(self.material.bulk, self.h)
         return self._bulk(
@@ -164,8 +183,10 @@ class TermFactory:
         )
 
     def magnetic(self, field: Magnetisation) -> list[SolidTerm]:
-        """Return the terms of a remanence, linear in the applied field, with the amplitude
-        lambda_m, and of a soft magnet.
+        """Return the terms of a remanence and of a soft magnet in the applied field.
+
+        The remanence's terms are linear in the field, with the amplitude lambda_m. A field in space
+        is known by its values at the displaced places; it is added to `fields`.
         """
         applied = None
         if field.in_space:
@@ -183,9 +204,7 @@ class TermFactory:
     def soft_magnetic(
         self, field: Magnetisation, soft_magnet: SoftMagnet, applied: AppliedField | None
     ) -> SolidTerm:
-        """Return the term of a soft-magnetic body in the field, see
-        `EnergyFactory.soft_magnetic`.
-        """
+        """Return the term of a soft-magnetic body; see `EnergyFactory.soft_magnetic`."""
         sheet, (scale, h) = Sheet(field), self._constants(soft_magnet.scale, self.h)
         law, n0, *parameters = self._of_sheet(sheet, soft_magnet, applied)
         density = SolidDensity(
@@ -194,8 +213,14 @@ class TermFactory:
         return self._bulk(TERM, density, group="magnetic", column="magnetic")
 
     def induced(self, field: Magnetisation) -> dict[str, ufl.Form]:
-        """Integrals of the polarisation over the undeformed volume of the modelled part, and that
-        volume.
+        """Return the forms that give the mean induced polarisation.
+
+        Returns
+        -------
+        dict[str, ufl.Form]
+            "induced x", "induced y" and "induced z": integrals of the polarisation over the
+            undeformed volume of the modelled part. "induced volume": that volume. Empty without a
+            soft material.
         """
         if field.soft is None:
             return {}
@@ -211,9 +236,11 @@ class TermFactory:
     def _of_sheet(
         self, sheet: Sheet, soft_magnet: SoftMagnet, applied: AppliedField | None
     ) -> "list[fem.Constant | fem.Function]":
-        """Parameters of a sheet's densities: the susceptibility, or the magnetisation state where
-        it saturates; normals of layers, amplitudes, and the vectors of the field or its polynomial
-        in space.
+        """Return the parameters of the densities of layers, in the order that `Sheet` takes them.
+
+        First the susceptibility, or the magnetisation state where the material saturates. Then the
+        undeformed normals of layers, the amplitudes, and last the vectors of the field or its
+        polynomial in space.
         """
         chi, V = soft_magnet.susceptibility, self.u.function_space
         if callable(chi):
@@ -229,7 +256,7 @@ class TermFactory:
         ]
         polynomials = [applied.polynomial] if applied else []
         if soft_magnet.saturation is not None:
-            if not self.saturated:  # energy and observed forms share it
+            if not self.saturated:  # the energy and the observed forms share the state
                 self.saturated.append(self._saturated(sheet, law, n0, amplitudes, applied))
             law = self.saturated[0]
         return [law, n0, *amplitudes, *self._constants(*sheet.vectors), *polynomials]
@@ -242,7 +269,10 @@ class TermFactory:
         amplitudes: Sequence[fem.Constant],
         applied: AppliedField | None,
     ) -> PointField:
-        """Return the magnetisation state of a material that saturates, at the points of cells."""
+        """Return the magnetisation state of a saturating material at the quadrature points.
+
+        The state holds two polynomials of the energy, at u and at u = 0; see `saturation`.
+        """
         V = self.u.function_space
         saturation, X = PointField(V.mesh, QUADRATURE_DEGREE, 2 * SIZE), fem.Function(V)
         X.interpolate(lambda x: x)
@@ -251,22 +281,25 @@ class TermFactory:
         normals = at_quadrature(n0, saturation.points)
 
         def places_and_normals() -> list[Array]:
+            """Return undeformed places, displacements, and present and undeformed normals."""
             x0, u = (
                 np.einsum("dqk,cki->dcqi", table, f.x.array.reshape(-1, 3)[V.dofmap.list])
                 for f in followed
             )
             G, H = (np.moveaxis(jet[1:], 0, -1) for jet in (x0, u))
+            # F from du/dX, both from derivatives by reference coordinates
             F = np.eye(3) + H @ np.linalg.inv(G)
-            n = np.linalg.solve(np.swapaxes(F, -1, -2), normals[..., None])[
-                ..., 0
-            ]  # cof F n0, but for its length
+            # along cof F n0
+            n = np.linalg.solve(np.swapaxes(F, -1, -2), normals[..., None])[..., 0]
             return [x0[0], u[0], n / np.linalg.norm(n, axis=-1, keepdims=True), normals]
 
         return sheet.saturated(chi, amplitudes, applied, saturation, followed, places_and_normals)
 
     def remanent(self, field: Magnetisation, applied: AppliedField | None) -> list[SolidTerm]:
-        """Return the terms of a remanence, linear in the applied field, with the amplitude
-        lambda_m.
+        """Return the terms of a remanence, linear in the applied field, with amplitude lambda_m.
+
+        A field known by its values (`applied`) has one term. Otherwise each uniform direction of
+        the field has its own amplitude, and a field gradient one more term.
         """
         pattern = field.remanent
         law = body_densities if field.law == "deformation" else rotation_law
@@ -289,7 +322,7 @@ class TermFactory:
         terms = []
         for amplitude, suffix, Ba in directions:
             density = SolidDensity(law.magnetic, (Br, *self._constants(Ba, self.h)))
-            of_field = self._bulk(
+            term = self._bulk(
                 "magnetic" + suffix,
                 density,
                 amplitude,
@@ -297,7 +330,7 @@ class TermFactory:
                 group="magnetic",
                 column="magnetic",
             )
-            terms.append(of_field)
+            terms.append(term)
         if field.gradient is not None:
             density = SolidDensity(
                 law.magnetic_gradient,
@@ -308,8 +341,17 @@ class TermFactory:
         return terms
 
     def pressure(self, classical: float, *, potential: bool = True) -> list[SolidTerm]:
-        """Return the terms of a live pressure with the amplitude p/p_c, on the outer face and above
-        the middle line of hinged ends; `classical` is p_c/E.
+        """Return the terms of a live pressure with the amplitude p/p_c.
+
+        It acts on the outer face and above the middle line of hinged ends.
+
+        Parameters
+        ----------
+        classical
+            p_c/E.
+        potential
+            Whether the load has a potential; otherwise its virtual work takes the place of the
+            gradient.
         """
         v = None if potential else ufl.TestFunction(self.u.function_space)
         return [
@@ -328,8 +370,9 @@ class TermFactory:
         ]
 
     def user_term(self, term: OwnTerm, amplitude: str | None = None) -> SolidTerm:
-        """Return a user's term, or a part's, on the outer face or of the body, with its own
-        amplitude or another.
+        """Return a user's term, or a part's, over the body's volume or on its outer face.
+
+        `amplitude` takes the place of the term's name as its amplitude.
         """
         assert term.density
         if term.of_volume:
@@ -346,8 +389,9 @@ class TermFactory:
         )
 
     def observed(self, term: OwnTerm) -> dict[str, ufl.Form]:
-        """Return the integrals that a term observes, by column, on the outer face or of the
-        body.
+        """Return the integrals that a term observes, by column name.
+
+        They run over the body's volume or its outer face, as the term's energy does.
         """
         if term.of_volume:
             densities = {
@@ -361,18 +405,24 @@ class TermFactory:
         }
 
     def _volume_density(self, term: OwnTerm, density_function: Callable[..., Expr]) -> SolidDensity:
-        """Return the density of a volume, which depends on places alone."""
+        """Return the density per volume of a term that depends on places alone."""
+        # jets with the value alone; derivatives are zero
         flat = [ufl.zero(3)] * len(ALL_DERIVATIVES)
-        count = len(term.parameters)
+        parameter_count = len(term.parameters)
         at_point = term.at_point(density_function)
 
         def per_volume(X: Expr, u: Expr, H: Expr, *parameters: Expr) -> Expr:
-            return at_point(Jet(X, *flat), Jet(u, *flat), *parameters[:count]) / parameters[count]
+            # the last parameter is h: energies count over E h R²
+            return (
+                at_point(Jet(X, *flat), Jet(u, *flat), *parameters[:parameter_count])
+                / parameters[parameter_count]
+            )
 
         constants = constants_of(term, self.u.function_space.mesh, self.free_constants)
         return SolidDensity(per_volume, (*constants, *self._constants(self.h)), VALUE)
 
     def _over_body(self, density: SolidDensity) -> ufl.Form:
+        """Return the integral of a density at u over the undeformed body."""
         dx = ufl.Measure(
             "dx", domain=self.body.mesh, metadata={"quadrature_degree": density.degree}
         )
@@ -380,7 +430,8 @@ class TermFactory:
         return density.function(X, self.u, H, *density.parameters) * dx
 
     def _face_density(self, term: OwnTerm, density_function: Callable[..., Expr]) -> SolidDensity:
-        """Return the density of a mid-surface on the outer face, per area of the reference cell."""
+        """Return a surface term's density on the outer face, per area of the reference cell."""
+        # second derivatives are zero on the face
         flat = [ufl.zero(3)] * len(SECOND_DERIVATIVES)
 
         def on_face(
@@ -396,16 +447,22 @@ class TermFactory:
         )
 
     def volume_change(self, origin: Array | None) -> ufl.Form:
-        """Delta V/R^3 under the outer face of the modelled part, from an origin; None: when points
-        move straight.
+        """Return Delta V/R^3 under the outer face of the modelled part.
+
+        It is counted from `origin` (3,) over R; None counts what points sweep on straight ways.
         """
         return self._on_faces(list(self._volume_densities(1.0, origin).values()))
 
     def moment(self, name: str, edge: str, intensity: float, amplitude: str) -> EndMoment:
-        """Return the term of a moment per length, in E h R, about the first tangent of an edge."""
+        """Return the term of a moment about the first tangent of an edge; collective.
+
+        `intensity` is the moment per length, in E h R; it acts on the end above the edge as a
+        traction that is linear through the thickness.
+        """
         Q = fem.functionspace(self.body.mesh, ("Lagrange", 2, (1,)))
         weight, reference_turn = fem.Function(Q), self._constants(np.array([1.0, 0.0]))[0]
         body = self.body
+        # 6 z (1 - z)/h, z from 0 to 1: its integral over the thickness is one
         weight.x.array[:] = body.at_nodes(Q, 6 * body.heights * (1 - body.heights) / body.thickness)
         parameters = (weight, *self._constants(intensity), reference_turn)
         density = SolidDensity(
@@ -423,8 +480,20 @@ class TermFactory:
     def _volume_densities(
         self, unit: float, origin: Array | None, *, potential: bool = True
     ) -> dict[str, SolidDensity]:
-        """Densities of p times the volume's change under the outer face, down to the middle line
-        where an end is hinged.
+        """Return densities of p times the change of volume under the outer face, by term name.
+
+        On hinged ends the volume reaches down to the middle line. There, cells wholly above the
+        line have one density, and those that hold it another, integrated on their upper half.
+
+        Parameters
+        ----------
+        unit
+            Pressure of an amplitude of one.
+        origin
+            Point (3,) over R that the volume is counted from; None for volume swept by straight
+            motion.
+        potential
+            Whether the pressure has a potential; otherwise densities also have a virtual work.
         """
         moves_straight, faces = origin is None, self.body.faces
         parameters = self._constants(
@@ -440,7 +509,7 @@ class TermFactory:
         if not potential:
             face_work = body_densities.follower_pressure_work
             end_work = body_densities.follower_pressure_work_on_end
-        of_faces = {
+        densities_by_name = {
             "pressure": SolidDensity(
                 face_density,
                 parameters,
@@ -453,17 +522,19 @@ class TermFactory:
         }
         if self.hinged:
             facets = np.unique(np.concatenate([faces[name] for name in self.hinged]))
-            links = self.body.mesh.topology.connectivity(2, 3)
-            low, high = self.body.layer_bounds[links.array[links.offsets[facets]]].T
-            parts = {
+            cells_of_facets = self.body.mesh.topology.connectivity(2, 3)
+            low, high = self.body.layer_bounds[
+                cells_of_facets.array[cells_of_facets.offsets[facets]]
+            ].T
+            masks = {
                 "whole": low > MIDSURFACE_HEIGHT - HEIGHT_TOLERANCE,
                 "upper": (low < MIDSURFACE_HEIGHT - HEIGHT_TOLERANCE)
                 & (high > MIDSURFACE_HEIGHT + HEIGHT_TOLERANCE),
             }
-            for name, is_in_part in parts.items():
-                if self.body.mesh.comm.allreduce(int(is_in_part.sum())):
-                    facets_of_part, upper = facets[is_in_part], name == "upper"
-                    of_faces[f"pressure {name}"] = SolidDensity(
+            for name, is_in_mask in masks.items():
+                if self.body.mesh.comm.allreduce(int(is_in_mask.sum())):
+                    facets_of_part, upper = facets[is_in_mask], name == "upper"
+                    densities_by_name[f"pressure {name}"] = SolidDensity(
                         end_density,
                         parameters,
                         VALUE + GRADIENT,
@@ -473,7 +544,7 @@ class TermFactory:
                         upper,
                         end_work,
                     )
-        return of_faces
+        return densities_by_name
 
     def _bulk(
         self,
@@ -485,13 +556,17 @@ class TermFactory:
         group: str = "",
         column: str = "",
     ) -> SolidTerm:
+        """Return the term of a density over the body; an empty group stands for the name."""
         energy = self._over_body(density)
         term = SolidTerm(name, density, energy, self.u, self.log, amplitude, linear=linear)
         term.group, term.column = group or name, column
         return term
 
     def _on_faces(self, densities: Sequence[SolidDensity], v: Expr | None = None) -> ufl.Form:
-        """Return the sum of energies on faces, or of virtual works of v."""
+        """Return the sum of the densities' integrals on their faces.
+
+        With the test function `v` it is the virtual work of each density in place of its energy.
+        """
         domain, u = self.body.mesh, self.u
         X, J, H = ufl.SpatialCoordinate(domain), ufl.Jacobian(domain), ufl.grad(u)
         ds, forms = face_measure(domain, [density.facets for density in densities]), []
@@ -500,12 +575,14 @@ class TermFactory:
             assert function
             parameters = density.parameters if v is None else (v, *density.parameters)
             if density.region == "outer":
+                # coordinates of the outer face are the first two of the reference cell
                 area = ufl.cross(J[:, 0], J[:, 1])
                 arguments = X, J[:, 0], J[:, 1], u, ufl.dot(H, J[:, 0]), ufl.dot(H, J[:, 1])
                 forms.append(
                     function(*arguments, *parameters) / ufl.sqrt(ufl.dot(area, area)) * ds(tag)
                 )
                 continue
+            # an end: n along the thickness, t along the edge
             n = J[:, 2] / ufl.sqrt(ufl.dot(J[:, 2], J[:, 2]))
             t = ufl.cross(n, ufl.FacetNormal(domain))
             per_area = function(X, u, H, n, t / ufl.sqrt(ufl.dot(t, t)), *parameters)

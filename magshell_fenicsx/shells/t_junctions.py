@@ -48,17 +48,16 @@ if TYPE_CHECKING:
 Array = NDArray[np.float64]
 Longs = NDArray[np.int64]
 TIE_STIFFNESS_RATIO = 1e4  # stiffness of a tie over that of an element
-PARAMETER_TOLERANCE = 2e-9  # of a parameter: rounding
+PARAMETER_TOLERANCE = 2e-9  # difference of two parameters that is rounding
 MAX_DISTANCE_IN_THICKNESSES = (
     0.05  # thicknesses: a place of the edge that is farther from the other mid-surface is not on it
 )
 SIDE_CORNERS = np.array([[1, 2], [0, 2], [0, 1]])
 CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
-CELL_RADIUS_FACTOR = 1.2  # of the radius of a cell's nodes about their centre, that of all of it
-TANGENT_COMPONENTS = 12  # of both tangents of both shells at a point
-AROUND_E3 = np.array(
-    [[[1, 0], [0, 0], [0, 1]], [[0, 0], [1, 0], [0, 0]]]
-)  # (U, W) -> vector and its derivative
+CELL_RADIUS_FACTOR = 1.2  # radius of a whole cell over that of its nodes, about their centre
+TANGENT_COMPONENTS = 12  # components of both tangents of both shells at a point
+# (U, W) -> vector and its derivative
+AROUND_E3 = np.array([[[1, 0], [0, 0], [0, 1]], [[0, 0], [1, 0], [0, 0]]])
 
 
 class TiedPoints(NamedTuple):
@@ -69,7 +68,7 @@ class TiedPoints(NamedTuple):
     unknowns
         (n, k) global numbers of the unknowns on which each point depends.
     gap
-        (n, 3, k) maps from these unknowns to u - u'.
+        (n, 3, k) maps from these unknowns to u - u', with u' the displacement of the other shell.
     tangents
         (n, 12, k) maps from these unknowns to both tangents of both shells.
     edge_directions
@@ -90,10 +89,12 @@ class TiedEdge(NamedTuple):
 
     Attributes
     ----------
+    joint
+        The edge and the other shell, with the stiffness of their connection.
     key
         Key of the case file, with which messages begin.
     is_other_shell
-        Whether each cell of this rank, ghosts included, belongs to the other shell.
+        Mask of this rank's cells, ghosts included, that belong to the other shell.
     """
 
     joint: Joint
@@ -104,7 +105,8 @@ class TiedEdge(NamedTuple):
 class TieTerm:
     """Energy of points of an edge that are tied to places of another shell.
 
-    It is an `assembly.terms.Term` and an `assembly.nonlocal_terms.NonlocalTerm`.
+    It is an `assembly.terms.Term` (a summand of the potential) and a `NonlocalTerm` (its tangent
+    has entries outside the sparsity pattern). Construction is collective and compiles kernels.
     """
 
     amplitude = None
@@ -118,6 +120,7 @@ class TieTerm:
         tied_points: TiedPoints,
         log: KernelLog,
     ) -> None:
+        """Compile the kernels of the term and take the angles of the placement; collective."""
         V = u.function_space
         self._comm, self._u, self._size = V.mesh.comm, u, V.dofmap.bs
         index = V.dofmap.index_map
@@ -130,24 +133,27 @@ class TieTerm:
         self._present = self._points.field(TANGENT_COMPONENTS)
         self._moved = self._points.field(TANGENT_COMPONENTS)
         # direction along the edge, sine and cosine of the placement, stiffness
-        self._fixed = fixed = self._points.field(5)
-        angle = _angle(self._present, self._moved, fixed)
-        sine = angle[0] * fixed[3] - angle[1] * fixed[2]
-        cosine = angle[1] * fixed[3] + angle[0] * fixed[2]
-        W = fixed[4] / 2 * ufl.atan2(sine, cosine) ** 2
+        self._fixed = fixed_field = self._points.field(5)
+        sine_and_cosine = _angle(self._present, self._moved, fixed_field)
+        sine = sine_and_cosine[0] * fixed_field[3] - sine_and_cosine[1] * fixed_field[2]
+        cosine = sine_and_cosine[1] * fixed_field[3] + sine_and_cosine[0] * fixed_field[2]
+        W = fixed_field[4] / 2 * ufl.atan2(sine, cosine) ** 2
         self._moved.x.array[:] = 0.0
         self._kernels: Mapping[str, PointKernel] = {
-            "angle": point_values("T-junction angle", angle, log),
+            "angle": point_values("T-junction angle", sine_and_cosine, log),
             "energy": point_values("T-junction energy", W, log),
             "gradient": point_gradient("T-junction gradient", [(W, self._moved)], log),
             "hessian": full_hessian("T-junction Hessian", W, self._moved, log),
         }
         self._placed = self._apply(self._tangents, global_values(r0))
-        values = fixed.x.array.reshape(-1, 5)[: len(self._unknowns)]
-        values[:, :2], values[:, 4] = tied_points.edge_directions, tied_points.stiffness[:, 1]
-        values[:, 2:4] = self._evaluate("angle", 0 * global_values(r0))
+        fixed_values = fixed_field.x.array.reshape(-1, 5)[: len(self._unknowns)]
+        fixed_values[:, :2], fixed_values[:, 4] = (
+            tied_points.edge_directions,
+            tied_points.stiffness[:, 1],
+        )
+        fixed_values[:, 2:4] = self._evaluate("angle", 0 * global_values(r0))
 
-    # as a term
+    # the interface of a term
 
     def compile_residual(self) -> None:
         """Compile nothing: the kernels of the term are compiled with it."""
@@ -156,11 +162,13 @@ class TieTerm:
         """Compile nothing: the kernels of the term are compiled with it."""
 
     def energy(self) -> float:
+        """Return the elastic energy of both ties at this rank's points; collective."""
         u = global_values(self._u)
         tie_energy = float(self._tie @ np.sum(self._apply(self._gaps, u) ** 2, axis=1)) / 2
         return tie_energy + (float(self._evaluate("energy", u).sum()) if self._turns else 0.0)
 
     def add_residual(self, b: Array, factor: float) -> None:
+        """Add factor times the forces of the ties to the local vector b; collective."""
         u = global_values(self._u)
         residual = np.zeros(u.size)
         forces = np.einsum(
@@ -172,13 +180,17 @@ class TieTerm:
         add_to_owners(b, residual, self._own, self._comm)
 
     def add_tangent(self, K: object, factor: float, clamped: object) -> None:
-        """Add nothing: what assembles the others adds `entries`."""
+        """Add nothing: the assembler of nonlocal terms adds `entries`."""
 
     def entries(self) -> Entries:
+        """Return rows, columns and values of the tangent; see `NonlocalTerm`."""
         return _entries(self._unknowns, self._second_variation(self._gaps, self._tangents))
 
     def coupled_pairs(self) -> tuple[Longs, Longs]:
-        """Return the pairs of nodes that act on each other, which always do; see `NonlocalTerm`."""
+        """Return the pairs of global nodes that act on each other, which never change.
+
+        See `NonlocalTerm`.
+        """
         return pairs_of(self._unknowns[:, :: self._size] // self._size)
 
     @property
@@ -187,18 +199,22 @@ class TieTerm:
         return 0.0
 
     def _second_variation(self, gap: Array, tangents: Array) -> Array:
-        """Return the second variation (n, k, k) at the present u, along any k unknowns from which
-        these maps lead; collective.
+        """Return the second variation (n, k, k) at the present u; collective.
+
+        `gap` (n, 3, k) and `tangents` (n, 12, k) map k unknowns to the tie's gap and to both
+        tangents of both shells. They may be other maps than those of the displacement, as of a
+        wave.
         """
         H = np.einsum("n,nck,ncl->nkl", self._tie, gap, gap, optimize=True)
         u = global_values(self._u)
         if self._turns and len(H):
-            of_parts = np.zeros((len(H), TANGENT_COMPONENTS, TANGENT_COMPONENTS))
+            hessians = np.zeros((len(H), TANGENT_COMPONENTS, TANGENT_COMPONENTS))
+            # the kernel gives the upper triangle of each symmetric Hessian
             upper = np.triu_indices(TANGENT_COMPONENTS)
-            of_parts[:, upper[0], upper[1]] = of_parts[:, upper[1], upper[0]] = self._evaluate(
+            hessians[:, upper[0], upper[1]] = hessians[:, upper[1], upper[0]] = self._evaluate(
                 "hessian", u
             )
-            H += np.einsum("nik,nij,njl->nkl", tangents, of_parts, tangents, optimize=True)
+            H += np.einsum("nik,nij,njl->nkl", tangents, hessians, tangents, optimize=True)
         return np.asarray(H)
 
     def _apply(self, maps: Array, u: Array) -> Array:
@@ -206,8 +222,14 @@ class TieTerm:
         return np.asarray(np.einsum("nck,nk->nc", maps, u.ravel()[self._unknowns]))
 
     def _evaluate(self, kernel: str, u: Array) -> Array:
-        """Return a kernel's values (n, ..) at the points, with this displacement (nodes,
-        components) of all nodes.
+        """Return a kernel's values (n, ..) at the points, at the displacement u of all nodes.
+
+        Parameters
+        ----------
+        kernel
+            "angle", "energy", "gradient" or "hessian".
+        u
+            (nodes, components) nodal values of all ranks.
         """
         count = len(self._unknowns)
         self._present.x.array[: count * TANGENT_COMPONENTS] = (
@@ -221,10 +243,14 @@ class SurfaceTJunction(TieTerm):
 
     Parameters
     ----------
+    tied_edge
+        The edge and the shell on which it stands.
+    r0, u
+        Placement and displacement.
     facets
         Local facets of the edge.
     stiffness
-        (cells of this rank, 2) E h and E h^3 of each over those of the first shell.
+        (cells of this rank, 2) E h and E h^3 of each cell over those of the first shell.
 
     Raises
     ------
@@ -242,6 +268,7 @@ class SurfaceTJunction(TieTerm):
         material: Material,
         log: KernelLog,
     ) -> None:
+        """Find the places that the edge is tied to; collective."""
         joint, surfaces = tied_edge.joint, MidSurfaces.gather(r0)
         edge = surfaces.edge_on_shell(facets, tied_edge.is_other_shell)
         edge.refuse_misplaced(r0.function_space.mesh.comm, material.h, tied_edge.key, joint)
@@ -253,25 +280,27 @@ class SurfaceTJunction(TieTerm):
 
 @dataclass(frozen=True)
 class EdgeOnShell:
-    """Points (n, 3) of an edge, and the places of another shell that are nearest to them.
+    """Quadrature points of an edge, and the places of another shell that are nearest to them.
 
     Attributes
     ----------
     cell, other_cell
-        (n,) global numbers of the cells of both.
+        (n,) global numbers of the cells of the edge and of the other shell.
     on_edge
         (3, n, functions): shape functions of the edge's cells at the points, and their derivatives.
     x
-        The points, undeformed.
+        (n, 3) the points, undeformed.
     directions
         (n, 2) the edge's direction in the coordinates of its cell.
     weight, length
-        (n,) the length for which a point stands, and that of its cell's side.
-    Y, distances
-        (n, 2) the places in their cells, and (n,) their distances, inf without a cell.
+        (n,) the length for which a point stands, and the length of its cell's side.
+    Y
+        (n, 2) reference coordinates of the nearest places in their cells.
+    distances
+        (n,) distances to the nearest places over R, inf without a cell.
     clearance
-        Greatest distance from the other shell of all nodes of a cell beside the edge, the least of
-        these cells.
+        Greatest distance of a cell's nodes from the other shell, minimised over the cells beside
+        the edge.
     """
 
     cell: Longs
@@ -286,12 +315,14 @@ class EdgeOnShell:
     clearance: float
 
     def refuse_misplaced(self, comm: MPI.Comm, h: float, key: str, joint: Joint) -> None:
-        """Refuse an edge that is not on the other shell, or whose own shell is; collective.
+        """Refuse an edge off the other shell, or one whose own shell lies in it; collective.
+
+        `h` is the thickness over R, `key` the key of the case file that messages begin with.
 
         Raises
         ------
         MeshError
-            On every rank, with the place and how far it is.
+            On every rank, with the place and the distance.
         """
         _refuse_apart(comm, self.distances, self.x, h, key, joint)
         if min(comm.allgather(self.clearance)) < MAX_DISTANCE_IN_THICKNESSES * h:
@@ -304,14 +335,16 @@ class EdgeOnShell:
 
 @dataclass(frozen=True)
 class MidSurfaces:
-    """The undeformed mid-surfaces of all shells, whole on every rank.
+    """The undeformed mid-surfaces of all shells, complete on every rank.
 
     Attributes
     ----------
+    V
+        Space of the placement.
     cells
         Cells of all ranks.
     r0
-        (nodes, 3) places.
+        (nodes, 3) places of all nodes over R.
     """
 
     V: fem.FunctionSpace
@@ -328,24 +361,25 @@ class MidSurfaces:
         return self.V.element.basix_element
 
     def shapes(self, X: Array) -> Array:
-        """Return (3, n, functions): shape functions at places and their derivatives."""
+        """Return shape functions and derivatives (3, n, functions) at places X (n, 2)."""
         return np.asarray(self._element.tabulate(1, X)[..., 0])
 
     def edge_on_shell(
         self, facets: NDArray[np.int32], is_other_shell: NDArray[np.bool_]
     ) -> EdgeOnShell:
-        """Return the foot of an edge on another shell; collective.
+        """Return quadrature points of an edge and their places on another shell; collective.
 
         Parameters
         ----------
         facets
             Local facets of the edge.
         is_other_shell
-            Whether each local cell is of the other shell.
+            Mask of the local cells that belong to the other shell.
         """
         first, nodes = self.cells.own_range.start, self.cells.nodes
         cells, ends = _cell_sides(self.V, facets, len(self.cells.own_range))
         s, weights = basix.make_quadrature(basix.CellType.interval, 2 * self._element.degree - 1)
+        # Gauss points along each side, in the coordinates of its cell
         X = ends[:, None, 0] + s[None, :, :1] * (ends[:, None, 1] - ends[:, None, 0])
         edge_directions = np.repeat(ends[:, 1] - ends[:, 0], len(s), axis=0)
         cell = np.repeat(first + cells, len(s))
@@ -355,32 +389,51 @@ class MidSurfaces:
         weight = np.tile(weights, len(cells)) * np.linalg.norm(tangent, axis=1)
         length = np.repeat(np.sum(weight.reshape(-1, len(s)), axis=1), len(s))
         shell = np.flatnonzero(self.cells.gather_values(is_other_shell))
-        other, Y, distances = self.nearest_places(x, shell)
+        other_cell, Y, distances = self.nearest_places(x, shell)
+        # a cell all of whose nodes are near the other shell lies in it
         places_of_cells = self.r0[nodes[first + cells]]
         distances_of_cells = self.nearest_places(places_of_cells.reshape(-1, 3), shell)[2].reshape(
             places_of_cells.shape[:2]
         )
         clearance = float(distances_of_cells.max(axis=1, initial=0.0).min(initial=np.inf))
         return EdgeOnShell(
-            cell, on_edge, x, edge_directions, weight, length, other, Y, distances, clearance
+            cell, on_edge, x, edge_directions, weight, length, other_cell, Y, distances, clearance
         )
 
     def nearest_places(self, x: Array, cells: Longs) -> tuple[Longs, Array, Array]:
-        """Return for points (n, 3) the nearest of some cells, the place in it (n, 2), and the
-        distance, inf without a cell.
+        """Return the nearest places of some cells to points.
+
+        Parameters
+        ----------
+        x
+            (n, 3) points over R.
+        cells
+            (m,) global numbers of the cells.
+
+        Returns
+        -------
+        nearest
+            (n,) global number of the nearest cell.
+        Y
+            (n, 2) reference coordinates of the place in that cell.
+        distances
+            (n,) distance over R; inf where no cell is near.
         """
         from scipy.spatial import cKDTree  # takes long to import
 
         nearest = np.zeros(len(x), dtype=np.int64)
         Y = np.zeros((len(x), 2))
         distances = np.full(len(x), np.inf)
-        nodal = self.r0[self.cells.nodes[cells]]
-        centres = nodal.mean(axis=1)
-        radii = CELL_RADIUS_FACTOR * np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
+        nodal_places = self.r0[self.cells.nodes[cells]]
+        centres = nodal_places.mean(axis=1)
+        radii = CELL_RADIUS_FACTOR * np.linalg.norm(nodal_places - centres[:, None], axis=2).max(
+            axis=1
+        )
         if len(cells):
             cells_near = cKDTree(centres).query_ball_point(x, 2 * radii.max())
         else:
             cells_near = [[]] * len(x)
+        # candidates: each point with all cells whose centre is near
         point = np.repeat(np.arange(len(x)), [len(numbers) for numbers in cells_near])
         candidate_cells = np.concatenate(
             [np.asarray(numbers, dtype=np.int64) for numbers in (*cells_near, [])]
@@ -401,9 +454,9 @@ class MidSurfaces:
         candidate_cells = candidate_cells[pair]
         reference_places = projections.X
         distance = projections.distance
-        order = np.lexsort(
-            (cells[candidate_cells], np.round(distance, 12), point)
-        )  # of equal ones the first
+        # nearest first; of equally near ones the first cell
+        order = np.lexsort((cells[candidate_cells], np.round(distance, 12), point))
+        # the first candidate of each point in this order
         best = order[np.flatnonzero(np.diff(point[order], prepend=-1))]
         nearest[point[best]] = cells[candidate_cells[best]]
         Y[point[best]] = reference_places[best]
@@ -412,14 +465,23 @@ class MidSurfaces:
 
 
 class MeridianTJunction(TieTerm):
-    """The junction of two meridians, which are `TieTerm`d at one point.
+    """The junction of two meridians, tied by a `TieTerm` at one point.
 
     Parameters
     ----------
+    key
+        Key of the case file, with which messages begin.
+    r0, u
+        Placement and displacement, with components along e_rho and e_z.
     tied
-        The parameters of both.
+        Parameters on the meridian chart of the edge and of its place on the other meridian.
     stiffness
-        See `SurfaceTJunction`.
+        (cells, 2) E h and E h^3 of each cell over those of the first shell.
+
+    Raises
+    ------
+    MeshError
+        If the edge is not on the other shell.
     """
 
     def __init__(
@@ -433,6 +495,7 @@ class MeridianTJunction(TieTerm):
         material: Material,
         log: KernelLog,
     ) -> None:
+        """Find the parallel that the edge is tied to; parameters are those of the class."""
         V = r0.function_space
         ends, dofs = _ends_of_cells(V), V.dofmap.list
         cells, self._shapes = _parallels(V, tied)
@@ -452,28 +515,34 @@ class MeridianTJunction(TieTerm):
         super().__init__(joint, r0, u, tied_points, log)
 
     def entries_of_waves(self, m: float) -> Entries:
-        """Return the entries of the second variation along waves, by the coefficients (U + V, V,
-        W), see `shells.waves`.
+        """Return the entries of the second variation along a wave cos(m theta).
+
+        Rows and columns number the wave's coefficients (U + V, V, W) at nodes; see `shells.waves`.
         """
+        # vectors and derivatives around e3 that (U, V, W) make, by cos and sin
         cosine = np.array([[[1, 0, 0], [0, 0, 0], [0, 0, 1]], [[0, 0, 0], [1, m, 0], [0, 0, 0]]])
         sine = np.array([[[0, 0, 0], [0, 1, 0], [0, 0, 0]], [[-m, -1, 0], [0, 0, 0], [0, 0, -m]]])
         U_from_P = np.array([[1, -1, 0], [0, 1, 0], [0, 0, 1]])
         H = sum(self._second_variation(*self._maps(part @ U_from_P)) for part in (cosine, sine))
+        # half: the mean of cos² and sin² around e3
         return _entries(self._numbers(3), np.asarray(H / 2))
 
     def _numbers(self, size: int) -> Longs:
+        """Return the numbers (1, k) of the unknowns of both cells, `size` of each node."""
         return np.asarray(size * self._nodes[:, :, None] + np.arange(size)).reshape(1, -1)
 
     def _maps(self, components: Array) -> tuple[Array, Array]:
-        """`gap` and `tangents`; `components` (2, 3, c) makes of a node's numbers its vector, and
-        the derivative around e3.
+        """Return `gap` and `tangents` of `TiedPoints`, from the unknowns of both cells.
+
+        `components` (2, 3, c) maps the c unknowns of a node to its vector and to that vector's
+        derivative around e3.
         """
         value, derivative = components
-        places, tangents = [], []
+        gap_blocks, tangent_blocks = [], []
         for N, slopes in self._shapes:
-            places.append(np.kron(N, value))
-            tangents.append(np.vstack([np.kron(slopes, value), np.kron(N, derivative)]))
-        return np.hstack([places[0], -places[1]])[None], block_diag(*tangents)[None]
+            gap_blocks.append(np.kron(N, value))
+            tangent_blocks.append(np.vstack([np.kron(slopes, value), np.kron(N, derivative)]))
+        return np.hstack([gap_blocks[0], -gap_blocks[1]])[None], block_diag(*tangent_blocks)[None]
 
 
 def _ends_of_cells(V: fem.FunctionSpace) -> Array:
@@ -484,16 +553,23 @@ def _ends_of_cells(V: fem.FunctionSpace) -> Array:
 def _parallels(
     V: fem.FunctionSpace, tied: tuple[float, float]
 ) -> tuple[list[Longs], list[tuple[Array, Array]]]:
-    """Return the cells at both parameters of a junction, with their shape functions there and
-    slopes, all in one row."""
+    """Return the cells at both parameters of a junction, and their shape functions.
+
+    Returns
+    -------
+    cells
+        Cells at each parameter; a vertex has two.
+    shapes
+        For each parameter, values and slopes of the shape functions of its cells in one row. At a
+        vertex each cell counts half.
+    """
     ends, shapes = _ends_of_cells(V), []
     is_inside = [
         (ends.min(axis=1) < s + PARAMETER_TOLERANCE) & (s - PARAMETER_TOLERANCE < ends.max(axis=1))
         for s in tied
     ]
-    cells = [
-        np.flatnonzero(cells_at) for cells_at in is_inside
-    ]  # a place on a vertex is tied to by the mean of two cells
+    # at a vertex, the mean of two cells is tied
+    cells = [np.flatnonzero(cells_at) for cells_at in is_inside]
     for s, cells_at in zip(tied, cells, strict=True):
         lengths = (ends[cells_at, 1] - ends[cells_at, 0])[:, None]
         N, slopes = V.element.basix_element.tabulate(1, (s - ends[cells_at, :1]) / lengths)[
@@ -506,12 +582,12 @@ def _parallels(
 def _refuse_parallels_apart(
     r0: fem.Function, tied: tuple[float, float], h: float, key: str, joint: Joint
 ) -> float:
-    """Return the radius of the ring of an edge, which must be on the other shell.
+    """Return the radius over R of an edge's ring, which must be on the other shell.
 
     Raises
     ------
     MeshError
-        If it is not.
+        If the edge is not on the other shell.
     """
     V, nodal = r0.function_space, r0.x.array.reshape(-1, 2)
     cells, shapes = _parallels(V, tied)
@@ -527,7 +603,9 @@ def _refuse_parallels_apart(
 def refuse_misplaced_parallels(
     joints: Sequence[Joint], meridian: Meridian, r0: fem.Function, h: float
 ) -> None:
-    """Refuse T-junctions of meridians whose edge is not on the other shell, as a model does.
+    """Refuse T-junctions of meridians whose edge is off the other shell, as a model would.
+
+    `h` is the thickness over R.
 
     Raises
     ------
@@ -542,20 +620,26 @@ def refuse_misplaced_parallels(
 
 
 def _entries(unknowns: Longs, H: Array) -> Entries:
+    """Return rows, columns and values of matrices H (n, k, k) between unknowns (n, k)."""
     rows, columns = np.broadcast_arrays(unknowns[:, :, None], unknowns[:, None, :])
     return rows.ravel(), columns.ravel(), H.ravel()
 
 
 def _tied_points(surfaces: MidSurfaces, edge: EdgeOnShell, ties: Array) -> TiedPoints:
-    """Return the points of an edge with what they take from the unknowns of both cells."""
+    """Return the tied points of an edge, with maps from the unknowns of both cells.
+
+    `ties` (n, 2) are the stiffnesses of both ties.
+    """
     nodes = surfaces.cells.nodes
     nodes_of_pairs = np.concatenate([nodes[edge.cell], nodes[edge.other_cell]], axis=1)
     points, pair_nodes = len(edge.x), nodes_of_pairs.shape[1]  # a rank may have no point
     edge_nodes, unknown_count, axes = nodes.shape[1], 3 * pair_nodes, np.eye(3)
     on_other = surfaces.shapes(edge.Y)
     derivatives = np.zeros((points, 4, pair_nodes))
+    # derivatives along both tangents of the edge's cell, then of the other cell
     derivatives[:, :2, :edge_nodes] = edge.on_edge[1:].transpose(1, 0, 2)
     derivatives[:, 2:, edge_nodes:] = on_other[1:].transpose(1, 0, 2)
+    # u - u': the other shell's shape functions count negative
     gap_weights = np.concatenate([edge.on_edge[0], -on_other[0]], axis=1)
     gap = np.einsum("nk,cd->nckd", gap_weights, axes)
     tangents = np.einsum("nik,cd->nickd", derivatives, axes)
@@ -571,8 +655,16 @@ def _tied_points(surfaces: MidSurfaces, edge: EdgeOnShell, ties: Array) -> TiedP
 def _tie_stiffness(
     joint: Joint, material: Material, factors: Array, length: Array, weight: Array
 ) -> Array:
-    """Return the stiffness (n, 2) of both ties at points that stand for a length `weight`, of cells
-    with sides of that `length`.
+    """Return the stiffness (n, 2) of the tie of places and of the tie of normals.
+
+    Parameters
+    ----------
+    factors
+        (n, 2) E h and E h^3 of the stiffer cell over those of the first shell.
+    length
+        (n,) length over R of the side of the edge's cell.
+    weight
+        (n,) length over R for which each point stands.
     """
     turning_stiffness: Array | float = joint.stiffness
     if joint.rigid:
@@ -587,10 +679,22 @@ def _tie_stiffness(
 def _refuse_apart(
     comm: MPI.Comm, distances: Array, x: Array, h: float, key: str, joint: Joint
 ) -> None:
+    """Refuse an edge whose points are off the other mid-surface; collective.
+
+    Parameters
+    ----------
+    distances, x
+        (n,) distances over R of this rank's points, and the points (n, 3).
+
+    Raises
+    ------
+    MeshError
+        On every rank, with the greatest distance and its place.
+    """
     worst = int(distances.argmax()) if len(distances) else -1
-    of_rank = (float(distances[worst]), x[worst]) if len(distances) else (0.0, np.zeros(3))
+    worst_of_rank = (float(distances[worst]), x[worst]) if len(distances) else (0.0, np.zeros(3))
     largest_distance, place = max(
-        comm.allgather(of_rank), key=lambda distance_and_place: distance_and_place[0]
+        comm.allgather(worst_of_rank), key=lambda distance_and_place: distance_and_place[0]
     )
     if largest_distance > MAX_DISTANCE_IN_THICKNESSES * h:
         edge, other = joint.edges
@@ -605,8 +709,14 @@ def _refuse_apart(
 
 
 def _cell_sides(V: fem.FunctionSpace, facets: NDArray[np.int32], owned: int) -> tuple[Longs, Array]:
-    """Return the local cells of this rank that have boundary facets, and both ends (n, 2, 2) of
-    each in the reference cell.
+    """Return this rank's own cells on boundary facets, with the sides that lie there.
+
+    Returns
+    -------
+    cells
+        (n,) local numbers.
+    ends
+        (n, 2, 2) both ends of each side in the reference cell.
     """
     topology = V.mesh.topology
     topology.create_connectivity(1, 2)
@@ -624,8 +734,10 @@ def _cell_sides(V: fem.FunctionSpace, facets: NDArray[np.int32], owned: int) -> 
 
 
 def _angle(tangents: fem.Function, increments: fem.Function, edge_direction: fem.Function) -> Expr:
-    """Sine and cosine of the angle between both normals about the edge, whose direction is the
-    first two of `edge_direction`.
+    """Return sine and cosine of the angle from normal n to normal m about the edge.
+
+    `tangents` and `increments` (12,) add up to both tangents of the edge's cell and of the other
+    one. The first two components of `edge_direction` give the edge in the coordinates of its cell.
     """
     a1, a2, b1, b2 = (
         ufl.as_vector([tangents[3 * i + c] + increments[3 * i + c] for c in range(3)])
@@ -642,7 +754,7 @@ def _angle(tangents: fem.Function, increments: fem.Function, edge_direction: fem
 
 
 def _tied_edges(joints: Sequence[Joint], surface: Midsurface) -> list[TiedEdge]:
-    """Return the edges of T-junctions: those of joints, then those of a mesh file's sheets."""
+    """Return the edges of T-junctions: those of joints, then those of a mesh file."""
     tied = [
         TiedEdge(joint, f"joints.{i}.edges", surface.patches[joint.edges[1]])
         for i, (joint, joint_cells) in enumerate(zip(joints, surface.joints, strict=True))
@@ -657,8 +769,9 @@ def _tied_edges(joints: Sequence[Joint], surface: Midsurface) -> list[TiedEdge]:
 def refuse_misplaced_edges(
     joints: Sequence[Joint], surface: Midsurface, r0: fem.Function, h: float
 ) -> None:
-    """Refuse T-junctions of surfaces whose edge is not on the other shell, as a model does;
-    collective.
+    """Refuse T-junctions of surfaces whose edge is off the other shell; collective.
+
+    `h` is the thickness over R.
 
     Raises
     ------
@@ -678,7 +791,9 @@ def refuse_misplaced_edges(
 def _refuse_coinciding_shells(
     tied_edges: Sequence[TiedEdge], surface: Midsurface, r0: fem.Function, h: float
 ) -> None:
-    """Refuse two shells that stand on a third one in the same place; collective.
+    """Refuse two shells that stand on a third one and lie in each other; collective.
+
+    `h` is the thickness over R.
 
     Raises
     ------
@@ -702,13 +817,19 @@ def _refuse_coinciding_shells(
 
 
 def _shell_of_edge(edge: str, surface: Midsurface) -> str | None:
-    """Return the name of the shell of an edge, which begins with it; None of a mesh file's edge."""
+    """Return the shell with whose name an edge's name begins; None for a mesh file's edge."""
     beginnings = {name: (f"{name}.", f"{name}_") for name in surface.patches}
     return next((name for name, words in beginnings.items() if edge.startswith(words)), None)
 
 
 def t_junction_terms(model: "ShellModel") -> list[SurfaceTJunction]:
-    """Return the T-junctions of a model on a mid-surface; collective."""
+    """Return the T-junction terms of a model on a mid-surface; collective.
+
+    Raises
+    ------
+    MeshError
+        On every rank, if an edge is misplaced.
+    """
     surface = model.midsurface
     tied_edges = _tied_edges(model.loads.joints, surface)
     if not tied_edges:
@@ -725,7 +846,7 @@ def t_junction_terms(model: "ShellModel") -> list[SurfaceTJunction]:
 
 
 def meridian_t_junction_terms(model: "MeridianModel") -> list[MeridianTJunction]:
-    """Return the T-junctions of a model on a meridian."""
+    """Return the T-junction terms of a model on a meridian; see `MeridianTJunction`."""
     meridian, factors, log = model.meridian, _stiffness_factors(model), model.kernels
     tied = enumerate(zip(model.loads.joints, meridian.tied, meridian.joints, strict=True))
     return [
@@ -738,7 +859,7 @@ def meridian_t_junction_terms(model: "MeridianModel") -> list[MeridianTJunction]
 
 
 def _stiffness_factors(model: "ShellModel | MeridianModel") -> Array:
-    """Return E h and E h^3 (cells of this rank, 2) of each cell over those of the first shell."""
+    """Return E h and E h^3 (cells, 2) of this rank's cells over those of the first shell."""
     cells = model.V.mesh.topology.index_map(model.V.mesh.topology.dim)
     factors = np.ones((cells.size_local + cells.num_ghosts, 2))
     if model.thickness is not None:

@@ -30,7 +30,7 @@ from magshell_fenicsx.models.shell.strains import TangentFrame
 from magshell_fenicsx.parts.natural.shape import covariant
 from magshell_fenicsx.platform import compat
 
-if TYPE_CHECKING:  # one of them is built
+if TYPE_CHECKING:  # a run builds only one kind of model
     from magshell_fenicsx.shells.meridian import MeridianModel
     from magshell_fenicsx.shells.shell import ShellModel
 
@@ -51,15 +51,17 @@ class Branch:
 
 @dataclass(frozen=True)
 class Memory:
-    """State of the branches after a step.
+    """History of the Maxwell branches after a step.
 
     Attributes
     ----------
     strains
-        q of each branch, (cells, places, 12).
-    rate, dt
-        Mean rate of the strain along the step and its length; None where the motion begins or turns
-        a corner.
+        Strain q of each branch's spring, (cells, nodes, 12).
+    rate
+        Mean rate of the shell's strain along the last step, (cells, nodes, 12); None where the
+        motion begins or turns a corner.
+    dt
+        Length of the last step.
     """
 
     strains: list[Array]
@@ -68,8 +70,10 @@ class Memory:
 
 
 class Viscosity:
-    """The viscous forces of a shell in motion; a `continuation.motion.ViscousForces`. Compiles
-    kernels.
+    """The viscous forces of a shell in motion; a `continuation.motion.ViscousForces`.
+
+    Construction compiles kernels. Strains are (cells, nodes, 12): six components each of the
+    membrane strain E and of the change of curvature K, at the nodes of every cell.
 
     Parameters
     ----------
@@ -78,12 +82,14 @@ class Viscosity:
     mu
         Amplitudes with the places of supports, which do not move.
     kelvin
-        Time tau of Kelvin and Voigt; zero without.
+        Relaxation time tau of the Kelvin-Voigt element; zero without.
+    branches
+        Maxwell branches.
 
     Attributes
     ----------
     memory
-        State after the steps so far.
+        History variables after the steps so far.
     creep_time
         `kelvin`.
     """
@@ -95,6 +101,7 @@ class Viscosity:
         kelvin: float,
         branches: Sequence[Branch],
     ) -> None:
+        """Compile the forms of viscous forces; parameters are those of the class."""
         self._model, self._mu, self._branches, self.creep_time = model, dict(mu), branches, kelvin
         V, domain = model.V, model.factory.domain
         Q = domain.discontinuous(STRAIN_SIZE)
@@ -118,15 +125,23 @@ class Viscosity:
         law = model.material.law
         self._viscous_tangent = _AddedViscousTangent(model) if law.linear != law else None
         self.memory = Memory([np.zeros((*self._places.shape, STRAIN_SIZE)) for _ in branches])
-        self._first_strain: tuple[Vector, Array] = (
-            np.empty(0),
-            np.empty(0),
-        )  # displacements and their strains
+        # displacements and their strains
+        self._first_strain: tuple[Vector, Array] = np.empty(0), np.empty(0)
         self._last_strain: tuple[Vector, Array] = self._first_strain
         self._force = np.zeros(model.system.size)
 
     def force(self, u0: Vector, u1: Vector, v: Vector, part: float, dt: float) -> Vector:
-        """Return the forces at a part of the step from u0 to u1, with the velocity v there."""
+        """Return the viscous forces at a fraction of the step from u0 to u1; collective.
+
+        Parameters
+        ----------
+        v
+            Velocity there.
+        part
+            The fraction, from 0 to 1.
+        dt
+            Length of the step.
+        """
         displacement = u0 + part * (u1 - u0)
         if self.creep_time:
             stress = self.creep_time * self._strain_rate(displacement, v)
@@ -136,6 +151,7 @@ class Viscosity:
             for branch, q, end in zip(
                 self._branches, self.memory.strains, self._evolved(u0, u1, dt), strict=True
             ):
+                # q is linear between the ends of the step
                 stress += branch.modulus * (part * end + (1 - part) * q)
         self._force = self._forces(
             stress, u0, displacement, self.stiffness(dt, 2 / dt) if dt else 0.0
@@ -143,8 +159,10 @@ class Viscosity:
         return self._force
 
     def tangent(self, u: Vector, mu: Amplitudes, dt: float, rate: float) -> Tangent:
-        """Return the system's tangent with that of these forces, which stiffen the shell, but no
-        body that it touches.
+        """Return the system's tangent with the derivative of these forces by u1; collective.
+
+        Viscous forces stiffen the shell, but no body that it touches. `rate` is dv/du at the end of
+        the step, of length `dt`.
         """
         stiffness = self.stiffness(dt, rate)
         if self._viscous_tangent is None:
@@ -155,8 +173,9 @@ class Viscosity:
             return self._model.system.tangent(u, mu)
 
     def stiffness(self, dt: float, rate: float) -> float:
-        """Return the factor of the elastic tangent that a step adds to it; `rate` is dv/du at the
-        end of the step.
+        """Return the viscous tangent over the elastic one for a step of length `dt`.
+
+        `rate` is dv/du at the end of the step.
         """
         return self.creep_time * rate + sum(
             b.modulus * (_retained_share(b, dt) + self._bending_share(b, dt) / dt)
@@ -168,7 +187,10 @@ class Viscosity:
         self.memory = Memory(self.memory.strains)
 
     def accept(self, u0: Vector, u1: Vector, dt: float) -> Vector:
-        """Go on from u1; return the force that the step was solved with."""
+        """Accept the step from u0 to u1, and return the force that it was solved with; collective.
+
+        The history variables move on to u1.
+        """
         if self._branches:
             self.memory = Memory(
                 self._evolved(u0, u1, dt), np.asarray(self._strain_change(u0, u1) / dt), dt
@@ -176,19 +198,31 @@ class Viscosity:
         return self._force
 
     def error_force(self, u0: Vector, u1: Vector, dt: float) -> Vector | None:
-        """Return the force at the end by which the curvature of the strain in time counts; None if
-        nothing does.
+        """Return the force at u1 due to the curvature of the strain in time, an error estimate.
+
+        None for the first step after `begin`, where no earlier rate is known. Collective.
         """
         rate = self.memory.rate
         if rate is None:
             return None
-        bend = self._strain_change(u0, u1) / dt - rate
+        change_of_rate = self._strain_change(u0, u1) / dt - rate
         return self._forces(
-            sum(b.modulus * self._bending_share(b, dt) for b in self._branches) * bend, u1, u1, 0.0
+            sum(b.modulus * self._bending_share(b, dt) for b in self._branches) * change_of_rate,
+            u1,
+            u1,
+            0.0,
         )
 
     def _forces(self, stress: Array, u0: Vector, u1: Vector, stiffness: float) -> Vector:
-        """Return the forces of a stress at nodes, and of edges that open from u0 to u1."""
+        """Return the forces of a stress at nodes and of edges that open from u0 to u1; collective.
+
+        Parameters
+        ----------
+        stress
+            (cells, nodes, 12), as a strain: the elastic law makes the stress of it.
+        stiffness
+            Factor of the elastic stiffness of edges; see `stiffness`.
+        """
         prescribed, system = self._prescribed, self._model.system
         self._field.x.array.reshape(-1, STRAIN_SIZE)[self._places] = stress
         prescribed.stiffness.value = stiffness
@@ -200,29 +234,34 @@ class Viscosity:
         return system.at_state(State(u1, self._mu)).gradient(self._forms)
 
     def _evolved(self, u0: Vector, u1: Vector, dt: float) -> list[Array]:
-        """Return q at the end of a step; the strain is quadratic in time through its ends and the
-        begin of the step before.
+        """Return the strain q of each branch at the end of a step, (cells, nodes, 12).
+
+        It integrates dq/dt = dE/dt - q/tau exactly for a strain E that is quadratic in time,
+        through both ends of the step and the begin of the step before.
         """
-        change, rate = self._strain_change(u0, u1), self.memory.rate
-        bend = 0.0 if rate is None else change / dt - rate
+        strain_change, rate = self._strain_change(u0, u1), self.memory.rate
+        change_of_rate = 0.0 if rate is None else strain_change / dt - rate
         return [
             np.asarray(
                 np.exp(-dt / b.time) * q
-                + _retained_share(b, dt) * change
-                + self._bending_share(b, dt) * bend
+                + _retained_share(b, dt) * strain_change
+                + self._bending_share(b, dt) * change_of_rate
             )
             for b, q in zip(self._branches, self.memory.strains, strict=True)
         ]
 
     def _bending_share(self, branch: Branch, dt: float) -> float:
-        """Return the part of a change of the mean rate, from the last step to this one, that is
-        left in the spring.
+        """Return the part of a change in the mean strain rate that stays in a branch's spring.
+
+        The change is from the last step to this one; the part is a time. Zero without an earlier
+        rate.
         """
         if self.memory.rate is None:
             return 0.0
         return _curvature_weight(dt / branch.time) * dt * 2 * dt / (dt + self.memory.dt)
 
     def _strain_change(self, u0: Vector, u1: Vector) -> Array:
+        """Return the strain at u1 minus that at u0; the last two displacements are kept."""
         if self._first_strain[0] is not u0:
             if self._last_strain[0] is u0:
                 self._first_strain = self._last_strain
@@ -233,6 +272,7 @@ class Viscosity:
         return self._last_strain[1] - self._first_strain[1]
 
     def _strain_rate(self, u: Vector, v: Vector) -> Array:
+        """Return the rate of strain at u along v, by a central difference; collective."""
         size = max_abs(self._model.system.comm, v)
         if size == 0:
             return np.zeros((*self._places.shape, STRAIN_SIZE))
@@ -240,7 +280,10 @@ class Viscosity:
         return np.asarray((self._strain(u + step * v) - self._strain(u - step * v)) / (2 * step))
 
     def _strain(self, u: Vector) -> Array:
-        """Return E and K (cells, places, 12) as tensors in space."""
+        """Return E and K (cells, nodes, 12) of a displacement as tensors in space.
+
+        Each of both gives its components xx, yy, zz, xy, xz, yz.
+        """
         jets = self._jets(self._model.system.with_ghosts(u, self._mu))
         tensors = [
             self._frame.tensor(S)
@@ -252,14 +295,14 @@ class Viscosity:
 
 
 class _AddedViscousTangent:
-    """Tangent of viscous forces whose law is not that of the elastic ones; an `AddedTangent` of the
-    system.
+    """Tangent of viscous forces whose law is not that of the elastic ones.
 
-    Viscous stresses are those of small strains: they make stiff what the strains of a stretched
-    shell leave soft.
+    It is an `AddedTangent`, a matrix that the system adds to its own. Viscous stresses are those of
+    small strains: they make stiff what the strains of a stretched shell leave soft.
     """
 
     def __init__(self, model: "ShellModel | MeridianModel") -> None:
+        """Compile the forms and add this tangent to those of the model's system."""
         self._system, self._stiffness = model.system, fem.Constant(model.V.mesh, 0.0)
         rates, v = _StrainRates(model), ufl.TestFunction(model.V)
         self._since, factor = rates.since, model.factory.domain.revolution_factor
@@ -274,7 +317,7 @@ class _AddedViscousTangent:
 
     @contextmanager
     def scaled_by(self, stiffness: float) -> Iterator[None]:
-        """Context in which tangents have this one, times a stiffness."""
+        """Let the system's tangents have this one, times a stiffness, within the context."""
         self._stiffness.value = stiffness
         try:
             yield
@@ -282,7 +325,10 @@ class _AddedViscousTangent:
             self._stiffness.value = 0.0
 
     def sum(self, K: PETSc.Mat, factors: Factors) -> PETSc.Mat:
-        """Return a tangent with the viscous one added, see `AddedTangent`."""
+        """Return the tangent K with the viscous one added; collective. See `AddedTangent`.
+
+        Outside `scaled_by` it is K itself.
+        """
         if not self._stiffness.value:
             return K
         self._since.x.array[:] = self._system.u.x.array
@@ -300,14 +346,18 @@ class _AddedViscousTangent:
 
 
 def _retained_share(branch: Branch, dt: float) -> float:
-    """Return the part of a strain, that grows evenly in a step, that is left in the spring at the
-    end.
+    """Return the part of a strain, evenly grown in a step, that the spring holds at its end.
+
+    (1 - exp(-dt/tau)) tau/dt, or 1 for dt = 0.
     """
     return float(-np.expm1(-dt / branch.time) * branch.time / dt) if dt else 1.0
 
 
 def _curvature_weight(z: float) -> float:
-    """The integral of exp(-z (1 - s)) (s - 1/2) over a step, 0 to 1."""
+    """Return the integral of exp(-z (1 - s)) (s - 1/2) over a step, s from 0 to 1.
+
+    z is the step over the relaxation time; a series takes the place of the formula at small z.
+    """
     if z < 1e-2:
         return z / 12 - z**2 / 24 + z**3 / 80
     return float((1 + np.exp(-z)) / (2 * z) + np.expm1(-z) / z**2)
@@ -315,8 +365,16 @@ def _curvature_weight(z: float) -> float:
 
 @dataclass(frozen=True)
 class _PrescribedStress:
-    """Inputs of viscous forces: stresses at nodes, and two displacements between which edges open,
-    with their stiffness.
+    """Given stresses and displacements, from which viscous forces follow.
+
+    Attributes
+    ----------
+    field
+        (12,) strain and change of curvature whose elastic stress is the viscous one, at nodes.
+    first_displacement, last_displacement
+        Displacements between which edges open.
+    stiffness
+        Viscous stiffness over the elastic one, of the opening edges.
     """
 
     field: fem.Function
@@ -325,14 +383,18 @@ class _PrescribedStress:
     stiffness: fem.Constant
 
     def strain(self, j: Jet, side: str) -> tuple[Expr, Expr]:
-        """Return the strain and the change of curvature that make the stress, on a side of an edge;
-        "" within a cell.
+        """Return strain and change of curvature whose elastic stress is the viscous one.
+
+        `j` is the jet of the placement. `side` is "+" or "-" on an interior edge, "" within a cell.
         """
         stress = self.field(side) if side else self.field
         return covariant(j, stress, 0), covariant(j, stress, 6)
 
     def stiff_opening(self, domain: IntegrationDomain, jump: Callable[[Jet], Expr]) -> Expr:
-        """Return the stiffness times the change of an edge's jump, a given number."""
+        """Return the stiffness times the opening of an edge between both displacements.
+
+        `jump` gives the edge's jump as a function of the deformed jet.
+        """
         jump_after, jump_before = (
             jump(domain.j0 + domain.jet(field))
             for field in (self.last_displacement, self.first_displacement)
@@ -341,8 +403,9 @@ class _PrescribedStress:
 
 
 class _StrainRates:
-    """Strains and jumps by a change of the displacement; they replace `_PrescribedStress` in the
-    derivative of the forces.
+    """Derivatives of strains and jumps along a change of the displacement, a trial function.
+
+    They replace `_PrescribedStress` in the forms of the tangent of viscous forces.
     """
 
     def __init__(self, model: "ShellModel | MeridianModel") -> None:
@@ -350,31 +413,36 @@ class _StrainRates:
         self._jet = model.factory.domain.jet(self.since)
 
     def strain(self, j: Jet, side: str) -> tuple[Expr, Expr]:
-        """Return the change of strain and curvature, see `_PrescribedStress`."""
+        """Return the changes of strain and curvature; arguments as in `_PrescribedStress`."""
         E, K = _strains(j, self._jet.side(side) if side else self._jet)
         return ufl.derivative(E, self.since, self._change), ufl.derivative(
             K, self.since, self._change
         )
 
     def stiff_opening(self, domain: IntegrationDomain, jump: Callable[[Jet], Expr]) -> Expr:
-        """Return the change of an edge's jump, see `_PrescribedStress`."""
+        """Return the change of an edge's jump; arguments as in `_PrescribedStress`."""
         return ufl.derivative(jump(domain.j0 + self._jet), self.since, self._change)
 
 
 def _strains(j: Jet, u: Jet) -> tuple[Expr, Expr]:
+    """Return membrane strain and change of curvature at the jets of placement and displacement."""
     return kin.membrane_strain(j, u), kin.curvature_change(j, u)
 
 
 def mirrored_jump(r0: Jet, m: Expr, normal: Expr) -> Callable[[Jet], Expr]:
-    """Return half of the jump across a plane with that normal, as a function of the deformed
-    jet.
+    """Return half the rotation jump across a mirror plane, as a function of the deformed jet.
+
+    `m` is the covector of the edge, `normal` the plane's unit normal.
     """
     nu1, nu2, _ = kin.conormal(r0, m)
     return lambda r: ufl.dot(kin.normal(r), normal) * ufl.dot(normal, r.r1 * nu1 + r.r2 * nu2)
 
 
 def held_jump(r0: Jet, m: Expr, n0: Expr) -> Callable[[Jet], Expr]:
-    """Return the jump to the normal n0 that an edge holds, as a function of the deformed jet."""
+    """Return the jump to a held normal n0 at an edge, as a function of the deformed jet.
+
+    `m` is the covector of the edge.
+    """
     nu1, nu2, _ = kin.conormal(r0, m)
     return lambda r: -ufl.dot(n0 - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
 
@@ -390,20 +458,20 @@ def _jump_of(edge: HeldEdge, r0: Jet, m: Expr) -> Callable[[Jet], Expr]:
 def _works(
     model: "ShellModel | MeridianModel", stresses: _PrescribedStress | _StrainRates
 ) -> list[ufl.Form]:
-    """Return the work of given stresses on the strains of u, and on edges as in C0 interior
-    penalty.
+    """Return the works of given stresses on strains, and on edges as in C0 interior penalty.
 
-    Its gradient is the viscous forces. Smooth surfaces have no jumps, so that these need no memory:
-    each step closes the edges that it opens.
+    Their gradients by u are the viscous forces. The first form holds cells and interior edges, and
+    each further one a held edge. Smooth surfaces have no jumps, so that edges need no memory: each
+    step closes the edges that it opens.
     """
     inner_work = _work_in_cells(model, stresses) + _work_on_interior_edges(model, stresses)
     return [inner_work, *_works_on_held_edges(model, stresses)]
 
 
 def _small_strain_law(model: "ShellModel | MeridianModel", j: Jet, side: str = "") -> Law:
-    """Return the law of the shell at small strains, which a viscous stress follows too.
+    """Return the shell's law at small strains, which viscous stresses follow.
 
-    `side` is that of an interior edge, "" elsewhere.
+    `j` is the jet of the placement. `side` is "+" or "-" on an interior edge, "" elsewhere.
     """
     thickness, materials = model.factory.thickness, model.factory.cell_materials
     law = densities.law_at(model.material.law.linear, j)
@@ -411,30 +479,34 @@ def _small_strain_law(model: "ShellModel | MeridianModel", j: Jet, side: str = "
         law = law.thicker((thickness(side) if side else thickness)[0])
     if materials is None:
         return law
-    numbers = materials(side) if side else materials
-    return law.with_material(*(numbers[i] for i in (0, 1, 3)))
+    material_numbers = materials(side) if side else materials
+    return law.with_material(*(material_numbers[i] for i in (0, 1, 3)))
 
 
 def _work_in_cells(
     model: "ShellModel | MeridianModel", stresses: _PrescribedStress | _StrainRates
 ) -> ufl.Form:
-    """Return the work of given stresses and moments in the cells."""
+    """Return the work of given membrane stresses and moments in the cells."""
     domain = model.factory.domain
     r0, u = domain.j0, domain.jet(model.u)
     E, K = _strains(r0, u)
     strain, bend = stresses.strain(r0, "")
-    up, law = kin.inverse_metric(r0), _small_strain_law(model, r0)
-    stretching = work(law.stress(strain, up), E)
-    bending = work(law.moment(strain, bend, up), K)
-    # of plies: a viscous bend makes membrane stress
-    coupling = work(law.moment(E, 0 * K, up), bend)
+    inverse_metric, law = kin.inverse_metric(r0), _small_strain_law(model, r0)
+    stretching = work(law.stress(strain, inverse_metric), E)
+    bending = work(law.moment(strain, bend, inverse_metric), K)
+    # in laminates, a viscous bend makes membrane stress, too
+    coupling = work(law.moment(E, 0 * K, inverse_metric), bend)
     return (stretching + bending + coupling) * kin.area_ratio(r0) * domain.dx()
 
 
 def _work_on_interior_edges(
     model: "ShellModel | MeridianModel", stresses: _PrescribedStress | _StrainRates
 ) -> ufl.Form:
-    """Return the work on the jumps between cells."""
+    """Return the work of given moments on the rotation jumps between cells.
+
+    As in C0 interior penalty it has three parts: given moment times jump, opening times moment, and
+    opening times penalty times jump.
+    """
     factory, domain = model.factory, model.factory.domain
     r0, u, m = domain.j0, domain.jet(model.u), domain.covector
     sides = ("+", "-")
@@ -462,7 +534,7 @@ def _work_on_interior_edges(
 def _works_on_held_edges(
     model: "ShellModel | MeridianModel", stresses: _PrescribedStress | _StrainRates
 ) -> list[ufl.Form]:
-    """Return the works on edges that hold the normal, or lie on mirror planes, one by one."""
+    """Return the works on edges that hold the normal or lie on mirror planes, one form each."""
     factory, domain = model.factory, model.factory.domain
     r0, u, m = domain.j0, domain.jet(model.u), domain.covector
     E, K = _strains(r0, u)
@@ -474,6 +546,7 @@ def _works_on_held_edges(
     works = []
     for held_edge in factory.held_edges:
         jump_of = _jump_of(held_edge, r0, m)
+        # the penalty acts on half the jump across a mirror plane
         modelled_sides = 1 if held_edge.plane is None else 2
         opening, jump = stresses.stiff_opening(domain, jump_of), jump_of(r0 + u)
         response = moment + modelled_sides * stiffness * jump

@@ -40,22 +40,30 @@ if TYPE_CHECKING:
     from magshell_fenicsx.shells.t_junctions import MeridianTJunction
 
 Array = NDArray[np.float64]
-DEGREE = 4  # of the matrix of a wave as a polynomial in m
+DEGREE = 4  # degree in m of a wave's matrix
 
 
 class Waves:
-    """The second variation Q_m of an axisymmetric shell, for any m >= 1.
+    """The second variation Q_m of an axisymmetric shell along waves cos(m theta), for any m >= 1.
+
+    Its matrices are those of coefficients (U + V, V, W) at the meridian's nodes.
 
     Parameters
     ----------
     system
         System of the axisymmetric displacement.
     energies
-        Its terms as functions of a jet.
+        The system's energies as functions of a jet.
+    meridian
+        Mesh of the meridian.
+    domain
+        Integration domain on the meridian.
     supports
         Supports of the axis and the ends.
+    log
+        Log that compiles kernels.
     nonlocal_terms
-        Contacts and T-junctions, whose entries are not in the pattern of the others.
+        Contacts and T-junctions, whose entries are not in the pattern of the other terms.
 
     Attributes
     ----------
@@ -78,6 +86,7 @@ class Waves:
         log: KernelLog,
         nonlocal_terms: "Sequence[MeridianContact | MeridianTJunction]" = (),
     ) -> None:
+        """Make the space of waves and the Hessians of the energies."""
         self.nonlocal_terms = nonlocal_terms
         degree = system.u.function_space.element.basix_element.degree
         self.V = V = fem.functionspace(meridian.mesh, ("Lagrange", degree, (3,)))
@@ -90,6 +99,10 @@ class Waves:
         self._set_system(system)
 
     def _set_largest(self, largest: int) -> None:
+        """Set the largest m, and the interpolation of matrices in m.
+
+        The five nodes 0, +-a and +-b are Chebyshev points of [-largest, largest].
+        """
         self.largest = largest
         self._nodes = largest * np.sin(np.pi / 4 * np.array([0, 1, 2, -1, -2]))
         self._weights = _lagrange_weights(self._nodes, np.arange(largest + 1))
@@ -100,34 +113,39 @@ class Waves:
         self._factorisation, self._counting = (Factorisation(self.V.mesh.comm) for _ in range(2))
 
     def for_system(self, system: FiniteElementSystem, largest: int) -> "Waves":
-        """Return the waves of another system with the same terms."""
-        _ = self._bands, self._rows_of_matrix  # both have these
-        other = copy(self)
-        other._set_system(system)
+        """Return the waves of another system with the same terms, which shares their kernels.
+
+        `largest` is its largest m.
+        """
+        _ = self._bands, self._rows_of_matrix  # computed before copying, as both share these
+        waves = copy(self)
+        waves._set_system(system)
         if largest != self.largest:
-            other._set_largest(largest)
-        return other
+            waves._set_largest(largest)
+        return waves
 
     def tangent(self, state: State, m: int) -> PETSc.Mat:
-        """Return the matrix of Q_m at an axisymmetric state; it is reused by the next call."""
+        """Return the matrix of Q_m at an axisymmetric state; the next call overwrites it."""
         (entries,) = self._system.at_state(state).evaluate_forms(lambda: self._entries(state, [m]))
         return self._with_nonlocal_entries(state, self._filled("tangent", entries.ravel(), m), m)
 
     def _with_nonlocal_entries(self, state: State, K: PETSc.Mat, m: int) -> PETSc.Mat:
-        """Return the matrix K with the entries of contacts and T-junctions at a state."""
+        """Return the matrix K of wave m with the entries of contacts and T-junctions at a state."""
         if not self.nonlocal_terms:
             return K
         entries = self._system.at_state(state).evaluate(
             lambda: [term.entries_of_waves(m) for term in self.nonlocal_terms]
         )
-        rows, columns, values = (np.concatenate(parts) for parts in zip(*entries, strict=True))
-        fixed = np.zeros(K.getSize()[0], dtype=bool)
-        fixed[self._rows(m)] = True
-        return with_entries(K, (rows, columns, values), fixed)
+        rows, columns, values = (np.concatenate(arrays) for arrays in zip(*entries, strict=True))
+        is_constrained = np.zeros(K.getSize()[0], dtype=bool)
+        is_constrained[self._rows(m)] = True
+        return with_entries(K, (rows, columns, values), is_constrained)
 
     def energies_along(self, phi: NDArray[np.float64], m: int) -> list[FormTerm]:
-        """Return Q_m(phi) as energies of the axisymmetric displacement, one for each energy of the
-        shell; for one phi and m at a time.
+        """Return the terms of Q_m(phi), functions of the axisymmetric displacement.
+
+        One for each nonlinear energy of the shell. A later call for other phi (coefficients at
+        nodes) or m changes these terms.
         """
         self._phi.x.array[:], self._m.value = phi, m
         if not self._energies:
@@ -141,14 +159,16 @@ class Waves:
         return self._energies
 
     def constraints(self, m: int) -> list[fem.DirichletBC]:
-        """Return the constraints at the axis and at the ends: a wave m = 1 may move the axis across
-        itself.
+        """Return the conditions of wave m at the axis and the ends.
+
+        A wave m = 1 may move the axis across itself, others may not.
         """
         return self._held_once if m == 1 else self._held
 
     def factor_at(self, state: State, m: int) -> Factorisation:
-        """Factor the matrix of Q_m at an axisymmetric state; the next call overwrites the
-        factors.
+        """Factor the matrix of Q_m at an axisymmetric state.
+
+        The next call overwrites the factors.
         """
         self._factorisation.factor(self.tangent(state, m))
         return self._factorisation
@@ -156,10 +176,10 @@ class Waves:
     def counts(self, state: State) -> list[int]:
         """Return the number of unstable directions of each wave m = 1, 2, ... `largest`.
 
-        A jet of a wave is quadratic in m, and so Q_m is a polynomial of degree 4: its matrices are
+        A jet of a wave is quadratic in m, and so Q_m is a polynomial of degree 4. Its matrices are
         interpolated between five, of m = 0, +-a and +-b. Q_-m is Q_m of the mirrored wave (U, -V,
-        W), and so three are assembled. Only those that are not positive definite are factored for
-        their inertia.
+        W), and so three are assembled. Only matrices that are not positive definite are factored
+        for their inertia.
         """
         values = self.sampled_tangents(state)
         if not self.nonlocal_terms:
@@ -172,34 +192,40 @@ class Waves:
         return unstable
 
     def sampled_tangents(self, state: State) -> NDArray[np.float64]:
-        """Return the entries (5, entries) of the matrices at the five m."""
-        of_nodes = self._system.at_state(state).evaluate_forms(
+        """Return the entries (5, entries) of the matrices at m = 0, a, b, -a, -b.
+
+        Entries are in the order of `_sparsity`, without constraints.
+        """
+        entries = self._system.at_state(state).evaluate_forms(
             lambda: self._entries(state, self._nodes[:3])
         )
-        return np.concatenate([of_nodes, _mirrored(of_nodes[1:])]).reshape(len(self._nodes), -1)
+        return np.concatenate([entries, _mirrored(entries[1:])]).reshape(len(self._nodes), -1)
 
     def counts_from(self, values: NDArray[np.float64]) -> list[int]:
-        """Return `counts` from the matrices that `sampled_tangents` gives."""
+        """Return `counts` from matrices that `sampled_tangents` gave."""
         unstable = [0] * self.largest
         for m in self._indefinite(values):
             unstable[m - 1] = self._interpolated_pivots(m, values)
         return unstable
 
     def indefinite(self, values: NDArray[np.float64]) -> set[int]:
-        """Return m - 1 of the waves whose matrices, as `sampled_tangents` gives them, are not
-        positive definite.
+        """Return m - 1 of each wave whose matrix is not positive definite.
+
+        `values` are matrices that `sampled_tangents` gave.
         """
         ranges = self._ranges
         try:
             return {m - 1 for m in self._indefinite(values)}
         finally:
-            self._ranges = ranges  # fit for states of the path
+            self._ranges = ranges  # the ranges stay those that fit states of the path
 
     def _entries(
         self, state: State, waves: Sequence[float] | NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the entries (waves, pairs of nodes, 3, 3) of Q_m's matrices, without constraints,
-        at the system's displacement.
+        """Return the entries of Q_m's matrices at the system's displacement, without constraints.
+
+        The shape is (waves, pairs of nodes, 3, 3); `waves` are the numbers m, which need not be
+        whole.
         """
         factors = {e.amplitude: factor_of(e.amplitude, state.mu) for e in self._nonlinear_energies}
         return self._points.entries(factors, [float(m) for m in waves])
@@ -211,8 +237,9 @@ class Waves:
 
     @cached_property
     def _sparsity(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Rows and columns of these entries: those of one triangle, and all of the nodes' own
-        blocks.
+        """Rows and columns of the entries of `_entries`, flat.
+
+        They cover one triangle of node pairs, with the full blocks of a node with itself.
         """
         rows, columns = (
             3 * a[:, None, None] + np.zeros((3, 3), dtype=np.int64)
@@ -222,11 +249,13 @@ class Waves:
 
     @cached_property
     def _rows_of_matrix(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
-        """The whole matrix in compressed rows: row starts, columns, and the number of each entry in
-        `_sparsity`.
+        """The full matrix in compressed rows: row starts, columns, and positions of values.
+
+        A position is the number of the entry in `_sparsity`.
         """
         rows, columns = self._sparsity
-        mirrored_entries = np.flatnonzero(rows // 3 != columns // 3)  # mirrored: the other triangle
+        # entries that the other triangle mirrors
+        mirrored_entries = np.flatnonzero(rows // 3 != columns // 3)
         positions = (
             np.concatenate([rows, columns[mirrored_entries]]),
             np.concatenate([columns, rows[mirrored_entries]]),
@@ -235,13 +264,12 @@ class Waves:
         return K.indptr.astype(PETSc.IntType), K.indices.astype(PETSc.IntType), K.data
 
     def _indefinite(self, values: NDArray[np.float64]) -> list[int]:
-        """Return the waves whose matrices are not positive definite, from the entries (nodes,
-        entries) at the nodes.
+        """Return the waves whose matrices are not positive definite, sorted.
 
-        On a range of m the matrix is a mean of its five Bernstein coefficients with
-        weights that are not negative: if these are positive definite, it is so for every m of the
-        range. Else the range is halved, for the next states too, until its waves are as few as
-        coefficients.
+        `values` (5, entries) are the matrices at the nodes of the interpolation in m. On a range of
+        m the matrix is a mean of its five Bernstein coefficients with weights that are not
+        negative. If these are positive definite, it is so for every m of the range. Else the range
+        is halved, for the next states too, until its waves are as few as coefficients.
         """
         bands_of_one, bands_of_others = self._bands
         matrix_of_one = bands_of_one.bands([self._weights[1] @ values])
@@ -254,10 +282,12 @@ class Waves:
         indefinite = set[int]()
         if not bands_of_one.is_positive_definite(matrix_of_one, np.ones(1)):
             indefinite.add(1)
-        open_ranges, self._ranges = [*self._ranges], []  # of others of the same terms too
+        # a new list: copies of the waves share the old one
+        open_ranges, self._ranges = [*self._ranges], []
         while open_ranges:
             wave_range = open_ranges.pop()
             first, last = wave_range.first, wave_range.last
+            # few waves: each is tested
             if wave_range.short:
                 indefinite |= {m for m in range(first, last + 1) if not is_definite_wave(m)}
             elif not (
@@ -271,43 +301,47 @@ class Waves:
         return sorted(indefinite)
 
     def _interpolated_pivots(self, m: int, values: NDArray[np.float64]) -> int:
+        """Return the number of negative pivots of the interpolated matrix of wave m."""
         self._counting.factor(self._filled("interpolated", self._weights[m] @ values, m))
         return self._counting.negative_pivots
 
     def _filled(self, name: str, entries: NDArray[np.float64], m: int) -> PETSc.Mat:
-        """Return a matrix with these entries, in the order of `_sparsity`, and constraints; the
-        next call overwrites it.
+        """Return the matrix of wave m with given entries and its constraints.
+
+        The next call with the same `name` overwrites it. `entries` are in the order of `_sparsity`.
         """
-        first, columns, places = self._rows_of_matrix
-        data = entries[places]
+        row_starts, columns, entry_numbers = self._rows_of_matrix
+        data = entries[entry_numbers]
         if name not in self._matrices:
             matrix = PETSc.Mat().createAIJ(
-                (len(first) - 1,) * 2, csr=(first, columns, data), comm=self.V.mesh.comm
+                (len(row_starts) - 1,) * 2, csr=(row_starts, columns, data), comm=self.V.mesh.comm
             )
             matrix.setOption(PETSc.Mat.Option.SYMMETRIC, True)
             matrix.setOption(PETSc.Mat.Option.KEEP_NONZERO_PATTERN, True)
             self._matrices[name] = matrix
         matrix = self._matrices[name]
-        matrix.setValuesCSR(first, columns, data)
+        matrix.setValuesCSR(row_starts, columns, data)
         matrix.assemble()
         matrix.zeroRowsColumns(self._rows(m), 1.0)
         return matrix
 
     def _rows(self, m: int) -> NDArray[np.int32]:
+        """Return the numbers of the constrained rows of wave m."""
         return np.concatenate([bc.dof_indices()[0] for bc in self.constraints(m)])
 
     def negative_pivots(self, state: State, m: int) -> int:
-        """Number of unstable directions among the waves m."""
+        """Return the number of unstable directions among the waves m at a state."""
         return self.factor_at(state, m).negative_pivots
 
     def unstable(self, state: State, largest: int | None = None) -> dict[int, int]:
-        """m -> number of unstable directions, for the waves that have any."""
+        """Return m -> number of unstable directions, for waves up to `largest` with any."""
         pivots = {
             m: self.negative_pivots(state, m) for m in range(1, (largest or self.largest) + 1)
         }
         return {m: count for m, count in pivots.items() if count}
 
     def _of_wave(self, e: Energy) -> tuple[ufl.Form, fem.Function]:
+        """Return the second variation of an energy along a wave v, as a form, and v."""
         v, u = fem.Function(self.V), domains.revolved_jet(self._system.u)
         cosine, sine = domains.wave_jets(v, self._m)
         return np.pi * (e.perturbed_form(u, cosine) + e.perturbed_form(u, sine)), v
@@ -323,20 +357,27 @@ class _WaveRange:
 
     Attributes
     ----------
+    first, last
+        Smallest and largest m.
+    short
+        Whether its waves are as few as Bernstein coefficients.
     inner
         (3, nodes) weights of values at the nodes in the inner three Bernstein coefficients.
     """
 
     def __init__(self, first: int, last: int, nodes: NDArray[np.float64]) -> None:
+        """Compute the Bernstein weights of the waves `first` to `last`, from the `nodes` in m."""
         self.first, self.last, self.short = first, last, last - first < DEGREE
         places = np.arange(DEGREE + 1) / DEGREE
         bernstein = [
             comb(DEGREE, i) * places**i * (1 - places) ** (DEGREE - i) for i in range(DEGREE + 1)
         ]
-        values = _lagrange_weights(nodes, first + (last - first) * places)
-        self.inner = np.linalg.solve(np.stack(bernstein, axis=1), values)[1:-1]
+        # Bernstein coefficients from values at five equidistant places of the range
+        weights_at_places = _lagrange_weights(nodes, first + (last - first) * places)
+        self.inner = np.linalg.solve(np.stack(bernstein, axis=1), weights_at_places)[1:-1]
 
     def halves(self, nodes: NDArray[np.float64]) -> list["_WaveRange"]:
+        """Return both halves of the range, which share their middle wave."""
         middle = round(sqrt(self.first * self.last))  # the matrices vary most at small m
         return [_WaveRange(self.first, middle, nodes), _WaveRange(middle, self.last, nodes)]
 
@@ -344,20 +385,22 @@ class _WaveRange:
 def _lagrange_weights(
     nodes: NDArray[np.float64], places: NDArray[np.float64] | NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """Return the weights (places, nodes) of values at nodes in their polynomial's values at other
-    places.
+    """Return the weights (places, nodes) of Lagrange's interpolation at other places.
+
+    They multiply values at the nodes in the polynomial's value at each place.
     """
     others = [np.delete(nodes, i) for i in range(len(nodes))]
     columns = [
-        np.prod((places[:, None] - rest) / (node - rest), axis=1)
-        for node, rest in zip(nodes, others, strict=True)
+        np.prod((places[:, None] - other_nodes) / (node - other_nodes), axis=1)
+        for node, other_nodes in zip(nodes, others, strict=True)
     ]
     return np.stack(columns, axis=1)
 
 
 def _mirrored(entries: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the entries (.., 3, 3) of Q_-m from those of Q_m: with -V in place of V, P = U + V
-    becomes P - 2 V.
+    """Return the entries (.., 3, 3) of Q_-m from those of Q_m.
+
+    With -V in place of V, P = U + V becomes P - 2 V.
     """
     mirrored = entries.copy()
     mirrored[..., 1] = -2 * mirrored[..., 0] - mirrored[..., 1]
@@ -367,7 +410,10 @@ def _mirrored(entries: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class WaveFamily:
-    """The waves of one number m; a `continuation.stability_monitor.ModeFamily`."""
+    """The waves of one number m, whose stability a monitor follows.
+
+    It is a `continuation.stability_monitor.ModeFamily`.
+    """
 
     waves: Waves
     m: int
@@ -377,13 +423,16 @@ class WaveFamily:
         return f"m = {self.m}"
 
     def factor_at(self, state: State) -> Factorisation:
-        """Factor their tangent at an axisymmetric state."""
+        """Factor the matrix of Q_m at an axisymmetric state.
+
+        The next call for these waves overwrites the factors.
+        """
         return self.waves.factor_at(state, self.m)
 
 
 @dataclass(frozen=True)
 class SymmetryBreakingWaves:
-    """All waves around the axis that are examined."""
+    """All waves around the axis that are examined, as symmetry-breaking modes of a meridian."""
 
     waves: Waves
 
@@ -394,8 +443,9 @@ class SymmetryBreakingWaves:
 
     @property
     def tangents(self) -> Waves | None:
-        """Tangents for a `StabilityMonitor`; None with contacts, whose entries have no pattern in
-        common.
+        """Waves that give tangents to a `StabilityMonitor`; None with contacts or T-junctions.
+
+        Their entries have no sparsity pattern in common.
         """
         return None if self.waves.nonlocal_terms else self.waves
 
@@ -409,10 +459,9 @@ class SymmetryBreakingWaves:
 
 
 class BandedMatrices:
-    """Weighted sums of small symmetric matrices that share one sparsity pattern, and whether they
-    are definite.
+    """Weighted sums of small symmetric matrices that share one sparsity pattern.
 
-    LAPACK's banded Cholesky factors answer that.
+    LAPACK's banded Cholesky factors tell whether a sum is positive definite.
 
     Parameters
     ----------
@@ -428,6 +477,7 @@ class BandedMatrices:
         columns: NDArray[np.int64],
         constrained_rows: NDArray[np.int32],
     ) -> None:
+        """Order rows for a narrow band; parameters are those of the class."""
         n = int(rows.max()) + 1
         positions = np.concatenate([rows, columns]), np.concatenate([columns, rows])
         pattern = coo_array((np.ones(2 * len(rows)), positions), (n, n)).tocsr()
@@ -438,16 +488,18 @@ class BandedMatrices:
         is_free[constrained_rows] = False
         self._free_entries = np.flatnonzero(is_free[rows] & is_free[columns])
         rows, columns = rows[self._free_entries], columns[self._free_entries]
+        # lower triangle in the order of reverse Cuthill and McKee
         i, j = np.maximum(place[rows], place[columns]), np.minimum(place[rows], place[columns])
         self._shape = (int((i - j).max(initial=0)) + 1, n)
-        self._band_positions = (i - j) + j * self._shape[
-            0
-        ]  # in LAPACK's lower band, column by column
+        # in LAPACK's lower band, column by column
+        self._band_positions = (i - j) + j * self._shape[0]
         self._held_places = place[constrained_rows]
 
     def bands(self, values: Iterable[Array]) -> Array:
-        """Return the lower bands (matrices, entries) of some matrices, with ones on the diagonal of
-        constrained rows.
+        """Return the lower bands (matrices, band entries) of some matrices.
+
+        Each matrix is given by the values of its pattern's entries; constrained rows get ones on
+        the diagonal.
         """
         values = list(values)
         stacked = np.zeros((len(values), self._shape[0] * self._shape[1]))
@@ -457,8 +509,9 @@ class BandedMatrices:
         return stacked
 
     def is_positive_definite(self, bands: Array, weights: Array) -> bool:
-        """Whether the weighted sum of some matrices is positive definite; the weights' sum is
-        one.
+        """Return whether a weighted sum of matrices is positive definite.
+
+        `bands` are those of the matrices, as `bands` gives them; the weights add up to one.
         """
         band = (weights @ bands).reshape(self._shape, order="F")
         return bool(lapack.dpbtrf(band, lower=1, overwrite_ab=1)[1] == 0)

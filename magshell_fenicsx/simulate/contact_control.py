@@ -56,33 +56,48 @@ MAX_STIFFENINGS = 4  # times that bodies become stiffer
 
 
 def state_at_first_contact(scene: Scene, step: ProgrammeStep, state: State) -> State:
-    """Return the state just after the body of a step first touches.
+    """Return the state just after the body of a step first touches the shell; collective.
 
-    It is the given one if the body touches already, and at the target if that is nearer.
+    The given state returns if the body touches already. If the step's target is nearer than the
+    first contact, the state has the body at the target.
+
+    Parameters
+    ----------
+    step
+        Step whose amplitude is the approach of a body, over h.
 
     Raises
     ------
     Stopped
         If the body never meets the shell, or the first contact has no equilibrium.
     """
-    goal, name, h = step.load.target or step.load.limit_target, step.name, scene.problem.material.h
-    end = goal[1] if goal and goal[0].quantity == "load" else inf  # of the approach
+    target, name, h = (
+        step.load.target or step.load.limit_target,
+        step.name,
+        scene.problem.material.h,
+    )
+    end_of_approach = (
+        target[1] if target and target[0].quantity == "load" else inf
+    )  # of the approach
     region = scene.model.region(state, name)
-    if region.penetration > GAP_TOLERANCE * h or end <= state.mu[name]:
+    if region.penetration > GAP_TOLERANCE * h or end_of_approach <= state.mu[name]:
         return state
     for _ in range(MAX_APPROACHES):
         gap = -scene.model.region(state, name).penetration / h
         if gap <= GAP_TOLERANCE:
             break
+        # the gap bounds the way to the first contact from below
         state = state.with_(state.u, name, state.mu[name] + gap)
-        if state.mu[name] + CONTACT_DEPTH >= end:
-            return state.with_(state.u, name, end)
+        if state.mu[name] + CONTACT_DEPTH >= end_of_approach:
+            return state.with_(state.u, name, end_of_approach)
     else:
         raise Stopped("the body does not meet the shell")
     reason = ""
-    for deep in FIRST_CONTACT_DEPTHS:
-        a = state.mu[name] + deep
-        outcome = scene.newton.solve(state.with_(state.u, name, a), name, PrescribedLoad(name, a))
+    for depth in FIRST_CONTACT_DEPTHS:
+        approach = state.mu[name] + depth
+        outcome = scene.newton.solve(
+            state.with_(state.u, name, approach), name, PrescribedLoad(name, approach)
+        )
         if outcome.converged:
             return outcome.state
         reason = outcome.reason
@@ -90,49 +105,66 @@ def state_at_first_contact(scene: Scene, step: ProgrammeStep, state: State) -> S
 
 
 def raised_stiffnesses(scene: Scene, state: State) -> dict[str, float]:
-    """Return settings of contacts that penetrate too much at a state, `STIFFENING` times as stiff.
+    """Return setting of a contact -> stiffness `STIFFENING` times as large, where it is too deep.
 
-    A stiffness that the case gives stays.
+    A contact is too deep if it penetrates more than its bound at this state. A stiffness that the
+    case gives stays, and so does one at its upper limit. Collective.
     """
     h, settings = scene.problem.material.h, dict[str, float]()
     for contact in scene.problem.loads.contacts:
-        k = state.mu.get(contact.setting, contact.stiffness)
-        deep = scene.model.region(state, contact.amplitude).penetration
+        stiffness = state.mu.get(contact.setting, contact.stiffness)
+        depth = scene.model.region(state, contact.amplitude).penetration
         if (
-            deep > contact.max_penetration * h
+            depth > contact.max_penetration * h
             and not contact.has_given_stiffness
-            and k < MAX_STIFFENING * contact.stiffness
+            and stiffness < MAX_STIFFENING * contact.stiffness
         ):
-            settings[contact.setting] = STIFFENING * k
-    for pair, deep in shell_penetrations(scene, state):
-        k = state.mu.get(pair.setting, pair.stiffness)
+            settings[contact.setting] = STIFFENING * stiffness
+    for pair, depth in shell_penetrations(scene, state):
+        stiffness = state.mu.get(pair.setting, pair.stiffness)
         if (
-            deep > BOUND_AT_POINTS * pair.max_penetration
+            depth > BOUND_AT_POINTS * pair.max_penetration
             and not pair.has_given_stiffness
-            and k < MAX_STIFFENING_OF_SHELLS * pair.stiffness
+            and stiffness < MAX_STIFFENING_OF_SHELLS * pair.stiffness
         ):
-            settings[pair.setting] = STIFFENING * k
+            settings[pair.setting] = STIFFENING * stiffness
     return settings
 
 
 def stiff_for(pair: Pair, speed: float, h: float) -> float:
     """Return the stiffness with which a pair that meets flat goes `IMPACT_PENETRATION` deep.
 
-    Its speed is over that of waves, and h over R.
+    The kinetic energy about the common velocity is then that of the penalty: m v^2 = k s^2, with
+    half the mass per area of the first shell as m.
 
-    The energy of both about their common velocity is then that of the penalty: m v^2 = k s^2, with
-    half the mass per area of the first shell.
+    Parameters
+    ----------
+    pair
+        Two shells that may touch.
+    speed
+        Their relative speed over that of waves.
+    h
+        Thickness over R.
     """
-    needed, k = (speed / (IMPACT_PENETRATION * h)) ** 2 / 2, pair.stiffness
-    while k < needed:
-        k *= STIFFENING
-    return k
+    needed_stiffness, stiffness = (speed / (IMPACT_PENETRATION * h)) ** 2 / 2, pair.stiffness
+    while stiffness < needed_stiffness:
+        stiffness *= STIFFENING
+    return stiffness
 
 
 def recall_cuts(stage: Stage, high: Point, numbers: Mapping[str, float]) -> None:
-    """Let numbers of cuts stand for those at a point of a step, as in an interrupted run.
+    """Let numbers of cuts stand for the cuts at the displacement of a point; collective.
 
-    Collective.
+    Cuts divide cells into segments with quadrature points of their own, and a state has only their
+    number. So an interrupted run that is repeated from its journal has the same cuts under the same
+    numbers.
+
+    Parameters
+    ----------
+    high
+    Point at whose displacement the cuts are made.
+    numbers
+        Setting of a pair's cuts -> their number; empty: nothing is done.
     """
     evaluation = stage.scene.model.system.at_state(stage.leave(high.state)) if numbers else None
     for shell_contact in _with_cuts(stage.scene):
@@ -143,12 +175,12 @@ def recall_cuts(stage: Stage, high: Point, numbers: Mapping[str, float]) -> None
 
 
 def closer_points(stage: Stage, low: Point, high: Point) -> dict[str, float]:
-    """Return the numbers of cuts with closer points of contact, for two points with an
-    instability between them.
+    """Return setting of a pair's cuts -> number of cuts with closer points of contact.
 
-    Empty if closer points change neither the number of unstable directions of both nor much of
-    their critical modes' stiffness: of an instability that they move, nobody knows whether it is
-    one.
+    It is for two points with an instability between them. The result is empty where closer points
+    would not matter: they change neither the number of unstable directions at both, nor much of the
+    stiffness of their critical modes. Otherwise the instability might be one of the points alone.
+    Collective.
     """
     scene, state = stage.scene, stage.leave(high.state)
     evaluation = scene.model.system.at_state(state)
@@ -162,26 +194,40 @@ def closer_points(stage: Stage, low: Point, high: Point) -> dict[str, float]:
 
 
 def _is_certain(stage: Stage, point: Point, finer: Mapping[str, float]) -> bool:
-    """Return whether closer points change no critical mode's stiffness at a point much.
+    """Return whether closer points of contact hardly change the critical mode at a point.
 
-    That is by less than `CERTAIN_STIFFNESS_CHANGE` of it.
+    Its stiffness then changes by less than the part `CERTAIN_STIFFNESS_CHANGE`, and the number of
+    unstable directions not at all. Also True if a mode is not found: then nothing says that closer
+    points would help.
 
-    True as well if a mode is not found: then nothing says that closer points would help.
+    Parameters
+    ----------
+    finer
+        Setting of a pair's cuts -> number of cuts with closer points.
     """
-    state_here, other = point.state, State(point.state.u, {**point.state.mu, **finer})
+    state_here, state_with_finer_cuts = (
+        point.state,
+        State(point.state.u, {**point.state.mu, **finer}),
+    )
     try:
-        mode, compared = (critical_mode(stage.newton, state) for state in (state_here, other))
+        mode, mode_with_finer_cuts = (
+            critical_mode(stage.newton, state) for state in (state_here, state_with_finer_cuts)
+        )
     except NoEigenpair:
         return True
-    error = abs(compared.eigenvalue - mode.eigenvalue)
+    error = abs(mode_with_finer_cuts.eigenvalue - mode.eigenvalue)
     return (
-        compared.negative_pivots == mode.negative_pivots
+        mode_with_finer_cuts.negative_pivots == mode.negative_pivots
         and error < CERTAIN_STIFFNESS_CHANGE * abs(mode.eigenvalue)
     )
 
 
 def better_cuts(scene: Scene, state: State) -> dict[str, float]:
-    """Return the numbers of cuts at a state that are much better than its own; collective."""
+    """Return setting of a pair's cuts -> number of new cuts, where these are much better.
+
+    Cuts age as shells slide on each other: their segments then no longer face single cells.
+    Collective.
+    """
     evaluation = scene.model.system.at_state(state)
     numbers = {
         shell_contact.pair.cuts: evaluation.evaluate(shell_contact.improved_cuts)
@@ -191,7 +237,7 @@ def better_cuts(scene: Scene, state: State) -> dict[str, float]:
 
 
 def with_cuts_here(scene: Scene, state: State) -> State:
-    """Return a state of another model with cuts at its own displacement; collective."""
+    """Return a state of another model with cuts made at its own displacement; collective."""
     evaluation = scene.model.system.at_state(state)
     return State(
         state.u,
@@ -206,6 +252,7 @@ def with_cuts_here(scene: Scene, state: State) -> State:
 
 
 def _with_cuts(scene: Scene) -> list[SurfaceContact]:
+    """Return the contacts between shells that have cuts: those of surfaces, not of meridians."""
     return [
         shell_contact
         for shell_contact in scene.model.shell_contacts
@@ -214,9 +261,10 @@ def _with_cuts(scene: Scene) -> list[SurfaceContact]:
 
 
 def with_own_contact(scene: Scene, state: State) -> State | None:
-    """Return a state with the penalties and cuts that it needs; None if it has them. Collective.
+    """Return a state with the stiffnesses and cuts that it needs; None if it has them; collective.
 
-    Penalties are stiffer where shells or bodies are too deep in each other.
+    Contacts become stiffer where shells or bodies penetrate too much. None also where no shells may
+    touch each other.
     """
     changed = (
         {**raised_stiffnesses(scene, state), **better_cuts(scene, state)}
@@ -227,7 +275,7 @@ def with_own_contact(scene: Scene, state: State) -> State | None:
 
 
 def shell_penetrations(scene: Scene, state: State) -> list[tuple[Pair, float]]:
-    """Return pairs of shells that may touch, with penetrations over the thickness; collective."""
+    """Return pairs of shells that may touch, each with penetration over thickness; collective."""
     evaluation = scene.model.system.at_state(state)
     return [
         (shell_contact.pair, evaluation.evaluate(shell_contact.relative_penetration))
@@ -236,44 +284,71 @@ def shell_penetrations(scene: Scene, state: State) -> list[tuple[Pair, float]]:
 
 
 def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
-    """Check that no shell passes through another one or itself between two points.
+    """Check that no shell passes through another one, itself or a mirror plane between two points.
 
-    The way between them is straight.
+    The way between the displacements of the two points is straight. Collective.
+
+    Parameters
+    ----------
+    low, high
+        Points with states of the stage's system.
 
     Raises
     ------
     StepTooLong
-        If one does.
+        If a shell passes through another one or itself.
+    PathStopped
+        If it touches its mirror image behind a plane that does not act as contact.
     """
     model, comm = stage.scene.model, stage.scene.comm
     if not model.shell_contacts:
         return
     if model.axisymmetric:
-        places = [
-            model.system.with_ghosts(s.u, s.mu).reshape(-1, 2)
-            for s in map(stage.leave, (low.state, high.state))
+        displacements_of_meridian = [
+            model.system.with_ghosts(model_state.u, model_state.mu).reshape(-1, 2)
+            for model_state in map(stage.leave, (low.state, high.state))
         ]
-        _refuse_through(model.shell_contacts, places)
+        _refuse_through(model.shell_contacts, displacements_of_meridian)
         return
     end = stage.leave(high.state)
     displacements = [
         gathered_displacement(stage.scene, state) for state in (stage.leave(low.state), end)
     ]
-    x0 = model.r0.x.array[: model.system.size].reshape(-1, 3)
-    x = x0 + model.system.with_ghosts(end.u, end.mu)[: model.system.size].reshape(-1, 3)
+    undeformed_places = model.r0.x.array[: model.system.size].reshape(-1, 3)
+    deformed_places = undeformed_places + model.system.with_ghosts(end.u, end.mu)[
+        : model.system.size
+    ].reshape(-1, 3)
     evaluation, shell_contacts = (
         model.system.at_state(end),
-        [t for t in model.shell_contacts if isinstance(t, SurfaceContact)],
+        [
+            shell_contact
+            for shell_contact in model.shell_contacts
+            if isinstance(shell_contact, SurfaceContact)
+        ],
     )
     owned = slice(*model.V.dofmap.index_map.local_range)
-    undeformed, half = (values[owned] for values in evaluation.evaluate(shell_contacts[0].halves))
-    half = np.minimum(half, undeformed)
+    undeformed_half_thickness, half_thickness = (
+        values[owned] for values in evaluation.evaluate(shell_contacts[0].halves)
+    )
+    half_thickness = np.minimum(half_thickness, undeformed_half_thickness)
+    # across these planes contact sees the other half
     seen_through = [*model.mirror.planes.values()] if model.multiplicity > 1 else []
-    for plane in (other for other in model.planes if other not in seen_through):
-        distance_before, distance_after = plane.signed_distance(x0), plane.signed_distance(x)
+    for plane in (
+        mirror_plane for mirror_plane in model.planes if mirror_plane not in seen_through
+    ):
+        distance_before, distance_after = (
+            plane.signed_distance(undeformed_places),
+            plane.signed_distance(deformed_places),
+        )
         side = np.sign(comm.allreduce(float(distance_before.sum())))
+        # nodes that were farther than the thickness from the plane, and now are within half of it
         if comm.allreduce(
-            int(np.sum((side * distance_before > 2 * undeformed) & (side * distance_after < half)))
+            int(
+                np.sum(
+                    (side * distance_before > 2 * undeformed_half_thickness)
+                    & (side * distance_after < half_thickness)
+                )
+            )
         ):
             raise PathStopped(
                 "the shell touches its mirror image behind a plane of boundary: symmetry, which it "
@@ -287,14 +362,14 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
 def passes(stage: Stage, low: Point | State, high: Point | State) -> bool:
     """Return whether a shell passes through another one, itself or a mirror plane.
 
-    The way between the two points is straight.
+    The way between the two points, or states of the stage's system, is straight. Collective.
     """
-    ends = (
+    end_points = (
         end if isinstance(end, Point) else Point(end, 0.0, 0.0 * end.u, 0.0, 0, 0)
         for end in (low, high)
     )
     try:
-        refuse_passing(stage, *ends)
+        refuse_passing(stage, *end_points)
     except (StepTooLong, PathStopped):
         return True
     return False
@@ -304,6 +379,19 @@ def _refuse_through(
     shell_contacts: Sequence[SurfaceContact] | Sequence[MeridianContact],
     ends: Sequence[NDArray[np.float64]],
 ) -> None:
+    """Check that no shell passes through another one on the straight way between two displacements.
+
+    Parameters
+    ----------
+    ends
+        Displacements over R at the two ends, as `passes_through` of the contacts takes them: of all
+        nodes of a surface, or (n, 2) of a meridian.
+
+    Raises
+    ------
+    StepTooLong
+        With the shells that pass.
+    """
     for shell_contact in shell_contacts:
         if shell_contact.passes_through(*ends):
             raise StepTooLong(
@@ -312,12 +400,12 @@ def _refuse_through(
 
 
 def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
-    """Check that the shell passes through no magnet between two points.
+    """Check that the shell passes through no magnet or other source between two points; collective.
 
     Raises
     ------
     PathStopped
-        With the magnet.
+        With the message of the source that it passes; the path must end there.
     """
     model, states = stage.scene.model, [stage.leave(point.state) for point in (low, high)]
     for field in model.fields:
@@ -334,53 +422,61 @@ def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
 def before_passing(stage: Stage, low: State, high: State) -> State:
     """Return the second of two states of a stage, or one before shells pass through each other.
 
-    It is on the straight way to the second state.
+    The latter is on the straight way to the second state, found by halving; it has the amplitudes
+    of the second state. Collective.
     """
     if not stage.scene.model.shell_contacts or not passes(stage, low, high):
         return high
-    part, end_of_way, displacement = 0.0, 1.0, high.u - low.u
+    safe_part, passing_part, displacement = 0.0, 1.0, high.u - low.u
     for _ in range(HALVINGS_BEFORE_PASSING):
-        middle = (part + end_of_way) / 2
+        middle = (safe_part + passing_part) / 2
         passes_there = passes(stage, low, State(low.u + middle * displacement, high.mu))
-        part, end_of_way = (part, middle) if passes_there else (middle, end_of_way)
-    return State(low.u + part * displacement, high.mu)
+        safe_part, passing_part = (safe_part, middle) if passes_there else (middle, passing_part)
+    return State(low.u + safe_part * displacement, high.mu)
 
 
 def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point) -> None:
-    """Check that a body does not go back the way it came.
+    """Check that a body does not go back the way it came; collective.
 
-    It would behind a fold at which it no longer holds the shell in place.
+    It would do so behind a fold at which it no longer holds the shell in place.
 
     Parameters
     ----------
     name
-        The amplitude that varies.
+        The amplitude that varies; nothing is checked unless it moves a body.
     points
-        The path up to here.
+        Points of the path so far.
     high
         The next point.
 
     Raises
     ------
     PathStopped
-        If it does, or if it no longer touches the shell and moves away from it.
+        If the body goes back on its path, or if it moves away from the shell without touching.
     """
     model, comm, low = stage.scene.model, stage.scene.comm, points[-1]
     if name not in model.contacts:
         return
     mu, h = [point.state.mu[name] for point in (*points, high)], stage.newton.system.length
-    top = int(np.argmax(np.abs(np.subtract(mu, mu[0]))))
-    fallen = max_abs(comm, high.state.u - points[min(top, len(points) - 1)].state.u)
-    if top == len(points) or fallen < RETURN_DISTANCE * h:
+    # the point of the farthest approach, from where the path may turn
+    turn = int(np.argmax(np.abs(np.subtract(mu, mu[0]))))
+    distance_from_turn = max_abs(comm, high.state.u - points[min(turn, len(points) - 1)].state.u)
+    if turn == len(points) or distance_from_turn < RETURN_DISTANCE * h:
         return
-    for a, b in pairwise(points[: top + 1]):
-        x, y = a.state.mu[name], b.state.mu[name]
-        if (mu[-1] - x) * (mu[-1] - y) > 0 or not a.dmu or not b.dmu:
+    for earlier_point, later_point in pairwise(points[: turn + 1]):
+        mu_a, mu_b = earlier_point.state.mu[name], later_point.state.mu[name]
+        if (mu[-1] - mu_a) * (mu[-1] - mu_b) > 0 or not earlier_point.dmu or not later_point.dmu:
             continue
-        t = scipy.interpolate.CubicHermiteSpline(
-            [x, y], [a.state.u, b.state.u], [a.du / a.dmu, b.du / b.dmu]
+        # displacement on the way there, at the same approach
+        displacement_before = scipy.interpolate.CubicHermiteSpline(
+            [mu_a, mu_b],
+            [earlier_point.state.u, later_point.state.u],
+            [earlier_point.du / earlier_point.dmu, later_point.du / later_point.dmu],
         )(mu[-1])
-        if max_abs(comm, high.state.u - t) < RETURN_TOLERANCE * fallen:
+        if (
+            max_abs(comm, high.state.u - displacement_before)
+            < RETURN_TOLERANCE * distance_from_turn
+        ):
             message = (
                 "the body goes back the way it came: at its fold the shell snaps under a given "
                 "approach"
@@ -398,35 +494,58 @@ def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point)
 def penetration_message(scene: Scene, state: State, *, moving: bool = False) -> str:
     """Return a message on a body or a shell that penetrates more than its bound; "" if none does.
 
-    It says which stiffness would halve the penetration. Where shells hit each other in a motion,
-    their bound is `IMPACT_BOUND_RATIO` times as large. Collective.
+    It says which stiffness would halve the penetration. Collective.
+
+    Parameters
+    ----------
+    moving
+        Whether the state is one of a motion, where shells may hit each other: then the bound
+        between shells is `IMPACT_BOUND_RATIO` times as large.
     """
     h = scene.problem.material.h
     for contact in scene.problem.loads.contacts:
-        deep = scene.model.region(state, contact.amplitude).penetration / h
-        if deep > contact.max_penetration:
-            k = state.mu.get(contact.setting, contact.stiffness)
+        depth = scene.model.region(state, contact.amplitude).penetration / h
+        if depth > contact.max_penetration:
+            stiffness = state.mu.get(contact.setting, contact.stiffness)
             return (
-                f"the penetration of the body {contact.body} is {deep:.3g} h, more than "
+                f"the penetration of the body {contact.body} is {depth:.3g} h, more than "
                 f"bodies.{contact.body}.penetration: {contact.max_penetration:g}; its stiffness is "
-                f"{k:.4g}: give four times as much"
+                f"{stiffness:.4g}: give four times as much"
             )
-    for pair, deep in shell_penetrations(scene, state):
-        largest = pair.max_penetration * (IMPACT_BOUND_RATIO if moving else 1.0)
-        if deep > largest:
-            what = f"the penetration between {pair.words} is {deep:.3g} h, more than {largest:g} h"
-            k = state.mu.get(pair.setting, pair.stiffness)
+    for pair, depth in shell_penetrations(scene, state):
+        bound = pair.max_penetration * (IMPACT_BOUND_RATIO if moving else 1.0)
+        if depth > bound:
+            finding = (
+                f"the penetration between {pair.words} is {depth:.3g} h, more than {bound:g} h"
+            )
+            stiffness = state.mu.get(pair.setting, pair.stiffness)
             if moving or pair.has_given_stiffness:
-                return f"{what}; contact: stiffness: is {k:.4g}: give four times as much"
-            return f"{what} even with the stiffest penalty: take smaller elements where they touch"
+                return f"{finding}; contact: stiffness: is {stiffness:.4g}: give four times as much"
+            return (
+                f"{finding} even with the stiffest penalty: take smaller elements where they touch"
+            )
     return ""
 
 
 def support_motion_limit(scene: Scene, state: State, name: str, end: float) -> tuple[float, str]:
-    """Return how far supports can move, and which shells they then hold in each other.
+    """Return how far supports can move before shells that they hold would overlap; collective.
 
-    If nothing stops them, that is the end, and "". What two supports hold does not give way. Nodes
-    stand for it, so that edges which cross are not seen.
+    Only nodes whose displacement is prescribed count, as they do not give way. Edges that cross
+    between nodes are not seen.
+
+    Parameters
+    ----------
+    name
+        Amplitude that moves supports.
+    end
+        Value at which the motion ends.
+
+    Returns
+    -------
+    limit
+        Largest value without overlap, at most `end`.
+    shells
+        Words for the shells that stop the motion; "" if nothing stops it.
     """
     model, comm, dim = scene.model, scene.model.system.comm, 2 if scene.model.axisymmetric else 3
     if name not in scene.motions or not model.shell_contacts:
@@ -435,10 +554,13 @@ def support_motion_limit(scene: Scene, state: State, name: str, end: float) -> t
     for bc in model.system.clamped:
         dofs = bc.dof_indices()[0]
         fixed[dofs[dofs < len(fixed)]] = True
-    held_nodes = np.flatnonzero(np.concatenate(comm.allgather(fixed)).reshape(-1, dim).all(axis=1))
+    prescribed_nodes = np.flatnonzero(
+        np.concatenate(comm.allgather(fixed)).reshape(-1, dim).all(axis=1)
+    )
     begin = state.mu[name]
 
     def meeting_shells(part: float) -> str:
+        """Return words for shells whose held nodes overlap after a part of the way, or ""."""
         moved_state = state.with_(state.u, name, begin + part * (end - begin))
         u = np.concatenate(
             comm.allgather(
@@ -447,25 +569,29 @@ def support_motion_limit(scene: Scene, state: State, name: str, end: float) -> t
         ).reshape(-1, dim)
         for shell_contact in model.shell_contacts:
             if (
-                shell_contact.gap_at_supports(held_nodes, u)
+                shell_contact.gap_at_supports(prescribed_nodes, u)
                 < -shell_contact.pair.max_penetration * scene.problem.material.h
             ):
                 return shell_contact.pair.words
         return ""
 
-    parts = np.linspace(0.0, 1.0, SAMPLES_OF_MOTION)
-    first = next((i for i in range(1, SAMPLES_OF_MOTION) if meeting_shells(parts[i])), None)
-    if first is None or meeting_shells(0.0):
+    parts_of_way = np.linspace(0.0, 1.0, SAMPLES_OF_MOTION)
+    first_meeting = next(
+        (i for i in range(1, SAMPLES_OF_MOTION) if meeting_shells(parts_of_way[i])), None
+    )
+    if first_meeting is None or meeting_shells(0.0):
         return end, ""
-    low, high = parts[first - 1 : first + 1]
+    free_part, overlapping_part = parts_of_way[first_meeting - 1 : first_meeting + 1]
     for _ in range(HALVINGS_OF_MOTION):
-        middle = (low + high) / 2
-        low, high = (low, middle) if meeting_shells(middle) else (middle, high)
-    return float(begin + low * (end - begin)), meeting_shells(high)
+        middle = (free_part + overlapping_part) / 2
+        free_part, overlapping_part = (
+            (free_part, middle) if meeting_shells(middle) else (middle, overlapping_part)
+        )
+    return float(begin + free_part * (end - begin)), meeting_shells(overlapping_part)
 
 
 def touching_bodies(scene: Scene, state: State) -> list[ContactBody]:
-    """Return the contacts of the bodies that touch."""
+    """Return the contacts of the bodies that penetrate the shell at a state; collective."""
     contacts = scene.problem.loads.contacts
     return [
         contact
@@ -479,10 +605,15 @@ def refuse_touching_shells(scene: Scene, state: State, result: str) -> None:
 
     Collective.
 
+    Parameters
+    ----------
+    result
+        Begin of the message: name of the result that has no gradient.
+
     Raises
     ------
     CaseError
-        With the shells that do.
+        With the shells that touch.
     """
     for pair, deep in shell_penetrations(scene, state):
         if deep > 0:
@@ -496,7 +627,8 @@ def refuse_touching_shells(scene: Scene, state: State, result: str) -> None:
 def contact_expanded_about(scene: Scene, state: State | None) -> Iterator[None]:
     """Expand contact between shells into polynomials about a state, for states near it.
 
-    None leaves contact as it is.
+    Within the context contact has fixed active sets, so that differences of states are smooth. None
+    leaves contact as it is. Collective.
     """
     if state is None:
         yield
@@ -512,17 +644,25 @@ def contact_expanded_about(scene: Scene, state: State | None) -> Iterator[None]:
 
 
 def with_stiffer_bodies(scene: Scene, state: State, bodies: list[ContactBody]) -> State | None:
-    """Return the equilibrium near a state with bodies `STIFFENING` times as stiff.
+    """Return the equilibrium near a state with bodies `STIFFENING` times as stiff; collective.
 
-    None if there is none within `MAX_DISPLACEMENT`.
+    Parameters
+    ----------
+    bodies
+        Contacts of the bodies that become stiffer, at least one.
+
+    Returns
+    -------
+    State or None
+        None if there is no equilibrium within the displacement `MAX_DISPLACEMENT` h.
     """
-    k = {
+    stiffnesses = {
         contact.setting: STIFFENING * state.mu.get(contact.setting, contact.stiffness)
         for contact in bodies
     }
     name = bodies[0].amplitude
     outcome = scene.newton.solve(
-        State(state.u, {**state.mu, **k}), name, PrescribedLoad(name, state.mu[name])
+        State(state.u, {**state.mu, **stiffnesses}), name, PrescribedLoad(name, state.mu[name])
     )
     if (
         not outcome.converged
@@ -544,15 +684,16 @@ def stiffened_equilibrium(scene: Scene, state: State) -> State:
         bodies = [
             contact for contact in touching_bodies(scene, state) if not contact.has_given_stiffness
         ]
-        harder = with_stiffer_bodies(scene, state, bodies) if bodies else None
-        if harder is None:
+        stiffer_state = with_stiffer_bodies(scene, state, bodies) if bodies else None
+        if stiffer_state is None:
             break
-        deep = max(scene.model.region(state, contact.amplitude).penetration for contact in bodies)
-        state, displacement = harder, _largest_displacement(scene, state, harder)
-        if displacement <= RIGID_RATIO * deep:
+        depth = max(scene.model.region(state, contact.amplitude).penetration for contact in bodies)
+        state, displacement = stiffer_state, _largest_displacement(scene, state, stiffer_state)
+        if displacement <= RIGID_RATIO * depth:
             break
     return state
 
 
 def _largest_displacement(scene: Scene, state: State, other: State) -> float:
+    """Return the largest component of the displacement between two states, over R; collective."""
     return max_abs(scene.model.system.comm, other.u - state.u)

@@ -24,17 +24,18 @@ MAX_GAP_EVALUATIONS = 40  # on the way of a step
 def first_contact(
     scene: Scene, leave: Callable[[State], State], here: State, prediction: State
 ) -> StepEvent:
-    """Return where shells that are apart first meet, and whether all that touch open; collective.
+    """Return where shells that are apart first meet on the way of a step; collective.
 
-    Of pairs that meet on the straight way between the two states of a step the first one counts. A
-    step ends just behind where it meets if the first state is near that, else just before.
+    The way between the two states is straight. The step ends just behind the contact if the first
+    state is near it, else just before. The event also says whether a pair that touches at the begin
+    comes apart.
 
     Parameters
     ----------
     leave
         State of the step's system -> state of the model.
     here, prediction
-        The states at both ends of the step.
+        States of the step's system at both ends of the step.
     """
     # contacts on meridians are no part of it
     contacts = [
@@ -44,50 +45,67 @@ def first_contact(
         return StepEvent()
     states = leave(here), leave(prediction)
     at_begin, at_end = map(scene.model.system.at_state, states)
-    u, v = (gathered_displacement(scene, state) for state in states)
-    meets, loses_forces = (1.0, False), False
+    begin_displacement, end_displacement = (gathered_displacement(scene, state) for state in states)
+    first_event, loses_forces = (1.0, False), False
     for contact in contacts:
         if at_begin.evaluate(contact.penetration):
             loses_forces |= not at_end.evaluate(contact.penetration)
         else:
-            onset = _onset(contact, scene.problem.material.h, u, v)
-            meets = min(meets, onset, key=lambda event: (event[0], not event[1]))
-    return StepEvent(*meets, loses_forces)
+            onset = _onset(contact, scene.problem.material.h, begin_displacement, end_displacement)
+            first_event = min(first_event, onset, key=lambda event: (event[0], not event[1]))
+    return StepEvent(*first_event, loses_forces)
 
 
 def gathered_displacement(scene: Scene, state: State) -> Array:
-    """Return the displacement (nodes, 3) of all ranks; collective."""
+    """Return the displacement (nodes, 3) of all ranks' nodes, over R; collective."""
     system = scene.model.system
-    parts = scene.comm.allgather(system.with_ghosts(state.u, state.mu)[: system.size])
-    return np.asarray(np.concatenate(parts).reshape(-1, 3))
+    displacements_of_ranks = scene.comm.allgather(
+        system.with_ghosts(state.u, state.mu)[: system.size]
+    )
+    return np.asarray(np.concatenate(displacements_of_ranks).reshape(-1, 3))
 
 
 def _onset(contact: SurfaceContact, h: float, u: Array, v: Array) -> tuple[float, bool]:
-    """Return where a step between displacements u and v ends for a contact that is open.
+    """Return where a step between two displacements ends for a contact that is open; collective.
 
-    The result is the part of the way, 1 without a contact, and whether the step ends behind it.
+    The gap is evaluated on the way, first in steps so short that no face passes through another
+    one. Then a bracket of the contact is divided by interpolation.
+
+    Parameters
+    ----------
+    h
+        Thickness over R.
+    u, v
+        Displacements (nodes, 3) of all ranks at both ends of the step.
+
+    Returns
+    -------
+    part, is_behind
+        The part of the way, 1 without a contact; and whether the step ends behind the contact.
     """
-    fastest = 2 * float(np.linalg.norm(v - u, axis=1).max())  # relative to each other
+    largest_approach = 2 * float(np.linalg.norm(v - u, axis=1).max())  # relative to each other
     depth = CONTACT_DEPTH * h
-    if not fastest or not contact.come_near(u, v):
+    if not largest_approach or not contact.come_near(u, v):
         return 1.0, False
     gap_at_low = contact.gap(u)
     if gap_at_low <= 0:
         return 1.0, False
-    sets_in, least_thickness = gap_at_low < NEAR_CONTACT * depth, contact.least_thickness()
-    low, high, gap_at_high, aim = 0.0, 0.0, 0.0, -depth if sets_in else depth
+    is_behind, least_thickness = gap_at_low < NEAR_CONTACT * depth, contact.least_thickness()
+    low, high, gap_at_high, aimed_gap = 0.0, 0.0, 0.0, -depth if is_behind else depth
     for _ in range(MAX_GAP_EVALUATIONS):
         if high:
-            part = low + (high - low) * (gap_at_low - aim) / (gap_at_low - gap_at_high)
+            part = low + (high - low) * (gap_at_low - aimed_gap) / (gap_at_low - gap_at_high)
         else:  # so far no face can pass through another one
-            part = min(1.0, low + (gap_at_low + CROSSING_DISTANCE * least_thickness) / fastest)
+            part = min(
+                1.0, low + (gap_at_low + CROSSING_DISTANCE * least_thickness) / largest_approach
+            )
         gap = contact.gap(u + part * (v - u))
-        if gap < aim - depth:
+        if gap < aimed_gap - depth:
             high, gap_at_high = part, gap
-        elif gap <= aim + depth:
-            return part, sets_in
+        elif gap <= aimed_gap + depth:
+            return part, is_behind
         elif part == 1.0:
             return 1.0, False
         else:
             low, gap_at_low = part, gap
-    return (high if sets_in else low) or low, sets_in
+    return (high if is_behind else low) or low, is_behind

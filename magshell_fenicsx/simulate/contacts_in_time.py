@@ -20,7 +20,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class _ContactPlaces:
-    """Places where bodies press, and displacements of shells that may touch, at a step's end."""
+    """Arguments of contact forces at one end of a step in time.
+
+    Attributes
+    ----------
+    bodies
+        For each body the state of the points on which it presses, see `BodyContact.point_state`.
+    shells
+        For each contact between shells the displacement of the shells that may touch.
+    """
 
     bodies: list[tuple[Array, float | Array]]
     shells: list[Array]
@@ -28,6 +36,8 @@ class _ContactPlaces:
 
 class ContactsInTime:
     """All contacts of a system in steps in time; a `continuation.motion.AveragedContact`.
+
+    All methods are collective.
 
     Parameters
     ----------
@@ -50,6 +60,7 @@ class ContactsInTime:
         body_contacts: Mapping[str, BodyContact],
         shell_contacts: Sequence[TimeAveragedContact],
     ) -> None:
+        """Take the contacts; nothing is computed before the first step."""
         self._system, self._shell_contacts = system, shell_contacts
         self._body_contacts = list(body_contacts.values())
         self.names = frozenset(body_contacts)
@@ -57,51 +68,71 @@ class ContactsInTime:
         self._begin: tuple[Vector, _ContactPlaces] | None = None
 
     def stiffened_settings(self, begin: State, v: Vector) -> dict[str, float]:
-        """Return settings of pairs of shells that are apart and may meet too fast for their
-        penalty.
+        """Return setting -> stiffness of pairs of shells that may meet too fast for their penalty.
+
+        Only pairs count that are apart, and whose stiffness the case does not give.
+
+        Parameters
+        ----------
+        begin
+            State where the step begins.
+        v
+            Velocity of the unknowns, over that of waves.
         """
         if not self._shell_contacts:
             return {}
         comm, nodes = self._system.comm, v.reshape(-1, self._system.u.function_space.dofmap.bs)
-        largest = np.max([nodes, -nodes], axis=1, initial=0.0)  # (2, 3): along each axis and back
-        fastest = np.max(comm.allgather(largest), axis=0)
+        largest_of_axes = np.max(
+            [nodes, -nodes], axis=1, initial=0.0
+        )  # (2, 3): along each axis and back
+        largest_of_all = np.max(comm.allgather(largest_of_axes), axis=0)
         # no two places move faster relative to each other
-        speed = float(np.linalg.norm(fastest.sum(axis=0)))
+        speed = float(np.linalg.norm(largest_of_all.sum(axis=0)))
         evaluation, settings = self._system.at_state(begin), dict[str, float]()
         for contact in self._shell_contacts:
             pair = contact.pair
-            k = begin.mu.get(pair.setting, pair.stiffness)
-            needed = stiff_for(pair, speed, self._system.length)
+            stiffness = begin.mu.get(pair.setting, pair.stiffness)
+            needed_stiffness = stiff_for(pair, speed, self._system.length)
             if (
-                needed > k
+                needed_stiffness > stiffness
                 and not pair.has_given_stiffness
                 and evaluation.evaluate(contact.penetration) <= 0
             ):
-                settings[pair.setting] = needed
+                settings[pair.setting] = needed_stiffness
         return settings
 
     def average_along(self, begin: State, end: State, part: float) -> None:
-        """Take the forces of a step at a part of it."""
+        """Let contact forces be means over a step in time, as a system takes them within it.
+
+        Parameters
+        ----------
+        begin, end
+            States at both ends of the step.
+        part
+            Position within the step, from 0 to 1, at which the system takes its forces.
+        """
         places_before, places_after = self._at_begin(begin), self._places(end)
-        for pressing, low, high in zip(
+        for pressing, place_before, place_after in zip(
             self._body_contacts, places_before.bodies, places_after.bodies, strict=True
         ):
-            pressing.average(low, high, part)
-        for contact, u, v in zip(
+            pressing.average(place_before, place_after, part)
+        for contact, displacement_before, displacement_after in zip(
             self._shell_contacts, places_before.shells, places_after.shells, strict=True
         ):
             contact.samples = ()
-            contact.samples = samples_of_step(contact, u, v, part)
+            contact.samples = samples_of_step(
+                contact, displacement_before, displacement_after, part
+            )
 
     def use_state_forces(self) -> None:
-        """Take the present forces again."""
+        """Let contact forces be those of the present state again."""
         for pressing in self._body_contacts:
             pressing.use_present_forces()
         for contact in self._shell_contacts:
             contact.samples = ()
 
     def penetration_message(self, begin: State, end: State) -> str:
-        """Return which shells pass through each other in a step, in words; empty if none do."""
+        """Return which shells pass through each other in a step, in words; "" if none do."""
         displacements = zip(self._at_begin(begin).shells, self._places(end).shells, strict=True)
         for contact, (places_before, places_after) in zip(
             self._shell_contacts, displacements, strict=True
@@ -111,17 +142,18 @@ class ContactsInTime:
         return ""
 
     def stored_energy(self, u: Vector, mu: Amplitudes) -> float:
-        """Return the energy of the shell itself with that of the contacts."""
+        """Return the energy of the shell itself together with that of its contacts."""
         self.use_state_forces()
         return self._system.stored_energy(u, mu)
 
     def _at_begin(self, begin: State) -> _ContactPlaces:
-        """Return the places at the begin of a step, which are computed once."""
+        """Return the arguments of contact forces at the begin of a step, computed once."""
         if self._begin is None or self._begin[0] is not begin.u:
             self._begin = begin.u, self._places(begin)
         return self._begin[1]
 
     def _places(self, state: State) -> _ContactPlaces:
+        """Return the arguments of contact forces at a state."""
         return self._system.at_state(state).evaluate(
             lambda: _ContactPlaces(
                 [contact.point_state for contact in self._body_contacts],

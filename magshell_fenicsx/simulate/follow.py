@@ -34,14 +34,14 @@ BEYOND_INSTABILITY = "beyond the first instability the path stopped: "
 
 
 def warn_of(remark: str) -> None:
-    """Give a remark as a warning."""
+    """Give a remark as a warning of Python."""
     warnings.warn(remark, stacklevel=3)
 
 
 def follow(
     scene: Scene, *, search: bool = True, remark: Callable[[str], None] = warn_of
 ) -> Iterator[Record]:
-    """Compute the history of a scene; yield every accepted point.
+    """Compute the history of a scene; yield the record of every accepted point; collective.
 
     With `until: limit` as its end, a history has its answer at the first instability: what stops it
     beyond that is a remark.
@@ -102,12 +102,14 @@ def follow(
 def follow_alone(
     scene: Scene, *, search: bool = False, remark: Callable[[str], None] = warn_of
 ) -> Iterator[Record]:
-    """Compute the history of a scene for what reads all of it in the scene itself; see `follow`.
+    """Yield the records of a history that stays in one scene; see `follow`.
+
+    It is for callers that read results in the scene itself.
 
     Raises
     ------
     Stopped
-        Also where it would go on in another model.
+        Also where the history would go on in another model.
     """
     for record in follow(scene, search=search, remark=remark):
         if record.scene is not None and record.scene is not scene:
@@ -119,10 +121,12 @@ def follow_alone(
 
 
 def _start(scene: Scene, state: State, *, has_rise: bool) -> Iterator[Record]:
-    """Yield the record of the undeformed shell.
+    """Yield the record of the undeformed shell; collective.
 
     Parameters
     ----------
+    state
+        State of the undeformed shell, without loads.
     has_rise
         Whether an energy moves the shell before the first step.
 
@@ -133,6 +137,7 @@ def _start(scene: Scene, state: State, *, has_rise: bool) -> Iterator[Record]:
     """
 
     def record(pivots: int, factorisations: int, clock: dict[str, float]) -> Record:
+        """Return the record of the undeformed shell with so many unstable directions."""
         zero = 0.0 * state.u
         point = Point(state, 0.0, zero, 0.0, pivots, pivots, 0, factorisations)
         return Record("start", "", point, clock=clock, scene=scene, shown=scene.displacement)
@@ -153,17 +158,21 @@ def _start(scene: Scene, state: State, *, has_rise: bool) -> Iterator[Record]:
         clock = initial_clock(scene, first_motion, state)
     yield record(pivots, 1, clock)
     if pivots:
-        why = scene.flat_triangle or "mesh.penalty is too small or the mesh too coarse"
-        raise Stopped(f"the undeformed shell is unstable in {pivots} directions: {why}")
+        reason = scene.flat_triangle or "mesh.penalty is too small or the mesh too coarse"
+        raise Stopped(f"the undeformed shell is unstable in {pivots} directions: {reason}")
 
 
 class _StepRun:
     """Run of one step of a programme: its path, and what follows an instability at its end.
 
+    `path` and then `records_beyond` are iterated over, once each.
+
     Parameters
     ----------
     scene
-        The scene at its begin.
+        The scene where the step begins.
+    step
+        Step of the programme.
     remark
         See `follow`.
 
@@ -182,6 +191,7 @@ class _StepRun:
     """
 
     def __init__(self, scene: Scene, step: ProgrammeStep, remark: Callable[[str], None]) -> None:
+        """Prepare the run; the path is followed by `path`."""
         self.scene, self.end, self.label, self.is_unstable = scene, scene.unloaded(), "", False
         self.place, problem = "", scene.problem
         if problem.listed:
@@ -197,12 +207,12 @@ class _StepRun:
 
     @property
     def has_answer(self) -> bool:
-        """Whether the step has the instability that it looks for, whatever stops it beyond."""
+        """Whether the step has found the instability that it looks for, whatever stops it later."""
         is_to_limit = self._step.until == "limit" and not self._step.load.released_by
         return self._first_instability is not None and is_to_limit
 
     def reason(self, error: Exception) -> str:
-        """Return why the step has stopped, in words."""
+        """Return the reason why the step has stopped, with terms that were not a number."""
         names = self.scene.model.system.nan_terms
         nan_text = ""
         if names:
@@ -210,7 +220,7 @@ class _StepRun:
         return f"{self.place}{error}{nan_text}"
 
     def path(self, state: State) -> Iterator[Record]:
-        """Yield the records of the path from a state."""
+        """Yield the records of the step's path from a state."""
         stream = RecordStream(records_of(self.scene, self._step, state))
         for record in stream:
             self._last, self.label = record, record.label
@@ -224,7 +234,7 @@ class _StepRun:
         self.end = stream.end
 
     def remark_on_release(self) -> str:
-        """Return a remark on a shell that is released after it has buckled; empty for others.
+        """Return a remark on a shell that has buckled before it is released to snap; "" for others.
 
         Raises
         ------
@@ -244,7 +254,10 @@ class _StepRun:
         return _buckled_text(self.scene, fold, self._first_instability)
 
     def records_beyond(self) -> Iterator[Record]:
-        """Yield the records of the branch or the snap that follows an instability at the end."""
+        """Yield the records of the branch or the snap from an instability at the end of the path.
+
+        There are none where the step does not ask for them.
+        """
         step, record = self._step, self._last
         if record is None:
             return
@@ -269,21 +282,22 @@ class _StepRun:
         self.end = stream.end
 
     def remark_on_point_forces(self, scene: Scene) -> None:
-        """Say which instabilities at point forces were left out since the last call."""
+        """Give remarks on the instabilities at point forces left out since the last call."""
         for sentence in scene.point_force_modes.take():
             self._remark(self.place + sentence)
 
     @property
     def _is_released_at_bifurcation(self) -> bool:
+        """Whether the shell snaps from a bifurcation, and so in the model that has its mode."""
         return self._step.until == "bifurcation" and self.label == "bifurcation"
 
     def _completed(self, record: Record) -> Record:
-        """Return a record with what a history knows of it.
+        """Return a record with its step, scene and function of the displacement; give its remarks.
 
         Raises
         ------
         Stopped
-            If something penetrates too much there.
+            If a body or a shell penetrates too much there.
         """
         scene, state = record.scene or self.scene, record.point.state
         if record.said:
@@ -299,9 +313,9 @@ class _StepRun:
 
 
 def energies_moving_the_shell(scene: Scene, state: State) -> dict[str, float]:
-    """Return amplitude -> value of the energies that move the undeformed shell.
+    """Return amplitude -> value of the own energies that move the undeformed shell; collective.
 
-    One is a surface tension.
+    An example is a surface tension. The displacement is that of the linear response.
     """
     system, energies = scene.model.system, dict[str, float]()
     for term in scene.problem.loads.user_terms:
@@ -321,6 +335,18 @@ def _rise(scene: Scene, name: str, value: float, state: State) -> Records:
     ----------
     name, value
         The amplitude of the energy, and its value at the end.
+    state
+        State of the undeformed shell.
+
+    Returns
+    -------
+    State
+        State at rest (the generator's return value).
+
+    Raises
+    ------
+    Stopped
+        If the path to rest is lost.
     """
     stage = load_stage(scene)
     path, start = stage.begin(name, "load", state, value / STEPS_OF_RISE, value)
@@ -331,7 +357,15 @@ def _rise(scene: Scene, name: str, value: float, state: State) -> Records:
 
 
 def _buckled_text(scene: Scene, fold: Record, first_instability: Record | None) -> str:
-    """Return words for a snap at whose fold modes that the model excludes are unstable."""
+    """Return a remark on a snap at whose fold modes that the model excludes are unstable.
+
+    Parameters
+    ----------
+    fold
+        Record of the fold, with the number of these modes.
+    first_instability
+        Record of the first instability of the step; None if none was located.
+    """
     count = fold.excluded_pivots
     since = "from the start of the step on"
     if first_instability and first_instability.mode not in OWN_MODES:
@@ -347,7 +381,9 @@ def _buckled_text(scene: Scene, fold: Record, first_instability: Record | None) 
 
 
 def _refuse_not_numbers(scene: Scene, state: State, place: str) -> None:
-    """Check that the forces at a state are numbers: no step could be small enough.
+    """Check that the forces at a state are numbers; collective.
+
+    Otherwise no step is small enough.
 
     Parameters
     ----------
@@ -357,7 +393,7 @@ def _refuse_not_numbers(scene: Scene, state: State, place: str) -> None:
     Raises
     ------
     Stopped
-        With the terms that are not.
+        With the terms whose forces are not numbers.
     """
     system = scene.model.system
     system.nan_terms = []

@@ -28,7 +28,7 @@ def dimensionless_time(problem: Problem, value: Time) -> float:
 
 
 def amplitude_of_level(problem: Problem, name: str, value: Level) -> float:
-    """Return a value of a history as an amplitude."""
+    """Return a value in a history of the case as an amplitude of the model."""
     if name != "lambda_m":
         return level_in(problem.context, name, value)
     return problem.lambda_m * level_in(problem.context, "field", value)
@@ -39,6 +39,10 @@ class LoadsInTime:
 
     Parameters
     ----------
+    load
+        The section of the step, with its histories.
+    state
+        State where the step begins.
     motions
         Amplitudes of supports, which must not jump.
 
@@ -56,6 +60,7 @@ class LoadsInTime:
     def __init__(
         self, problem: Problem, load: TimeSection, state: State, motions: Collection[str]
     ) -> None:
+        """Make a curve for each history, collect its kinks, and check that supports do not jump."""
         self._mu, time = dict(state.mu), partial(dimensionless_time, problem)
         histories = dict(zip(load.drives, load.history.values(), strict=True))
         unit, steps = problem.time_unit or 1.0, {step.name: step.load for step in problem.programme}
@@ -65,19 +70,20 @@ class LoadsInTime:
             step = steps.get(name)
             value = step.in_history(state.mu[name]) if step else state.mu[name]
             level = partial(amplitude_of_level, problem, name)
-            size = problem.lambda_m if isinstance(history, str) and name == "lambda_m" else 1.0
+            strength = problem.lambda_m if isinstance(history, str) and name == "lambda_m" else 1.0
             self._curves[name] = _scaled(
                 curve(history, time_in_case_unit, level, value),
-                size,
+                strength,
                 unit,
                 step.of_history if step else float,
             )
             self.marks |= set(marks(history, time, time(load.duration)))
-            first, present = self._curves[name](0.0, False), state.mu[name]
-            jump = abs(first - present)
-            if name in motions and jump > JUMP_TOLERANCE * max(1.0, abs(present)):
+            first_value, present_value = self._curves[name](0.0, False), state.mu[name]
+            jump = abs(first_value - present_value)
+            if name in motions and jump > JUMP_TOLERANCE * max(1.0, abs(present_value)):
                 raise CaseError(
-                    f"history.{name}: begins at {first:.6g}, but the support is at {present:.6g}"
+                    f"history.{name}: begins at {first_value:.6g}, but the support is at "
+                    f"{present_value:.6g}"
                 )
 
         times = [time(load.duration)]
@@ -87,25 +93,48 @@ class LoadsInTime:
     def rates(
         self, t: float, before: bool, names: Collection[str]
     ) -> dict[str, tuple[float, float]]:
-        """Return first and second derivatives by time of some amplitudes, to second order.
+        """Return amplitude -> first and second derivative by time, by one-sided differences.
+
+        The differences are of second order.
 
         Parameters
         ----------
+        t
+            Time over the unit of time of the model.
         before
-            Whether they are taken from values before t, which may be a jump.
+            Whether they are taken from values before t, where a jump may be.
+        names
+            The amplitudes; those without a history are left out.
         """
         backward = before and t >= 3 * self._difference_step
         rates, step = {}, -self._difference_step if backward else self._difference_step
         for name in set(self._curves) & set(names):
-            a, b, c, d = (self._curves[name](t + i * step, backward) for i in range(4))
-            rates[name] = (4 * b - 3 * a - c) / (2 * step), (2 * a - 5 * b + 4 * c - d) / step**2
+            value_0, value_1, value_2, value_3 = (
+                self._curves[name](t + i * step, backward) for i in range(4)
+            )
+            rates[name] = (
+                (4 * value_1 - 3 * value_0 - value_2) / (2 * step),
+                (2 * value_0 - 5 * value_1 + 4 * value_2 - value_3) / step**2,
+            )
         return rates
 
     def __call__(self, t: float, before: bool) -> dict[str, float]:
-        """Return all amplitudes at a time, just `before` it or after it."""
+        """Return all amplitudes at a time, just before it if `before`, else after it."""
         return self._mu | {name: history(t, before) for name, history in self._curves.items()}
 
 
 def _scaled(history: Curve, size: float, unit: float, amplitude: Callable[[float], float]) -> Curve:
-    """Return a history in the model's unit of time, times a size, as an amplitude."""
+    """Return a history in the model's unit of time, as an amplitude.
+
+    Parameters
+    ----------
+    history
+        Function of the time in the case's unit, and of whether it is just before a jump.
+    size
+        Factor of its values.
+    unit
+        Unit of time of the model, in that of the case.
+    amplitude
+        Function from a value in the history to the amplitude.
+    """
     return lambda t, before: amplitude(size * history(t * unit, before))

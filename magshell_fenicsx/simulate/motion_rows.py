@@ -44,13 +44,13 @@ class RefinedSteps:
     Attributes
     ----------
     steps
-        Those of the motion.
+        Options of the motion's time steps.
     rows
-        The displacements of the last coarse run.
+        Displacements at the rows of the last coarse run.
     errors
-        Their estimated errors, over the system's length.
+        Estimated errors of these displacements, over the system's length.
     ratio
-        Steps of the motion over those of the last coarse run.
+        Length of the motion's steps over that of the last coarse run's steps.
     """
 
     steps: TimeSteps
@@ -61,16 +61,19 @@ class RefinedSteps:
     def error(self, scene: Scene, row: int, u: Vector | None) -> float:
         """Return the estimated error of the motion's displacement, over the system's length.
 
+        Collective.
+
         Parameters
         ----------
         row
-            Number of the row.
+            Number of the row, or of the next row of a time between rows.
         u
-            The displacement at the row; None for the error before it.
+            The displacement at the row; None at a time between rows.
         """
         row, square = min(row, len(self.rows) - 1), self.ratio**2
         if u is None or self.ratio > CLEAR_STEP_RATIO:
             return square * self.errors[row]
+        # the error falls with the square of the steps, so the difference of both runs shows it
         return square / (1 - square) * _distance(scene, u, self.rows[row])
 
 
@@ -89,12 +92,12 @@ class StepRefinement:
     scene, held_conjugates, marks
         See `MotionRows`.
     begin
-        A new integrator and the motion's begin.
+        Function that returns a new integrator, and the motion at its begin.
     ends
-        The times of rows.
+        Times of the rows, ascending.
     is_over
-        Whether a motion need not be followed beyond the second of two rows; the third argument is
-        the largest kinetic energy.
+        Function of the motions at two successive rows, and the largest kinetic energy so far:
+        whether a motion need not be followed beyond the second row.
     """
 
     scene: Scene
@@ -105,7 +108,13 @@ class StepRefinement:
     is_over: Callable[[Motion, Motion, float], bool]
 
     def __call__(self, steps: TimeSteps) -> RefinedSteps:
-        """Return steps with which the error at all rows is below the tolerance."""
+        """Return steps with which the error at all rows is below the tolerance; collective.
+
+        Parameters
+        ----------
+        steps
+            Options of time steps, with the tolerance.
+        """
         scene, tolerance = self.scene, steps.tolerance
         coarse_tolerance = min(COARSE_TOLERANCE_RATIO * tolerance, MAX_COARSE_TOLERANCE)
         coarse_steps = replace(steps, tolerance=max(tolerance, coarse_tolerance))
@@ -113,30 +122,36 @@ class StepRefinement:
             (max_abs(scene.model.system.comm, motion.v), motion.t, mean_step)
             for motion, mean_step in self._rows(coarse_steps)
         ]
-        largest_speed, fastest, _ = max(speeds)
-        longest = max(step for speed, _, step in speeds if speed >= FAST_SPEED * largest_speed)
-        coarse_steps = replace(coarse_steps, longest=longest, fastest=fastest)
+        largest_speed, time_of_largest_speed, _ = max(speeds)
+        longest_step = max(step for speed, _, step in speeds if speed >= FAST_SPEED * largest_speed)
+        coarse_steps = replace(coarse_steps, longest=longest_step, fastest=time_of_largest_speed)
         rows = [motion.u for motion, _ in self._rows(coarse_steps)]
-        refinement, ratio = 1.0, 0.5
+        step_factor, ratio = 1.0, 0.5
         while True:
-            refinement *= ratio
+            step_factor *= ratio
             errors = list[float]()
-            for i, (motion, _) in enumerate(self._rows(coarse_steps.refined(refinement))):
+            for i, (motion, _) in enumerate(self._rows(coarse_steps.refined(step_factor))):
                 coarser_u = rows[min(i, len(rows) - 1)]
+                # from the difference of two runs, whose errors go as the square of the steps
                 errors.append(ratio**2 / (1 - ratio**2) * _distance(scene, motion.u, coarser_u))
                 rows[i : i + 1] = [motion.u]
             largest_error = max(*errors, TINY_ERROR)
-            needed = refinement * float(np.sqrt(AIMED_ERROR * tolerance / largest_error))
-            needed = min(
-                max(needed, MIN_STEP_RATIO), (tolerance / coarse_steps.tolerance) ** (1 / 3)
+            needed_refinement = step_factor * float(
+                np.sqrt(AIMED_ERROR * tolerance / largest_error)
             )
-            if needed * MAX_STEP_RATIO >= refinement:
-                refined = coarse_steps.refined(needed)
-                return RefinedSteps(refined, rows[: len(errors)], errors, needed / refinement)
+            needed_refinement = min(
+                max(needed_refinement, MIN_STEP_RATIO),
+                (tolerance / coarse_steps.tolerance) ** (1 / 3),
+            )
+            if needed_refinement * MAX_STEP_RATIO >= step_factor:
+                refined = coarse_steps.refined(needed_refinement)
+                return RefinedSteps(
+                    refined, rows[: len(errors)], errors, needed_refinement / step_factor
+                )
             ratio = 0.25
 
     def _rows(self, steps: TimeSteps) -> Iterator[tuple[Motion, float]]:
-        """Yield the motion at each row, and the mean step before it."""
+        """Yield the motion at each row, and the mean time step before this row."""
         integrator, motion = self.begin()
         rows = MotionRows(self.scene, integrator, self.held_conjugates, steps, self.marks)
         time_step, largest_kinetic = steps.first, integrator.kinetic(motion)
@@ -151,22 +166,25 @@ class StepRefinement:
 
 
 def _progress_point(motion: Motion) -> Point:
-    """Return a motion as a point that a listener to the progress of a run gets."""
+    """Return a motion as a point, for listeners to the progress of a run."""
     return Point(State(motion.u, motion.mu), motion.t, motion.v, 0.0, 0, 0)
 
 
 @dataclass
 class MotionRows:
-    """Moves a scene from row to row.
+    """Moves a motion from row to row, and keeps its rows in the journal.
 
     Parameters
     ----------
     held_conjugates
-        See `make_stage`.
+        Amplitude -> its conjugate, see `make_stage`.
+    steps
+        Options of time steps.
     marks
         Times at which loads have kinks or jumps.
     refinement
-        Chooses the steps for the tolerance of these; None: they are taken as they are.
+        Chooses steps so that the errors of rows are within the tolerance of `steps`; None: these
+        are taken as they are.
     """
 
     scene: Scene
@@ -182,30 +200,45 @@ class MotionRows:
     def advanced(
         self, motion: Motion, time_step: float, end: float, *, is_known: bool = False
     ) -> tuple[Motion, float]:
-        """Return the motion at a later time, and the step to go on with.
+        """Return the motion at a later time, and the time step to go on with; collective.
 
         Parameters
         ----------
+        time_step
+            First time step.
+        end
+            The later time.
         is_known
             Whether the journal has the motion at that time.
         """
         check = partial(self.scene.journal.check, is_known)
-        for t in [*sorted(t for t in self.marks if motion.t < t < end), end]:
+        for mark in [*sorted(mark for mark in self.marks if motion.t < mark < end), end]:
             # the acceleration after a mark is another one
             if motion.t in self.marks and self.integrator.begins_anew(motion.t):
                 motion = self.integrator.begin(motion.t, motion.u, motion.v, motion)
-            motion, time_step = advance(self.integrator, motion, t, self.steps, time_step, check)
+            motion, time_step = advance(self.integrator, motion, mark, self.steps, time_step, check)
         return motion, time_step
 
     def crossing(
         self, motion: Motion, time_step: float, end: Motion, event: Callable[[Motion], float]
     ) -> float:
-        """Return the time between two motions at which a function of them changes its sign."""
+        """Return the time between two motions at which a function of a motion changes its sign.
+
+        Parameters
+        ----------
+        time_step
+            First time step after `motion`.
+        end
+            The later motion.
+        event
+            The function.
+        """
         tolerance = EVENT_TIME_TOLERANCE * (end.t - motion.t)
         known_motions = {motion.t: motion, end.t: end}
         self._refactor()
 
         def event_at(t: float) -> float:
+            """Return the function at a time between the two motions."""
             return event(known_motions.get(t) or self.advanced(motion, time_step, t)[0])
 
         time = float(scipy.optimize.brentq(event_at, motion.t, end.t, xtol=tolerance))
@@ -214,10 +247,20 @@ class MotionRows:
     def journalled(
         self, motion: Motion, time_step: float, end: float
     ) -> tuple[Motion, float, Point]:
-        """Return the motion at a later time, the step to go on with, and the point there.
+        """Return the motion at a later time, from the journal if this has it; collective.
 
-        In the journal these are three points: the motion, what it needs besides, and what the
-        latest factors belong to.
+        In the journal a row is three points: the motion, its companion with what it needs besides,
+        and the state to which the latest factors belong.
+
+        Returns
+        -------
+        motion, time_step, point
+            The motion, the time step to go on with, and the point for a record.
+
+        Raises
+        ------
+        Stopped
+            If time steps become too small.
         """
         scene, integrator = self.scene, self.integrator
         points = list[Point]()
@@ -261,7 +304,7 @@ class MotionRows:
     def _replayed(
         self, point: Point, companion: Point, factored_point: Point
     ) -> tuple[Motion, float, Point]:
-        """Return a row from its three points of the journal."""
+        """Return a row from its three points of the journal, see `journalled`."""
         self._factored_point = factored_point
         self.scene.newton.factorisation.habit = point.habit
         motion = Motion(
@@ -278,35 +321,50 @@ class MotionRows:
         return motion, point.dmu, point
 
     def _companions(self, motion: Motion) -> tuple[Point, Point]:
-        """Return the points of the journal with what a motion and its factors need besides."""
-        zero, integrator = 0.0 * motion.a, self.integrator
+        """Return the two points of the journal that follow the point of a motion.
+
+        The first has acceleration, potentials, work, dissipation and error. The second has the
+        state to which the latest factors belong.
+        """
+        zero_vector, integrator = 0.0 * motion.a, self.integrator
         companion = Point(
             State(motion.a, motion.potentials),
             motion.work,
-            zero,
+            zero_vector,
             motion.dissipated,
             0,
             0,
             error=motion.error,
         )
-        factored = integrator.factored_state
-        if factored is None:
-            factored = FactoredState(zero, {}, 0.0, integrator.factorisation.habit)
-        state = State(factored.u, factored.mu)
-        return companion, Point(state, factored.dt, zero, 0.0, 0, 0, habit=factored.habit)
+        factored_state = integrator.factored_state
+        if factored_state is None:
+            factored_state = FactoredState(zero_vector, {}, 0.0, integrator.factorisation.habit)
+        state = State(factored_state.u, factored_state.mu)
+        return companion, Point(
+            state, factored_state.dt, zero_vector, 0.0, 0, 0, habit=factored_state.habit
+        )
 
     def _error(self, motion: Motion, end: float) -> float:
-        """Return the estimated error of a motion over the system's length; 0 if it is unknown."""
+        """Return the estimated error of a motion over the system's length; 0 without a refinement.
+
+        Parameters
+        ----------
+        end
+            Time of the motion; at an event between rows the error of the next row counts.
+        """
         if not (self.refinement and self._refined_steps):
             return 0.0
-        ends = self.refinement.ends
-        row = int(np.searchsorted(ends, end))
-        return self._refined_steps.error(self.scene, row, motion.u if end == ends[row] else None)
+        row_times = self.refinement.ends
+        row = int(np.searchsorted(row_times, end))
+        return self._refined_steps.error(
+            self.scene, row, motion.u if end == row_times[row] else None
+        )
 
     def _negative_pivots(self, state: State) -> int:
-        """Return the number of unstable directions at a state.
+        """Return the number of unstable directions at a state; collective.
 
-        Rigid motions that are free have no stiffness: the sign of their pivots is rounding.
+        It is 0 for a shell that moves freely. Free rigid motions have no stiffness: the sign of
+        their pivots is rounding.
         """
         stage = make_stage(self.scene, state, self.held_conjugates)
         if self.scene.free_in_time:
@@ -314,17 +372,18 @@ class MotionRows:
         return stage.newton.factor_at(stage.enter(state)).negative_pivots
 
     def _refactor(self) -> None:
-        """Make the factors that the run had: others end iterations elsewhere, within their
-        tolerance.
+        """Make the factors again that the interrupted run had, so that the motion repeats.
+
+        With other factors, iterations would end elsewhere within their tolerance. Collective.
         """
-        factored, self._factored_point = self._factored_point, None
+        factored_point, self._factored_point = self._factored_point, None
         # beside a body factors belong to a whole step: each interval makes its own
         if self.integrator.contact:
             self.integrator.factored_state = None
-        if factored and factored.s and not self.integrator.contact:
-            state = factored.state
+        if factored_point and factored_point.s and not self.integrator.contact:
+            state = factored_point.state
             self.integrator.factor(
-                FactoredState(state.u, dict(state.mu), factored.s, factored.habit)
+                FactoredState(state.u, dict(state.mu), factored_point.s, factored_point.habit)
             )
-        elif factored:
-            self.integrator.factorisation.habit = factored.habit
+        elif factored_point:
+            self.integrator.factorisation.habit = factored_point.habit

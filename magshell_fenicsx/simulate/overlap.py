@@ -26,14 +26,20 @@ MAX_CELLS = 20_000  # of larger meshes nothing is looked for: it would take more
 
 
 def refuse_overlap(problem: Problem, cells: int) -> None:
-    """Check that shells that may touch do not overlap, and T-junctions are on their shells.
+    """Check that shells that may touch do not overlap, and that T-junctions are on their shells.
 
-    Of shells that get thinner, and of images of a half, a scene does.
+    Larger meshes are not checked, nor are shells that get thinner, or images of a half: a scene
+    checks these.
+
+    Parameters
+    ----------
+    cells
+        Number of cells of the mesh.
 
     Raises
     ------
     MeshError
-        With the shells, by how much, and where.
+        With the shells, by how much they overlap, and where.
     CaseError
         If magnetised parts are in each other.
     """
@@ -74,22 +80,29 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
 def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:
     """Check that no mid-surfaces of magnetised parts are in each other.
 
-    Forces between them would be no numbers.
+    Forces between such parts would not be numbers.
+
+    Parameters
+    ----------
+    r0
+        Undeformed placement of the whole surface.
+    h
+        Thickness over R.
 
     Raises
     ------
     CaseError
-        In the words of a scene, which sees more: parts too near for the size of their cells.
+        With the message of a scene, which also refuses parts too near for the size of their cells.
     """
     from magshell_fenicsx.parts.magnetism.interacting import TOO_NEAR
     from magshell_fenicsx.parts.magnetism.stacked_faces import OVERLAP_DISTANCE
 
     surfaces, V = MidSurfaces.gather(r0), r0.function_space
     nodes = surfaces.cells.nodes
-    part = component_numbers(V)[V.dofmap.list[: len(nodes), 0]]
-    for number in np.unique(part)[1:]:
-        own_nodes = np.unique(nodes[part == number])
-        others = np.flatnonzero(part < number)
-        distances = surfaces.nearest_places(surfaces.r0[own_nodes], others)[2]
+    part_of_cell = component_numbers(V)[V.dofmap.list[: len(nodes), 0]]
+    for number in np.unique(part_of_cell)[1:]:
+        own_nodes = np.unique(nodes[part_of_cell == number])
+        cells_of_earlier_parts = np.flatnonzero(part_of_cell < number)
+        distances = surfaces.nearest_places(surfaces.r0[own_nodes], cells_of_earlier_parts)[2]
         if distances.min(initial=np.inf) < OVERLAP_DISTANCE * h:
             raise CaseError(TOO_NEAR)

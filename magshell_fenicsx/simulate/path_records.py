@@ -55,12 +55,17 @@ Records = Generator[Record, None, State]  # records, and the model's state at th
 
 
 class RecordStream:
-    """Records to iterate over once.
+    """Records of a path, to iterate over once; afterwards the state at their end is known.
+
+    Parameters
+    ----------
+    records
+        Generator of records that returns the model's state after the last one.
 
     Attributes
     ----------
     end
-        The model's state at their end, after the last one.
+        State of the model after the last record; without unknowns before the iteration ends.
     """
 
     def __init__(self, records: Records) -> None:
@@ -73,14 +78,28 @@ class RecordStream:
 def follow_path(
     stage: Stage, path: Path, start: Point, goal: ContinuationGoal, branches: int = 0
 ) -> Records:
-    """Yield the records of a path, with instabilities that the model excludes, and of branches.
-
-    Each direction of the branch at the first bifurcation is followed for that number of steps, or
-    to the target.
+    """Yield the records of a path: its points, instabilities that the model excludes, and branches.
 
     With `until: bifurcation` an excluded instability ends the path. With `until: limit` the path
     continues to the first instability of the model itself, up to `MAX_RATIO_TO_EXCLUDED` times the
-    load of the first excluded one.
+    load of the first excluded one. Collective.
+
+    Parameters
+    ----------
+    stage
+        Scene with the solver of the step.
+    start
+        First point of the path.
+    goal
+        Where the path ends.
+    branches
+        Number of steps for each direction of the branch at the first bifurcation; a goal with a
+        target replaces this number. 0: no branch is followed.
+
+    Returns
+    -------
+    State
+        State of the model at the end of the path (the generator's return value).
 
     Raises
     ------
@@ -99,10 +118,11 @@ def follow_path(
 
 
 def checked_run(stage: Stage, path: Path, start: Point, goal: ContinuationGoal) -> ContinuationRun:
-    """Return a continuation run whose contacts are checked.
+    """Return a continuation run that checks contact between each two successive points.
 
-    Bodies become stiffer on it; shells are cut anew, and get closer points where these move an
-    instability. Magnets on the way and returning bodies end it.
+    Penalties of bodies and shells become stiffer on this run. Shells are cut anew, and get closer
+    points of contact where these move an instability. A shell that passes through a magnet, or a
+    body that goes back the way it came, ends the run.
     """
     checks = _Checks(stage, path, goal.until != "points")
     checks.walk = walk = ContinuationRun(path, start, goal, checks, checks.too_deep)
@@ -110,7 +130,9 @@ def checked_run(stage: Stage, path: Path, start: Point, goal: ContinuationGoal) 
 
 
 class _Checks:
-    """Checks between each two successive points of a run; `renew` of a `ContinuationRun`.
+    """Checks of contact between each two successive points of a run.
+
+    An instance is the hook `renew` of a `ContinuationRun`, which calls it after each step.
 
     Parameters
     ----------
@@ -120,7 +142,7 @@ class _Checks:
     Attributes
     ----------
     walk
-        The run that they are of.
+        The run that is checked.
     """
 
     walk: ContinuationRun
@@ -132,7 +154,13 @@ class _Checks:
         self._begin = np.nan, 0
 
     def __call__(self, low: Point, high: Point) -> State | None:
-        """Return the first point's state with changed penalties or cuts; None if they are fit.
+        """Return the state to solve again with changed penalties or cuts; None if they are fit.
+
+        Parameters
+        ----------
+        low, high
+            Two successive points; the state that is returned is that of `low`, with changed
+            settings.
 
         Raises
         ------
@@ -155,26 +183,29 @@ class _Checks:
         return State(low.state.u, {**low.state.mu, **changed}) if changed else None
 
     def too_deep(self, point: Point) -> str:
-        """Return how deep contacts are at a point between two of the run.
+        """Return a message on contacts that are too deep at a point between two points of the run.
 
-        It is "" where none is beyond its bound, or no penalty would rise.
+        It is "" where no penetration is beyond its bound, or no penalty could become stiffer.
+        Collective.
         """
         scene = self._stage.scene
         if not (scene.model.contacts or scene.model.shell_contacts):
             return ""
 
-        def find() -> RecordedValues:
+        def recorded_message() -> RecordedValues:
             state = self._stage.leave(point.state)
             message = penetration_message(scene, state)
             may_rise = bool(message) and bool(raised_stiffnesses(scene, state))
             return RecordedValues({"said": message if may_rise else ""})
 
-        return str(self._path.recorded_values(find).values["said"])
+        return str(self._path.recorded_values(recorded_message).values["said"])
 
     def _finding(self, low: Point, high: Point) -> RecordedValues:
-        """Return why the second of two points is refused, or which amplitudes change.
+        """Return why the second of two points is refused, or which settings of contact change.
 
-        With changed amplitudes it is solved again.
+        The keys are `too_long` (reason for a shorter step); or `stopped`, `at_high` and `final`
+        (reason for the end of the path); or `stiffer` and `cuts`, each amplitude -> new value,
+        empty without a change.
         """
         stage = self._stage
         try:
@@ -200,15 +231,20 @@ class _Checks:
 class _StageRecords:
     """Records of `follow_path`, with points of the stage's system.
 
-    One run follows the other: in shorter steps, or by arc length, where load control fails.
+    Where load control fails, another run continues the path: in shorter steps, or by arc length.
 
     Parameters
     ----------
+    stage
+        Scene with the solver of the step.
+    run
+        First run.
     branches
         See `follow_path`.
     """
 
     def __init__(self, stage: Stage, run: ContinuationRun, branches: int) -> None:
+        """Prepare the records; the path is followed as `records` is iterated over."""
         self._stage, self._first_run, self._branches = stage, run, branches
         self._goal, self._monitor = run.goal, stage.scene.stability_monitor
         self._branch_switch: BranchSwitch | None = None
@@ -217,31 +253,44 @@ class _StageRecords:
         self._stop_reason, self._is_final = "", False
 
     def records(self) -> Records:
-        """Yield the records; the return value is the state at the end of the last run."""
+        """Yield the records of the path, of all its runs and of its branches.
+
+        Returns
+        -------
+        State
+            State of the stage's system at the end of the last run (the generator's return value).
+
+        Raises
+        ------
+        Stopped
+            If the path has stopped before its goal.
+        """
         stage, goal, run = self._stage, self._goal, self._first_run
         stage.scene.progress.doing("looking for modes that the model excludes")
-        path, finest = run.path, run.path.options.smallest
+        path, shortest_step = run.path, run.path.options.smallest
         if path.control == "load" and goal.targets:
-            run.path = _ending_early(path, path.options.first, finest)
+            run.path = _ending_early(path, path.options.first, shortest_step)
         for applied in stage.scene.model.fields:
             applied.lost = ""
         self._monitor.begin(path, run.points[0], stage.leave)
         records_ahead: list[Record] = []  # a fold that load control cannot pass
-        onward: ContinuationRun | None = run
-        while onward:
-            run, path, onward = onward, onward.path, None
+        next_run: ContinuationRun | None = run
+        while next_run:
+            run, path, next_run = next_run, next_run.path, None
             has_ended = yield from self._records_of_run(run, path)
             if has_ended:
                 break
             if self._stop_reason:
-                records_ahead, onward = _after_stop(stage, run, finest, final=self._is_final)
-            if onward:
-                is_by_arc = onward.path.control == "arc"
+                records_ahead, next_run = _after_stop(
+                    stage, run, shortest_step, final=self._is_final
+                )
+            if next_run:
+                is_by_arc = next_run.path.control == "arc"
                 stage.scene.progress.doing(
                     "going on by arc length" if is_by_arc else "in shorter steps"
                 )
                 self._stop_reason = ""
-                self._monitor.begin(onward.path, onward.points[0], stage.leave)
+                self._monitor.begin(next_run.path, next_run.points[0], stage.leave)
         yield from records_ahead
         reason = self._reason(path, records_ahead)
         if reason:
@@ -251,7 +300,13 @@ class _StageRecords:
         return run.points[-1].state
 
     def _records_of_run(self, run: ContinuationRun, path: Path) -> Generator[Record, None, bool]:
-        """Yield the records of one run; return whether an excluded instability ends the path."""
+        """Yield the records of one run.
+
+        Returns
+        -------
+        bool
+            Whether an excluded instability ended the path (the generator's return value).
+        """
         stage, goal = self._stage, self._goal
         try:
             for label, point in run:
@@ -281,21 +336,29 @@ class _StageRecords:
         return False
 
     def _limit(self, path: Path, excluded: Sequence[Record]) -> None:
-        """Let a path to a limit end at a multiple of the first excluded instability."""
+        """Let a path with `until: limit` end soon after its first excluded instability.
+
+        Its amplitude may reach `MAX_RATIO_TO_EXCLUDED` times that of the instability.
+
+        Parameters
+        ----------
+        excluded
+            New records of excluded instabilities; may be empty.
+        """
         if excluded and self._goal.until == "limit":
             amplitude_there = abs(excluded[0].point.state.mu[path.name])
             self._furthest = min(self._furthest, MAX_RATIO_TO_EXCLUDED * amplitude_there)
 
     def _record(self, run: ContinuationRun, path: Path, label: Label, point: Point) -> Record:
-        """Return the record of a point of a run."""
+        """Return the record of a point; the branch of the first bifurcation is kept for later."""
         stage, mode = self._stage, ""
         label = _label_of(stage, path, label, point, ends=run.done)
         if label == "bifurcation":
             by_arc = _arc_length_path(stage, path)
-            switch = switch_branch(by_arc, point, partial(passes, stage))
-            self._branch_switch = self._branch_switch or switch
-            if switch:
-                mode = "symmetric" if switch.symmetric else "asymmetric"
+            branch_switch = switch_branch(by_arc, point, partial(passes, stage))
+            self._branch_switch = self._branch_switch or branch_switch
+            if branch_switch:
+                mode = "symmetric" if branch_switch.symmetric else "asymmetric"
         if label == "fold":
             value = amount(stage.scene, path.name, point.state.mu[path.name])
             self._fold_text = f"; the last fold is at {value}"
@@ -304,7 +367,14 @@ class _StageRecords:
         return Record(label, path.name, point, mode, excluded_pivots=unstable, said=remark)
 
     def _reason(self, path: Path, records_ahead: Sequence[Record]) -> str:
-        """Return why the path has stopped, in words; empty if it has reached its goal."""
+        """Return the reason why the path has stopped, in words; "" if it has reached its goal.
+
+        Parameters
+        ----------
+        records_ahead
+            A fold that load control cannot pass, with excluded instabilities before it; may be
+            empty.
+        """
         scene, reason = self._stage.scene, self._stop_reason
         if records_ahead:
             at = amount(scene, path.name, records_ahead[-1].point.state.mu[path.name])
@@ -313,68 +383,101 @@ class _StageRecords:
                 f"load control cannot pass the fold at {at}, before its target, {target}; {reason}"
             )
         if self._monitor.unlocated:
-            why = (
+            unlocated_text = (
                 "a mode that the reduced model excludes is unstable from an unknown point on: "
                 f"{self._monitor.unlocated}"
             )
-            reason = f"{reason}; {why}" if reason else why
+            reason = f"{reason}; {unlocated_text}" if reason else unlocated_text
         return reason
 
 
 def _after_stop(
     stage: Stage, walk: ContinuationRun, finest: float, *, final: bool
 ) -> tuple[list[Record], ContinuationRun | None]:
-    """Return what ends a run that has stopped, or the run that goes on.
+    """Return how a path goes on after a run that has stopped.
 
-    What ends it is a fold, with the excluded instabilities before it.
+    Under load control a fold may explain why the last step failed. Otherwise a new run takes
+    shorter steps, down to `finest`. Without a target the new run is by arc length.
 
-    Under load control it goes on in steps down to `finest`, unless a fold explains why the last
-    step failed.
+    Parameters
+    ----------
+    walk
+        The run that has stopped.
+    finest
+        Shortest step that may be tried, as a change of the load.
+    final
+        Whether the reason forbids that the path goes on.
+
+    Returns
+    -------
+    records_ahead
+        The fold that ends the path, after excluded instabilities on the way; else empty.
+    next_run
+        The run that goes on; None if the path ends.
     """
-    path, goal, last = walk.path, walk.goal, walk.points[-1]
+    path, goal, last_point = walk.path, walk.goal, walk.points[-1]
     if path.control != "load" or not goal.targets:
         return [], None if final else _onward_by_arc(stage, walk)
     shortest = path.options.smallest
     last_resort = final or shortest <= finest
-    reach = abs(goal.targets[-1] - last.s)
+    reach = abs(goal.targets[-1] - last_point.s)
     if not last_resort:  # the step that failed ends at the next target, or before
         distances = [
-            (target - last.s) * np.sign(goal.targets[-1] - last.s) for target in goal.targets
+            # positive where the target is ahead
+            (target - last_point.s) * np.sign(goal.targets[-1] - last_point.s)
+            for target in goal.targets
         ]
         reach = min(2 * shortest, *(distance for distance in distances if distance > 0))
     records_ahead = _fold_ahead(stage, walk, reach)
     if records_ahead or last_resort:
         return records_ahead, None
-    return [], checked_run(stage, _ending_early(path, shortest, finest), last, goal)
+    return [], checked_run(stage, _ending_early(path, shortest, finest), last_point, goal)
 
 
 def _ending_early(path: Path, first: float, finest: float) -> Path:
-    """Return the path with steps that end early, to look for a fold."""
+    """Return the path with shorter first steps and a shortest step that is reached soon.
+
+    So a step that fails ends the run early, and a fold is looked for.
+
+    Parameters
+    ----------
+    first, finest
+        First step, and least value of the shortest step, in the controlled quantity.
+    """
     return path.with_step_options(
         replace(path.options, first=first, smallest=max(finest, FIRST_STEP_REDUCTION * first))
     )
 
 
 def _onward_by_arc(stage: Stage, walk: ContinuationRun) -> ContinuationRun | None:
-    """Return a run by arc length from where another one stopped; None if it must not or cannot be.
+    """Return a run by arc length from where another run stopped; None if there is none.
 
-    An instability is where it is however the path is controlled: only a target belongs to its
-    control.
+    There is none where the run was by arc length already, or has a target: an instability is at the
+    same load under any control, but a target belongs to its control. Step lengths start from the
+    median step of the run that stopped.
     """
     path, goal, points = walk.path, walk.goal, walk.points
     if path.control == "arc" or goal.targets:
         return None
-    last, name, metric = points[-1], path.name, path.metric
+    last_point, name, metric = points[-1], path.name, path.metric
     step_lengths = [
-        metric.norm(b.state.u - a.state.u, b.state.mu[name] - a.state.mu[name])
-        for a, b in pairwise(points)
+        metric.norm(
+            next_point.state.u - point.state.u, next_point.state.mu[name] - point.state.mu[name]
+        )
+        for point, next_point in pairwise(points)
     ]
-    first = float(np.median(step_lengths or [path.options.first * metric.norm(last.du, last.dmu)]))
+    first_length = float(
+        np.median(step_lengths or [path.options.first * metric.norm(last_point.du, last_point.dmu)])
+    )
     by_arc = stage.path(
-        name, "arc", StepOptions(first, LONGEST * first, 1e-6 * first), metric.scale
+        name,
+        "arc",
+        StepOptions(first_length, LONGEST * first_length, 1e-6 * first_length),
+        metric.scale,
     )
     start = by_arc.start(
-        last.state, last.dmu * (last.s - points[-2].s if step_lengths else goal.sense)
+        last_point.state,
+        last_point.dmu * (last_point.s - points[-2].s if step_lengths else goal.sense),
     )
     return checked_run(stage, by_arc, start, goal)
 
@@ -382,21 +485,29 @@ def _onward_by_arc(stage: Stage, walk: ContinuationRun) -> ContinuationRun | Non
 def _branches(
     stage: Stage, path: Path, crossing: BranchSwitch, goal: ContinuationGoal, steps: int
 ) -> Iterator[Record]:
-    """Follow both directions of a branch, to the target of the path or for a number of steps."""
-    reasons = []
+    """Yield the records of both directions of a branch.
+
+    Each ends at the target of the path, or after `steps` steps.
+
+    Raises
+    ------
+    Stopped
+        After both, with the reasons, if a direction is lost.
+    """
+    stop_reasons = []
     for number, start in enumerate(crossing.starts, 1):
         try:
             yield from follow_branch(
                 stage, _arc_length_path(stage, path), start, off_path(goal, steps), number
             )
         except Stopped as e:
-            reasons.append(f"branch {number}: {e}")
-    if reasons:
-        raise Stopped("; ".join(reasons))
+            stop_reasons.append(f"branch {number}: {e}")
+    if stop_reasons:
+        raise Stopped("; ".join(stop_reasons))
 
 
 def off_path(goal: ContinuationGoal, steps: int) -> ContinuationGoal:
-    """Return the goal of a branch: the target of the path, or a number of steps."""
+    """Return the goal of a branch: the target of its path if it has one, else a number of steps."""
     return goal if goal.until == "target" else ContinuationGoal("points", steps=steps)
 
 
@@ -405,12 +516,19 @@ def follow_branch(
 ) -> Records:
     """Yield the records of a branch, by arc length.
 
-    The return value is the state at the end, of the step's system.
-
     Parameters
     ----------
+    path
+        Path with arc-length control.
+    start
+        First point of the branch; it is corrected again until its contacts are fit.
     number
-        See `Record.branch`.
+        Number of the branch, see `Record.branch`.
+
+    Returns
+    -------
+    State
+        State of the step's system at the end (the generator's return value).
 
     Raises
     ------
@@ -466,25 +584,34 @@ def _arc_length_path(stage: Stage, path: Path) -> Path:
 def _fold_ahead(stage: Stage, walk: ContinuationRun, reach: float) -> list[Record]:
     """Return the fold that ended a path under load control, located by arc length.
 
-    Excluded instabilities on the way come first. The result is empty if there is no fold within
-    the change `reach` of the load.
+    Parameters
+    ----------
+    walk
+        The run under load control that has stopped.
+    reach
+        Largest change of the load to the fold.
+
+    Returns
+    -------
+    list of Record
+        The fold, after excluded instabilities on the way; empty if there is no fold within reach.
     """
     path, points, name = walk.path, walk.points, walk.path.name
-    last = points[-1]
-    first = np.copysign(path.options.first, walk.goal.targets[-1] - last.s)
-    onward = last.s - points[-2].s if len(points) > 1 else float(first)
-    by_arc, start = stage.resume(name, "arc", last.state, onward, path.metric.scale)
+    last_point = points[-1]
+    first_change = np.copysign(path.options.first, walk.goal.targets[-1] - last_point.s)
+    load_change = last_point.s - points[-2].s if len(points) > 1 else float(first_change)
+    by_arc, start = stage.resume(name, "arc", last_point.state, load_change, path.metric.scale)
     stage.scene.stability_monitor.begin(by_arc, start, stage.leave)
-    passed: list[Record] = []
+    excluded: list[Record] = []
     try:
         for label, point in ContinuationRun(by_arc, start, ContinuationGoal("limit", steps=20)):
             crossings = stage.scene.stability_monitor.pass_to(point, evaluate=label == "fold")
-            passed += _excluded_records(stage, by_arc, crossings)
-            if abs(point.state.mu[name] - last.s) > reach:
+            excluded += _excluded_records(stage, by_arc, crossings)
+            if abs(point.state.mu[name] - last_point.s) > reach:
                 return []
             if label == "fold":
                 return [
-                    *passed,
+                    *excluded,
                     Record(
                         label, name, point, excluded_pivots=stage.scene.stability_monitor.unstable
                     ),
@@ -495,7 +622,14 @@ def _fold_ahead(stage: Stage, walk: ContinuationRun, reach: float) -> list[Recor
 
 
 def _label_of(stage: Stage, path: Path, label: Label, point: Point, *, ends: bool) -> Label:
-    """Return the label of a point of a run; an instability of a point force is a step.
+    """Return the label of a point; an instability under a point force is labelled as a step.
+
+    Such an instability depends on the mesh, and is noted in `PointForceModes`.
+
+    Parameters
+    ----------
+    ends
+        Whether the point is the last of its run.
 
     Raises
     ------
@@ -520,7 +654,7 @@ def _label_of(stage: Stage, path: Path, label: Label, point: Point, *, ends: boo
 def _excluded_records(stage: Stage, path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
     """Yield records of the points where excluded modes become unstable or stable.
 
-    Those of a point force are noted and left out.
+    Crossings of modes under a point force are noted in `PointForceModes` and left out.
     """
     for crossing in crossings:
         force_point = point_of_crossing(stage, path, crossing)
@@ -538,22 +672,28 @@ def _excluded_records(stage: Stage, path: Path, crossings: Iterable[Crossing]) -
 
 
 def cluster_remark(scene: Scene, walk: ContinuationRun, point: Point) -> str:
-    """Return a remark on instabilities that were not parted, at the point that stands for them.
+    """Return a remark on instabilities too close to each other to be located one by one.
 
-    It is empty at other points.
+    It stands at the first point of each such cluster of a run; at other points it is "".
     """
-    other_end = next((high for low, high in walk.clusters if low is point), None)
+    other_end = next(
+        (high_point for low_point, high_point in walk.clusters if low_point is point), None
+    )
     if other_end is None:
         return ""
     name, count = walk.path.name, abs(other_end.negative_pivots - point.negative_pivots)
-    first, last = (amount(scene, name, end.state.mu[name]) for end in (point, other_end))
+    first_amount, last_amount = (
+        amount(scene, name, end.state.mu[name]) for end in (point, other_end)
+    )
     if count > 1:
         return (
-            f"instabilities in {count} directions between {first} and {last} are too close to be "
+            f"instabilities in {count} directions between {first_amount} and {last_amount} are "
+            "too close to be "
             "located one by one"
         )
     return (
-        f"a fold and another instability between {first} and {last} are too close to be located "
+        f"a fold and another instability between {first_amount} and {last_amount} are too close "
+        "to be located "
         "one by one"
     )
 
@@ -561,26 +701,44 @@ def cluster_remark(scene: Scene, walk: ContinuationRun, point: Point) -> str:
 def amount(scene: Scene, name: str, value: float) -> str:
     """Return the value of an amplitude, as "pressure = 0.326233 (53.7 Pa)"."""
     column = amplitude(name).column
-    in_units = scene.sizes.column(column)
-    measured = in_units and f" ({value * scene.sizes.size(column):.6g} {in_units.si})"
+    unit_column = scene.sizes.column(column)
+    measured = unit_column and f" ({value * scene.sizes.size(column):.6g} {unit_column.si})"
     return f"{name} = {value:.6g}{measured or ''}"
 
 
 def _stop_message(scene: Scene, path: Path, stop: PathStopped, points: list[Point]) -> str:
-    """Return the message for a lost path; it names a fold in the controlled quantity."""
-    last = stop.point
-    place = f"the last point has {amount(scene, path.name, last.state.mu[path.name])}: {stop}"
+    """Return the message for a lost path.
+
+    Under a controlled displacement it names a fold ahead, if the tangents of the last points show
+    one.
+
+    Parameters
+    ----------
+    stop
+        Reason and last point.
+    points
+        Points of the run up to there.
+    """
+    last_point = stop.point
+    place = f"the last point has {amount(scene, path.name, last_point.state.mu[path.name])}: {stop}"
     if path.control == "load":
         return f"load control stopped; {place}. To pass a limit point, use control: arc"
-    previous = points[-2] if len(points) > 1 else last
-    if path.control == "arc" or previous.dmu == last.dmu:
+    previous = points[-2] if len(points) > 1 else last_point
+    if path.control == "arc" or previous.dmu == last_point.dmu:
         return f"the controlled path stopped; {place}"
     # near a fold in the controlled s, (ds/dmu)^2 falls linearly to zero with s
-    a, b = previous.dmu**-2, last.dmu**-2
-    distance_ahead = b * (last.s - previous.s) / (a - b) if a > b else np.inf
-    if 0 < distance_ahead / (last.s - previous.s) < 10:
+    squared_slope_before, squared_slope_last = previous.dmu**-2, last_point.dmu**-2
+    distance_ahead = (
+        squared_slope_last
+        * (last_point.s - previous.s)
+        / (squared_slope_before - squared_slope_last)
+        if squared_slope_before > squared_slope_last
+        else np.inf
+    )
+    if 0 < distance_ahead / (last_point.s - previous.s) < 10:
         return (
-            f"the path turns back in the controlled displacement, {distance_ahead / last.s:.2%} "
+            "the path turns back in the controlled displacement, "
+            f"{distance_ahead / last_point.s:.2%} "
             "beyond the last point: a fold that displacement control cannot pass, but control: arc "
             f"can; {place}"
         )

@@ -44,7 +44,9 @@ _known: dict[str, tuple[Mode, ...]] = {}  # a sweep has many cases with one perf
 
 
 def with_modes(problem: Problem, comm: MPI.Comm) -> Problem:
-    """Return the problem with the modes that it has as imperfections; collective.
+    """Return a problem with the modes of its perfect shell as imperfections; collective.
+
+    Modes are remembered for other cases with the same perfect shell.
 
     Raises
     ------
@@ -53,19 +55,31 @@ def with_modes(problem: Problem, comm: MPI.Comm) -> Problem:
     """
     if problem.pending_modes is None:
         return problem
-    count, bare = problem.pending_modes.count, problem.pending_modes.perfect()
-    this = json.dumps([count, bare.document.data, bare.document.outside])
-    if this not in _known or not bare.document.data:
+    count, perfect_problem = problem.pending_modes.count, problem.pending_modes.perfect()
+    key_of_perfect_shell = json.dumps(
+        [count, perfect_problem.document.data, perfect_problem.document.outside]
+    )
+    if key_of_perfect_shell not in _known or not perfect_problem.document.data:
         if len(_known) > 3:
             _known.clear()
-        _known[this] = perfect_modes(bare, count, comm)
-    return problem.pending_modes.with_modes(_known[this])
+        _known[key_of_perfect_shell] = perfect_modes(perfect_problem, count, comm)
+    return problem.pending_modes.with_modes(_known[key_of_perfect_shell])
 
 
 def perfect_modes(problem: Problem, count: int, comm: MPI.Comm) -> tuple[Mode, ...]:
     """Return the lowest modes of a shell at its first instability; collective.
 
-    Without an instability they are those at the end of its history.
+    Without an instability they are the modes at the end of its history.
+
+    Parameters
+    ----------
+    count
+        Number of modes.
+
+    Raises
+    ------
+    CaseError
+        If the shell has no load, or fewer modes.
     """
     scene = Scene(problem, comm)
     state = scene.unloaded()
@@ -95,32 +109,42 @@ def perfect_modes(problem: Problem, count: int, comm: MPI.Comm) -> tuple[Mode, .
 
 
 def _shape(scene: Scene, mode: ShellMode) -> Mode:
-    """Return a mode as a function of the place.
+    """Return a mode as a function of the place, with largest value 1; collective.
 
-    Of several shells it has one function for each that it moves.
+    Of several shells it has a function for each shell that it moves.
     """
     model, mirror = scene.model, None
     if model.axisymmetric:
-        x, w = _along_meridian(model, mode)
+        places, inward_displacements = _along_meridian(model, mode)
         order = np.argsort(model.V.tabulate_dof_coordinates()[:, 0])
         is_of_shell = [is_own[order] for is_own in nodes_of_shells(scene)]
     else:
         assert model.thin
-        x, w = _at_nodes(scene, model, mode)
+        places, inward_displacements = _at_nodes(scene, model, mode)
         is_of_shell = all_nodes_of_shells(scene)
         mirror = model.mirror if model.multiplicity > 1 else None
-    node_count, sign = len(x), -1.0 if mode.label == "antisymmetric" else 1.0
+    node_count, sign = len(places), -1.0 if mode.label == "antisymmetric" else 1.0
     if mirror:
-        x, w = np.vstack([x, mirror.image(x)]), np.concatenate([w, sign * w])
-    w = over_largest(x, w)
+        places, inward_displacements = (
+            np.vstack([places, mirror.image(places)]),
+            np.concatenate([inward_displacements, sign * inward_displacements]),
+        )
+    inward_displacements = over_largest(places, inward_displacements)
 
     def shape_of_shell(nodes: NDArray[np.int64]) -> Shape:
+        """Return the mode of the shell with these nodes as a function of the place."""
         if model.axisymmetric:
-            return on_meridian(x[nodes], w[nodes], int(mode.label.removeprefix("m = ") or 0))
+            return on_meridian(
+                places[nodes],
+                inward_displacements[nodes],
+                int(mode.label.removeprefix("m = ") or 0),
+            )
         if not mirror:
-            return on_surface(x[nodes], w[nodes], x[nodes])
+            return on_surface(places[nodes], inward_displacements[nodes], places[nodes])
         nodes_and_images = np.concatenate([nodes, node_count + nodes])
-        function = on_surface(x[nodes_and_images], w[nodes_and_images], x[nodes])
+        function = on_surface(
+            places[nodes_and_images], inward_displacements[nodes_and_images], places[nodes]
+        )
         return in_frame(MirroredMode(function, mirror, sign), -scene.problem.azimuth)
 
     nodes_of_shell = [np.flatnonzero(is_own) for is_own in is_of_shell]
@@ -131,42 +155,52 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
         {
             name: shape_of_shell(nodes)
             for name, nodes in zip(names, nodes_of_shell, strict=True)
-            if np.abs(w[nodes]).max() > MIN_DISPLACEMENT
+            if np.abs(inward_displacements[nodes]).max() > MIN_DISPLACEMENT
         }
     )
 
 
 def _along_meridian(model: "MeridianModel", mode: ShellMode) -> tuple[Array, Array]:
-    """Return all nodes (n, 3) and the inward displacements (n,) there, in their order along it.
+    """Return nodes (n, 3) and inward displacements (n,) in their order along the meridian.
 
-    They are from the coefficients (U + V, V, W) of a wave, or (U, W) of an axisymmetric mode.
+    The displacements come from the coefficients (U + V, V, W) of a wave, or (U, W) of an
+    axisymmetric mode.
     """
     V = model.waves.V if mode.label else model.V
     order, order_of_model = (
         np.argsort(space.tabulate_dof_coordinates()[:, 0]) for space in (V, model.V)
     )
-    values = mode.vector.reshape(len(order), -1)[order]
-    in_plane = values
+    coefficients = mode.vector.reshape(len(order), -1)[order]
+    in_plane = coefficients
     if mode.label:
-        in_plane = np.column_stack([values[:, 0] - values[:, 1], values[:, 2]])
+        in_plane = np.column_stack([coefficients[:, 0] - coefficients[:, 1], coefficients[:, 2]])
     normal = nodal_normals(model.r0)[order_of_model][:, [0, 2]]
     rho, z = model.r0.x.array.reshape(-1, 2)[order_of_model].T
     return np.column_stack([rho, 0 * z, z]), -np.einsum("ij,ij->i", in_plane, normal)
 
 
 def _at_nodes(scene: Scene, model: "ShellModel", mode: ShellMode) -> tuple[Array, Array]:
-    """Return all nodes (n, 3) and the inward displacements (n,) there, on every rank."""
+    """Return all nodes (n, 3) and inward displacements (n,) there, on every rank; collective."""
     V, comm = model.V, scene.comm
     dofs = V.dofmap.list[: V.mesh.topology.index_map(2).size_local]
     numbers = V.dofmap.index_map.local_to_global(dofs.ravel().astype(np.int32))
     table = V.element.basix_element.tabulate(1, compat.interpolation_points(V))[:, :, :, 0]
-    r0, v = (
+    # (cells, nodes, 3) of own cells
+    r0, displacements = (
         x.reshape(-1, 3)[dofs] for x in (model.r0.x.array, model.system.with_ghosts(mode.vector))
     )
     _, r_1, r_2 = np.matmul(table[:, None], r0)
-    parts = comm.allgather((numbers, *(a.reshape(-1, 3) for a in (r0, v, np.cross(r_1, r_2)))))
-    node_numbers, x, v, n = (np.concatenate(part) for part in zip(*parts, strict=True))
-    total = np.column_stack([np.bincount(node_numbers, c) for c in n.T])
-    n0 = total / np.linalg.norm(total, axis=1)[:, None]
-    first = np.unique(node_numbers, return_index=True)[1]
-    return x[first], -np.einsum("ij,ij->i", v[first], n0)
+    gathered = comm.allgather(
+        (numbers, *(vectors.reshape(-1, 3) for vectors in (r0, displacements, np.cross(r_1, r_2))))
+    )
+    node_numbers, x, displacements, normals_of_cells = (
+        np.concatenate(part) for part in zip(*gathered, strict=True)
+    )
+    # normals of the cells at a node are added with the area ratio as weight
+    sum_of_normals = np.column_stack(
+        [np.bincount(node_numbers, component) for component in normals_of_cells.T]
+    )
+    n0 = sum_of_normals / np.linalg.norm(sum_of_normals, axis=1)[:, None]
+    # each node once, of the cells that share it
+    first_occurrence = np.unique(node_numbers, return_index=True)[1]
+    return x[first_occurrence], -np.einsum("ij,ij->i", displacements[first_occurrence], n0)

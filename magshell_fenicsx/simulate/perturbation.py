@@ -49,7 +49,7 @@ KEYS_WITHOUT_GRADIENT = (*KEYS_OUTSIDE_THE_MODEL, "loading", "points", "boundary
 
 
 def number_at_key(context: Context, key: str) -> float:
-    """Return the number at a key such as "magnetic.remanent.polar".
+    """Return the number of a case at a key such as "magnetic.remanent.polar".
 
     Raises
     ------
@@ -57,10 +57,10 @@ def number_at_key(context: Context, key: str) -> float:
         If there is no number, or one that changes the mesh, a target or the modes of the perfect
         shell.
     """
-    part, _ = _value_and_kind(context, key)
-    if isinstance(part, bool) or not isinstance(part, int | float):
-        raise CaseError(f"{key}: is no number that the case gives: {part!r}")
-    if isinstance(part, int):
+    number, _ = _value_and_kind(context, key)
+    if isinstance(number, bool) or not isinstance(number, int | float):
+        raise CaseError(f"{key}: is no number that the case gives: {number!r}")
+    if isinstance(number, int):
         raise CaseError(f"{key}: is a whole number: it has no gradient")
     if key.startswith("magnetic.remanent.layers.") and key.endswith(".fraction"):
         raise CaseError(
@@ -70,9 +70,9 @@ def number_at_key(context: Context, key: str) -> float:
         raise CaseError(f"{key}: the fractions of the plies add up to 1: one alone has no gradient")
     # of one of several shells, in its own section
     own_key = key.split(".", 2)[2] if key.startswith("shells.") else key
-    section_key, _, rest = own_key.partition(".")
+    section_key, _, key_in_section = own_key.partition(".")
     differentiable_keys = (*MATERIAL_KEYS, *DEVIATION_KEYS)
-    is_geometry = section_key == "shell" and rest.split(".")[0] not in differentiable_keys
+    is_geometry = section_key == "shell" and key_in_section.split(".")[0] not in differentiable_keys
     if section_key in KEYS_WITHOUT_GRADIENT or is_geometry:
         raise CaseError(
             f"{key}: a number of the mesh, of the shape, of a target or of the output has no "
@@ -87,22 +87,24 @@ def number_at_key(context: Context, key: str) -> float:
             f"{key}: the modes of the perfect shell, which the case has as imperfections, change "
             "with it: give their file (kind: modes, file)"
         )
-    return float(part)
+    return float(number)
 
 
 def scale_at_key(context: Context, key: str) -> float:
-    """Return the scale of the number at a key, which changes are small against.
+    """Return the scale of the number at a key; steps of differences are small against this scale.
 
     It is the number itself; of a zero the largest number of its list, of a zero length R in the
     case's unit, else one.
     """
     value, is_length_key = _value_and_kind(context, key)
-    if size := float(abs(value)):
-        return size
-    neighbours, _ = _value_and_kind(context, key.rpartition(".")[0])
-    if isinstance(neighbours, list):
-        sizes = [abs(v) for v in neighbours if isinstance(v, float | int)]
-        if largest := max(sizes, default=0.0):
+    if magnitude := float(abs(value)):
+        return magnitude
+    parent_value, _ = _value_and_kind(context, key.rpartition(".")[0])
+    if isinstance(parent_value, list):
+        magnitudes = [
+            abs(neighbour) for neighbour in parent_value if isinstance(neighbour, float | int)
+        ]
+        if largest := max(magnitudes, default=0.0):
             return largest
     return context.shell.reference if is_length_key else 1.0
 
@@ -110,37 +112,47 @@ def scale_at_key(context: Context, key: str) -> float:
 def _value_and_kind(context: Context, key: str) -> tuple[Any, bool]:
     """Return the value at a key, and whether it is a length by the type of its section.
 
+    Parameters
+    ----------
+    key
+        Names and indices, joined by dots.
+
     Raises
     ------
     CaseError
         If there is no such key.
     """
-    part: Any = {
+    value: Any = {
         name: section for name, section in context.sections.items() if name != "imperfections"
     }
     is_length_key = False
     for name in key.split("."):
         try:
-            if isinstance(part, list):
-                part = part[int(name)]
-            elif isinstance(part, dict):
-                part = part[name]
+            if isinstance(value, list):
+                value = value[int(name)]
+            elif isinstance(value, dict):
+                value = value[name]
             else:
-                field = type(part).model_fields[name]
+                field = type(value).model_fields[name]
                 is_length_key = is_length(field.annotation, field.metadata)
-                part = getattr(part, name)
+                value = getattr(value, name)
         except (LookupError, ValueError, AttributeError):
             raise CaseError(f"{key}: the case has no such key ({name})") from None
-    return part, is_length_key
+    return value, is_length_key
 
 
 def refuse_unknown_parameters(context: Context, names: Iterable[str], start: State) -> None:
     """Check that gradients can be taken by fields, amplitudes and numbers with these names.
 
+    Parameters
+    ----------
+    start
+        State whose amplitudes are allowed.
+
     Raises
     ------
     CaseError
-        If one is none of the case.
+        If the case does not have one of them.
     """
     try:
         for name in names:
@@ -151,7 +163,12 @@ def refuse_unknown_parameters(context: Context, names: Iterable[str], start: Sta
 
 
 def perturbed_scene(scene: Scene, key: str, value: float) -> Scene:
-    """Return the scene with another number, on the same mesh; collective.
+    """Return the scene of the case with another number, on the same mesh; collective.
+
+    Parameters
+    ----------
+    key, value
+        Key of the number in the case, and its new value.
 
     Raises
     ------
@@ -173,20 +190,28 @@ def perturbed_scene(scene: Scene, key: str, value: float) -> Scene:
 
 
 def _rims(problem: Problem) -> list[object]:
-    """Return half-width and place of each rim of a patch."""
+    """Return half-width and place of each rim of a dimple that is an edge of a patch."""
     shell = problem.context.shell
-    local = [
+    local_imperfections = [
         section for section in problem.imperfections.values() if isinstance(section, LocalSection)
     ]
     return [
         (section.half_width(shell.R_over_h, shell.poisson_ratio), section.at)
-        for section in local
+        for section in local_imperfections
         if section.patch
     ]
 
 
 def problem_on_mesh_of(scene: Scene, new: Problem) -> Problem:
-    """Return a problem on the mesh of a scene in its chart; imperfections may differ."""
+    """Return a problem on the mesh of a scene, with the mesh's places in the chart.
+
+    The problem may differ from that of the scene in numbers, also in those of imperfections.
+
+    Parameters
+    ----------
+    new
+        The problem.
+    """
     old, model = scene.problem, scene.model
     meridian, shape = old.meridian, old.shape
     if model.midsurface:
@@ -215,21 +240,29 @@ def state_with_new_loads(
     dependent_names: Collection[str] = (),
     steps: int | None = None,
 ) -> State:
-    """Return the state with the loads of the new scene.
+    """Return a state of the scene `old` with the loads of the scene `new`.
 
-    Where its targets are other numbers, amplitudes are in proportion.
+    An amplitude is scaled by the ratio of its targets, its stiffnesses or its initial values in the
+    two scenes.
 
     Parameters
     ----------
     dependent_names
-        Amplitudes that are results, or follow from what is held.
+        Amplitudes that stay: results, and unknowns at held conjugates.
     steps
         How many steps of the programme led to the state; None: all.
+
+    Raises
+    ------
+    CaseError
+        If the field of the first scene is zero and that of the second is not.
     """
     ratios = target_ratios(old, new, "load", steps)
     field_names = [name for name in state.mu if name.startswith("lambda_")]
-    for contact, other in zip(old.problem.loads.contacts, new.problem.loads.contacts, strict=True):
-        ratios[contact.setting] = other.stiffness / contact.stiffness
+    for contact, new_contact in zip(
+        old.problem.loads.contacts, new.problem.loads.contacts, strict=True
+    ):
+        ratios[contact.setting] = new_contact.stiffness / contact.stiffness
     # stiffnesses of parts are amplitudes too
     old_values, new_values = old.unloaded().mu, new.unloaded().mu
     ratios |= {
@@ -255,7 +288,14 @@ def target_ratios(
 ) -> dict[str, float]:
     """Return amplitude -> target of the new scene over that of the old one, where they differ.
 
-    These are targets with units.
+    A target with a unit may differ as a number of the case changes this unit.
+
+    Parameters
+    ----------
+    quantity
+        "load" or "conjugate": what the targets prescribe.
+    steps
+        How many steps of the programme count; None: all.
     """
     ratios = dict[str, float]()
     for step, new_step in zip(
@@ -270,17 +310,20 @@ def target_ratios(
 
 
 def same_chart_bounds(shape: object, other: object) -> bool:
-    """Return whether two shapes have the same bounds of their charts, as far as these are known."""
-    a, b = chart_bounds(shape), chart_bounds(other)
+    """Return whether two shapes have the same bounds of their charts; True if unknown."""
+    bounds, other_bounds = chart_bounds(shape), chart_bounds(other)
     return (
-        a is None
-        or b is None
-        or (np.allclose(a[0], b[0], 0, 1e-14) and np.allclose(a[1], b[1], 0, 1e-14))
+        bounds is None
+        or other_bounds is None
+        or (
+            np.allclose(bounds[0], other_bounds[0], 0, 1e-14)
+            and np.allclose(bounds[1], other_bounds[1], 0, 1e-14)
+        )
     )
 
 
 def chart_bounds(shape: object) -> tuple[Array, Array] | None:
-    """Return the bounds of the chart of a shape; None if they are not known."""
+    """Return the bounds of the chart of a shape, lower and upper (2,); None if unknown."""
     if isinstance(shape, Grid):
         return np.array(shape.low), np.array(shape.high)
     box: tuple[Array, Array] | None = getattr(shape, "box", None)

@@ -1,5 +1,6 @@
-"""Instabilities within a thickness of a point force: they are none of the shell, and are not
-reported; see `shells.near_points`.
+"""Instabilities within a thickness of a point force, which are not reported.
+
+They depend on the mesh, and so they are none of the shell; see `shells.near_points`.
 """
 
 from collections.abc import Callable
@@ -14,9 +15,9 @@ from magshell_fenicsx.simulate.stage import Stage
 
 
 def point_of_crossing(stage: Stage, path: Path, crossing: Crossing) -> str:
-    """Return the point force within a thickness of which a symmetry-breaking mode is.
+    """Return the name of a point force, if an excluded mode at its crossing is local to it.
 
-    It is "" for a mode of the shell. Collective.
+    Local means within a thickness. The name is "" for a mode of the shell. Collective.
     """
     modes = stage.scene.model.symmetry_breaking_modes
     assert modes, "they have crossed"
@@ -29,9 +30,17 @@ def point_of_crossing(stage: Stage, path: Path, crossing: Crossing) -> str:
 
 
 def point_of_instability(stage: Stage, path: Path, label: str, point: Point) -> str:
-    """Return the point force within a thickness of which the mode of a fold or a bifurcation is.
+    """Return the name of a point force, if the mode of an instability is local to it.
 
-    It is "" for a mode of the shell. The mode of a fold is the path's tangent. Collective.
+    Local means within a thickness. The name is "" for a mode of the shell. The mode of a fold is
+    the path's tangent. Collective.
+
+    Parameters
+    ----------
+    label
+        "fold" or "bifurcation".
+    point
+        The located point.
     """
 
     def mode() -> Vector:
@@ -45,15 +54,24 @@ def point_of_instability(stage: Stage, path: Path, label: str, point: Point) -> 
 def _recorded_point(
     stage: Stage, path: Path, mode: Callable[[], Vector], waves: int | None = None
 ) -> str:
+    """Return the name of the point force to which a mode is local, or "", also from a journal.
+
+    Parameters
+    ----------
+    mode
+        Function that returns the mode; it may raise `NoEigenpair`.
+    waves
+        Number of waves of the mode around a meridian; None of other modes.
+    """
     model = stage.scene.model
     places = places_of_point_forces(model, stage.scene.problem.loads)
     if not places:
         return ""
 
-    def find() -> RecordedValues:
+    def name_of_point() -> RecordedValues:
         try:
             return RecordedValues({"point": point_of_mode(model, places, mode(), waves)})
         except NoEigenpair:
             return RecordedValues({"point": ""})
 
-    return str(path.recorded_values(find).values["point"])
+    return str(path.recorded_values(name_of_point).values["point"])

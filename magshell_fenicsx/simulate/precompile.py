@@ -53,7 +53,13 @@ OCTANT: dict[str, Any] = {  # symmetric in three planes, each a kernel of its ow
 
 
 def precompile(degree: int, make_problem: Callable[[Source], Problem]) -> float:
-    """Compile the kernels of shells of a degree and of solids; return the time in seconds."""
+    """Compile the kernels of shells of a degree and of solids; return the time in seconds.
+
+    Parameters
+    ----------
+    make_problem
+        Function from a source of a case to its problem.
+    """
     start = time.perf_counter()
     for data in _cases(degree):
         scene = Scene(make_problem(Source("precompile", data)), MPI.COMM_WORLD)
@@ -62,7 +68,7 @@ def precompile(degree: int, make_problem: Callable[[Source], Problem]) -> float:
 
 
 def _cases(degree: int) -> Iterator[dict[str, Any]]:
-    """Yield data of cases that need the kernels, of shells of a degree and of solids."""
+    """Yield data of cases that together need the kernels of shells of a degree and of solids."""
     for symmetry, loading in SCENES:
         yield {
             **HEMISPHERE,

@@ -61,7 +61,7 @@ class UnreadPlace(LostResult):
     Attributes
     ----------
     place
-        In the unit of readings.
+        Value of the prescribed quantity, in the unit of readings.
     """
 
     def __init__(self, message: str, place: float) -> None:
@@ -80,11 +80,11 @@ class Reading:
     Attributes
     ----------
     of
-        Name of the result.
+        Name of the result, a column of path.csv or an instability.
     at
         The place where it is read; None: the end of the path.
     change
-        Whether it is the change since the step began.
+        Whether the change since the step began is read instead of the value.
     """
 
     of: str
@@ -94,14 +94,14 @@ class Reading:
 
 @dataclass
 class Readings:
-    """Values of readings, with their slopes.
+    """Values of n readings, with their derivatives by p numbers.
 
     Attributes
     ----------
     values, slopes
         (n,) and (n, p).
     curves
-        Result -> places and values at all points of the last step's path.
+        Result -> pairs of place and value at all points of the last step's path.
     """
 
     values: Array
@@ -114,10 +114,14 @@ class PrescribedQuantity:
 
     Attributes
     ----------
+    scene, step
+        The scene, and its last step.
     name
         The amplitude of the step.
+    by_conjugate
+        Whether the displacement conjugate to the load is prescribed.
     column, dimensionless_column
-        Its column in the case's unit, and without.
+        Column of the quantity in the case's unit, and that without unit.
 
     Raises
     ------
@@ -126,6 +130,7 @@ class PrescribedQuantity:
     """
 
     def __init__(self, scene: Scene) -> None:
+        """Find the quantity by the last step, with its columns and the size of its unit."""
         programme = scene.problem.programme
         if not programme or programme[-1].load.motion:
             raise CaseError("the case has no last step that prescribes a load or a displacement")
@@ -146,21 +151,32 @@ class PrescribedQuantity:
         self.column = column_in_unit.name if column_in_unit else self.dimensionless_column
 
     def place_of(self, state: State) -> float:
-        """Return the place of a state."""
+        """Return the place of a state, in the unit of `column`."""
         if not self.by_conjugate:
             return float(self._size * state.mu[self.name])
         potential = self.scene.model.system.potential(state.u, state.mu, self.name)
         return float(-self._size * potential / self._unit)
 
     def constraint(self, system: System, place: float) -> ConstraintRow:
-        """Return the equation that holds at a place."""
+        """Return the equation that holds at a place.
+
+        Parameters
+        ----------
+        system
+            System of the step, with possible further unknowns.
+        place
+            Value in the unit of `column`.
+        """
         value = place / self._size * self._unit
         if self.by_conjugate:
             return PrescribedConjugate(system, self.name, value)
         return PrescribedLoad(self.name, value)
 
     def load_rate(self, key: str) -> float:
-        """Return d ln mu/dp of the load that keeps its place, less that which gradients keep.
+        """Return d ln mu/dp of the load that keeps its place, less the rate that gradients have.
+
+        The unit of a place may depend on p. A gradient by p lets the target of the step change with
+        the case; what is missing for a fixed place is returned.
 
         Parameters
         ----------
@@ -175,15 +191,22 @@ class PrescribedQuantity:
         problem = self.scene.problem
         value = number_at_key(problem.context, key)
         step = DIFFERENCE_STEP * scale_at_key(problem.context, key)
-        low, high = (problem.with_values({key: value + sign * step}) for sign in (-1, 1))
-        sizes = [sizes_in_units(each).size(self.dimensionless_column) for each in (low, high)]
-        factors = [self._load_factor(each) for each in (low, high)]
-        width = 2 * step
-        needed = -(sizes[1] - sizes[0]) / (width * self._size)
-        kept_by_gradients = (factors[1] - factors[0]) / width
+        low_problem, high_problem = (
+            problem.with_values({key: value + sign * step}) for sign in (-1, 1)
+        )
+        sizes = [
+            sizes_in_units(problem_nearby).size(self.dimensionless_column)
+            for problem_nearby in (low_problem, high_problem)
+        ]
+        factors = [
+            self._load_factor(problem_nearby) for problem_nearby in (low_problem, high_problem)
+        ]
+        two_steps = 2 * step
+        needed_rate = -(sizes[1] - sizes[0]) / (two_steps * self._size)
+        rate_of_gradients = (factors[1] - factors[0]) / two_steps
         if not self.by_conjugate:
-            return float(needed - kept_by_gradients)
-        if abs(needed - kept_by_gradients) * abs(value or 1.0) > UNIT_RATE_TOLERANCE:
+            return float(needed_rate - rate_of_gradients)
+        if abs(needed_rate - rate_of_gradients) * abs(value or 1.0) > UNIT_RATE_TOLERANCE:
             raise CaseError(
                 f"{key}: changes the unit of {self.column}: give the target of {self.step.key} "
                 "that unit"
@@ -191,9 +214,14 @@ class PrescribedQuantity:
         return 0.0
 
     def _load_factor(self, other: Problem) -> float:
-        """Return the load of another problem over that of the scene, as gradients have it.
+        """Return the load of a problem over that of the scene, as gradients scale it.
 
         See `simulate.perturbation.state_with_new_loads`.
+
+        Parameters
+        ----------
+        other
+            The same case with another number.
         """
         problem = self.scene.problem
         if self.name.startswith("lambda_") and problem.lambda_m:
@@ -206,20 +234,19 @@ class PrescribedQuantity:
 
 
 class ResultSampler:
-    """The path of a scene, on which results are read; collective.
+    """The path of a scene, on which results are read.
+
+    The path is followed when a sampler is made, as far as the readings need it. All methods are
+    collective.
 
     Parameters
     ----------
     requests
-        What will be read: the path is followed as far as that needs it.
-
-    Raises
-    ------
-    LostResult
-        If the path is lost before.
+        The readings to come.
     """
 
     def __init__(self, scene: Scene, requests: Sequence[Reading]) -> None:
+        """Follow the path until all places are passed, or to its end if a reading needs this."""
         self.scene, self._history = scene, History()
         self._records, self._record_at_place = list[Record](), dict[float | None, Record]()
         self._stop_reason, remarks = "", list[str]()
@@ -231,9 +258,16 @@ class ResultSampler:
                 self._history.add(record)
                 self._records.append(record)
                 if places_ahead and record.step == last_step:
-                    ends = self._path()[-2:]
-                    low, high = (self.prescribed.place_of(end.point.state) for end in ends)
-                    passed = {x for x in places_ahead if (low - x) * (high - x) <= 0}
+                    last_records = self._path()[-2:]
+                    place_before, place_now = (
+                        self.prescribed.place_of(end.point.state) for end in last_records
+                    )
+                    # places between the last two points of the path
+                    passed = {
+                        place
+                        for place in places_ahead
+                        if (place_before - place) * (place_now - place) <= 0
+                    }
                     places_ahead -= passed
                 if record.step == last_step and not places_ahead and not to_end:
                     break
@@ -256,13 +290,19 @@ class ResultSampler:
         return records[max(begin - 1, 0) :]
 
     def curve(self, column: str, *, change: bool = False) -> list[tuple[float, float]]:
-        """Return places and values of a column at the points of the last step."""
+        """Return pairs of place and value of a column at the points of the last step.
+
+        Parameters
+        ----------
+        change
+            Whether values are changes since the step began.
+        """
         at_begin = float(self._observed[0][1][column]) if change else 0.0
         return [(place, float(row[column]) - at_begin) for place, row in self._observed]
 
     @cached_property
     def _observed(self) -> list[tuple[float, dict[str, float]]]:
-        """Places and rows of the points of the last step."""
+        """Pairs of place and row (column -> value) at the points of the last step."""
         states = [record.point.state for record in self._path()]
         rows = [(state, self.scene.observe(state)) for state in states]
         return [
@@ -271,12 +311,12 @@ class ResultSampler:
         ]
 
     def adjoint(self, reading: Reading) -> Adjoint:
-        """Return the adjoint of a reading, not of its change.
+        """Return the adjoint of a reading's result; `change` has no influence on it.
 
         Raises
         ------
         LostResult
-            If it is not on the path.
+            If the reading is not on the path.
         """
         scene, result = self.scene, reading.of
         if reading.at is not None:
@@ -294,38 +334,57 @@ class ResultSampler:
             raise LostResult(f"no {result}: {e}") from None
 
     def adjoint_at(self, record: Record, column: str) -> Adjoint:
-        """Return the adjoint of a column at a point of the last step."""
+        """Return the adjoint of a column at a record of the last step."""
         return adjoint(self.scene, record, column, None, self._history.begins)
 
     def slopes(self, adjoints: Sequence[Adjoint], key: str, has_place: Sequence[bool]) -> Array:
-        """Return derivatives of results by a number of the case.
+        """Return derivatives (n,) of results by a number of the case.
 
-        A place stays where `has_place` says that there is one.
+        Parameters
+        ----------
+        adjoints
+            Adjoints of the n results.
+        key
+            Key of the number in the case.
+        has_place
+            For each result, whether it is read at a place, which stays as the number changes.
         """
-        others = dict[float, Scene]()  # the same for all results
-        slopes = np.array([float(derivative(each, key, others)) for each in adjoints])  # type: ignore[arg-type]
+        scenes_at_values = dict[float, Scene]()  # the same for all results
+        slopes = np.array(
+            [
+                float(derivative(result_adjoint, key, scenes_at_values))  # type: ignore[arg-type]
+                for result_adjoint in adjoints
+            ]
+        )
         if not any(has_place) or not (rate := self.prescribed.load_rate(key)):
             return slopes
         name = self.prescribed.name
-        by_place = [
-            float(derivative(each, name)) * each.state.mu[name] * rate if keeps_place else 0.0  # type: ignore[arg-type]
-            for each, keeps_place in zip(adjoints, has_place, strict=True)
+        # dy/dmu times dmu/dp of the load that keeps the place
+        slopes_by_place = [
+            float(derivative(result_adjoint, name))  # type: ignore[arg-type]
+            * result_adjoint.state.mu[name]
+            * rate
+            if keeps_place
+            else 0.0
+            for result_adjoint, keeps_place in zip(adjoints, has_place, strict=True)
         ]
-        return np.asarray(slopes + np.array(by_place))
+        return np.asarray(slopes + np.array(slopes_by_place))
 
     @property
     def begin(self) -> Record:
-        """Begin of the last step, as a point of it."""
+        """The begin of the last step, as a record of this step."""
         name, step = self.prescribed.name, self.prescribed.step.number
         return replace(self._path()[0], label="target", amplitude=name, step=step)
 
     def record_at(self, place: float) -> Record:
-        """Return the equilibrium at a place, where the path first passes it; collective.
+        """Return the record of the equilibrium at a place, where the path first passes this place.
+
+        Each place is solved once.
 
         Raises
         ------
         PlaceOutsidePath
-            If it does not.
+            If the path does not reach the place.
         LostResult
             If Newton's method fails there.
         """
@@ -334,24 +393,26 @@ class ResultSampler:
         return self._record_at_place[place]
 
     def _record_at(self, place: float) -> Record:
+        """Return the record of the equilibrium at a place, see `record_at`."""
         path, prescribed = self._path(), self.prescribed
         values = [prescribed.place_of(record.point.state) for record in path]
-        slack = PATH_END_TOLERANCE * (max(values) - min(values)) if values else 0.0
+        tolerance = PATH_END_TOLERANCE * (max(values) - min(values)) if values else 0.0
         segments = (
-            k
-            for k in range(len(path) - 1)
-            if self._is_between(values[k], values[k + 1], place, slack)
+            segment
+            for segment in range(len(path) - 1)
+            if self._is_between(values[segment], values[segment + 1], place, tolerance)
         )
-        k = next(segments, None)
-        if k is None:
+        segment = next(segments, None)
+        if segment is None:
             extent = "has no such point"
             if len(values) > 1:
                 extent = f"goes from {min(values):.6g} to {max(values):.6g}"
-            why = f" ({self._stop_reason})" if self._stop_reason else ""
+            stop_text = f" ({self._stop_reason})" if self._stop_reason else ""
             raise PlaceOutsidePath(
-                f"{prescribed.column} = {place:.6g} is outside the path, which {extent}{why}", place
+                f"{prescribed.column} = {place:.6g} is outside the path, which {extent}{stop_text}",
+                place,
             )
-        low, high = ((values[i], path[i].point.state) for i in (k, k + 1))
+        low, high = ((values[i], path[i].point.state) for i in (segment, segment + 1))
         stage = stage_of_step(self.scene, prescribed.step, low[1])
         try:
             state = self._state_between(stage, low, high, place)
@@ -370,34 +431,50 @@ class ResultSampler:
         place: float,
         halvings: int = MAX_HALVINGS,
     ) -> State:
-        """Return the equilibrium at a place between two.
+        """Return the equilibrium at a place between two states of the path.
 
-        Where Newton's method fails, first one halfway to the nearer of the two is found.
+        Where Newton's method fails, an equilibrium halfway to the nearer state is found first.
+
+        Parameters
+        ----------
+        low, high
+            Place and state of the model at both sides.
+        halvings
+            How many more halvings are allowed.
+
+        Raises
+        ------
+        LostResult
+            If Newton's method fails after all halvings, or leaves the path.
         """
-        (first, a), (last, b) = low, high
-        part = float(np.clip((place - first) / ((last - first) or 1.0), 0.0, 1.0))
+        (low_place, low_state), (high_place, high_state) = low, high
+        part = float(np.clip((place - low_place) / ((high_place - low_place) or 1.0), 0.0, 1.0))
         mu = {
-            name: (1 - part) * value + part * b.mu.get(name, value) for name, value in a.mu.items()
+            name: (1 - part) * value + part * high_state.mu.get(name, value)
+            for name, value in low_state.mu.items()
         }
         system, comm = self.scene.model.system, self.scene.comm
-        guess = system.with_moved_supports(State((1 - part) * a.u + part * b.u, mu))
+        guess = system.with_moved_supports(
+            State((1 - part) * low_state.u + part * high_state.u, mu)
+        )
         row = self.prescribed.constraint(stage.newton.system, place)
         outcome = stage.newton.solve(stage.enter(guess), self.prescribed.name, row)
         state = stage.leave(outcome.state)
-        tolerance = max_abs(comm, b.u - a.u) + PATH_END_TOLERANCE * system.length
+        tolerance = max_abs(comm, high_state.u - low_state.u) + PATH_END_TOLERANCE * system.length
         if outcome.converged and max_abs(comm, state.u - guess.u) <= tolerance:
             return state
         if not halvings:
             raise LostResult(
                 "the iteration has left the path" if outcome.converged else outcome.reason
             )
-        half = (place + (first if part < 0.5 else last)) / 2
-        middle = half, self._state_between(stage, low, high, half, halvings - 1)
+        half_way_place = (place + (low_place if part < 0.5 else high_place)) / 2
+        middle = half_way_place, self._state_between(stage, low, high, half_way_place, halvings - 1)
         ends = (middle, high) if part < 0.5 else (low, middle)
         return self._state_between(stage, *ends, place, halvings - 1)
 
     @staticmethod
     def _is_between(low: float, high: float, place: float, slack: float) -> bool:
+        """Return whether a place is between two places, up to a tolerance."""
         return min(low, high) - slack <= place <= max(low, high) + slack
 
 
@@ -414,19 +491,20 @@ def read(
     Parameters
     ----------
     requests
-        What is read.
+        The n readings.
     keys
-        Numbers of the case that results are differentiated by.
+        Numbers of the case by which results are differentiated.
     slopes
-        Whether they are; else slopes are zero.
+        Whether to differentiate; else slopes are zero.
     fields
-        Fields that they are differentiated by too (see `gradients.gradient`) -> how many numbers
-        they have, and what makes the derivatives by these of a gradient; they follow those by keys.
+        Field by which results are differentiated as well (see `gradients.gradient`) -> how many
+        numbers this field has, and a function from a gradient to the derivatives by these numbers.
+        They follow the derivatives by `keys`.
 
     Raises
     ------
     LostResult
-        If the path does not have one of them.
+        If the path does not have a reading.
     CaseError
         If a result has no derivative.
     """
@@ -435,16 +513,19 @@ def read(
     adjoints = [sampler.adjoint(request) for request in requests]
     adjoints += [sampler.adjoint_at(sampler.begin, result) for result in changing]
     has_place = [request.at is not None for request in requests] + [True for _ in changing]
-    values = np.array([each.value_in_unit for each in adjoints])
+    values = np.array([result_adjoint.value_in_unit for result_adjoint in adjoints])
     count_of_numbers = len(keys) + sum(count for count, _ in fields.values())
     derivatives = np.zeros((len(adjoints), count_of_numbers))
     for i, key in enumerate(keys if slopes else ()):
         derivatives[:, i] = sampler.slopes(adjoints, key, has_place)
-    first = len(keys)
-    for field_name, (count, of_field) in fields.items() if slopes else ():
-        for row, each in zip(derivatives, adjoints, strict=True):
-            row[first : first + count] = of_field(derivative(each, field_name))  # type: ignore[arg-type]
-        first += count
+    first_column = len(keys)
+    for field_name, (count, derivatives_by_numbers) in fields.items() if slopes else ():
+        for row, result_adjoint in zip(derivatives, adjoints, strict=True):
+            row[first_column : first_column + count] = derivatives_by_numbers(
+                derivative(result_adjoint, field_name)  # type: ignore[arg-type]
+            )
+        first_column += count
+    # a change is the reading less that at the begin of the step
     for i, request in enumerate(requests):
         if request.change:
             at_begin = len(requests) + changing.index(request.of)

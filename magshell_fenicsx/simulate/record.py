@@ -22,7 +22,7 @@ AT_POINT_FORCES = (
 
 @dataclass(frozen=True)
 class Record:
-    """A point of the history and its origin.
+    """A point of the history, a row of path.csv, with its origin.
 
     Attributes
     ----------
@@ -32,6 +32,8 @@ class Record:
         the amplitudes of the point where its step ends.
     amplitude
         The amplitude that varied ("" at the start).
+    point
+        State and tangent of the path, with the number of unstable directions.
     mode
         For a mode that a reduced model excludes and that becomes unstable or stable here:
         "antisymmetric" to the mirror plane of a half shell, or "m = 7" waves around an axisymmetric
@@ -84,21 +86,31 @@ class Record:
 
 @dataclass
 class PointForceModes:
-    """The instabilities at point forces that were left out, with one sentence for each force.
+    """Notes on instabilities at point forces that were left out, one sentence for each force.
 
     Attributes
     ----------
     points
         Names of points that have a sentence.
     sentences
-        Those that nobody has taken.
+        Sentences that nobody has taken.
     """
 
     points: set[str] = field(default_factory=set)
     sentences: list[str] = field(default_factory=list)
 
     def note(self, point: str, at: str, modes: str) -> None:
-        """Note the first instability at a point, with the value of the amplitude."""
+        """Note the first instability at a point force; later ones at the same point are not noted.
+
+        Parameters
+        ----------
+        point
+            Name of the point.
+        at
+            Amplitude and its value, in words.
+        modes
+            Name of the mode, or words for the instability.
+        """
         if point not in self.points:
             self.points.add(point)
             self.sentences.append(
@@ -107,7 +119,7 @@ class PointForceModes:
             )
 
     def take(self) -> list[str]:
-        """Return the sentences that nobody has taken."""
+        """Return the sentences that nobody has taken; they count as taken then."""
         sentences, self.sentences = self.sentences, []
         return sentences
 

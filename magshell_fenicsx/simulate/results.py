@@ -67,35 +67,40 @@ class Functional:
 
 
 def functional(scene: Scene, state: State, result: str | Target) -> Functional:
-    """Return a column of path.csv, or the distance to a target, as a functional; collective.
+    """Return a result as a functional of the state, with its derivatives; collective.
 
-    The latter is the mean square over the area, in R^2.
+    Parameters
+    ----------
+    result
+        A column of path.csv; or a target shape, whose mean square distance over the area, in R^2,
+        is the result.
 
     Raises
     ------
     CaseError
-        If the scene has no such column, or it has no derivative here; the message has those that
-        have one.
+        If the scene has no such column, or it has no derivative here; the message has the columns
+        that have one.
     """
     model, system = scene.model, scene.model.system
     if callable(result):
         return _misfit(scene, state, result)
-    zero: Vector = np.zeros(system.size)
+    zero_by_u: Vector = np.zeros(system.size)
     if result == "energy":
         by_u = model.multiplicity * system.residual(state.u, state.mu)
         return Functional(scene.observe(state)["energy"], by_u, energy=model.multiplicity)
     points = _displacements(scene)
     if result in points:
-        point, i = points[result]
-        by_u = scene.problem.length * (_to_case_frame(scene) @ model.probe(point))[i]
+        point, axis = points[result]
+        by_u = scene.problem.length * (_to_case_frame(scene) @ model.probe(point))[axis]
         return Functional(scene.observe(state)[result], system.zero_at_supports(by_u))
     if result in (conjugate_columns := conjugates(scene)):
-        name, unit = conjugate_columns[result]
-        by_u = np.asarray(-system.load(state.u, state.mu, name) / unit)
-        value = -system.potential(state.u, state.mu, name) / unit
+        name, conjugate_unit = conjugate_columns[result]
+        by_u = np.asarray(-system.load(state.u, state.mu, name) / conjugate_unit)
+        value = -system.potential(state.u, state.mu, name) / conjugate_unit
         forms = [(term, -value / model.load_size[name]) for term in model.size_terms(name)]
-        return Functional(value, by_u, potentials={name: -1 / unit}, forms=forms)
+        return Functional(value, by_u, potentials={name: -1 / conjugate_unit}, forms=forms)
     if result in AT_POLE and "pole" in model.normals:
+        # w = -u . n0 at the pole
         by_u = np.asarray(-(model.normals["pole"] @ model.probe("pole")) / scene.problem.material.h)
         by_normal = {"pole": -1 / scene.problem.material.h}
         return Functional(
@@ -105,21 +110,25 @@ def functional(scene: Scene, state: State, result: str | Target) -> Functional:
         )
     if result in (forces := _forces(scene)):
         return _reaction(scene, state, *forces[result], result)
-    for room in OBSERVABLES:
-        if slope := room.slope(scene.view, state, result):
+    for part_observables in OBSERVABLES:
+        if slope := part_observables.slope(scene.view, state, result):
             return Functional(slope.value, slope.by_u, slope.by_mu, slope=slope)
     name = next((name for name in state.mu if result in (name, amplitude(name).column)), "")
     if name:
-        return Functional(state.mu[name], zero, {name: 1.0})
+        return Functional(state.mu[name], zero_by_u, {name: 1.0})
     raise CaseError(
         f"{result}: has no gradient here; allowed are {', '.join(differentiable(scene, state))}"
     )
 
 
 def differentiable(scene: Scene, state: State) -> list[str]:
-    """Return the columns of path.csv that `functional` takes, and those of them in units."""
+    """Return the columns of path.csv that `functional` takes, also those in units."""
     at_pole = AT_POLE if "pole" in scene.model.normals else ()
-    rooms = (column for room in OBSERVABLES for column in room.differentiable(scene.problem.loads))
+    part_columns = (
+        column
+        for observables in OBSERVABLES
+        for column in observables.differentiable(scene.problem.loads)
+    )
     amplitudes = (
         amplitude(name).column for name in state.mu if name not in scene.model.system.history
     )
@@ -130,7 +139,7 @@ def differentiable(scene: Scene, state: State) -> list[str]:
             *_displacements(scene),
             *_forces(scene),
             *at_pole,
-            *rooms,
+            *part_columns,
             *amplitudes,
         )
     )
@@ -138,18 +147,18 @@ def differentiable(scene: Scene, state: State) -> list[str]:
 
 
 def in_units(scene: Scene, state: State, column: str) -> tuple[str, str]:
-    """Return the dimensionless column of a column in units, and the scale of its unit.
+    """Return the dimensionless column of a column in units, and the name of the scale of its unit.
 
-    Of another column these are the column itself, and "".
+    Another column is returned itself, with "".
     """
-    for name in differentiable(scene, state):
-        if (in_unit := scene.sizes.column(name)) and in_unit.name == column:
-            return name, quantity(name).scale
+    for dimensionless_column in differentiable(scene, state):
+        if (in_unit := scene.sizes.column(dimensionless_column)) and in_unit.name == column:
+            return dimensionless_column, quantity(dimensionless_column).scale
     return column, ""
 
 
 def _displacements(scene: Scene) -> dict[str, tuple[str, int]]:
-    """Return columns of named points -> the point and the axis."""
+    """Return column of a named point's displacement -> the point and the axis (0, 1 or 2)."""
     return {
         f"{point}_u{axis}": (point, i)
         for point in scene.problem.context.points
@@ -158,43 +167,64 @@ def _displacements(scene: Scene) -> dict[str, tuple[str, int]]:
 
 
 def force_unit(scene: Scene) -> float:
-    """Return E h R^2 over R in the case's unit of force."""
+    """Return the unit of forces E h R^2/R as a number in the case's unit of force."""
     return scene.problem.modulus * scene.problem.material.h * scene.problem.length**2
 
 
 def _forces(scene: Scene) -> dict[str, tuple[str, int]]:
-    """Return column of a force of a support -> the support and the axis."""
+    """Return column of a reaction -> the support and the axis (0, 1 or 2)."""
     supports = scene.problem.supports if scene.problem.reactions else ()
     return {f"{name}_f{axis}": (name, i) for name in supports for i, axis in enumerate("xyz")}
 
 
 def _reaction(scene: Scene, state: State, name: str, axis: int, result: str) -> Functional:
-    """Return a force of a support along an axis; `result` is its column."""
+    """Return the reaction of a support along an axis of the case, as a functional; collective.
+
+    Parameters
+    ----------
+    name, axis
+        Name of the support, and number of the axis.
+    result
+        Column of the reaction, for messages.
+
+    Raises
+    ------
+    CaseError
+        If a pressure at a free edge has no potential.
+    """
     system, problem = scene.model.system, scene.problem
     if scene.model.without_potential and problem.loads.pressure:
         raise CaseError(
             f"{result}: has no gradient under a pressure at a free edge, which has no potential"
         )
     axis_direction = rotation(problem.azimuth)[:, axis]
-    e = force_unit(scene) * weights(scene.model, name, axis_direction, problem.mirror)
-    value = dot(system.comm, e, system.forces(state.u, state.mu))
+    reaction_vector = force_unit(scene) * weights(scene.model, name, axis_direction, problem.mirror)
+    value = dot(system.comm, reaction_vector, system.forces(state.u, state.mu))
     return Functional(
-        value, system.zero_at_supports(system.at_state(state).stiffness_along(e)), reaction=e
+        value,
+        system.zero_at_supports(system.at_state(state).stiffness_along(reaction_vector)),
+        reaction=reaction_vector,
     )
 
 
 def conjugates(scene: Scene) -> dict[str, tuple[str, float]]:
-    """Return column -> the amplitude whose conjugate it is, and the conjugate's unit."""
+    """Return column -> the amplitude whose conjugate it is, and the unit of this conjugate."""
     model, loads = scene.model, scene.problem.loads
     amplitudes = {"volume_change": "pressure"} if loads.pressure else {}
     amplitudes |= {
-        column: name for room in OBSERVABLES for name, column in room.conjugates(loads).items()
+        column: name
+        for observables in OBSERVABLES
+        for name, column in observables.conjugates(loads).items()
     }
     with_units = {column: (name, scene.conjugate_unit(name)) for column, name in amplitudes.items()}
     for name in (*loads.forces, *loads.dead):
-        if size := model.force_unit if name in loads.forces else model.load_size.get(name, 0.0):
+        if (
+            load_size := model.force_unit
+            if name in loads.forces
+            else model.load_size.get(name, 0.0)
+        ):
             column = "w_over_h" if name == loads.displaced else f"w_{name}_over_h"
-            with_units[column] = name, size * scene.problem.material.h
+            with_units[column] = name, load_size * scene.problem.material.h
     return with_units
 
 
@@ -204,10 +234,14 @@ def _to_case_frame(scene: Scene) -> Array:
 
 
 def offset(scene: Scene, target: Target) -> fem.Function:
-    """Return the displacement that reaches the target, at the nodes of the model."""
+    """Return the displacement from the undeformed shell to a target, at the nodes of the model.
+
+    It is a field that follows from the placement, so that it has derivatives by the shape.
+    """
     axes, Q = scene.model.axes, rotation(scene.problem.azimuth)
 
     def offset_from(r0: fem.Function) -> PlacementField:
+        """Return the displacement from a placement to the target."""
         offsets = PlacementField(r0.function_space, "offset", offset_from)
         places = np.zeros((np.size(r0.x.array) // len(axes), 3))
         places[:, axes] = np.reshape(r0.x.array, (-1, len(axes)))
@@ -219,9 +253,9 @@ def offset(scene: Scene, target: Target) -> fem.Function:
 
 
 def distances(scene: Scene, state: State, target: Target) -> tuple[float, float]:
-    """Return root mean square and largest distance to a target, over R; collective.
+    """Return root mean square and largest distance of a state to a target, over R; collective.
 
-    The largest distance is that of the nodes.
+    The mean is over the area, and the largest distance is that of the nodes.
     """
     system, offset_to_target = scene.model.system, offset(scene, target)
     u = system.with_ghosts(state.u, state.mu)
@@ -233,7 +267,7 @@ def distances(scene: Scene, state: State, target: Target) -> tuple[float, float]
 
 
 def _misfit(scene: Scene, state: State, target: Target) -> Functional:
-    """Return the mean square distance to a target over the area, in R^2."""
+    """Return the mean square distance to a target over the area, in R^2, as a functional."""
     model, system = scene.model, scene.model.system
     over_area, offset_to_target = model.over_area(), offset(scene, target)
     gap, log = system.u - offset_to_target, model.kernels
@@ -249,18 +283,25 @@ def _misfit(scene: Scene, state: State, target: Target) -> Functional:
 
 
 def barrier(scene: Scene, step: ProgrammeStep, begin: State, end: State) -> float:
-    """Return the work of a step's load between two states without it, over E h R^2; collective.
+    """Return the energy barrier that a step passes, over E h R^2; collective.
 
-    It is the change of the energy under the other loads as they are held: that of Pi, plus the
-    integral of q dmu for each amplitude whose conjugate q is held.
+    It is the work of the step's load between two states without this load: the change of Pi, plus
+    the integral of q dmu for each other amplitude whose conjugate q is held.
+
+    Parameters
+    ----------
+    begin, end
+        States at both ends of the step.
     """
     held_conjugates = held_conjugates_of_step(scene, step, begin)
     energy_before, energy_after = (sum(scene.energies(state).values()) for state in (begin, end))
     change = energy_after - energy_before
     for name, q in held_conjugates.items():
-        a, b = begin.mu[name], end.mu[name]
+        mu_before, mu_after = begin.mu[name], end.mu[name]
         work = (
-            scipy.integrate.quad(lambda mu, q=q: q(mu)[0], a, b)[0] if callable(q) else q * (b - a)
+            scipy.integrate.quad(lambda mu, q=q: q(mu)[0], mu_before, mu_after)[0]
+            if callable(q)
+            else q * (mu_after - mu_before)
         )
         change += scene.model.multiplicity * work
     return float(change)

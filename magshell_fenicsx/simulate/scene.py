@@ -52,7 +52,7 @@ NOT_COUNTED = "boundary: the shell moves freely: its unstable directions are not
 
 
 def build_model(problem: Problem, comm: MPI.Comm) -> "ShellModel":
-    """Return the model of a shell, of half of it or a sector, on all ranks together."""
+    """Return the model of a shell, of half of it or of a sector; collective."""
     from magshell_fenicsx.shells.shell import ShellModel  # a meridian does without
 
     surface = build_midsurface(problem, comm)
@@ -71,7 +71,7 @@ def build_model(problem: Problem, comm: MPI.Comm) -> "ShellModel":
 
 
 def build_meridian_model(problem: Problem, *, assembled: bool = True) -> MeridianModel:
-    """Return the model of a meridian, which is whole on every rank.
+    """Return the model of an axisymmetric shell by its meridian, which is whole on every rank.
 
     Parameters
     ----------
@@ -91,14 +91,19 @@ def build_meridian_model(problem: Problem, *, assembled: bool = True) -> Meridia
 
 
 def build_meridian(problem: Problem) -> Meridian:
-    """Return the mesh of the meridian of a problem, on every rank."""
+    """Return the mesh of the meridian of a problem, the same on every rank.
+
+    Named points become nodes. Two names for one point share a node.
+    """
     chart = problem.meridian
     assert chart
     points = {}
-    for name, x in problem.points.items():
+    for name, place in problem.points.items():
         # of names for one point, the first
-        first_name = next(other for other, place in problem.points.items() if place is x)
-        points[name] = chart.locate_named(first_name, x)
+        first_name = next(
+            other_name for other_name, other_place in problem.points.items() if other_place is place
+        )
+        points[name] = chart.locate_named(first_name, place)
     shells = [(shell.name, shell.ends) for shell in chart.shell_meridians]
     held_names = [
         name for name, condition in problem.conditions.items() if condition not in UNHELD_CONDITIONS
@@ -116,10 +121,14 @@ def build_meridian(problem: Problem) -> Meridian:
 
 
 def build_solid_model(problem: Problem, comm: MPI.Comm) -> "SolidModel":
-    """Return the model of a body or half of it, on all ranks together."""
+    """Return the model of a body or of half of it; collective.
+
+    The body is the triangulated mid-surface, swept through its thickness in layers of elements.
+    """
     from magshell_fenicsx.shells.solid import SolidModel
 
     def factor(x: Array) -> Array:
+        """Return thickness over h (n,) at undeformed places (n, 3)."""
         thicknesses = (problem.thickness or Thickness()).values_at(x)
         refuse_unfit(thicknesses, x, comm)
         return thicknesses
@@ -149,12 +158,14 @@ def build_midsurface(problem: Problem, comm: MPI.Comm) -> Midsurface:
 
 
 class Scene:
-    """A problem ready to be solved.
+    """A problem ready to be solved: its finite element model with a solver.
 
     Parameters
     ----------
     problem
         Everything that will be computed.
+    comm
+        Ranks that share the model; all of them make the scene.
 
     Attributes
     ----------
@@ -164,8 +175,8 @@ class Scene:
         The record of the solver's results for an interrupted run, and the listener to its status.
         The caller that runs the scene sets both.
     remesh
-        Changes the mesh of a larger model that has a mode which this one excludes; by default that
-        of the case stays.
+        Function that changes the mesh of a larger model's problem, where a mode has led out of this
+        model; by default the mesh of the case stays.
     warnings
         Warnings of what is unphysical, or may be too large.
     allows_rigid_motion
@@ -177,6 +188,7 @@ class Scene:
     """
 
     def __init__(self, problem: Problem, comm: MPI.Comm = MPI.COMM_WORLD) -> None:
+        """Build the model, and check that it is held or may move; collective."""
         start = time.perf_counter()
         if problem.pending_modes:
             raise CaseError(
@@ -226,24 +238,38 @@ class Scene:
     def with_field_strength(self, context: Context) -> "Scene":
         """Return the scene of a case that differs by the strength of the field alone.
 
-        It has the same model and solver.
+        It has the same model and solver. Neither is built again.
+
+        Parameters
+        ----------
+        context
+            What the sections of the other case have made of its file.
         """
         return self._copy(
             problem=replace(self.problem, context=context, lambda_m=strength(context))
         )
 
     def with_model(self, problem: Problem, model: MeridianModel) -> "Scene":
-        """Return the scene of a problem that differs in numbers, with the model that has these."""
+        """Return the scene of a problem that differs in numbers alone, with a model that has them.
+
+        The solver has the options of this scene's solver.
+        """
         return self._copy(
             problem=problem, model=model, newton=BorderedNewton(model.system, self.newton.options)
         )
 
     def _copy(self, **changes: Any) -> "Scene":
-        """Return a copy with changed attributes; cached properties are computed anew."""
-        other = object.__new__(Scene)
-        attributes = {name: v for name, v in vars(self).items() if name not in vars(Scene)}
-        vars(other).update(attributes | changes)
-        return other
+        """Return a copy with changed attributes; cached properties are computed anew.
+
+        Parameters
+        ----------
+        changes
+            Name of an attribute -> its new value.
+        """
+        copied_scene = object.__new__(Scene)
+        attributes = {name: value for name, value in vars(self).items() if name not in vars(Scene)}
+        vars(copied_scene).update(attributes | changes)
+        return copied_scene
 
     @property
     def plan(self) -> Problem:
@@ -253,7 +279,7 @@ class Scene:
 
     @property
     def flat_triangle(self) -> str:
-        """Words for a triangle that is too flat for the penalty; empty if none is."""
+        """Message on a triangle that is too flat for the penalty; "" if none is."""
         surface = self.model.midsurface
         if surface is None or self.problem.body:
             return ""
@@ -267,7 +293,7 @@ class Scene:
 
     @cached_property
     def stability_monitor(self) -> StabilityMonitor:
-        """Monitor of the modes that the model excludes.
+        """Monitor of the modes that the model excludes, which counts unstable ones along a path.
 
         Its first use compiles their kernels.
         """
@@ -275,12 +301,12 @@ class Scene:
 
     @cached_property
     def point_force_modes(self) -> PointForceModes:
-        """The instabilities at point forces that were left out."""
+        """Notes on instabilities at point forces that are left out of the history."""
         return PointForceModes()
 
     @cached_property
     def unresolved(self) -> list[str]:
-        """Details of the problem's formulas that the mesh misses, in words; collective."""
+        """Messages on details of the problem's formulas that the mesh misses; collective."""
         model, formulas = self.model, case_formulas(self.problem.context)
         if not formulas:
             return []
@@ -289,9 +315,9 @@ class Scene:
         )
 
     def lost_field_text(self) -> str:
-        """Return the end of a message on a path that has found no field somewhere; collective.
+        """Return the end of a message on a path where an applied field was not known; collective.
 
-        It is empty if fields were found everywhere since the begin of the path.
+        It is "" if every field was finite at all places since the begin of the path.
         """
         lost_here = [field.lost for field in self.model.fields if field.lost]
         places = [
@@ -303,14 +329,14 @@ class Scene:
 
     @property
     def left_out(self) -> list[str]:
-        """Phrases for what the model lacks."""
+        """Phrases for the physics that the model leaves out."""
         lacks_of_parts = (observables.left_out(self.view) for observables in OBSERVABLES)
         return [*self.problem.left_out, *(phrase for lacks in lacks_of_parts for phrase in lacks)]
 
     def unloaded(self) -> State:
-        """Return the undeformed shell.
+        """Return the state of the undeformed shell, without loads.
 
-        Amplitudes are zero, except user-defined ones with a value.
+        Amplitudes are zero, except user-defined ones with an initial value.
         """
         field = self.problem.loads.magnetic
         turns = (motion.name for motion in field.turns) if field else ()
@@ -327,7 +353,19 @@ class Scene:
         return State(self.model.zero(), {name: values.get(name, 0.0) for name in sorted(names)})
 
     def displacement(self, state: State) -> fem.Function:
-        """Return the displacement of a state as a dolfinx function, see `Record.u`; collective."""
+        """Return the displacement of a state as a dolfinx function, see `Record.u`; collective.
+
+        Parameters
+        ----------
+        state
+            State of the scene; it may have further amplitudes.
+
+        Raises
+        ------
+        ValueError
+            If the state is of another scene, if the scene models half of a user's mesh, or if other
+            ranks solve it than hold that mesh.
+        """
         self.refuse_foreign(state, allows_more=True)
         model, surface = self.model, self.model.midsurface
         displacement = fem.Function(model.u.function_space, name="u")
@@ -350,7 +388,7 @@ class Scene:
         return user_mesh.displacement(displacement, surface.source_triangles, mesh_file.scale)
 
     def refuse_foreign(self, state: State, *, allows_more: bool = False) -> None:
-        """Refuse a state of another scene, as far as it shows.
+        """Check that a state may be one of this scene, by its numbers and names.
 
         Parameters
         ----------
@@ -369,19 +407,22 @@ class Scene:
                 f"this scene has {unloaded.u.size}; take records of follow or trace of the same "
                 "scene"
             )
-        others = state.mu.keys() - unloaded.mu.keys() - {*self.model.system.history}
-        missing = unloaded.mu.keys() - state.mu.keys()
-        if missing or (others and not allows_more):
-            theirs, ours = (", ".join(sorted(mu)) or "none" for mu in (state.mu, unloaded.mu))
+        further_amplitudes = state.mu.keys() - unloaded.mu.keys() - {*self.model.system.history}
+        missing_amplitudes = unloaded.mu.keys() - state.mu.keys()
+        if missing_amplitudes or (further_amplitudes and not allows_more):
+            names_of_state, names_of_scene = (
+                ", ".join(sorted(mu)) or "none" for mu in (state.mu, unloaded.mu)
+            )
             raise ValueError(
-                f"this state is of another scene: its amplitudes are {theirs}, those of this scene "
-                f"{ours}"
+                f"this state is of another scene: its amplitudes are {names_of_state}, those "
+                f"of this scene {names_of_scene}"
             )
 
     def observe(self, state: State) -> dict[str, float]:
-        """Return the physical columns of a table row.
+        """Return column of path.csv -> its dimensionless value at a state; collective.
 
-        They are loads, displacements over h, volume, and energies over E h R^2.
+        Loads are over their unit, displacements over h, the change of volume over R^3, and energies
+        over E h R^2. A column without a value is NaN.
         """
         self.refuse_foreign(state, allows_more=True)
         model, h, loads = self.model, self.problem.material.h, self.model.loads
@@ -416,7 +457,7 @@ class Scene:
         return columns | self._observe_own_terms(state)
 
     def _observe_own_terms(self, state: State) -> dict[str, float]:
-        """Return the integrals that user-defined energies observe."""
+        """Return column -> integral over the shell that an own energy observes; collective."""
         model, columns = self.model, dict[str, float]()
         for term in self.problem.loads.user_terms:
             factor = state.mu[term.name] if term.density else 1.0
@@ -426,7 +467,10 @@ class Scene:
         return columns
 
     def energies(self, state: State) -> dict[str, float]:
-        """Return the energy of each term, over E h R^2; all parts of one field together."""
+        """Return group of terms -> energy over E h R^2 of the whole shell; collective.
+
+        All terms of one field are one group. Terms of loads have the factor of their amplitude.
+        """
         model, by_group = self.model, defaultdict[str, float](float)
         potentials = model.system.energies(state.u, state.mu)
         for term in model.system.terms:
@@ -436,31 +480,27 @@ class Scene:
 
     @property
     def _own_amplitudes(self) -> dict[str, float]:
-        """The amplitudes of natural shape, imperfections, user-defined energies and parameters,
-        with initial values.
-        """
+        """Initial amplitudes of natural shape, imperfections, own energies and parameters."""
         return own_amplitudes(self.problem.loads)
 
     @property
     def motions(self) -> frozenset[str]:
-        """The amplitudes of supports that move."""
+        """Names of the amplitudes that move supports."""
         return frozenset(move.motion.name for move in self.problem.loads.moves)
 
     @property
     def sources(self) -> dict[str, str]:
-        """Amplitudes of moving sources and their columns, see `source_columns`."""
+        """Amplitude of a moving source -> its column, see `source_columns`."""
         return source_columns(self.problem.loads)
 
     @cached_property
     def sizes(self) -> Sizes:
-        """The sizes of the units."""
+        """Sizes of the case's units, by which dimensionless columns become columns in units."""
         return sizes_in_units(self.problem)
 
     @cached_property
     def extra_columns(self) -> tuple[str, ...]:
-        """The columns of a row besides those of every run; the last ones are those in the case's
-        units.
-        """
+        """Columns of a row besides those of every run; those in the case's units come last."""
         return extra_columns(self.problem)
 
     def energy_of_shell(self, state: State, energy: float) -> float:
@@ -469,7 +509,7 @@ class Scene:
         Parameters
         ----------
         energy
-            The energy of the state with these.
+            Energy of the state with the potentials of the loads, over E h R^2.
         """
         system = self.model.system
         potentials = sum(
@@ -481,7 +521,7 @@ class Scene:
 
     @property
     def view(self) -> ModelView:
-        """View of the model that observables of parts are read from."""
+        """The model with the units and the frame of reports, for observables of parts."""
         problem = self.problem
         sense = copysign(1.0, problem.lambda_m)
         place = problem.mirror, problem.azimuth
@@ -505,29 +545,37 @@ class Scene:
         return to_magpylib(self.view, record.point.state, parts)
 
     def conjugate_unit(self, name: str) -> float:
-        """Return -dPi/dmu of one unit of a target.
+        """Return the value of -dPi/dmu that counts as one unit of a target for an amplitude.
 
-        The unit is ΔV/R³ of a pressure, w/h of a force, and the shell's length of dead loads.
+        The unit is ΔV/R³ of a pressure, w/h of a force, and the shell's length of dead loads; 0 for
+        an amplitude that has no such unit.
         """
         units = (observables.conjugate_unit(self.view, name) for observables in OBSERVABLES)
         return next((unit for unit in units if unit is not None), 0.0)
 
     def _observe_points(self, state: State) -> dict[str, float]:
-        """Return the displacements of named points in the unit of the shell's lengths."""
+        """Return column -> component of a named point's displacement, in the case's length unit."""
         displacements: dict[str, float] = {}
         for point in self.problem.context.points:
             u = self.problem.length * self.model.displacement(state.u, point)
             u = u @ rotation(self.problem.azimuth)
             displacements |= {
-                f"{point}_u{axis}": float(c) for axis, c in zip("xyz", u, strict=True)
+                f"{point}_u{axis}": float(component)
+                for axis, component in zip("xyz", u, strict=True)
             }
         return displacements
 
 
 def _beyond_memory(problem: Problem, comm: MPI.Comm) -> str | None:
-    """Return a warning of a problem near the machine's memory, see `refuse_beyond_memory`.
+    """Return a warning if a problem comes near the machine's memory, else None; collective.
 
-    Every rank asks its own machine, and the first refusal is that of all.
+    Every rank asks its own machine, and all ranks act on the first refusal, see
+    `refuse_beyond_memory`.
+
+    Raises
+    ------
+    CaseError
+        If the problem needs more memory than a machine has.
     """
     if comm.size == 1:
         return refuse_beyond_memory(problem)

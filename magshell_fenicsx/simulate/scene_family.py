@@ -70,29 +70,42 @@ class NoInfluence(CaseError):
 def first_instability(records: Sequence[Record]) -> Record:
     """Return the first instability of a history's last step, which ends its case.
 
+    Parameters
+    ----------
+    records
+        Rows of a history in order; those of branches do not count.
+
     Raises
     ------
     NoInstability
-        If there is none.
+        If the last step has no located fold or bifurcation.
     """
-    path = [record for record in records if not record.branch]
-    last_step = path[-1].step if path else 0
-    located = [record for record in path if record.label in LOCATED and record.step == last_step]
-    if not located:
+    records_of_path = [record for record in records if not record.branch]
+    last_step = records_of_path[-1].step if records_of_path else 0
+    instabilities = [
+        record for record in records_of_path if record.label in LOCATED and record.step == last_step
+    ]
+    if not instabilities:
         raise NoInstability(
             "the case ends without an instability, and a boundary is that of a fold or a "
             "bifurcation: give its last step until: limit, and a load that reaches one"
         )
-    return located[0]
+    return instabilities[0]
 
 
 def refuse_excluded_mode(mode: str) -> None:
-    """Check that a model has the mode of an instability.
+    """Check that the model itself has the mode of an instability.
+
+    Parameters
+    ----------
+    mode
+        Name of the mode, see `Record.mode`: "m = 7" and "antisymmetric" are modes that a reduced
+        model excludes.
 
     Raises
     ------
     ExcludedInstability
-        If it has not.
+        If the model excludes it.
     """
     if mode.startswith(WAVES) or mode == "antisymmetric":
         raise ExcludedInstability(
@@ -102,14 +115,16 @@ def refuse_excluded_mode(mode: str) -> None:
 
 @dataclass(frozen=True)
 class _LinearAmplitudes:
-    """Amplitudes that are linear in the number: no problem is made for its values.
+    """Amplitudes that are linear in the number p, so that no problem is made for its values.
 
     Attributes
     ----------
     value
-        A value of the number.
-    amplitudes, rates
-        The amplitudes there, and their derivatives by the number.
+        A value of p.
+    amplitudes
+        Amplitude -> its value at this p.
+    rates
+        Amplitude -> its derivative by p.
     """
 
     value: float
@@ -117,7 +132,7 @@ class _LinearAmplitudes:
     rates: dict[str, float]
 
     def at(self, p: float) -> dict[str, float]:
-        """Return the amplitudes at another value."""
+        """Return amplitude -> its value at another p."""
         return {
             name: amplitude + self.rates[name] * (p - self.value)
             for name, amplitude in self.amplitudes.items()
@@ -125,27 +140,35 @@ class _LinearAmplitudes:
 
 
 class SceneFamily:
-    """Scenes of one case in a number; a `continuation.augmented.SystemFamily`.
+    """Scenes of one case in a number p of this case; a `continuation.augmented.SystemFamily`.
+
+    It gives systems and tangents at any p, for a boundary of stability that follows one
+    instability. All methods that take a state take one of the stage's system (a scene with the
+    solver of a step).
 
     Parameters
     ----------
-    scene, record
-        The scene at `value`, and its instability.
+    scene
+        Scene of the case at p = `value`.
+    record
+        Row of its history at the instability that is followed.
     make_problem
-        Makes the problem at a value.
+        Makes the problem at a value of p.
+    value
+        The number p of the case itself.
     value_range
-        The range of values.
+        Least and largest value of p.
 
     Attributes
     ----------
     kind, name
-        Kind of the instability, and the amplitude in which it is.
+        Kind of the instability, and the amplitude in which it is located.
     mode
         See `Record`.
     m
         Number of waves around a meridian; 0: the mode is one of the model itself.
     has_one_scene
-        Whether only amplitudes depend on the number.
+        Whether only amplitudes depend on p, so that one scene serves all values.
 
     Raises
     ------
@@ -161,6 +184,7 @@ class SceneFamily:
         value: float,
         value_range: tuple[float, float],
     ) -> None:
+        """Find out how scenes depend on the number, and whether they can share a scene or forms."""
         self.kind: Kind = "fold" if record.label == "fold" else "bifurcation"
         self.name, self.mode = record.amplitude, record.mode
         self.m = int(record.mode.removeprefix(WAVES)) if record.mode.startswith(WAVES) else 0
@@ -184,21 +208,27 @@ class SceneFamily:
             self._linear_amplitudes = self._find_linear_amplitudes(value, self._test_value)
 
     def _find_linear_amplitudes(self, a: float, b: float) -> _LinearAmplitudes | None:
-        """Return the amplitudes if they are linear between two values; else None."""
+        """Return the amplitudes if they are linear in p, else None.
+
+        Their values at the middle of `a` and `b` are compared with the means of those at the two
+        ends.
+        """
         low, middle, high = (self._amplitudes(p) for p in (a, (a + b) / 2, b))
         for name in low:
-            ends = low[name] + high[name]
+            sum_of_ends = low[name] + high[name]
             if not isclose(
-                2 * middle[name], ends, rel_tol=LINEARITY_TOLERANCE, abs_tol=TINY_AMPLITUDE
+                2 * middle[name], sum_of_ends, rel_tol=LINEARITY_TOLERANCE, abs_tol=TINY_AMPLITUDE
             ):
                 return None
         return _LinearAmplitudes(a, low, {name: (high[name] - low[name]) / (b - a) for name in low})
 
     def _choose_test_value(self, value: float) -> float:
-        """Return another value, to compare forces there.
+        """Return another value of p, at which forces are compared with those at `value`.
 
-        A term that is zero at the start, as a field may be, is in the scene of that value, which
-        then is the origin of all.
+        A term that is zero at the start, as a field may be, is missing in the first scene. If the
+        scene at another value has more amplitudes, it becomes the origin of the family, and the
+        record's state is transferred to it. There the new amplitudes are zero, but lambda_m is the
+        strength of the field.
         """
         low, high = self._range
         step = TEST_DISTANCE * (high - low)
@@ -206,6 +236,7 @@ class SceneFamily:
         names = self._origin.unloaded().mu.keys()
         scenes = {p: self._scene(p) for p in candidates}
         names_at = {p: scene.unloaded().mu.keys() for p, scene in scenes.items()}
+        # the scene with the most amplitudes
         test_value = max(candidates, key=lambda p: len(names_at[p]))
         new_names = names_at[test_value] - names
         if not names_at[test_value] > names:
@@ -223,12 +254,20 @@ class SceneFamily:
         return (value + test_value) / 2
 
     def _refuse_unfollowable(self, scene: Scene) -> None:
-        """Refuse an instability whose loads change along a boundary, or an excluded one."""
+        """Check that an instability can be followed along a boundary.
+
+        Raises
+        ------
+        ExcludedInstability
+            If the model excludes its mode.
+        CaseError
+            If the loads of earlier steps, or held conjugates, would change along the boundary.
+        """
         record, programme = self._record, scene.problem.programme
         if not (self.m and scene.model.axisymmetric):
             refuse_excluded_mode(record.mode)
         earlier_steps, step = programme[: record.step - 1], programme[record.step - 1]
-        if earlier_steps and any(how != "load" for how in step.load.hold.values()):
+        if earlier_steps and any(law != "load" for law in step.load.hold.values()):
             raise CaseError(
                 f"{step.key}.hold: a boundary needs what is held to be held from the start: give "
                 "one step"
@@ -243,7 +282,9 @@ class SceneFamily:
 
     @cached_property
     def start(self) -> tuple[State, Vector]:
-        """The instability in the unknowns of the family, and a null vector.
+        """State of the stage's system at the instability, and a null vector of its tangent.
+
+        The null vector is that of the waves where `m` is not zero. Collective.
 
         Raises
         ------
@@ -260,16 +301,19 @@ class SceneFamily:
 
     @property
     def excludes(self) -> bool:
-        """Whether there are waves around a meridian, which its model excludes."""
+        """Whether the model is a meridian, whose waves around it are excluded modes."""
         return self._base.scene.model.axisymmetric
 
     def kind_of(self, m: int, at: BoundaryPoint | None = None) -> Kind:
         """Return the kind of a boundary of m waves, or of the model's own mode (m = 0).
 
+        It is a fold where the load does work along the null vector.
+
         Parameters
         ----------
         at
-            A point near it; None: at the instability.
+            A point of the boundary near the place in question; None: the kind of the first
+            instability.
         """
         if m:
             return "bifurcation"
@@ -281,12 +325,17 @@ class SceneFamily:
         return "fold" if abs(phi @ load) > MIN_FOLD_WORK * work_scale else "bifurcation"
 
     def mode_at(self, crossing: BoundaryPoint, m: int, m_of_boundary: int) -> Vector:
-        """Return the mode that is neutral at a point of a boundary besides that of the boundary.
+        """Return the second neutral mode at a point where two boundaries cross.
 
         Parameters
         ----------
-        m, m_of_boundary
-            Numbers of waves of the mode, and of that of the boundary; 0: of the model itself.
+        crossing
+            Point of the boundary at which another mode is neutral as well.
+        m
+            Number of waves of the mode that is returned; 0: a mode of the model itself.
+        m_of_boundary
+            Number of waves of the boundary's mode; the mode that is returned is orthogonal to this
+            one where both have the same number.
 
         Raises
         ------
@@ -306,35 +355,50 @@ class SceneFamily:
     def null_vector(
         self, p: float, state: State, m: int, other_mode: Vector | None = None
     ) -> Vector:
-        """Return the mode of m waves at a state where these are neutral, nearly.
+        """Return a nearly neutral mode of m waves, of length one, by inverse iteration.
 
-        It is orthogonal to another mode, if one is given.
+        Parameters
+        ----------
+        p, state
+            Number, and state of the stage's system, at which waves are nearly neutral.
+        other_mode
+            Mode to which the result is orthogonal; None: no such mode.
         """
         factors = self.factored_tangent(p, state, m)
-        v = np.sin(1.0 + np.arange(factors.matrix.getLocalSize()[0]))
+        # a fixed start without symmetries, so that runs repeat
+        vector = np.sin(1.0 + np.arange(factors.matrix.getLocalSize()[0]))
         for _ in range(INVERSE_ITERATIONS):
-            v = factors.solve(v)
+            vector = factors.solve(vector)
             if other_mode is not None:
-                v = v - (other_mode @ v) / (other_mode @ other_mode) * other_mode
-            v /= np.linalg.norm(v)
-        return v
+                vector = vector - (other_mode @ vector) / (other_mode @ other_mode) * other_mode
+            vector /= np.linalg.norm(vector)
+        return vector
 
     def factored_tangent(self, p: float, state: State, m: int) -> Factorisation:
-        """Return the factors of the tangent of m waves, see `continuation.symmetry_breaking`."""
+        """Return the factors of the tangent of m waves at p and a state of the stage's system.
+
+        Part of the interface that `continuation.symmetry_breaking` needs.
+        """
         stage = self._stage_at(p)
         return _waves(stage).factor_at(stage.leave(state), m)
 
     def quadratic_form(self, p: float, state: State, m: int, v: Vector) -> float:
-        """Return v K v of the tangent of m waves, see `continuation.symmetry_breaking`."""
+        """Return v . K v, with the tangent K of m waves at p and a state of the stage's system.
+
+        Part of the interface that `continuation.symmetry_breaking` needs.
+        """
         return float(v @ self._times_tangent(self._stage_at(p), state, m, v))
 
     def counts(self, p: float, state: State) -> list[int]:
-        """Return numbers of unstable waves, see `continuation.symmetry_breaking`."""
+        """Return the number of unstable directions of each wave m = 1, 2, ... at p and a state.
+
+        Part of the interface that `continuation.symmetry_breaking` needs.
+        """
         stage = self._stage_at(p)
         return _waves(stage).counts(stage.leave(state))
 
     def _times_tangent(self, stage: Stage, state: State, m: int, v: Vector) -> Vector:
-        """Return the tangent of m waves times v."""
+        """Return K v, with the tangent K of m waves at a state of the stage's system."""
         K = _waves(stage).tangent(stage.leave(state), m)
         x, y = K.createVecs()
         x.setArray(v)
@@ -342,40 +406,54 @@ class SceneFamily:
         return np.array(y.array_r)
 
     def solver_at(self, p: float) -> BorderedNewton:
-        """Return the solver at a value."""
+        """Return the solver of the stage's system at p.
+
+        Raises
+        ------
+        NoSystem
+            If there is no scene at p.
+        """
         return self._stage_at(p).newton
 
     def _stage_at(self, p: float) -> Stage:
+        """Return the stage at p: the only one, or that of the scene at p."""
         return self._base if self.has_one_scene else self._stage(p)
 
     def amplitudes(self, p: float) -> dict[str, float]:
-        """Return the amplitudes besides that of the instability."""
+        """Return amplitude -> its value at p, for all but the amplitude of the instability."""
         return self._other_amplitudes(self._stage_at(p), p)
 
     @property
     def costly(self) -> bool:
-        """Whether each value has a scene of its own."""
+        """Whether each value of p has a scene of its own."""
         return not self.has_one_scene
 
     def difference_weights(self, p: float, *, low_order: bool = False) -> list[tuple[float, float]]:
-        """Return weights and values of a difference of second order, where values are allowed.
+        """Return pairs of weight and value of p for a difference quotient by p.
 
-        One of low order is of first order, with one scene besides that of p itself.
+        The derivative of a quantity by p is about the sum of weight times the quantity at the
+        value. It is of second order: central, or to one side with three values where p has no
+        problem on both sides.
+
+        Parameters
+        ----------
+        low_order
+            Whether to take a difference of first order, from p itself and one more value.
         """
-        d = DIFFERENCE_STEP * abs(self._range[1] - self._range[0])
-        central = [(0.5 / d, p + d), (-0.5 / d, p - d)]
+        step = DIFFERENCE_STEP * abs(self._range[1] - self._range[0])
+        central = [(0.5 / step, p + step), (-0.5 / step, p - step)]
         if self._linear_amplitudes:
             return central
         if low_order:
-            d = d if self._has_problem(p + d) else -d
-            return [(1 / d, p + d), (-1 / d, p)]
-        if self._has_problem(p - d) and self._has_problem(p + d):
+            step = step if self._has_problem(p + step) else -step
+            return [(1 / step, p + step), (-1 / step, p)]
+        if self._has_problem(p - step) and self._has_problem(p + step):
             return central
-        d = d if self._has_problem(p + 2 * d) else -d
-        return [(-1.5 / d, p), (2 / d, p + d), (-0.5 / d, p + 2 * d)]
+        step = step if self._has_problem(p + 2 * step) else -step
+        return [(-1.5 / step, p), (2 / step, p + step), (-0.5 / step, p + 2 * step)]
 
     def _has_problem(self, p: float) -> bool:
-        """Whether a value is allowed."""
+        """Return whether a value of p is allowed in the case."""
         try:
             self.problem(p)
         except NoSystem:
@@ -383,12 +461,12 @@ class SceneFamily:
         return True
 
     def problem(self, p: float) -> Problem:
-        """Return the problem at a value.
+        """Return the problem at p; the latest `MAX_PROBLEMS` are remembered.
 
         Raises
         ------
         NoSystem
-            If it is not allowed.
+            If p is not allowed in the case.
         """
         if p not in self._problems:
             try:
@@ -400,7 +478,7 @@ class SceneFamily:
         return self._problems[p]
 
     def _stage(self, p: float) -> Stage:
-        """Return the stage at a value; the latest ones are remembered."""
+        """Return the stage of the scene at p; the latest `MAX_STAGES` are remembered."""
         stage = self._stages.pop(p, None)
         if stage is None:
             scene = self._scene(p)
@@ -414,7 +492,13 @@ class SceneFamily:
         return stage
 
     def _scene(self, p: float) -> Scene:
-        """Return the scene at a value, on the mesh of the first one in its chart."""
+        """Return the scene at p, on the mesh of the first one in its chart; collective.
+
+        Raises
+        ------
+        NoSystem
+            If the model's symmetry or the mesh differs in kind, or there is no mesh.
+        """
         old, new = self._origin.problem, self.problem(p)
         symmetries = [(each.axisymmetric, each.mirror, each.azimuth) for each in (old, new)]
         if symmetries[0] != symmetries[1]:
@@ -430,14 +514,19 @@ class SceneFamily:
             raise NoSystem(f"there is no mesh: {e}") from None
 
     def _state_in(self, base: Scene, p: float) -> State:
-        """Return the record's state in the unknowns of the family, whose order may differ."""
+        """Return the record's state in the unknowns of another scene, with the amplitudes at p.
+
+        The order of unknowns on the ranks may differ between scenes of the family.
+        """
         state = self._record.point.state
         return State(transfer(self._origin, base, state.u), self._amplitudes(p))
 
     def _amplitudes(self, p: float) -> dict[str, float]:
-        """Return the amplitudes of the model at the instability, for another value.
+        """Return amplitude of the model -> its value at the instability, for the number p.
 
-        Those that the case gives are those of the problem at that value.
+        Loads that earlier steps have driven to their targets take the targets of the problem at p.
+        So do amplitudes that still have their initial values, and magnetic amplitudes scale with
+        the strength of the field.
         """
         if self._linear_amplitudes:
             return self._linear_amplitudes.at(p)
@@ -458,21 +547,24 @@ class SceneFamily:
             if name in new_values and value and mu.get(name) == value
         }
         if old.lambda_m and new.lambda_m != old.lambda_m:
-            ratio = new.lambda_m / old.lambda_m
+            strength_ratio = new.lambda_m / old.lambda_m
             mu |= {
-                name: ratio * value
+                name: strength_ratio * value
                 for name, value in mu.items()
                 if name.startswith("lambda_") and name != self.name
             }
         return mu
 
     def _depends_by_amplitudes_alone(self, value: float) -> bool:
-        """Whether the forces of another value are those of other amplitudes in the same scene.
+        """Return whether p enters the forces by amplitudes alone; collective.
+
+        Then the scene at `value` has, with the amplitudes at the test value, the same forces as the
+        scene at the test value.
 
         Raises
         ------
         NoInfluence
-            If they are the same.
+            If p does not change the forces.
         """
         p, comm = self._test_value, self._origin.model.system.comm
         forces = self._forces(self._base, value)
@@ -484,8 +576,10 @@ class SceneFamily:
         return max_abs(comm, forces_at_p - forces_by_amplitudes) <= FORCE_TOLERANCE * size
 
     def _share_forms(self, value: float) -> None:
-        """Take the forms of one scene for all values, if the forces of those that have a scene are
-        then the same.
+        """Let the scenes at all p share the forms of one meridian, if forces stay the same.
+
+        Forces at values that have a scene of their own are compared before and after, relative to
+        their change by p. If they differ, each value keeps a scene of its own.
         """
         shared_forms = SharedForms.of_scene(self._base.scene)
         if shared_forms is None:
@@ -505,9 +599,9 @@ class SceneFamily:
         self._shared_forms, self._stages = None, stages
 
     def _forces(self, stage: Stage, p: float) -> Vector:
-        """Return residual, load, and the tangent along the null vector at the instability.
+        """Return residual, load, and tangent times null vector, in one vector on this rank.
 
-        They are those of another scene, at another value.
+        They are those of a stage at p, at the displacement of the first instability.
         """
         system, (state, phi) = stage.newton.system, self.start
         mu = {**self._other_amplitudes(stage, p), self.name: state.mu[self.name]}
@@ -524,20 +618,29 @@ class SceneFamily:
         )
 
     def _other_amplitudes(self, stage: Stage, p: float) -> dict[str, float]:
-        """Return the amplitudes of a stage's system besides that of the instability."""
+        """Return the amplitudes of a stage's system at p, without that of the instability."""
         mu = stage.enter(State(self._first.point.state.u, self._amplitudes(p))).mu
         return {name: value for name, value in mu.items() if name != self.name}
 
 
 def _waves(stage: Stage) -> Waves:
-    """Return the waves that the meridian of a stage excludes."""
+    """Return the waves around the meridian of a stage, which its axisymmetric model excludes."""
     model = stage.scene.model
     assert model.axisymmetric
     return model.waves
 
 
 def problem_on_moved_mesh(scene: Scene, new: Problem) -> Problem:
-    """Return a problem on the mesh of a scene, which is stretched with the chart."""
+    """Return a problem on the mesh of a scene, which is stretched with the chart.
+
+    A meridian's vertices move linearly between knots, the parameters at which cells must end. The
+    nodes of a flat mesh move with the bounds of the chart.
+
+    Raises
+    ------
+    NoSystem
+        If the mesh cannot follow the change of the chart.
+    """
     on_mesh, old = problem_on_mesh_of(scene, new), scene.problem
     if scene.model.axisymmetric:
         assert old.meridian
@@ -555,8 +658,8 @@ def problem_on_moved_mesh(scene: Scene, new: Problem) -> Problem:
         old_bounds, new_bounds = chart_bounds(old.shape), chart_bounds(new.shape)
         if old_bounds is None or new_bounds is None or patch.nodes.shape[1] != 2:
             raise NoSystem("the mesh of this shape cannot move with the number")
-        low, size = old_bounds[0], old_bounds[1] - old_bounds[0]
+        old_low, old_size = old_bounds[0], old_bounds[1] - old_bounds[0]
         new_low, new_size = new_bounds[0], new_bounds[1] - new_bounds[0]
-        nodes = new_low + (patch.nodes - low) / size * new_size
+        nodes = new_low + (patch.nodes - old_low) / old_size * new_size
         return replace(on_mesh, shape=replace(patch, nodes=nodes), points=new.points)
     return on_mesh

@@ -28,17 +28,23 @@ FIELD_KEYS = {"magnetic": {"remanent"}, "shell": {"thickness_factor"}, "natural"
 
 @dataclass
 class SceneReuse:
-    """The latest scene, which serves the next problem if it can."""
+    """Keeper of the latest scene, which serves the next problem if it can.
+
+    Attributes
+    ----------
+    scene
+        The latest scene; None before the first one.
+    """
 
     scene: Scene | None = None
 
     def scene_for(self, problem: Problem, comm: MPI.Comm) -> Scene:
-        """Return the scene of a problem; collective.
+        """Return the scene of a problem, the latest one with new fields where possible; collective.
 
         Raises
         ------
         MeshError
-            If it cannot be made.
+            If the scene cannot be made.
         """
         scene, self.scene = self.scene, None
         if scene is None or not update_fields(scene, problem):
@@ -52,7 +58,9 @@ def update_fields(scene: Scene, problem: Problem) -> bool:
 
     Returns
     -------
-    Whether they are all that differs and the scene has them as fields; otherwise it stays as it is.
+    bool
+        Whether the problem differs in these alone and the scene has them as fields; if not, the
+        scene stays as it is.
 
     Raises
     ------
@@ -79,9 +87,9 @@ def update_fields(scene: Scene, problem: Problem) -> bool:
 
 
 def _data_without_fields(problem: Problem) -> dict[str, Any]:
-    """Return the data of a problem's case without the fields that a scene can take."""
+    """Return the data of a problem's case, key by key, without the fields that a scene can take."""
     return {
-        key: {name: v for name, v in section.items() if name not in FIELD_KEYS[key]}
+        key: {name: value for name, value in section.items() if name not in FIELD_KEYS[key]}
         if key in FIELD_KEYS
         else section
         for key, section in problem.document.data.items()
@@ -89,7 +97,7 @@ def _data_without_fields(problem: Problem) -> dict[str, Any]:
 
 
 def _fields(problem: Problem) -> tuple[bool | str | float, ...]:
-    """Return which fields the terms of a problem have."""
+    """Return which fields the terms of a problem have, to be compared with another problem."""
     magnetic, natural = problem.loads.magnetic, problem.loads.natural
     amplitudes = natural.amplitudes if natural else ()
     soft_scale = magnetic.soft.scale if magnetic and magnetic.soft else 0.0
@@ -98,17 +106,17 @@ def _fields(problem: Problem) -> tuple[bool | str | float, ...]:
 
 
 def _has_fields_by_patch(problem: Problem) -> bool:
-    """Whether a field is given by patches of a mesh."""
+    """Return whether a field of a problem is given by patches of a mesh."""
     magnetic, natural, thickness = problem.loads.magnetic, problem.loads.natural, problem.thickness
     has_natural_patches = natural is not None and any(
-        isinstance(v, Mapping) for v in (natural.curvature, natural.stretch)
+        isinstance(field, Mapping) for field in (natural.curvature, natural.stretch)
     )
     has_patches = (magnetic and magnetic.patches) or (thickness and thickness.patches)
     return has_natural_patches or bool(has_patches)
 
 
 def _set_fields(model: "ShellModel | MeridianModel", problem: Problem) -> None:
-    """Put the fields of a problem into the coefficients of a model."""
+    """Put the fields of a problem into the coefficients of a model; collective."""
     magnetic, natural, r0 = problem.loads.magnetic, problem.loads.natural, model.r0
     coefficients = {
         coefficient.name: coefficient

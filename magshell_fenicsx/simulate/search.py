@@ -45,17 +45,17 @@ FLATNESS_TOLERANCE = 1e-6
 
 
 def dented_states(scene: Scene, state: State) -> Iterator[State]:
-    """Yield dented copies of a state; collective.
+    """Yield dented copies of a state of the model, as guesses of snapped shapes; collective.
 
     There are none of flat shells. Of several shells each is dented alone, then all are.
     """
     system = scene.model.system
-    x = (scene.model.r0.x.array[: system.size] + state.u).reshape(-1, scene.model.V.dofmap.bs)
+    places = (scene.model.r0.x.array[: system.size] + state.u).reshape(-1, scene.model.V.dofmap.bs)
     h = scene.problem.material.h
-    shells = [CurvedShell.of_nodes(scene, x, is_own) for is_own in nodes_of_shells(scene)]
-    curved = [shell for shell in shells if shell.top > MIN_HEIGHT * h]
+    shells = [CurvedShell.of_nodes(scene, places, is_own) for is_own in nodes_of_shells(scene)]
+    curved_shells = [shell for shell in shells if shell.top > MIN_HEIGHT * h]
     for depth in DEPTHS:
-        dents = [shell.dent(depth, h) for shell in curved]
+        dents = [shell.dent(depth, h) for shell in curved_shells]
         for dent in [*dents, np.sum(dents, axis=0)] if len(dents) > 1 else dents:
             yield State(state.u + system.zero_at_supports(dent.ravel()), dict(state.mu))
 
@@ -67,13 +67,13 @@ class CurvedShell:
     Attributes
     ----------
     is_own
-        (n,) which nodes are its own.
+        (n,), whether a node of this rank belongs to the shell.
     normal
         Unit normal of the plane.
     height
-        (n,) heights of nodes along the normal.
+        (n,), heights of nodes along the normal, over R.
     top
-        The largest height.
+        The largest height of all ranks.
     """
 
     is_own: NDArray[np.bool_]
@@ -83,7 +83,17 @@ class CurvedShell:
 
     @classmethod
     def of_nodes(cls, scene: Scene, x: Array, is_own: NDArray[np.bool_]) -> "CurvedShell":
-        """Return the shell of some of this rank's nodes at places x (n, 2 or 3); collective."""
+        """Return the shell of some of this rank's nodes; collective.
+
+        Its normal points to the side on which most of it is.
+
+        Parameters
+        ----------
+        x
+            Places (n, 2 or 3) of this rank's nodes, over R.
+        is_own
+            (n,), whether a node belongs to the shell.
+        """
         comm = scene.model.system.comm
         normal, level = _plane(scene, x, is_own)
         height = x @ normal - level
@@ -94,33 +104,36 @@ class CurvedShell:
         return cls(is_own, normal, height, top)
 
     def dent(self, depth: float, h: float) -> Array:
-        """Return the displacement (n, 2 or 3) of a dent.
+        """Return the displacement (n, 2 or 3) of a dent: the top is mirrored in a plane below it.
 
         Parameters
         ----------
         depth
-            Its part of the shell's height.
+            Depth of the dent over the shell's height.
         h
             The thickness over R.
         """
         width = FOLD_WIDTH * np.sqrt(2 * h * depth * self.top)
         lowest_plane = min(SUPPORT_DISTANCE * width, self.top / 2)
         height_above = self.height - max((1 - depth) * self.top, lowest_plane)
-        dent = np.where(self.is_own, -2 * width * np.logaddexp(0.0, height_above / width), 0.0)
-        return np.outer(dent, self.normal)
+        # log(1 + exp) is a smooth max(0, height above the plane): the fold is rounded
+        displacement_along_normal = np.where(
+            self.is_own, -2 * width * np.logaddexp(0.0, height_above / width), 0.0
+        )
+        return np.outer(displacement_along_normal, self.normal)
 
 
 def _plane(scene: Scene, x: Array, is_own: NDArray[np.bool_]) -> tuple[Array, float]:
-    """Return the unit normal of the plane of the supports, and its height along it.
+    """Return the unit normal of the plane of the supports, and its height along it; collective.
 
-    Of a shell without supports it is the best plane.
+    For a shell without supports it is the best plane through the shell.
 
     Parameters
     ----------
     x
         Places (n, 2 or 3) of this rank's nodes.
     is_own
-        (n,) which are the shell's own.
+        (n,), whether a node belongs to the shell.
     """
     is_held = np.zeros(len(x), dtype=bool)
     for support in scene.model.supports.values():
@@ -128,23 +141,31 @@ def _plane(scene: Scene, x: Array, is_own: NDArray[np.bool_]) -> tuple[Array, fl
     is_held &= is_own
     if scene.model.axisymmetric:
         return np.array([0.0, 1.0]), float(x[is_held, 1].mean()) if is_held.any() else 0.0
-    level, spread = _moments(scene, x[is_held])
-    size, axes = np.linalg.eigh(spread)
+    centre, covariance = _moments(scene, x[is_held])
+    variances, axes = np.linalg.eigh(covariance)
     # on one line: the plane through it that is nearest to the shell
-    if size[1] <= FLATNESS_TOLERANCE * size[2]:
-        _, spread = _moments(scene, x[is_own])
-        direction = np.outer(axes[:, 2], axes[:, 2]) if size[2] > 0 else np.zeros((3, 3))
+    if variances[1] <= FLATNESS_TOLERANCE * variances[2]:
+        _, covariance = _moments(scene, x[is_own])
+        direction = np.outer(axes[:, 2], axes[:, 2]) if variances[2] > 0 else np.zeros((3, 3))
         projection = np.eye(3) - direction
-        size, axes = np.linalg.eigh(projection @ spread @ projection + direction * np.trace(spread))
+        variances, axes = np.linalg.eigh(
+            projection @ covariance @ projection + direction * np.trace(covariance)
+        )
     normal = np.where(np.abs(axes[:, 0]) < ROUNDING, 0.0, axes[:, 0])
+    # the largest component is positive
     normal /= np.linalg.norm(normal) * np.sign(normal[np.argmax(np.abs(normal))])
-    return normal, float(level @ normal)
+    return normal, float(centre @ normal)
 
 
 def _moments(scene: Scene, x: Array) -> tuple[Array, Array]:
-    """Return the mean (3,) and the covariance (3, 3) of places of all ranks.
+    """Return the mean (3,) and the covariance (3, 3) of places of all ranks; collective.
 
-    Of a half or a sector the images of the places are among them.
+    For a half or a sector the images of the places count too.
+
+    Parameters
+    ----------
+    x
+        Places (n, 3) of this rank.
     """
     comm, mirror = scene.model.system.comm, scene.problem.mirror
     if mirror:
@@ -157,7 +178,9 @@ def _moments(scene: Scene, x: Array) -> tuple[Array, Array]:
 def search_at_end_of_step(
     scene: Scene, step: ProgrammeStep, begin: State, end: State
 ) -> Iterator[Record]:
-    """Yield the solutions that the search of a step finds at its end, if the case requests one.
+    """Yield records of the solutions that the search of a step finds at its end; collective.
+
+    Without a search in the step there are none.
 
     Parameters
     ----------
@@ -206,47 +229,61 @@ def solutions(
         if isinstance(start, Record) and start.amplitude in state.mu
         else next(iter(state.mu))
     )
-    rest = scene.newton.solve(state, name, PrescribedLoad(name, state.mu[name]))
-    if not rest.converged:
-        raise Stopped(f"there is no equilibrium to start from near the given state: {rest.reason}")
+    outcome = scene.newton.solve(state, name, PrescribedLoad(name, state.mu[name]))
+    if not outcome.converged:
+        raise Stopped(
+            f"there is no equilibrium to start from near the given state: {outcome.reason}"
+        )
     search = SearchSection(solutions=most, guesses=guesses, stable=stable, seconds=seconds)
-    yield from _solutions(load_stage(scene), name, rest.state, search)
+    yield from _solutions(load_stage(scene), name, outcome.state, search)
 
 
 def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> Iterator[Record]:
-    """Yield the records of the solutions that a search finds from a state of the model."""
+    """Yield the records of the solutions that a search finds from a state of the model; collective.
+
+    Parameters
+    ----------
+    stage
+        Scene with the solver of the step.
+    name
+        Amplitude of the step.
+    search
+        Limits of the search.
+    """
     scene, start = stage.scene, time.perf_counter()
     dents = _Dents(stage, state)
 
     def is_over() -> bool:
+        """Return whether the time of the search is over, by the clock of rank 0; collective."""
         is_late = search.seconds is not None and time.perf_counter() - start > search.seconds
         return bool(scene.comm.bcast(is_late))
 
     path = stage.path(name, "load", StepOptions(1.0, 1.0, 1.0))
     guesses = [partial(dents.settled, number) for number in range(dents.count)]
     limits = SearchLimits(search.solutions, search.guesses, is_over)
-    excluded = scene.model.symmetry_breaking_modes
-    descend = dents.descended if search.stable else None
+    excluded_modes = scene.model.symmetry_breaking_modes
+    descend_to_stable = dents.descended if search.stable else None
     solutions_found = further_solutions(
-        path, stage.enter(state), guesses, limits, stage.displaced, descend, _rules(stage)
+        path, stage.enter(state), guesses, limits, stage.displaced, descend_to_stable, _rules(stage)
     )
     for number, solution in enumerate(solutions_found, 1):
         point = stage.point(solution)
-        unstable = sum(excluded.counts(point.state)) if excluded else 0
+        unstable = sum(excluded_modes.counts(point.state)) if excluded_modes else 0
         yield Record("solution", name, point, branch=number, excluded_pivots=unstable)
 
 
 def _rules(stage: Stage) -> AcceptanceRules:
-    """Return the rules for solutions.
+    """Return the rules by which a search accepts solutions.
 
-    They have penalties and cuts of their own, within the bound, and no shell passes through
-    another.
+    A solution has penalties and cuts of its own, within the bound, and no shell passes through
+    another on the way to it.
     """
     scene = stage.scene
     if not scene.model.shell_contacts:
         return AcceptanceRules()
 
     def with_fit_contact(state: State) -> State | None:
+        """Return a state of the stage with the contact settings it needs; None if it has them."""
         changed = with_own_contact(scene, stage.leave(state))
         return State(state.u, {**state.mu, **changed.mu}) if changed else None
 
@@ -254,7 +291,18 @@ def _rules(stage: Stage) -> AcceptanceRules:
 
 
 class _Dents:
-    """Dented shells that have settled, as states of a stage."""
+    """Dented shells that have settled, as states of a stage.
+
+    Parameters
+    ----------
+    state
+        State of the model that is dented.
+
+    Attributes
+    ----------
+    count
+        Number of dented shells.
+    """
 
     def __init__(self, stage: Stage, state: State) -> None:
         self._stage, self._state = stage, state
@@ -263,16 +311,23 @@ class _Dents:
 
     @cached_property
     def _settling(self) -> Settling:
+        """How dented shells settle in energy, without passing through each other."""
         scene = self._stage.scene
         return Settling(scene.model.system, scene.unloaded(), partial(passes, load_stage(scene)))
 
     def settled(self, number: int) -> State:
-        """Return a dented shell that has settled without shells that pass through each other."""
+        """Return a dented shell that has settled, as a state of the stage; collective.
+
+        Parameters
+        ----------
+        number
+            Number of the dented shell, from 0.
+        """
         guess = before_passing(load_stage(self._stage.scene), self._state, self._guesses[number])
         return self._stage.enter(self._settling.settled(guess))
 
     def descended(self, state: State) -> State:
-        """Return a state of the stage further down in energy.
+        """Return a state of the stage with less energy, reached from another one; collective.
 
         Amplitudes whose conjugates are held stay.
         """

@@ -56,7 +56,12 @@ DEVIATION_STEP = 1e-6  # for dr0/dp
 
 
 def fold_at(scene: Scene, record: Record) -> Fold:
-    """Return the fold of a record with the label "fold", with its null vector; collective.
+    """Return the fold at a record with the label "fold", with its null vector; collective.
+
+    Parameters
+    ----------
+    record
+        Row of the history of this scene.
 
     Raises
     ------
@@ -73,7 +78,10 @@ def fold_at(scene: Scene, record: Record) -> Fold:
 
 
 def stage_of_record(scene: Scene, record: Record) -> Stage:
-    """Return the stage of a record's step, which holds what the step holds."""
+    """Return the stage of a record's step: the scene with the solver of this step.
+
+    It holds the conjugates that the step holds, at the values of the record.
+    """
     if not record.step:
         return load_stage(scene)
     return stage_of_step(scene, scene.problem.programme[record.step - 1], record.point.state)
@@ -118,10 +126,16 @@ def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dic
 
 
 def _field_column(scene: Scene, state: State) -> dict[str, Vector]:
-    """Return the load column of lambda_m for a problem whose field is zero.
+    """Return "lambda_m" -> load column of a field whose strength is zero in the problem.
 
-    It is the slope of the magnetic energy in lambda_m. Empty without a section magnetic, and where
-    the field preserves less symmetry than the model has.
+    Collective. The column is the slope of the residual by lambda_m. Empty without a section
+    `magnetic`, with a field that is not zero, and where the field preserves less symmetry than the
+    model has.
+
+    Parameters
+    ----------
+    state
+        State of the stage's system.
     """
     problem = scene.problem
     if problem.context.section_of(MagneticSection) is None or "lambda_m" in state.mu:
@@ -141,7 +155,15 @@ def _field_column(scene: Scene, state: State) -> dict[str, Vector]:
 
 @dataclass(frozen=True)
 class _RemanenceWithin:
-    """A remanence in one patch, zero elsewhere."""
+    """A remanence in one patch, zero elsewhere.
+
+    Attributes
+    ----------
+    remanence
+        Vector (3,) over the largest flux density, or function of places and normals (n, 3).
+    patch
+        Function of places and normals that is 1 in the patch, and 0 elsewhere.
+    """
 
     remanence: Array | Pattern
     patch: WithinRims
@@ -152,7 +174,16 @@ class _RemanenceWithin:
 
 
 def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
-    """Return mu_i dPi_i/du of the magnetic terms, with the remanence of one patch only."""
+    """Return name of a sensitivity -> load column mu_i dPi_i/du of the remanence of one patch.
+
+    Pi_i is the magnetic energy, mu_i its amplitude. Empty without a remanence, of a soft material
+    alone, and where magnets interact. Collective.
+
+    Parameters
+    ----------
+    fold
+        Fold with a state of the model.
+    """
     field = scene.model.loads.magnetic
     if field is None or (field.soft and field.soft.alone) or scene.model.loads.interaction:
         return {}
@@ -171,41 +202,65 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
         return WithinRims(rims, unit_factor if patch == "rest" else 0 * unit_factor)
 
     patches = (*rims_by_patch, "rest")
-    alone = {patch: _RemanenceWithin(field.remanent, factor_of(patch)) for patch in patches}
+    field_of_patch = {
+        patch: _RemanenceWithin(field.remanent, factor_of(patch)) for patch in patches
+    }
     return {
         f"remanence {patch}": _magnetic_column(
             scene, fold.state, replace(field, remanent=remanence)
         )
-        for patch, remanence in alone.items()
+        for patch, remanence in field_of_patch.items()
     }
 
 
 def _remanence_columns_of_shells(
     scene: Scene, state: State, field: Magnetisation, patches: Mapping[str, Array | Pattern]
 ) -> dict[str, Vector]:
-    """Return the columns of `_remanence_columns` for each of several shells."""
+    """Return name of a sensitivity -> load column of the remanence of one of several shells.
+
+    Collective.
+
+    Parameters
+    ----------
+    patches
+        Shell -> its remanence.
+    """
     model = scene.model
     patches_of_cells: Mapping[str, NDArray[np.bool_]]
     if model.midsurface:
-        cells = model.midsurface.mesh.topology.index_map(2)
-        patches_of_cells, count = model.midsurface.patches, cells.size_local + cells.num_ghosts
+        cell_map = model.midsurface.mesh.topology.index_map(2)
+        patches_of_cells, cell_count = (
+            model.midsurface.patches,
+            cell_map.size_local + cell_map.num_ghosts,
+        )
     else:
         assert model.axisymmetric
-        patches_of_cells, count = model.meridian.patches, len(model.meridian.order)
+        patches_of_cells, cell_count = model.meridian.patches, len(model.meridian.order)
     without_field = dict.fromkeys(patches, np.zeros(3))
-    alone = {
+    field_of_shell = {
         name: replace(field, patches={**without_field, name: remanence}).on_cells(
-            patches_of_cells, count
+            patches_of_cells, cell_count
         )
         for name, remanence in patches.items()
     }
     return {
-        f"remanence {name}": _magnetic_column(scene, state, field) for name, field in alone.items()
+        f"remanence {name}": _magnetic_column(scene, state, field)
+        for name, field in field_of_shell.items()
     }
 
 
 def _magnetic_column(scene: Scene, state: State, field: Magnetisation) -> Vector:
-    """Return lambda_m dPi/du of a field; dPi/du where the problem has none."""
+    """Return the load column lambda_m dPi/du of a magnetised shell, zero at supports; collective.
+
+    Without an amplitude lambda_m in the state its factor is 1.
+
+    Parameters
+    ----------
+    state
+        State of the model.
+    field
+        Magnetisation, whose remanence replaces that of the model.
+    """
     model, system = scene.model, scene.model.system
     column, terms = fem.Function(model.V), magnetic_terms(scene, state, field)
 
@@ -222,9 +277,12 @@ def _magnetic_column(scene: Scene, state: State, field: Magnetisation) -> Vector
 
 
 def magnetic_terms(scene: Scene, state: State, field: Magnetisation) -> Sequence[FormTerm]:
-    """Return the model's terms of a remanence with another one, in the fields of a state.
+    """Return the magnetic terms of a model with another remanence, in the applied field of a state.
 
-    There are none of what is soft alone.
+    Parameters
+    ----------
+    field
+        Magnetisation with this remanence. A soft material alone has no terms.
     """
     terms, fields = _magnetic_terms_and_fields(scene, field)
     for applied in fields:
@@ -235,6 +293,10 @@ def magnetic_terms(scene: Scene, state: State, field: Magnetisation) -> Sequence
 def _magnetic_terms_and_fields(
     scene: Scene, field: Magnetisation
 ) -> tuple[Sequence[FormTerm], Sequence[AppliedField]]:
+    """Return the magnetic terms of a remanence, and the applied fields that they read.
+
+    A soft material alone has neither; beside a remanence it is left out.
+    """
     model, log, fields = scene.model, KernelLog(), list[AppliedField]()
     factory = replace(model.factory, log=log, fields=fields)
     if field.soft and field.soft.alone:
@@ -246,9 +308,9 @@ def _magnetic_terms_and_fields(
 
 
 def imperfection_sensitivities(stage: Stage, fold: Fold) -> dict[str, float]:
-    """Return derivatives by numbers of imperfections, angles in degrees; collective.
+    """Return derivatives of a fold's amplitude by numbers of imperfections; collective.
 
-    The keys of the numbers are those below `shell`.
+    The keys of the numbers are those below `shell`; angles are in degrees.
 
     A number of a rim that separates patches of a remanence or of a natural shape is left out: the
     mesh has no place for a rim that moves. What a half or a meridian excludes by symmetry is zero.
@@ -263,6 +325,16 @@ def imperfection_sensitivities(stage: Stage, fold: Fold) -> dict[str, float]:
 
 
 def _varies(problem: Problem, section: ImperfectionSection, name: str) -> bool:
+    """Return whether a number of an imperfection can vary on the mesh of the problem.
+
+    A rim between patches cannot move. A centre must be given by angles on a sphere, and not at the
+    pole.
+
+    Parameters
+    ----------
+    name
+        Number of the section, such as "width" or "at.polar".
+    """
     if section.patch and problem.patched and name != "amplitude":
         return False
     if not name.startswith("at."):
@@ -273,6 +345,16 @@ def _varies(problem: Problem, section: ImperfectionSection, name: str) -> bool:
 
 
 def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
+    """Return the derivative of a fold's amplitude by one number of an imperfection; collective.
+
+    The deviation changes along dw0/dp, by two nested central differences: `tiny` for dw0/dp, `step`
+    for the residual.
+
+    Parameters
+    ----------
+    key, name
+        Key of the imperfection, such as "imperfections.0", and its number, such as "at.polar".
+    """
     scene = stage.scene
     if scene.problem.axisymmetric and name.startswith("at."):
         return 0.0
@@ -280,11 +362,14 @@ def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
     unit = _unit(problem, key, name)
     step, tiny = RESIDUAL_STEP * unit, DEVIATION_STEP * unit
     forward, backward = (
-        _deviation(scene, with_changed_number(problem.imperfections, key, name, c), key)
-        for c in (tiny, -tiny)
+        _deviation(
+            scene, with_changed_number(problem.imperfections, key, name, change_of_number), key
+        )
+        for change_of_number in (tiny, -tiny)
     )
 
     def load_change(change: float) -> float:
+        """Return the change of the fold's amplitude for a change of the number, to first order."""
         difference = DeviationDifference(forward, backward, change / (2 * tiny))
         return _load_change(stage, fold, with_deviation(scene, difference))
 
@@ -292,20 +377,27 @@ def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
     factors = [
         fold.state.mu[amplitude] for amplitude, keys in keys_of_amplitudes.items() if key in keys
     ]
+    # where the imperfection grows in a step, its amplitude multiplies the deviation
     return (factors or [1.0])[0] * (load_change(step) - load_change(-step)) / (2 * step)
 
 
 def _load_change(stage: Stage, fold: Fold, other: Scene) -> float:
     """Return -(left . R)/(left . R_mu) of a fold's state in a scene with a slightly other shell.
 
-    Both scenes have the same mesh. What touches there is what touches in the state, see
-    `expand_contact`.
+    It is the change of the fold's amplitude to first order, with the left null vector and the
+    residual R. Places in contact are those of the fold's state, see `expand_contact`. Collective.
+
+    Parameters
+    ----------
+    other
+        Scene of the other shell on the same mesh.
     """
     scene, size = stage.scene, stage.scene.model.system.size
     assert same_mesh(scene, other)
     u, left_null_vector = (
-        np.concatenate([transfer(scene, other, v[:size]), v[size:]])
-        for v in (fold.state.u, fold.left_null_vector)
+        # unknown amplitudes of a device follow the displacement
+        np.concatenate([transfer(scene, other, vector[:size]), vector[size:]])
+        for vector in (fold.state.u, fold.left_null_vector)
     )
     expand_contact(scene, other, stage.leave(fold.state))
     system = stage.on_scene(other).newton.system
@@ -314,9 +406,10 @@ def _load_change(stage: Stage, fold: Fold, other: Scene) -> float:
 
 
 def expand_contact(scene: Scene, other: Scene, state: State) -> None:
-    """Expand the penalties of contact in another scene into polynomials about a state of the first.
+    """Expand all contact in another scene into polynomials about a state of the first scene.
 
-    Both scenes have the same mesh.
+    Places in contact then stay, so that differences of residuals are smooth. Both scenes have the
+    same mesh. Collective.
     """
     expand_shell_contact(scene, other, state)
     evaluation = scene.model.system.at_state(state)
@@ -329,15 +422,16 @@ def expand_contact(scene: Scene, other: Scene, state: State) -> None:
 def expand_shell_contact(scene: Scene, other: Scene, state: State) -> None:
     """Expand contact between shells in another scene into polynomials about a state of the first.
 
-    Both scenes have the same mesh.
+    Both scenes have the same mesh. Where the first scene holds an expansion, the other one takes
+    it. Collective.
     """
     assert np.array_equal(scene.model.V.dofmap.list, other.model.V.dofmap.list), (
         "contact is given by numbers of cells"
     )
     evaluation = scene.model.system.at_state(state)
-    of_one: Sequence[Any] = scene.model.shell_contacts
-    of_other: Sequence[Any] = other.model.shell_contacts
-    for shell_contact, other_contact in zip(of_one, of_other, strict=True):
+    contacts: Sequence[Any] = scene.model.shell_contacts
+    other_contacts: Sequence[Any] = other.model.shell_contacts
+    for shell_contact, other_contact in zip(contacts, other_contacts, strict=True):
         if shell_contact.held:
             other_contact.hold(shell_contact.held)
         else:
@@ -345,19 +439,30 @@ def expand_shell_contact(scene: Scene, other: Scene, state: State) -> None:
 
 
 def member_shell_sensitivities(stage: Stage, fold: Fold) -> dict[str, float]:
-    """Return derivatives by numbers of imperfections of several shells, by key; collective."""
+    """Return key -> derivative of a fold's amplitude by a number of an imperfection; collective.
+
+    The imperfections are those of several shells, each of which has its own section in the case.
+    """
     context, derivatives = stage.scene.problem.context, dict[str, float]()
     for name, member in (context.sections.get("shells") or {}).items():
-        for i, section in enumerate(member.shell.imperfections):
+        for index, section in enumerate(member.shell.imperfections):
             for number in section.parameters:
-                key = f"shells.{name}.shell.imperfections.{i}.{number}"
+                key = f"shells.{name}.shell.imperfections.{index}.{number}"
                 if not number.startswith("at."):
                     derivatives[key] = _derivative_by_number(stage, fold, key)
     return derivatives
 
 
 def _derivative_by_number(stage: Stage, fold: Fold, key: str) -> float:
-    """Return the derivative by a number of the case, as a central difference of the residual."""
+    """Return the derivative of a fold's amplitude by a number of the case; collective.
+
+    It is a central difference of residuals, with a scene for each of two values.
+
+    Parameters
+    ----------
+    key
+        Key of the number in the case, as in "shells.upper.shell.imperfections.0.amplitude".
+    """
     scene, context = stage.scene, stage.scene.problem.context
     value, step = number_at_key(context, key), RESIDUAL_STEP * scale_at_key(context, key)
     forward, backward = (
@@ -368,6 +473,10 @@ def _derivative_by_number(stage: Stage, fold: Fold, key: str) -> float:
 
 
 def _unit(problem: Problem, key: str, name: str) -> float:
+    """Return the scale of a number of an imperfection, over which differences take their steps.
+
+    It is the width itself, the half-width in degrees of an angle, and 1 (over h) of a depth.
+    """
     section, shell = problem.imperfections[key], problem.context.shell
     if name == "width":
         return float(getattr(section, name))
@@ -380,47 +489,78 @@ def _unit(problem: Problem, key: str, name: str) -> float:
 def with_changed_number(
     sections: Imperfections, key: str, name: str, change: float
 ) -> Imperfections:
-    """Return imperfections with one changed number, such as "at.polar" of "imperfections.0"."""
+    """Return imperfections with one number that differs by `change`.
+
+    Parameters
+    ----------
+    key, name
+        Key of the imperfection, such as "imperfections.0", and its number, such as "at.polar".
+    """
     return {**sections, key: _changed(sections[key], name, change)}
 
 
 def _changed(part: Any, path: str, change: float) -> Any:
-    """Return a number, or a section or a list with another number somewhere in it."""
+    """Return a section, a list or a number with a changed number in it.
+
+    Parameters
+    ----------
+    path
+        Keys and indices to the number, joined by dots; "": the part is the number itself.
+    """
     if not path:
         return part + change
-    first, _, rest = path.partition(".")
+    key, _, remaining_path = path.partition(".")
     if isinstance(part, list):
         return [
-            _changed(item, rest, change) if i == int(first) else item for i, item in enumerate(part)
+            _changed(item, remaining_path, change) if i == int(key) else item
+            for i, item in enumerate(part)
         ]
-    return part.model_copy(update={first: _changed(getattr(part, first), rest, change)})
+    return part.model_copy(update={key: _changed(getattr(part, key), remaining_path, change)})
 
 
 @dataclass(frozen=True)
 class DeviationDifference:
-    """A deviation along the derivative of another one, by the difference of two of its values."""
+    """A deviation along the derivative of another one, by the difference of two of its values.
+
+    Attributes
+    ----------
+    forward, backward
+        The other deviation for two values of its number.
+    factor
+        What multiplies their difference.
+    """
 
     forward: Deviation
     backward: Deviation
     factor: float
 
     def __call__(self, places: Array) -> Array:
+        """Return the deviation w0 (n,) at places (n, 3)."""
         return np.asarray(self.factor * (self.forward(places) - self.backward(places)))
 
 
 @dataclass(frozen=True)
 class _MirroredDeviation:
-    """The mean of a deviation and its image: its part that half of a shell has."""
+    """The mean of a deviation and its mirror image: the part that half of a shell has."""
 
     deviation: Deviation
     mirror: Mirror
 
     def __call__(self, places: Array) -> Array:
+        """Return the deviation w0 (n,) at places (n, 3)."""
         return np.asarray((self.deviation(places) + self.deviation(self.mirror.image(places))) / 2)
 
 
 def _deviation(scene: Scene, sections: Imperfections, key: str) -> Deviation:
-    """Return the deviation of one of some imperfections, in the frame of the scene's model."""
+    """Return the deviation of one imperfection, in the frame of the scene's model.
+
+    With a mirror plane it is symmetric about this plane.
+
+    Parameters
+    ----------
+    sections, key
+        All imperfections, and the key of the one in question.
+    """
     problem, number = scene.problem, list(sections).index(key)
     # by number: the geometries have random dimples one by one
     geometries = imperfection_geometries(sections, reference_shell_of(problem.context.shell))
@@ -432,10 +572,11 @@ def _deviation(scene: Scene, sections: Imperfections, key: str) -> Deviation:
 
 
 def with_deviation(scene: Scene, deviation: Deviation) -> Scene:
-    """Return the scene on the same mesh in the chart, with one more deviation."""
+    """Return the scene on the same mesh in the chart, with one more deviation; collective."""
     problem, model = scene.problem, scene.model
 
     def deviated(embedding: object) -> DeviatedEmbedding:
+        """Return an embedding with the further deviation."""
         assert isinstance(embedding, DeviatedEmbedding)
         return replace(embedding, deviations=(*embedding.deviations, deviation))
 

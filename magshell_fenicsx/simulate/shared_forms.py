@@ -20,16 +20,16 @@ Numbers = dict[str, list[Array]]  # name of a term -> its numbers
 
 @dataclass
 class _NumbersOfForms:
-    """The numbers in the forms of a model, by a value of what they depend on.
+    """The numbers in the forms of a model, by a value p of what they depend on.
 
-    A `SettableNumber`: setting its `value` puts the numbers for this value in place.
+    A `SettableNumber`: setting its `value` puts the numbers for this p in place.
 
     Attributes
     ----------
     places
-        The arrays of the model that its forms read.
+        Name of a term -> the arrays of the model that its forms read.
     for_values
-        Value -> the numbers for it.
+        p -> the numbers for p, in the order of `places`.
     """
 
     places: Numbers
@@ -38,6 +38,7 @@ class _NumbersOfForms:
 
     @property
     def value(self) -> float:
+        """The p whose numbers are in place."""
         return self._value
 
     @value.setter
@@ -51,14 +52,16 @@ class _NumbersOfForms:
 
 
 class SharedForms:
-    """Forms of one scene that others share; it must not be evaluated until these `leave` it.
+    """Forms of one meridian that scenes for several values p of a number share.
+
+    The scene that has made them must not be evaluated until the others `leave` them.
 
     Parameters
     ----------
-    model
-        The model of the scene.
+    scene, model
+        The scene, and its model.
     places
-        The arrays of the model's `numbers`.
+        Name of a term -> the arrays of the model that its forms read.
     """
 
     def __init__(self, scene: Scene, model: MeridianModel, places: Numbers) -> None:
@@ -67,7 +70,7 @@ class SharedForms:
 
     @staticmethod
     def of_scene(scene: Scene) -> "SharedForms | None":
-        """Return the forms of a scene; None if cases do not differ in numbers alone."""
+        """Return the forms of a scene; None if other cases would differ in more than numbers."""
         model = scene.model
         if not model.axisymmetric:
             return None
@@ -75,9 +78,14 @@ class SharedForms:
         return SharedForms(scene, model, places) if places else None
 
     def scene_at(self, value: float, problem: Problem) -> Scene | None:
-        """Return the scene of a problem at a value of what varies.
+        """Return the scene of a problem on the shared forms; None if these do not fit.
 
-        None if its numbers are not in the same places.
+        They fit if the numbers of the problem's model have the same shapes.
+
+        Parameters
+        ----------
+        value
+            The p of the problem.
         """
         model = build_meridian_model(problem, assembled=False)
         numbers, places = model.numbers(), self._numbers.places
@@ -88,13 +96,21 @@ class SharedForms:
         return self._scene.with_model(problem, shared_model)
 
     def leave(self) -> None:
-        """Let the scene have its own numbers again."""
+        """Put the numbers of the first scene in place again."""
         self._numbers.value = np.inf
 
 
 def _shapes(numbers: Numbers) -> list[tuple[str, list[tuple[int, ...]]]]:
-    return [(name, [np.shape(number) for number in of_term]) for name, of_term in numbers.items()]
+    """Return the shapes of the numbers of each term, by name."""
+    return [
+        (name, [np.shape(number) for number in numbers_of_term])
+        for name, numbers_of_term in numbers.items()
+    ]
 
 
 def _copied(numbers: Numbers) -> Numbers:
-    return {name: [np.array(number) for number in of_term] for name, of_term in numbers.items()}
+    """Return a copy of the numbers of all terms."""
+    return {
+        name: [np.array(number) for number in numbers_of_term]
+        for name, numbers_of_term in numbers.items()
+    }

@@ -30,12 +30,20 @@ SHORTEST = 1e-5  # step, over the first
 
 @dataclass(frozen=True)
 class Stage:
-    """A scene with a solver of its system, or of a substitute system for a step.
+    """A scene with the solver of one step of its programme.
+
+    The step's system may have further unknowns, or one amplitude that stands for several; states
+    are translated between this system and the model.
 
     Attributes
     ----------
+    scene
+        The model of a problem.
+    newton
+        Solver of the step's system.
     device
-        Prescribes the conjugates of some amplitudes; None if all are loads.
+        Prescribes the conjugates of some amplitudes, which are then unknowns; None if all
+        amplitudes are loads.
     parametrised
         Varies several amplitudes together; None if the step varies one amplitude of the model.
     """
@@ -61,7 +69,13 @@ class Stage:
         return replace(point, state=self.leave(point.state), du=self.displacement(point.du))
 
     def on_scene(self, scene: Scene) -> "Stage":
-        """Return the stage of the same step on another scene, with the same held values."""
+        """Return the stage of the same step on another scene, with the same held values.
+
+        Parameters
+        ----------
+        scene
+            Scene whose model has the same amplitudes.
+        """
         system: System = scene.model.system
         device = self.device.for_system(system) if self.device else None
         parametrised = self.parametrised.for_system(device or system) if self.parametrised else None
@@ -73,7 +87,7 @@ class Stage:
         return self.device.padded(u) if self.device else u
 
     def displaced(self, x: Vector) -> Vector:
-        """Return a vector of the step's system with displacements alone.
+        """Return a vector of the step's system with its displacements alone.
 
         It has zeros for the unknown amplitudes and at supports.
         """
@@ -81,11 +95,22 @@ class Stage:
         return self.padded(zero_at_supports(self.displacement(x)))
 
     def displacement(self, x: Vector) -> Vector:
-        """Return the model's displacement of a vector of the step's system."""
+        """Return the displacement of the model in a vector of the step's system."""
         return self.device.displacement(x) if self.device else x
 
     def path(self, name: str, control: Control, options: StepOptions, scale: float = 1.0) -> Path:
         """Return a path of the step's system.
+
+        Parameters
+        ----------
+        name
+            The amplitude that varies.
+        control
+            What is prescribed: "load", "conjugate" or "arc" (the arc length).
+        options
+            Lengths of steps.
+        scale
+            See `Path`.
 
         Raises
         ------
@@ -107,17 +132,17 @@ class Stage:
 
         Parameters
         ----------
+        name, control, scale
+            See `path`.
         first
             About the change of the amplitude in the first step.
-        scale
-            See `Path`.
         """
         return self.resume(name, control, self.enter(state), first, scale)
 
     def resume(
         self, name: str, control: Control, state: State, first: float, scale: float = 1.0
     ) -> tuple[Path, Point]:
-        """Return a path as `begin` does, from a state of the step's system."""
+        """Return a path and its first point as `begin` does, from a state of the step's system."""
         path = self.path(name, control, StepOptions(1.0, 1.0, 1.0), abs(scale))
         start = path.start(state, first)
         step = abs(first / start.dmu)
@@ -126,7 +151,13 @@ class Stage:
 
 
 def _refuse_open(scene: Scene, name: str) -> None:
-    """Refuse to prescribe the volume where a free edge leaves the pressure without a potential."""
+    """Check that the pressure has a potential, where a volume is to be held or prescribed.
+
+    Raises
+    ------
+    Stopped
+        If the pressure follows a free edge, and so has no potential.
+    """
     if name == "pressure" and (open_at := scene.model.without_potential):
         raise Stopped(
             "a volume cannot be held or prescribed: a pressure that follows the free edge "
@@ -135,7 +166,7 @@ def _refuse_open(scene: Scene, name: str) -> None:
 
 
 def load_stage(scene: Scene) -> Stage:
-    """Return a stage in which all other amplitudes are loads."""
+    """Return a stage in which all amplitudes are loads."""
     return Stage(scene, scene.newton)
 
 
@@ -145,14 +176,14 @@ def make_stage(
     held_conjugates: Mapping[str, HeldConjugate] | None = None,
     curves: tuple[str, Mapping[str, Curve], float] | None = None,
 ) -> Stage:
-    """Return the stage of a step.
+    """Return the stage of a step; collective.
 
     Parameters
     ----------
     state
-        A state in equilibrium.
+        A state of the model in equilibrium.
     held_conjugates
-        Amplitude -> its conjugate, see `Device`.
+        Amplitude that becomes unknown -> its conjugate, see `Device`.
     curves
         Name of an amplitude, the amplitudes that are functions of it, and its value at the state.
 

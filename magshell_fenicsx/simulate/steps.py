@@ -31,7 +31,17 @@ from magshell_fenicsx.simulate.symmetry_switch import (
 
 
 def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
-    """Yield the records of a step; the return value is the state at its end.
+    """Yield the records of a step of the programme; collective.
+
+    Parameters
+    ----------
+    state
+        State of the model where the step begins.
+
+    Returns
+    -------
+    State
+        State of the model at its end (the generator's return value).
 
     Raises
     ------
@@ -71,6 +81,7 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
             first_instability = record
         yield replace(record, label=course.label) if course.label and not is_located else record
         if is_located and course.forbidden and not forbidden:
+            # words for an instability that the step does not allow, or ""
             forbidden = course.forbidden(record.point.state.mu, record.mode or record.label)
         if forbidden and course.at_once:
             raise Stopped(forbidden)
@@ -87,12 +98,20 @@ def _within_support_limits(
 ) -> tuple[Drive, str]:
     """Return a drive that ends before supports hold shells in each other, and why it ends there.
 
-    The reason is empty if it goes on to its own end.
+    Parameters
+    ----------
+    drive
+        How the step drives its amplitude.
+
+    Returns
+    -------
+    drive, reason
+        The drive with its targets within the limit; "" as the reason where nothing limits it.
 
     Raises
     ------
     Stopped
-        If it has no target before that.
+        If no target is within the limit.
     """
     if drive.end is None or drive.quantity != "load":
         return drive, ""
@@ -111,7 +130,7 @@ def _within_support_limits(
 
 
 def _with_step_options(scene: Scene, path: Path, course: StepCourse, drive: Drive) -> Path:
-    """Return a path with lengths of steps for its course and for contact between shells."""
+    """Return a path with lengths of steps that suit its course, and contact between shells."""
     if drive.step is not None:
         path = path.with_step_options(StepOptions(drive.step, 2 * drive.step, 1e-4 * drive.step))
     if course.finer:
@@ -122,10 +141,15 @@ def _with_step_options(scene: Scene, path: Path, course: StepCourse, drive: Driv
 
 
 def follow_branch_of_step(scene: Scene, step: ProgrammeStep, bifurcation: Record) -> Records:
-    """Yield the records of the branch at the bifurcation that ends a step.
+    """Yield the records of the branch at the bifurcation that ends a step; collective.
 
-    It goes to the step's target, or for its `points` steps. The model is the smallest that has the
-    mode, and so is that of the state at the end, the return value.
+    It goes to the step's target, or for its `points` steps, in the smallest model that has the
+    mode.
+
+    Returns
+    -------
+    State
+        State of this model at the end (the generator's return value).
 
     Raises
     ------
@@ -144,13 +168,13 @@ def follow_branch_of_step(scene: Scene, step: ProgrammeStep, bifurcation: Record
 def symmetry_switch_of_step(
     scene: Scene, step: ProgrammeStep, bifurcation: Record
 ) -> SymmetrySwitch:
-    """Return the bifurcation that ends a step, in the model that has its mode."""
+    """Return the bifurcation that ends a step, in the smallest model with its mode; collective."""
     scale = abs(_drive(scene, step, bifurcation.point.state).scale)
     return switch_symmetry(stage_of_step(scene, step, bifurcation.point.state), bifurcation, scale)
 
 
 def leaves_path(step: ProgrammeStep) -> bool:
-    """Return whether what follows the bifurcation at a step's end is a branch or a snap."""
+    """Return whether a step leaves its path at its bifurcation, for a branch or a snap."""
     return step.until == "bifurcation" and (
         step.load.follows_branch or step.load.released_by is not None
     )
@@ -162,18 +186,29 @@ def is_symmetry_breaking(record: Record) -> bool:
 
 
 def _at_held_conjugate(scene: Scene, step: ProgrammeStep, state: State, drive: Drive) -> Records:
-    """Yield the records to the first instability of a shell whose conjugate the step drives.
+    """Yield the records to the first instability, where the step drives a held conjugate.
 
-    The load itself is not driven.
+    The conjugate of the step's load varies as an amplitude of its own, and the load is unknown.
+
+    Parameters
+    ----------
+    drive
+        How the step drives its amplitude.
+
+    Returns
+    -------
+    State
+        State of the model at the end (the generator's return value).
     """
     held_conjugates, name = held_conjugates_of_step(scene, step, state), step.name
     q = -scene.model.system.potential(state.u, state.mu, name)
-    others = {key: conjugate for key, conjugate in held_conjugates.items() if key != name}
-    path_of_load, _ = make_stage(scene, state, others).begin(
+    # conjugates besides that of the step's own load
+    other_conjugates = {key: conjugate for key, conjugate in held_conjugates.items() if key != name}
+    path_of_load, _ = make_stage(scene, state, other_conjugates).begin(
         name, "arc", state, drive.first, drive.scale
     )
     conjugate_name = f"conjugate of {name}"
-    stage = make_stage(scene, state, {**others, name: conjugate_name})
+    stage = make_stage(scene, state, {**other_conjugates, name: conjugate_name})
     start_state = State(state.u, state.mu | {conjugate_name: q})
     path, start = stage.begin(conjugate_name, "arc", start_state, drive.first)
     path = path.with_step_options(path_of_load.options)
@@ -185,7 +220,7 @@ def _at_held_conjugate(scene: Scene, step: ProgrammeStep, state: State, drive: D
 
 
 def stage_of_step(scene: Scene, step: ProgrammeStep, state: State) -> Stage:
-    """Return the stage of a step, from any state of it."""
+    """Return the stage of a step, a scene with its solver, from any state of the step."""
     curves = step.load.curves(_step_start(scene, step, state))
     held_conjugates = held_conjugates_of_step(scene, step, state)
     return make_stage(scene, state, held_conjugates, curves and (step.name, *curves))
@@ -194,18 +229,27 @@ def stage_of_step(scene: Scene, step: ProgrammeStep, state: State) -> Stage:
 def held_conjugates_of_step(
     scene: Scene, step: ProgrammeStep, state: State
 ) -> dict[str, float | Conjugate]:
-    """Return amplitude -> its conjugate that a step holds, with the values of a state."""
+    """Return amplitude -> its conjugate that a step holds, at the value of a state.
+
+    The conjugate of a gas is a function of the amplitude; others are numbers, -dPi/dmu.
+    """
     held_conjugates = dict[str, float | Conjugate]()
-    for name, how in step.load.hold.items():
-        if isinstance(how, Gas):
-            held_conjugates[name] = enclosed_gas(scene, how.gas, state).law()
-        elif how == "conjugate":
+    for name, law in step.load.hold.items():
+        if isinstance(law, Gas):
+            held_conjugates[name] = enclosed_gas(scene, law.gas, state).law()
+        elif law == "conjugate":
             held_conjugates[name] = -scene.model.system.potential(state.u, state.mu, name)
     return held_conjugates
 
 
 def enclosed_gas(scene: Scene, section: GasSection, state: State) -> EnclosedGas:
-    """Return the gas that is closed in at an equilibrium."""
+    """Return the gas that is enclosed at a state in equilibrium.
+
+    Parameters
+    ----------
+    section
+        The section of the gas in the case.
+    """
     problem, system, unit = scene.problem, scene.model.system, scene.conjugate_unit("pressure")
     q = -system.potential(state.u, state.mu, "pressure")
     shell, p_c = problem.context.shell, problem.material.classical_pressure
@@ -213,15 +257,16 @@ def enclosed_gas(scene: Scene, section: GasSection, state: State) -> EnclosedGas
 
 
 def _drive(scene: Scene, step: ProgrammeStep, state: State) -> Drive:
-    """Return how a step drives its amplitude from a state."""
+    """Return how a step drives its amplitude, if it begins at a state."""
     return step.load.course(_step_start(scene, step, state)).drive
 
 
 def _step_start(scene: Scene, step: ProgrammeStep, state: State) -> StepStart:
-    """Return the begin of a step at a state, in the model's terms."""
+    """Return the begin of a step at a state, with what a load reads of model and problem."""
     model, problem = scene.model, scene.problem
 
     def potential(name: str) -> float:
+        """Return dPi/dmu of an amplitude at the state."""
         return model.system.potential(state.u, state.mu, name)
 
     return StepStart(

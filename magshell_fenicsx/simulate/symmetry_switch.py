@@ -51,12 +51,12 @@ PLANE_TOLERANCE = 1e-9  # over R: distance of a place in a mirror plane
 
 @dataclass(frozen=True)
 class SymmetrySwitch:
-    """A bifurcation in the model that has its mode.
+    """A bifurcation in the model that has its mode, from which the branch can be followed.
 
     Attributes
     ----------
     stage
-        The stage of the step there.
+        The larger scene with the solver of the step.
     path
         A path by arc length, in the amplitude of the step.
     point
@@ -80,7 +80,13 @@ class SymmetrySwitch:
         return self.stage.scene
 
     def record(self, number: int) -> Record:
-        """Return the point in the model's own amplitudes and displacements."""
+        """Return the record of the bifurcation, in the model's own amplitudes and displacements.
+
+        Parameters
+        ----------
+        number
+            Number of the branch, see `Record.branch`.
+        """
         point = self.stage.point(self.point)
         state = self.scene.model.system.advance(point.state, point.state.mu)
         return Record(
@@ -100,7 +106,9 @@ def switch_symmetry(stage: Stage, bifurcation: Record, scale: float) -> Symmetry
     Parameters
     ----------
     stage
-        The stage of the step that has found it.
+        The scene that has found the bifurcation, with the solver of the step.
+    bifurcation
+        Its record.
     scale
         See `continuation.path.Path`.
 
@@ -112,23 +120,24 @@ def switch_symmetry(stage: Stage, bifurcation: Record, scale: float) -> Symmetry
     stage.scene.progress.doing("handing over to the model that has the mode")
     if bifurcation.mode in OWN_MODES:
         return _switch_in_same_model(stage, bifurcation, scale)
-    new = model_with_mode(stage.scene, bifurcation.mode)
-    new_stage = stage.on_scene(new)
+    new_scene = model_with_mode(stage.scene, bifurcation.mode)
+    new_stage = stage.on_scene(new_scene)
     try:
         mode = ShellModes(stage.scene.model).null_vector(bifurcation.point.state, bifurcation.mode)
     except ModesNotFound as e:
         raise Stopped(
             f"the mode of the bifurcation ({bifurcation.mode}) is not found: {e}"
         ) from None
-    u, phi = _carried_over(stage.scene, new, bifurcation, mode)
-    mu = {**new.unloaded().mu, **bifurcation.point.state.mu}
+    u, phi = _carried_over(stage.scene, new_scene, bifurcation, mode)
+    mu = {**new_scene.unloaded().mu, **bifurcation.point.state.mu}
     path = _arc_length_path(new_stage, bifurcation.amplitude, scale)
     located: Point | State | str = _settled_contact(new_stage, path, State(u, mu), phi)
     if isinstance(located, State):
         located = path.recorded(partial(_located, new_stage, path, located, phi))
     if isinstance(located, str):
         raise Stopped(
-            f"the bifurcation ({bifurcation.mode}) is not found in the {new.problem.included[0]}: "
+            f"the bifurcation ({bifurcation.mode}) is not found in the "
+            f"{new_scene.problem.included[0]}: "
             f"{located}"
         )
     switch = SymmetrySwitch(new_stage, path, located, unstable=bifurcation.excluded_pivots)
@@ -136,7 +145,18 @@ def switch_symmetry(stage: Stage, bifurcation: Record, scale: float) -> Symmetry
 
 
 def _switch_in_same_model(stage: Stage, bifurcation: Record, scale: float) -> SymmetrySwitch:
-    """Return the bifurcation of a record whose mode the model has."""
+    """Return the bifurcation of a record whose mode the model itself has; collective.
+
+    Parameters
+    ----------
+    stage, bifurcation, scale
+        See `switch_symmetry`.
+
+    Raises
+    ------
+    Stopped
+        If the mode is not found.
+    """
     path = _arc_length_path(stage, bifurcation.amplitude, scale)
     state = stage.enter(bifurcation.point.state)
     try:
@@ -149,42 +169,57 @@ def _switch_in_same_model(stage: Stage, bifurcation: Record, scale: float) -> Sy
 
 
 def model_with_mode(scene: Scene, mode: str) -> Scene:
-    """Return the smallest model that has a mode which a model excludes; collective.
+    """Return the scene of the smallest model that has a mode which a scene excludes; collective.
+
+    Parameters
+    ----------
+    scene
+        Scene of the reduced model; the new scene shares its journal and listener.
+    mode
+        Name of the mode, see `Record.mode`.
 
     Raises
     ------
     Stopped
-        If it cannot be built.
+        If no larger model can be built.
     """
     symmetries: list[int | str] = ["none"]
     if mode.startswith(WAVES):
         symmetries = [int(mode.removeprefix(WAVES)), "half", "none"]
-    why = ""
+    first_reason = ""
     for symmetry in symmetries:
         try:
             problem = scene.remesh(scene.problem.with_values({"symmetry": symmetry}))
-            new = Scene(problem, scene.comm)
+            new_scene = Scene(problem, scene.comm)
         except (CaseError, MeshError) as e:
-            why = why or str(e)
+            first_reason = first_reason or str(e)
             continue
-        scene.journal.begin(new.model.V)
-        new.journal, new.progress = scene.journal, scene.progress
-        return new
-    raise Stopped(f"no model has the mode {mode}: {why}")
+        scene.journal.begin(new_scene.model.V)
+        new_scene.journal, new_scene.progress = scene.journal, scene.progress
+        return new_scene
+    raise Stopped(f"no model has the mode {mode}: {first_reason}")
 
 
 def follow_switched_branch(
     stage: Stage, bifurcation: Record, goal: ContinuationGoal, scale: float, number: int
 ) -> Records:
-    """Yield the records of the branch at a bifurcation, in the model that has its mode.
+    """Yield the records of the branch at a bifurcation, in the model that has its mode; collective.
 
-    The return value is the state at their end. One direction is followed: the other is the same
-    shape, turned about e3 or mirrored.
+    One direction is followed: the other is the same shape, turned about e3 or mirrored.
 
     Parameters
     ----------
+    stage, bifurcation, scale
+        See `switch_symmetry`.
+    goal
+        Where the branch ends.
     number
         See `Record.branch`.
+
+    Returns
+    -------
+    State
+        State of the larger model at the end (the generator's return value).
 
     Raises
     ------
@@ -210,7 +245,15 @@ def follow_switched_branch(
 
 
 def _arc_length_path(stage: Stage, name: str, scale: float) -> Path:
-    """Return a path by arc length with the steps of a branch."""
+    """Return a path by arc length with the steps of a branch.
+
+    Parameters
+    ----------
+    name
+        The amplitude that varies.
+    scale
+        See `continuation.path.Path`.
+    """
     return stage.path(
         name, "arc", StepOptions(FIRST_STEP, LONGEST * FIRST_STEP, 1e-5 * FIRST_STEP), scale
     )
@@ -224,16 +267,36 @@ def _point_along(
     error: float = 0.0,
     load_error: float = 0.0,
 ) -> Point:
-    """Return a point of a path whose direction is a mode, in lengths of the system."""
+    """Return a point of a path whose direction is a mode, scaled to the system's length.
+
+    Parameters
+    ----------
+    phi
+        The mode, of any size.
+    unstable
+        Number of unstable directions.
+    error, load_error
+        See `Point`.
+    """
     direction = np.asarray(phi * path.system.length / max_abs(path.system.comm, phi))
     return Point(state, 0.0, direction, 0.0, unstable, unstable, error=error, load_error=load_error)
 
 
 def _settled_contact(stage: Stage, path: Path, guess: State, phi: Vector) -> State | str:
-    """Return a state that was carried over at rest, but for a force along the mode.
+    """Return a state near a guess that is at rest, but for a force along the mode; collective.
 
-    Shells that touch have cuts and penalties of the model's own then. Without contact it is the
-    guess itself. If there is none, the result is the reason.
+    The guess comes from another model. Shells that touch get cuts and penalties of this model.
+    Without contact the state is the guess itself.
+
+    Parameters
+    ----------
+    guess, phi
+        State and mode of the model.
+
+    Returns
+    -------
+    State or str
+        State of the model, or the reason why there is none.
     """
     scene = stage.scene
     if not scene.model.shell_contacts:
@@ -252,7 +315,15 @@ def _settled_contact(stage: Stage, path: Path, guess: State, phi: Vector) -> Sta
 
 
 def _at_rest(stage: Stage, path: Path, guess: State, mode: Vector) -> Point | str:
-    """Return the point near a guess that a force along a mode holds at rest, or why not."""
+    """Return the point near a guess that a force along a mode holds at rest, or why there is none.
+
+    Parameters
+    ----------
+    guess
+        State of the model.
+    mode
+        Vector of the step's system.
+    """
     try:
         held_point = held_along(stage.newton, stage.enter(guess), mode)
     except np.linalg.LinAlgError:
@@ -263,13 +334,20 @@ def _at_rest(stage: Stage, path: Path, guess: State, mode: Vector) -> Point | st
 
 
 def _located(stage: Stage, path: Path, guess: State, phi: Vector) -> Point | str:
-    """Return the bifurcation near a guess by its mode, in a step's system, or why not."""
+    """Return the bifurcation near a guess by its mode, as a point of a path, or why there is none.
+
+    Parameters
+    ----------
+    guess, phi
+        State and mode of the model.
+    """
     state, mode = stage.enter(guess), stage.padded(phi)
     try:
         located = find_bifurcation(stage.newton, state, mode, path.name)
     except BifurcationLost:
         return "Newton's method does not converge; take a finer mesh"
     comm = path.system.comm
+    # the mode keeps its sense, and so the branch its side
     sign = 1.0 if dot(comm, located.phi, mode) > 0 else -1.0
     point = _point_along(
         path, located.state, sign * located.phi, located.unstable, located.error, located.load_error
@@ -278,36 +356,56 @@ def _located(stage: Stage, path: Path, guess: State, phi: Vector) -> Point | str
 
 
 def _differences(old: Scene, event: Record, switch: SymmetrySwitch) -> str:
-    """Return what a switch has changed, in words; collective."""
-    new, name = switch.scene, event.amplitude
+    """Return a message on what a switch has changed at its bifurcation; collective.
+
+    Parameters
+    ----------
+    old, event
+        Scene of the reduced model, and its record of the bifurcation.
+    switch
+        The bifurcation in the larger model.
+    """
+    new_scene, name = switch.scene, event.amplitude
     state = switch.stage.point(switch.point).state
-    old_row, new_row = old.observe(event.point.state), new.observe(state)
-    a, b = amount_of(old, name, event.point.state), amount_of(new, name, state)
-    load_change = abs(b - a) / max(abs(a), TINY)
+    old_row, new_row = old.observe(event.point.state), new_scene.observe(state)
+    old_load, new_load = amount_of(old, name, event.point.state), amount_of(new_scene, name, state)
+    load_change = abs(new_load - old_load) / max(abs(old_load), TINY)
     old_energy = old_row["energy"]
     energy_change = abs(new_row["energy"] - old_energy) / max(abs(old_energy), TINY)
     deflection_change = abs(new_row["w_over_h"] - old_row["w_over_h"])
     count_text = ""
-    if new.problem.is_half:
-        exception = ", but for its turning about e3" if new.problem.turns else ""
+    if new_scene.problem.is_half:
+        exception = ", but for its turning about e3" if new_scene.problem.turns else ""
         count_text = f"; its excluded_pivots are those of all other modes of the shell{exception}"
     return (
-        f"the branch of the mode ({event.mode}) is followed in the {new.problem.included[0]}, "
-        f"{new.model.system.dofs} unknowns: its bifurcation is at {amount(new, name, b)}, by "
+        f"the branch of the mode ({event.mode}) is followed in the "
+        f"{new_scene.problem.included[0]}, "
+        f"{new_scene.model.system.dofs} unknowns: its bifurcation is at "
+        f"{amount(new_scene, name, new_load)}, by "
         f"{load_change:.2g} of it beside that of the {old.problem.included[0]}; the energy there "
         f"differs by {energy_change:.2g} of it, w/h by {deflection_change:.2g}{count_text}"
     )
 
 
 def amount_of(scene: Scene, name: str, state: State) -> float:
-    """Return the value of an amplitude of a state, or of a step that drives several."""
+    """Return the value of an amplitude at a state; lambda_m of a step that drives several."""
     return state.mu.get(name, state.mu.get("lambda_m", 0.0))
 
 
 def _carried_over(
     old: Scene, new: Scene, bifurcation: Record, mode: Vector
 ) -> tuple[Vector, Vector]:
-    """Return displacement and mode in the unknowns of a model with less symmetry; collective."""
+    """Return displacement and mode of a record in the unknowns of a larger model; collective.
+
+    Both are zero at supports, on this rank.
+
+    Parameters
+    ----------
+    old, new
+        Scenes of the reduced model and of the larger one.
+    mode
+        The excluded mode, as `ShellModes.null_vector` of the reduced model gives it.
+    """
     system, u = new.model.system, bifurcation.point.state.u
     if old.model.axisymmetric:
         s, theta = _along_meridian(old, new)
@@ -322,10 +420,16 @@ def _carried_over(
 
 
 def _along_meridian(old: Scene, new: Scene) -> tuple[Array, Array]:
-    """Return meridian parameters and azimuths (rad) of a surface's nodes, in its model's frame."""
+    """Return meridian parameters and azimuths (rad) of a surface's nodes, in its model's frame.
+
+    Parameters
+    ----------
+    old, new
+        Scenes of the meridian and of the surface.
+    """
     chart = old.problem.meridian
     assert chart
-    s, theta = np.array([chart.locate(x) for x in new.model.chart()]).reshape(-1, 2).T
+    s, theta = np.array([chart.locate(place) for place in new.model.chart()]).reshape(-1, 2).T
     return s, theta
 
 
@@ -334,7 +438,17 @@ def _revolved(
 ) -> tuple[Array, Array]:
     """Return displacement and wave of a meridian at places of a surface, (n, 3) each.
 
-    The wave is U cos e_rho + V sin e_theta + W cos e_z, with the crest of u . n inwards.
+    The wave is U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z. Its sign is such
+    that the largest crest of u . n at theta = 0 is inwards.
+
+    Parameters
+    ----------
+    s, theta
+        (n,), meridian parameters and azimuths (rad) of the places.
+    u
+        Unknowns of the axisymmetric displacement.
+    wave, m
+        Unknowns (U + V, V, W) of the wave, and its number of crests.
     """
     radial, axial = _evaluated(model, model.V, u, s).T
     U_and_V, V, W = _evaluated(model, model.symmetry_breaking_modes.waves.V, wave, s).T
@@ -342,6 +456,7 @@ def _revolved(
     e_rho, e_theta = np.column_stack([cos, sin, zero]), np.column_stack([-sin, cos, zero])
 
     def in_space(a: Array, b: Array, c: Array) -> Array:
+        """Return vectors (n, 3) with components along e_rho, e_theta and e_z."""
         return np.asarray(
             a[:, None] * e_rho + b[:, None] * e_theta + np.column_stack([zero, zero, c])
         )
@@ -356,68 +471,112 @@ def _sign(model: MeridianModel, wave: Vector) -> float:
     """Return the sign with which a wave's largest crest at azimuth 0 is inwards."""
     V = model.symmetry_breaking_modes.waves.V
     values = wave.reshape(-1, 3)[np.argsort(V.tabulate_dof_coordinates()[:, 0])]
+    # U at azimuth 0; a little of W decides where U is zero
     crests = values[:, 0] - values[:, 1] + 1e-3 * values[:, 2]
     return 1.0 if crests[np.argmax(np.abs(crests))] < 0 else -1.0
 
 
 def _evaluated(model: MeridianModel, V: fem.FunctionSpace, x: Vector, s: Array) -> Array:
-    """Return components (n, k) of a field on the meridian at its parameters s (n,)."""
+    """Return components (n, k) of a field on the meridian at places.
+
+    Parameters
+    ----------
+    x
+        Unknowns of the field in the space V.
+    s
+        (n,), meridian parameters.
+    """
     domain = model.meridian.mesh
-    ends = domain.geometry.x[compat.geometry_dofs(domain), 0]
-    begin = ends.min(axis=1)
-    order = np.argsort(begin)
-    cells = order[np.clip(np.searchsorted(begin[order], s, side="right") - 1, 0, len(order) - 1)]
-    local = np.clip((s - ends[cells, 0]) / (ends[cells, 1] - ends[cells, 0]), 0.0, 1.0)
-    table = V.element.basix_element.tabulate(0, local[:, None])[0, :, :, 0]
-    nodes = x.reshape(-1, V.dofmap.bs)[V.dofmap.list[cells]]
-    return np.asarray(np.einsum("np,npc->nc", table, nodes))
+    cell_ends = domain.geometry.x[compat.geometry_dofs(domain), 0]
+    cell_begin = cell_ends.min(axis=1)
+    order = np.argsort(cell_begin)
+    # the last cell that begins before s
+    cells = order[
+        np.clip(np.searchsorted(cell_begin[order], s, side="right") - 1, 0, len(order) - 1)
+    ]
+    local_coordinate = np.clip(
+        (s - cell_ends[cells, 0]) / (cell_ends[cells, 1] - cell_ends[cells, 0]), 0.0, 1.0
+    )
+    table = V.element.basix_element.tabulate(0, local_coordinate[:, None])[0, :, :, 0]
+    values_at_nodes = x.reshape(-1, V.dofmap.bs)[V.dofmap.list[cells]]
+    return np.asarray(np.einsum("np,npc->nc", table, values_at_nodes))
 
 
 def _mirrored(old: Scene, new: Scene, u: Vector, mode: Vector) -> tuple[Array, Array]:
     """Return displacement and antisymmetric mode of a half at the nodes of the whole shell.
 
-    Each has shape (n, 3). Collective.
+    Both are extended to the other half, the displacement symmetrically. Collective.
+
+    Parameters
+    ----------
+    old, new
+        Scenes of the half and of the whole shell.
+    u, mode
+        Unknowns of the half.
+
+    Returns
+    -------
+    displacement, mode
+        (n, 3) each, in the frame of the new scene.
     """
     comm, size = old.model.system.comm, old.model.system.size
     mirror = old.problem.mirror
     assert isinstance(mirror, Mirror)
-    parts = [old.model.r0.x.array[:size], u[:size], mode[:size]]
-    places, *fields = (np.concatenate(comm.allgather(part.reshape(-1, 3))) for part in parts)
+    local_vectors = [old.model.r0.x.array[:size], u[:size], mode[:size]]
+    places, *fields = (
+        np.concatenate(comm.allgather(local_vector.reshape(-1, 3)))
+        for local_vector in local_vectors
+    )
     has_image = mirror.signed_distance(places) > PLANE_TOLERANCE
-    S = mirror.reflection
-    x = np.concatenate([places, mirror.image(places[has_image])])
+    reflection = mirror.reflection
+    places_of_both_halves = np.concatenate([places, mirror.image(places[has_image])])
     values = np.hstack(
         [
-            np.concatenate([field, sign * field[has_image] @ S])
+            # displacement and mode have images of opposite signs
+            np.concatenate([field, sign * field[has_image] @ reflection])
             for field, sign in zip(fields, (1.0, -1.0), strict=True)
         ]
     )
     # from the new frame to the old one
-    Q = rotation(old.problem.azimuth) @ rotation(new.problem.azimuth).T
-    new_places = new.model.r0.x.array[: new.model.system.size].reshape(-1, 3) @ Q.T
+    rotation_to_old = rotation(old.problem.azimuth) @ rotation(new.problem.azimuth).T
+    new_places = new.model.r0.x.array[: new.model.system.size].reshape(-1, 3) @ rotation_to_old.T
     new_values = np.zeros((len(new_places), 6))
     for old_nodes, new_nodes in nodes_by_shell(old, new):
         if new_nodes.any():
             nodes = np.concatenate([old_nodes, old_nodes[has_image]])
             new_values[new_nodes] = interpolated_on_surface(
-                x[nodes], values[nodes], new_places[new_nodes]
+                places_of_both_halves[nodes], values[nodes], new_places[new_nodes]
             )
-    return new_values[:, :3] @ Q, new_values[:, 3:] @ Q
+    return new_values[:, :3] @ rotation_to_old, new_values[:, 3:] @ rotation_to_old
 
 
 def interpolated_on_surface(x: Array, values: Array, places: Array) -> Array:
-    """Return values (n, k) on a smooth surface at places (n, 3) near nodes x.
+    """Return values (n, k) on a smooth surface at places near its nodes.
 
-    They are those of cubic polynomials in the tangent plane.
+    At each place a cubic polynomial in the tangent plane is fitted to the nearest nodes, with
+    weights that fall with distance.
+
+    Parameters
+    ----------
+    x, values
+        Nodes (m, 3), and values (m, k) there.
+    places
+        (n, 3).
     """
     count = min(NEIGHBOURS, len(x))
     neighbours = scipy.spatial.cKDTree(x).query(places, count)[1].reshape(len(places), count)
     offsets = x[neighbours] - places[:, None]
-    size = np.linalg.norm(offsets, axis=2).max(axis=1)
+    radius = np.linalg.norm(offsets, axis=2).max(axis=1)
     centred = offsets - offsets.mean(axis=1, keepdims=True)
+    # the two axes of the tangent plane, from the spread of the neighbours
     axes = np.linalg.svd(centred, full_matrices=False)[2][:, :2]
-    a, b = np.moveaxis(np.einsum("nki,nji->nkj", offsets, axes) / size[:, None, None], 2, 0)
-    basis = np.stack([a**i * b**j for i in range(4) for j in range(4 - i)], axis=2)
-    weight = np.exp(-4 * (a**2 + b**2))[..., None]
+    first_coordinate, second_coordinate = np.moveaxis(
+        np.einsum("nki,nji->nkj", offsets, axes) / radius[:, None, None], 2, 0
+    )
+    basis = np.stack(
+        [first_coordinate**i * second_coordinate**j for i in range(4) for j in range(4 - i)], axis=2
+    )
+    weight = np.exp(-4 * (first_coordinate**2 + second_coordinate**2))[..., None]
     coefficients = np.linalg.pinv(weight * basis) @ (weight * values[neighbours])
+    # the constant of the polynomial is its value at the place
     return np.asarray(coefficients[:, 0])

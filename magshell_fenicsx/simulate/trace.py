@@ -30,16 +30,20 @@ Amount = float | str
 def target_values(
     scene: Scene, name: str, key: str, amounts: Sequence[Amount] | Amount, *, of_load: bool
 ) -> list[float]:
-    """Return amounts of an amplitude, or of its conjugate -Pi_i(u), as numbers.
+    """Return amounts of an amplitude, or of its conjugate -Pi_i(u), as numbers of the model.
 
-    One amount alone gives a list of one.
+    One amount alone gives a list of one number.
 
     Parameters
     ----------
+    name
+        The amplitude.
     key
-        The argument of `trace` that has them, for messages.
+        The argument of `trace` that has the amounts, for messages.
+    amounts
+        Numbers, or texts with a unit.
     of_load
-        Whether they are of the amplitude itself.
+        Whether they are amounts of the amplitude itself.
 
     Raises
     ------
@@ -47,12 +51,28 @@ def target_values(
         If one is neither a number nor text with a unit that this quantity has in this case.
     """
     is_single = isinstance(amounts, str | Real) or amounts is None
-    listed: Sequence[Any] = [amounts] if is_single else cast(Sequence[Any], amounts)
-    return [_number(scene, name, f"trace: {key}: {amount!r}", amount, of_load) for amount in listed]
+    list_of_amounts: Sequence[Any] = [amounts] if is_single else cast(Sequence[Any], amounts)
+    return [
+        _number(scene, name, f"trace: {key}: {amount!r}", amount, of_load)
+        for amount in list_of_amounts
+    ]
 
 
 def _number(scene: Scene, name: str, place: str, amount: Any, of_load: bool) -> float:
-    """Return an amount as a number; `place` is the begin of a message."""
+    """Return an amount as a number of the model, see `target_values`.
+
+    Parameters
+    ----------
+    place
+        Begin of a message.
+    amount
+        Number, or text with a unit.
+
+    Raises
+    ------
+    ValueError
+        If it is neither, or the quantity has no unit in this case.
+    """
     if isinstance(amount, Real):
         return float(amount)
     if not isinstance(amount, str):
@@ -61,13 +81,17 @@ def _number(scene: Scene, name: str, place: str, amount: Any, of_load: bool) -> 
     unit, scale = scene.sizes.unit(column), quantity(column).scale
     forces = (*scene.model.loads.forces, *scene.model.contacts)
     may_have_unit = of_load or name == "pressure" or name in forces
-    text = unit.text if unit else next((other.text for other in quantity(column).units), "")
+    text = (
+        unit.text
+        if unit
+        else next((unit_of_quantity.text for unit_of_quantity in quantity(column).units), "")
+    )
     if not (text and may_have_unit):
-        what = name if of_load else f"the conjugate of {name}"
-        raise ValueError(f"{place}: {what} has no unit here: give a number")
+        quantity_text = name if of_load else f"the conjugate of {name}"
+        raise ValueError(f"{place}: {quantity_text} has no unit here: give a number")
     if unit is None:
-        needed = "youngs_modulus and lengths of the shell with units"
-        raise ValueError(f"{place}: has a unit: that needs {needed}; a number is in {scale}")
+        needed_keys = "youngs_modulus and lengths of the shell with units"
+        raise ValueError(f"{place}: has a unit: that needs {needed_keys}; a number is in {scale}")
     try:
         number = in_units(text)(amount) / scene.sizes.by_unit[unit.key]
     except ValueError as e:
@@ -147,12 +171,14 @@ def trace(  # noqa: PLR0913
         raise ValueError(
             f"trace: {name}: give first, the change of the amplitude in the first step, not zero"
         )
-    rest = scene.newton.solve(state, name, PrescribedLoad(name, state.mu[name]))
-    if not rest.converged:
-        raise Stopped(f"there is no equilibrium to start from near the given state: {rest.reason}")
+    outcome = scene.newton.solve(state, name, PrescribedLoad(name, state.mu[name]))
+    if not outcome.converged:
+        raise Stopped(
+            f"there is no equilibrium to start from near the given state: {outcome.reason}"
+        )
     if control == "conjugate":
         displacement = scene.newton.response(
-            rest.state, name, PrescribedLoad(name, 0.0), exact=True
+            outcome.state, name, PrescribedLoad(name, 0.0), exact=True
         ).du
         system = scene.newton.system
         largest = max_abs(system.comm, displacement) * abs(first)
@@ -161,7 +187,7 @@ def trace(  # noqa: PLR0913
                 f"{name} moves nothing at the start, so nothing is conjugate to it: follow it by "
                 "arc length"
             )
-    path, first_point = load_stage(scene).begin(name, control, rest.state, first, 10 * first)
+    path, first_point = load_stage(scene).begin(name, control, outcome.state, first, 10 * first)
     if targets and control == "conjugate":
         step = abs(targets[-1] - first_point.s) / 10
         path = path.with_step_options(StepOptions(step, 2 * step, 1e-5 * step))
@@ -177,15 +203,23 @@ def trace(  # noqa: PLR0913
 def _with_reached(
     records: Iterator[Record], name: str, targets: Sequence[float]
 ) -> Iterator[Record]:
-    """Yield the records; the last one says if it is not at the last target."""
-    last, missed = next(records), len(targets)
+    """Yield records; the last one says whether the last target was reached, else it warns.
+
+    Parameters
+    ----------
+    name
+        The amplitude.
+    targets
+        Targets in order; each has a record with the label "target" if it is reached.
+    """
+    last_record, targets_ahead = next(records), len(targets)
     for record in records:
-        yield last
-        last, missed = record, missed - (record.label == "target")
-    if missed > 0:
-        mode = f" ({last.mode})" if last.mode else ""
-        place = f"{last.label}{mode} at {name} = {last.point.state.mu[name]:.6g}"
+        yield last_record
+        last_record, targets_ahead = record, targets_ahead - (record.label == "target")
+    if targets_ahead > 0:
+        mode = f" ({last_record.mode})" if last_record.mode else ""
+        place = f"{last_record.label}{mode} at {name} = {last_record.point.state.mu[name]:.6g}"
         warnings.warn(
             f"trace: {name}: ends at a {place}, before its target {targets[-1]:.6g}", stacklevel=2
         )
-    yield replace(last, reached=missed <= 0)
+    yield replace(last_record, reached=targets_ahead <= 0)

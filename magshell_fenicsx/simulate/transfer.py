@@ -32,7 +32,8 @@ def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
 
     Returns
     -------
-    Owned degrees of freedom of `target`, zero at its supports.
+    Vector
+        Owned degrees of freedom of `target`, zero at its supports.
     """
     comm, system = source.model.system.comm, target.model.system
     if source.model is target.model:
@@ -59,9 +60,18 @@ def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
 
 
 def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
-    """Return values at x (n, 1 or 2).
+    """Return values (n, k) at places of the chart, interpolated by radial basis functions.
 
     Derivatives jump at the rim, so each side uses only its own nodes.
+
+    Parameters
+    ----------
+    nodes, values
+        Nodes (m, 1, 2 or 3) and values (m, k) there.
+    x
+        Places (n, 1, 2 or 3).
+    rim
+        Distance of the rim from the origin of the chart; inf without a rim.
     """
     values_at_x: Array = np.zeros((len(x), values.shape[1]))
     polar_of_nodes, polar = np.linalg.norm(nodes, axis=1), np.linalg.norm(x, axis=1)
@@ -84,12 +94,12 @@ def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
 
 
 def same_mesh(source: Scene, target: Scene) -> bool:
-    """Return whether both have the same nodes, in any order and on any ranks; collective."""
+    """Return whether two scenes have the same nodes, in any order and on any ranks; collective."""
     return _matching(source, target) is not None
 
 
 def _matching(source: Scene, target: Scene) -> NDArray[np.int64] | None:
-    """Return the number of each node of this rank among all nodes of the source.
+    """Return the number of each node of this rank among all nodes of the source; collective.
 
     None on all ranks if the nodes differ.
     """
@@ -99,9 +109,16 @@ def _matching(source: Scene, target: Scene) -> NDArray[np.int64] | None:
 def matching(
     nodes: Array, chart_places: Array, comm: MPI.Comm = MPI.COMM_SELF
 ) -> NDArray[np.int64] | None:
-    """Return the number of each of this rank's places among all nodes.
+    """Return the number of each of this rank's places among nodes; collective.
 
-    None on all ranks if they differ.
+    None on all ranks if places and nodes differ.
+
+    Parameters
+    ----------
+    nodes
+        Coordinates of all nodes.
+    chart_places
+        Coordinates of this rank's places.
     """
     distance, number = scipy.spatial.cKDTree(nodes).query(chart_places)
     equal = (
@@ -119,6 +136,13 @@ class _Stretch:
     displacements normal to the surface are scaled by q^2 and tangential ones by q^3. This preserves
     the shape of the strains u_n/R + u_t,s + u_n,s^2/2 of a shallow shell, which Newton's method is
     most sensitive to.
+
+    Attributes
+    ----------
+    rim, source_rim
+        Polar angles (rad) of the rims of target and source.
+    edge
+        Polar angle (rad) of the edge of both.
     """
 
     rim: float
@@ -131,7 +155,15 @@ class _Stretch:
         return np.asarray(x * self._polar(polar) / np.maximum(polar, TINY))
 
     def turn(self, u: Array, x: Array) -> Array:
-        """Return displacements u (n, 2 or 3) of the source, rotated and scaled for points x."""
+        """Return displacements of the source, rotated to the frames of the target and scaled.
+
+        Parameters
+        ----------
+        u
+            Displacements (n, 2 or 3) at the corresponding places of the source.
+        x
+            Points (n, 1 or 2) of the target's chart.
+        """
         polar = np.linalg.norm(x, axis=1, keepdims=True)
         azimuth = x / np.maximum(polar, TINY) if x.shape[1] == 2 else np.ones_like(polar)
         from_frame, to_frame = _frame(self._polar(polar), azimuth), _frame(polar, azimuth)
@@ -143,14 +175,16 @@ class _Stretch:
 
     def _polar(self, polar: Array) -> Array:
         """Return polar angles of the source from those of the target."""
-        t = self._part_beyond_rim(polar)
+        part_beyond_rim = self._part_beyond_rim(polar)
         ratio = self.source_rim / self.rim
-        return np.asarray(np.clip(ratio * polar + (1 - ratio) * self.edge * t**2, 0, self.edge))
+        return np.asarray(
+            np.clip(ratio * polar + (1 - ratio) * self.edge * part_beyond_rim**2, 0, self.edge)
+        )
 
     def _slope(self, polar: Array) -> Array:
         """Return the derivative of the source's polar angles by those of the target."""
-        ratio, t = self.source_rim / self.rim, self._part_beyond_rim(polar)
-        slope = ratio + (1 - ratio) * self.edge * 2 * t / (self.edge - self.rim)
+        ratio, part_beyond_rim = self.source_rim / self.rim, self._part_beyond_rim(polar)
+        slope = ratio + (1 - ratio) * self.edge * 2 * part_beyond_rim / (self.edge - self.rim)
         return np.asarray(np.maximum(slope, 0.5))
 
     def _part_beyond_rim(self, polar: Array) -> Array:
@@ -161,7 +195,12 @@ class _Stretch:
 def _frame(polar: Array, azimuth: Array) -> tuple[Array, Array]:
     """Return unit vectors normal to the sphere and along its meridians.
 
-    `azimuth` (n, 1 or 2) are unit vectors of the azimuth.
+    Parameters
+    ----------
+    polar
+        Polar angles (n, 1).
+    azimuth
+        Unit vectors of the azimuth (n, 1 or 2).
     """
     return np.hstack([np.sin(polar) * azimuth, np.cos(polar)]), np.hstack(
         [np.cos(polar) * azimuth, -np.sin(polar)]
@@ -169,7 +208,7 @@ def _frame(polar: Array, azimuth: Array) -> tuple[Array, Array]:
 
 
 def _stretch(source: Scene, target: Scene) -> _Stretch | None:
-    """Return the map between dimpled spheres; None for other surfaces."""
+    """Return the map between the charts of two dimpled spheres; None for other surfaces."""
     rims, edges = [], []
     for scene in (target, source):
         embedding, shape = scene.problem.embedding, scene.problem.shape
@@ -191,21 +230,22 @@ def _stretch(source: Scene, target: Scene) -> _Stretch | None:
 def nodes_by_shell(
     source: Scene, target: Scene
 ) -> Iterator[tuple[NDArray[np.bool_], NDArray[np.bool_]]]:
-    """Yield for each shell its nodes among all of a scene, and among this rank's of another one.
+    """Yield for each shell its nodes among all of `source`, and among this rank's of `target`.
 
-    Shells that touch are near each other, and move in different ways. Collective.
+    Both are masks. Shells that touch are near each other but move in different ways, so they must
+    not be mixed. Collective.
     """
     return zip(all_nodes_of_shells(source), nodes_of_shells(target), strict=True)
 
 
 def all_nodes_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
-    """Return for each shell which nodes of all ranks are its own; collective."""
+    """Return a mask for each shell: which nodes of all ranks belong to it; collective."""
     comm = scene.model.system.comm
     return [np.concatenate(comm.allgather(is_own)) for is_own in nodes_of_shells(scene)]
 
 
 def nodes_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
-    """Return for each shell which of this rank's nodes are its own; of one shell all are."""
+    """Return a mask for each shell: which of this rank's nodes belong to it; one shell has all."""
     model = scene.model
     nodes, count = model.V.dofmap.list, model.system.size // model.V.dofmap.bs
     return [
@@ -215,9 +255,9 @@ def nodes_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
 
 
 def cells_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
-    """Return for each shell which of this rank's cells are its own, ghosts included.
+    """Return a mask for each shell: which of this rank's cells, ghosts included, belong to it.
 
-    Of one shell all are.
+    One shell has all cells.
     """
     model, names = scene.model, list(scene.problem.context.sections.get("shells") or {})
     if len(names) < 2:
@@ -233,7 +273,7 @@ def cells_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
 
 
 def _all_nodes(scene: Scene) -> Array:
-    """Return the nodes of all ranks in the chart."""
+    """Return the coordinates of the nodes of all ranks in the chart; collective."""
     return np.concatenate(scene.model.system.comm.allgather(chart(scene)))
 
 

@@ -47,7 +47,15 @@ REST_DISTANCE = 1e-2  # over the system's length: an equilibrium so near is the 
 
 @dataclass(frozen=True)
 class MovingState(State):
-    """A state with a velocity, and that of its supports where these move."""
+    """A state of the model with a velocity, from which a motion can go on.
+
+    Attributes
+    ----------
+    v
+        Velocity of the unknowns on this rank, over R and the unit of time.
+    ground
+        Velocity of the supports, where these move; None where they rest.
+    """
 
     v: Vector
     ground: Vector | None = None
@@ -56,19 +64,28 @@ class MovingState(State):
 def motion_records(
     scene: Scene, load: TimeSection, state: State, held_conjugates: Mapping[str, HeldConjugate]
 ) -> Records:
-    """Yield the records of a step in time; the return value is the state at its end.
+    """Yield the records of a step in time, one for each row; collective.
 
     Parameters
     ----------
+    load
+        The section of the step: its duration, rows, loads in time and end.
     state
-        Where it begins: a `MovingState`, or at rest.
+        State where the motion begins: a `MovingState`, or a state at rest.
     held_conjugates
         Amplitude -> its conjugate, as of `make_stage`.
+
+    Returns
+    -------
+    State
+        State at the end (the generator's return value): the equilibrium near a shell at rest, else
+        a `MovingState`.
 
     Raises
     ------
     Stopped
-        If steps in time become too small, or the shell does not come to rest.
+        If steps in time become too small, or the end that the step asks for is not reached within
+        its duration.
     """
     start = _MotionStart(scene, load, state, held_conjugates)
     integrator, motion = start.begin()
@@ -85,28 +102,31 @@ def motion_records(
         )
     rows = MotionRows(scene, integrator, held_conjugates, steps, marks, refinement)
     time_step, ending = steps.first, ""
-    for end in row_times:
+    for row_time in row_times:
         previous, first_step = motion, time_step
-        motion, time_step, point = rows.journalled(previous, first_step, end)
+        motion, time_step, point = rows.journalled(previous, first_step, row_time)
+        # the row moves from its time to that of the event
         if end_of_motion.event and end_of_motion.has_event(previous, motion):
             event_time = rows.crossing(previous, first_step, motion, end_of_motion.event)
             motion, time_step, point = rows.journalled(previous, first_step, event_time)
             ending = "event"
         clock = energies.clock(motion)
         excluded_pivots = _excluded_pivots(scene, point.state)
-        rest = None
+        state_at_rest = None
         if load.until == "rest" and energies.is_quiet:
-            rest = _equilibrium_near(scene, held_conjugates, point.state)
+            state_at_rest = _equilibrium_near(scene, held_conjugates, point.state)
         if load.until == "instability" and point.negative_pivots + excluded_pivots:
             ending = "instability"
-        if load.until == "duration" and end == row_times[-1]:
+        if load.until == "duration" and row_time == row_times[-1]:
             ending = "duration"
         record = Record("step", "time", point, excluded_pivots=excluded_pivots, clock=clock)
         yield replace(record, label="target") if ending else record
-        if rest:
-            clock = energies.clock_at_rest(motion, rest, clock)
-            yield replace(record, label="target", point=replace(point, state=rest), clock=clock)
-            return rest
+        if state_at_rest:
+            clock = energies.clock_at_rest(motion, state_at_rest, clock)
+            yield replace(
+                record, label="target", point=replace(point, state=state_at_rest), clock=clock
+            )
+            return state_at_rest
         if ending:
             supports = integrator.supports
             velocity = supports.velocity(motion.t, True) if supports else None
@@ -122,12 +142,23 @@ def motion_records(
 def snap_records(
     scene: Scene, snap: SnapSection, fold: Record, held_conjugates: Mapping[str, HeldConjugate]
 ) -> Records:
-    """Yield the records of a snap from a fold or a bifurcation to rest.
+    """Yield the records of a snap from a fold or a bifurcation to rest; collective.
 
-    The return value is the state at its end. Loads are constant, except those whose conjugates are
-    `held_conjugates`. The shell leaves a fold along the path's direction there, a bifurcation along
-    its mode. Its drag is in proportion to the frequency of its third mode of vibration: the first
-    one has none there.
+    Loads are constant, except those whose conjugates are `held_conjugates`. The shell leaves a fold
+    along the path's direction there, a bifurcation along its mode. Its drag is in proportion to the
+    frequency of its third mode of vibration, as the first one has frequency zero there.
+
+    Parameters
+    ----------
+    fold
+        Record at the fold or bifurcation.
+    held_conjugates
+        Amplitude -> its conjugate, as of `make_stage`.
+
+    Returns
+    -------
+    State
+        State at rest (the generator's return value).
 
     Raises
     ------
@@ -148,13 +179,13 @@ def snap_records(
         until="rest",
     )
     direction = system.zero_at_supports(fold.point.du)
-    size = snap.push * system.length / max_abs(system.comm, direction)
-    pushed_state = State(state.u + size * direction, state.mu)
+    push_length = snap.push * system.length / max_abs(system.comm, direction)
+    pushed_state = State(state.u + push_length * direction, state.mu)
     return (yield from motion_records(scene, load, pushed_state, held_conjugates))
 
 
 def _time_steps(scene: Scene, load: TimeSection) -> TimeSteps:
-    """Return the options of the lengths of a step's time steps."""
+    """Return the options for the lengths of time steps, over the unit of time of the model."""
     duration = dimensionless_time(scene.problem, load.duration)
     fixed = None if load.step is None else dimensionless_time(scene.problem, load.step)
     return TimeSteps(fixed, load.tolerance, fixed or duration / load.points / 10, load.balance)
@@ -162,6 +193,15 @@ def _time_steps(scene: Scene, load: TimeSection) -> TimeSteps:
 
 class _MotionStart:
     """Begin of a step in time: its loads, and the state with its velocity.
+
+    A coarser run of the same motion begins again from here.
+
+    Parameters
+    ----------
+    load
+        The section of the step.
+    state, held_conjugates
+        See `motion_records`.
 
     Attributes
     ----------
@@ -176,6 +216,7 @@ class _MotionStart:
         state: State,
         held_conjugates: Mapping[str, HeldConjugate],
     ) -> None:
+        """Find displacement and velocity at the begin, with a push and a velocity by formulas."""
         self._scene, self._load, self._state, self._held = scene, load, state, held_conjugates
         self.loads = LoadsInTime(scene.problem, load, state, scene.motions)
         unit = scene.problem.time_unit or 1.0
@@ -188,7 +229,7 @@ class _MotionStart:
         self._u, self._v = u, v
 
     def begin(self) -> tuple[Integrator, Motion]:
-        """Return a new integrator, and the motion where it begins."""
+        """Return a new integrator, and the motion at time zero; collective."""
         scene, state, load = self._scene, self._state, self._load
         viscous = viscosity(scene, state)
         device = make_stage(scene, state, self._held).device
@@ -210,7 +251,13 @@ class _MotionStart:
         return integrator, integrator.begin(0.0, self._u, self._v)
 
     def _support_inertia(self, *, is_viscous: bool) -> SupportInertia | None:
-        """Return what supports that move bring to the motion; None if all are at rest."""
+        """Return the inertia forces of supports that move; None if all supports are at rest.
+
+        Raises
+        ------
+        CaseError
+            If supports of a viscous shell move.
+        """
         scene, state, loads = self._scene, self._state, self.loads
         moving = scene.motions & set(self._load.drives)
         if not moving:
@@ -233,8 +280,10 @@ class _MotionEnd:
 
     Attributes
     ----------
+    load
+        The section of the step, which says how the motion ends.
     event
-        Function of a motion that changes its sign at the event; None without one.
+        Function of a motion that changes its sign at the event; None without an event.
     """
 
     load: TimeSection
@@ -242,7 +291,7 @@ class _MotionEnd:
     event: Callable[[Motion], float] | None
 
     def has_event(self, previous: Motion, next_motion: Motion) -> bool:
-        """Whether the event is between two motions."""
+        """Return whether the event is between two motions, those of successive rows."""
         if self.event is None:
             return False
         return self.event(previous) * self.event(next_motion) <= 0 and self.event(
@@ -267,10 +316,15 @@ class _MotionEnd:
 class _Energies:
     """Energies of a motion since its begin, as columns of its rows.
 
+    Parameters
+    ----------
+    begin
+        The motion at time zero.
+
     Attributes
     ----------
     kinetic, largest_kinetic
-        Kinetic energy of the model at the last row, and the largest one so far.
+        Kinetic energy of the model at the last row, and the largest one so far, over E h R^2.
     """
 
     def __init__(self, scene: Scene, integrator: Integrator, begin: Motion) -> None:
@@ -280,29 +334,41 @@ class _Energies:
 
     @property
     def is_quiet(self) -> bool:
-        """Whether the shell may be at rest at the last row."""
+        """Whether the shell may be at rest at the last row, as its kinetic energy is small."""
         return self.kinetic <= QUIET_ENERGY * self.largest_kinetic
 
     def clock(self, motion: Motion) -> dict[str, float]:
-        """Return time and energies of a row, which is the last one then."""
-        size = self._scene.model.multiplicity
+        """Return the columns of a row in time; the row then counts as the last one.
+
+        The keys are time (in s of a case with units), and kinetic, dissipated, work and imbalance:
+        energies over E h R^2 of the whole shell since the begin. Collective.
+        """
+        multiplicity = self._scene.model.multiplicity
         self.kinetic = self._integrator.kinetic(motion)
         self.largest_kinetic = max(self.largest_kinetic, self.kinetic)
         stored_energy = self._scene.model.system.stored_energy(motion.u, motion.mu)
         imbalance = self.kinetic + stored_energy + motion.dissipated - motion.work - self._at_begin
         return {
             "time": motion.t * (self._scene.problem.time_unit or 1.0),
-            "kinetic": size * self.kinetic,
-            "dissipated": size * motion.dissipated,
-            "work": size * motion.work,
-            "imbalance": size * imbalance,
+            "kinetic": multiplicity * self.kinetic,
+            "dissipated": multiplicity * motion.dissipated,
+            "work": multiplicity * motion.work,
+            "imbalance": multiplicity * imbalance,
         }
 
     def clock_at_rest(
         self, motion: Motion, rest: State, clock: Mapping[str, float]
     ) -> dict[str, float]:
-        """Return the clock of the equilibrium near a row; `clock` is that of the row."""
-        system, size = self._scene.model.system, self._scene.model.multiplicity
+        """Return the columns in time of the equilibrium near the last row; collective.
+
+        Parameters
+        ----------
+        motion, clock
+            Motion at the last row, and its columns.
+        rest
+            The equilibrium.
+        """
+        system, multiplicity = self._scene.model.system, self._scene.model.multiplicity
         # constant loads do work on the way to rest
         changes = {
             name: system.potential(rest.u, rest.mu, name) - potential
@@ -312,11 +378,19 @@ class _Energies:
         work = motion.work - sum(motion.mu[name] * change for name, change in changes.items())
         stored_energy = system.stored_energy(rest.u, rest.mu)
         imbalance = stored_energy + motion.dissipated - work - self._at_begin
-        return {**clock, "kinetic": 0.0, "work": size * work, "imbalance": size * imbalance}
+        return {
+            **clock,
+            "kinetic": 0.0,
+            "work": multiplicity * work,
+            "imbalance": multiplicity * imbalance,
+        }
 
 
 def _excluded_pivots(scene: Scene, state: State) -> int:
-    """Return the number of unstable directions at a state that the model excludes."""
+    """Return the number of unstable directions at a state that the model excludes; collective.
+
+    It is 0 for a shell that moves freely, whose rigid motions would count.
+    """
     symmetry_breaking_modes = None if scene.free_in_time else scene.model.symmetry_breaking_modes
     return sum(symmetry_breaking_modes.counts(state)) if symmetry_breaking_modes else 0
 
@@ -324,7 +398,20 @@ def _excluded_pivots(scene: Scene, state: State) -> int:
 def _event_function(
     scene: Scene, event: EventSection | None, state: State
 ) -> Callable[[Motion], float] | None:
-    """Return the function of a motion that changes its sign at an event; None without one."""
+    """Return the function of a motion that changes its sign at an event; None without an event.
+
+    It is the excess of a column over the value of the event.
+
+    Parameters
+    ----------
+    state
+        A state, by which columns are known.
+
+    Raises
+    ------
+    CaseError
+        If there is no such column.
+    """
     if event is None:
         return None
     if event.column not in (columns := scene.observe(state)):
@@ -333,6 +420,7 @@ def _event_function(
         )
 
     def excess(motion: Motion) -> float:
+        """Return the column at a motion less the value of the event; collective."""
         moved_state = scene.model.system.with_moved_supports(State(motion.u, motion.mu))
         return scene.observe(moved_state)[event.column] - event.value
 
@@ -342,8 +430,12 @@ def _event_function(
 def _equilibrium_near(
     scene: Scene, held_conjugates: Mapping[str, HeldConjugate], state: State
 ) -> State | None:
-    """Return the equilibrium near a state; None if there is none near, or an unstable one."""
+    """Return the stable equilibrium near a state, under the same loads; None if there is none.
+
+    Penalties of contact become stiffer until nothing penetrates too much. Collective.
+    """
     stage, comm = make_stage(scene, state, held_conjugates), scene.model.system.comm
+    # a load that does no work stands for the amplitude that the solver expects
     start = stage.enter(state)
     start, new_settings = start.with_(start.u, NO_LOAD, 0.0), dict[str, float]()
     while True:
@@ -351,8 +443,8 @@ def _equilibrium_near(
         distance = max_abs(comm, outcome.state.u - start.u) / scene.model.system.length
         if not outcome.converged or distance > REST_DISTANCE:
             return None
-        rest = stage.leave(outcome.state)
-        stiffer = raised_stiffnesses(scene, rest)
+        state_at_rest = stage.leave(outcome.state)
+        stiffer = raised_stiffnesses(scene, state_at_rest)
         if not stiffer:
             break
         new_settings |= stiffer
@@ -360,20 +452,26 @@ def _equilibrium_near(
     if stage.newton.factor_at(outcome.state).negative_pivots:
         return None
     return State(
-        rest.u, state.mu | {name: rest.mu[name] for name in (*held_conjugates, *new_settings)}
+        state_at_rest.u,
+        state.mu | {name: state_at_rest.mu[name] for name in (*held_conjugates, *new_settings)},
     )
 
 
 def viscosity(scene: Scene, state: State) -> Viscosity | None:
-    """Return the viscous forces of the shell at rest in a state; None without."""
+    """Return the viscous forces of a shell that is at rest at a state; None of an elastic shell.
+
+    Times of viscosity and relaxation are over the unit of time of the model, and moduli over E.
+    """
     problem, shell = scene.problem, scene.problem.context.shell
     if shell.viscosity is None and not shell.relaxation:
         return None
     model, branches = scene.model, list[Branch]()
     for branch in shell.relaxation:
-        size = float(in_units("pascal")(branch.modulus))
-        ratio = size / (shell.youngs_modulus or 1.0) if isinstance(branch.modulus, str) else size
-        branches.append(Branch(ratio, dimensionless_time(problem, branch.time)))
+        modulus = float(in_units("pascal")(branch.modulus))
+        relative_modulus = (
+            modulus / (shell.youngs_modulus or 1.0) if isinstance(branch.modulus, str) else modulus
+        )
+        branches.append(Branch(relative_modulus, dimensionless_time(problem, branch.time)))
     assert model.thin
     return Viscosity(model, state.mu, dimensionless_time(problem, shell.viscosity or 0.0), branches)
 
@@ -381,7 +479,16 @@ def viscosity(scene: Scene, state: State) -> Viscosity | None:
 def pushed_along_mode(
     scene: Scene, push: PushSection, state: State, v: Vector
 ) -> tuple[Vector, Vector]:
-    """Return displacement and velocity with a natural mode of the model, inward at the pole."""
+    """Return displacement and velocity with a natural mode added, inward at the pole; collective.
+
+    Parameters
+    ----------
+    push
+        Number of the mode among those of the model's symmetry, its displacement over h and its
+        velocity.
+    v
+        Velocity before, over R and the unit of time.
+    """
     comm = scene.model.system.comm
     modes = ShellModes(scene.model)
     symmetric_modes = [mode for mode in modes.vibrations(state, push.mode) if not mode.label]
@@ -391,14 +498,29 @@ def pushed_along_mode(
     phi = np.asarray(mode / max_abs(comm, mode))
     deflection = scene.model.deflection(phi, "pole")
     if abs(deflection) < MIN_POLE_DEFLECTION:
+        # where the pole rests, the larger crests give the sign
         deflection = dot(comm, phi, phi**2)
-    h = np.copysign(scene.problem.material.h, deflection)
+    signed_thickness = np.copysign(scene.problem.material.h, deflection)
     unit = scene.problem.time_unit or 1.0
-    return state.u + push.displacement * h * phi, v + push.velocity * unit * h * phi
+    return (
+        state.u + push.displacement * signed_thickness * phi,
+        v + push.velocity * unit * signed_thickness * phi,
+    )
 
 
 def velocity_by_formula(scene: Scene, components: Sequence[str]) -> Vector:
-    """Return the velocity at the nodes by formulas of the undeformed place; zero at supports."""
+    """Return the velocity of the nodes by formulas of the undeformed place; zero at supports.
+
+    Parameters
+    ----------
+    components
+        Three formulas of x, y, z, in the case's frame and units.
+
+    Returns
+    -------
+    Vector
+        Unknowns of this rank, over R and the unit of time.
+    """
     model, R, Q = scene.model, scene.problem.length, rotation(scene.problem.azimuth)
     unit, axes = scene.problem.time_unit or 1.0, model.axes
     places = vectors_in_space(model.r0.x.array, len(axes))
@@ -408,17 +530,21 @@ def velocity_by_formula(scene: Scene, components: Sequence[str]) -> Vector:
 
 
 def initial_clock(scene: Scene, load: TimeSection, state: State) -> dict[str, float]:
-    """Return the clock of the state before a step in time, with the energy of its velocity.
+    """Return the columns in time of the state before a step in time: its kinetic energy.
 
-    It is empty if the step has no initial velocity.
+    It is empty if the step has no initial velocity. Collective.
     """
-    v = velocity_by_formula(scene, load.velocity) if load.velocity else 0.0 * state.u
+    velocity = velocity_by_formula(scene, load.velocity) if load.velocity else 0.0 * state.u
     if load.push and load.push.velocity:
-        v = pushed_along_mode(scene, load.push, state, v)[1]
-    if not max_abs(scene.comm, v):
+        velocity = pushed_along_mode(scene, load.push, state, velocity)[1]
+    if not max_abs(scene.comm, velocity):
         return {}
     M = mass(scene.model)
-    x, Mx = M.createVecs()
-    x.setArray(v)
-    M.mult(x, Mx)
-    return {"kinetic": scene.model.multiplicity * dot(scene.comm, v, np.array(Mx.array_r)) / 2}
+    mass_argument, momentum = M.createVecs()
+    mass_argument.setArray(velocity)
+    M.mult(mass_argument, momentum)
+    return {
+        "kinetic": scene.model.multiplicity
+        * dot(scene.comm, velocity, np.array(momentum.array_r))
+        / 2
+    }

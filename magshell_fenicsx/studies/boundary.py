@@ -1,5 +1,6 @@
-"""The boundary of stability of a case: its instability followed in a second key, with cusps, as
-table and picture.
+"""The boundary of stability of a case: its instability, followed in a second key.
+
+Results are a table and a picture, with cusps and other special points.
 """
 
 import copy
@@ -73,8 +74,16 @@ CHANGED = "a fold and a bifurcation change their order"
 
 @dataclass(frozen=True)
 class Range:
-    """The key that varies, from its first to its last value in a unit, and the least number of
-    steps between these.
+    """The key of a case that varies, and its range.
+
+    Attributes
+    ----------
+    first, last
+        First and last value in `unit`, in either order.
+    unit
+        Unit of the values; "" without.
+    steps
+        Least number of steps between both.
     """
 
     key: str
@@ -89,17 +98,17 @@ class Range:
         return min(self.first, self.last), max(self.first, self.last)
 
     def text(self, value: float) -> str:
-        """A value as in the case file."""
+        """Return a value in the unit as in the case file."""
         return f"{float(value)!r} {self.unit}".rstrip()
 
 
 def parse_range(text: str) -> Range:
-    """Read `--over`.
+    """Read `--over`, the key of a boundary and its range.
 
     Raises
     ------
     CaseError
-        If it has another form, or is no range.
+        If the text has another form, or is no range.
 
     Examples
     --------
@@ -109,13 +118,13 @@ def parse_range(text: str) -> Range:
     40
     """
     key, _, values = text.partition("=")
-    parts = values.split(":")
+    bounds_and_steps = values.split(":")
     try:
-        if not re.fullmatch(r"\w+(\.\w+)*", key) or len(parts) not in (2, 3):
+        if not re.fullmatch(r"\w+(\.\w+)*", key) or len(bounds_and_steps) not in (2, 3):
             raise ValueError
-        unit = number_and_unit(parts[0])[1] or number_and_unit(parts[1])[1]
-        first, last = (in_unit(part, unit) for part in parts[:2])
-        steps = int(parts[2]) if len(parts) == 3 else STEPS
+        unit = number_and_unit(bounds_and_steps[0])[1] or number_and_unit(bounds_and_steps[1])[1]
+        first, last = (in_unit(bound, unit) for bound in bounds_and_steps[:2])
+        steps = int(bounds_and_steps[2]) if len(bounds_and_steps) == 3 else STEPS
     except ValueError:
         raise CaseError(f"--over {text}: {FORMS}") from None
     if not np.isfinite([first, last]).all() or first == last:
@@ -132,7 +141,7 @@ def parse_range(text: str) -> Range:
 
 @dataclass(frozen=True)
 class StabilityBoundary:
-    """A finished boundary.
+    """A finished boundary of stability: a curve of instabilities in the plane of a key and a load.
 
     Attributes
     ----------
@@ -170,8 +179,8 @@ def boundary(
     """Follow the instability at the end of a case in a second key; collective, two ranks work.
 
     The case is run once. From its instability both directions are followed, through turning points,
-    until the key leaves its range; what the folder has of an interrupted boundary is kept. See
-    `continuation.boundary`.
+    until the key leaves its range. Points that the folder has of an interrupted boundary are kept.
+    See `continuation.boundary`.
 
     Parameters
     ----------
@@ -184,7 +193,7 @@ def boundary(
         Makes a case of its source.
     start
         Another instability: "DIR:POINT", a located point of the run in a folder, whose case takes
-        the place of `file`.
+        the place of `file`. None: the first instability of the last step.
 
     Raises
     ------
@@ -202,9 +211,9 @@ def boundary(
     for setting in settings if start else ():
         override(source, setting)
     folder, name = user_folder(out), Path(file).name
-    once: Say = say if comm.rank == 0 else lambda line: None
-    with FOLDER.locked(folder, comm, name), heard(comm, once) as once:
-        say = once if comm.rank == 0 else say
+    say_on_first_rank: Say = say if comm.rank == 0 else lambda line: None
+    with FOLDER.locked(folder, comm, name), heard(comm, say_on_first_rank) as say_on_first_rank:
+        say = say_on_first_rank if comm.rank == 0 else say
         journal = partial(
             Journal, folder / "points", _identity(source, span, make_case, begun_at.text)
         )
@@ -214,7 +223,7 @@ def boundary(
         )
         name_of_mode = begin["mode"]
         if name_of_mode == "antisymmetric":
-            once("the instability is antisymmetric: the whole shell is modelled")
+            say_on_first_rank("the instability is antisymmetric: the whole shell is modelled")
             override(source, "symmetry=none")
             half_source = begun_at.anywhere()
             begin = access_disk(
@@ -225,13 +234,19 @@ def boundary(
             first_instability([])
         name_of_mode = name_of_mode if begin["label"] == "bifurcation" else begin["mode"]
         begin = {**begin, "name_of_mode": name_of_mode, "is_first": not begun_at.text}
-        once(
+        say_on_first_rank(
             f"{span.key} = {span.text(value)}: {begin['label']} at "
             f"{load_text(begin['row'], begin['amplitude'])}"
         )
-        senses = [sense for sense, end in ((-1, span.ends[0]), (1, span.ends[1])) if end != value]
+        directions = [
+            sense for sense, end in ((-1, span.ends[0]), (1, span.ends[1])) if end != value
+        ]
 
         def followed(sense: int) -> Iterator[str]:
+            """Follow one direction, down (-1) or up (1) in the key, unless its journal is finished.
+
+            Yields a line of text.
+            """
             part_journal = journal("down" if sense < 0 else "up")
             if not part_journal.outcome:
                 part_journal.finish(
@@ -240,31 +255,47 @@ def boundary(
             rows = part_journal.outcome["rows"]
             yield f"{len(rows) - 1} points from {span.text(value)} to {span.text(rows[-1]['key'])}"
 
-        compute(senses, followed, comm, say)
+        compute(directions, followed, comm, say)
         outcomes = access_disk(
             comm,
-            lambda: {sense: journal("down" if sense < 0 else "up").outcome for sense in senses},
+            lambda: {sense: journal("down" if sense < 0 else "up").outcome for sense in directions},
         )
         stability_boundary = _put_together(outcomes, begin, span, name, settings)
         access_disk(comm, lambda: _write(stability_boundary, folder))
     for line in stability_boundary.content["said"]:
-        once(line)
+        say_on_first_rank(line)
     return stability_boundary
 
 
 def _value(source: Source, span: Range, make_case: MakeCase, may_be_outside: bool) -> float:
-    """Return the key's value at which the boundary starts: the case's own value, or where that may
-    be outside the range, the nearest end.
+    """Return the value of the key, in the unit of the range, at which the boundary starts.
+
+    It is the value of the case; outside the range the nearest end. If the case has no number in
+    this unit there, such as a word, it is the first value of the range.
+
+    Parameters
+    ----------
+    may_be_outside
+        Whether the value of the case may be outside the range.
+
+    Raises
+    ------
+    CaseError
+        If the key is a section, a list or a truth value, or its value is outside.
     """
-    words = span.key.split(".")
-    raw = value_at(source.data, words)
-    raw = value_at(make_case(source).model_dump(mode="json"), words) if raw is None else raw
+    key_path = span.key.split(".")
+    value_in_case = value_at(source.data, key_path)
+    value_in_case = (
+        value_at(make_case(source).model_dump(mode="json"), key_path)
+        if value_in_case is None
+        else value_in_case
+    )
     try:
-        value = in_unit(str(raw), span.unit)
+        value = in_unit(str(value_in_case), span.unit)
     except ValueError:
-        if isinstance(raw, dict | list | bool):
+        if isinstance(value_in_case, dict | list | bool):
             raise CaseError(
-                f"--over {span.key}: is no number in the case, but {type(raw).__name__}"
+                f"--over {span.key}: is no number in the case, but {type(value_in_case).__name__}"
             ) from None
         value = span.first
     if not may_be_outside and not span.ends[0] <= value <= span.ends[1]:
@@ -276,12 +307,14 @@ def _value(source: Source, span: Range, make_case: MakeCase, may_be_outside: boo
 
 
 def _problem(source: Source, span: Range, make_case: MakeCase, value: float) -> Problem:
-    """The problem at a value of the key.
+    """Return the problem of the case at a value of the key, in the unit of the range.
+
+    It has the modes of the perfect shell that its imperfections need.
 
     Raises
     ------
     CaseError
-        If it is not valid.
+        If the problem is not valid.
     """
     source_at_value, assignment = copy.deepcopy(source), f"{span.key}={span.text(value)}"
     try:
@@ -294,7 +327,7 @@ def _problem(source: Source, span: Range, make_case: MakeCase, value: float) -> 
 
 
 def _identity(source: Source, span: Range, make_case: MakeCase, start: str) -> str:
-    """Hash of the case, the range and the start."""
+    """Return a hash of the case, the range and the text of the start, for names of journals."""
     case = make_case(source)
     data = [case.model_dump(mode="json") | case.outside, asdict(span), *([start] if start else [])]
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
@@ -309,7 +342,31 @@ def _begin(
     say: Say,
     start: Start,
 ) -> dict[str, Any]:
-    """The run to the instability, as data; without a label there is none."""
+    """Run the case to the instability at which the boundary starts, or take it from the journal.
+
+    Parameters
+    ----------
+    span, value
+        Range of the key, and the value in its unit at which the case is run.
+    journal
+        Keeps the outcome of the run.
+    say
+        Called with remarks of the run.
+    start
+        Says which instability of the history is taken.
+
+    Returns
+    -------
+    Label, mode, amplitude, step and load of the instability, and its state as text; the label is ""
+    if there is none.
+
+    Raises
+    ------
+    CaseError
+        If the problem at an end of the range is not valid, or `start` is not found.
+    Stopped
+        If the path is lost before the instability.
+    """
     for end in span.ends:
         _problem(source, span, make_case, end)
     if journal.outcome:
@@ -324,21 +381,21 @@ def _begin(
     except Stopped as e:  # what lies beyond an instability does not matter
         lost_reason = e
     try:
-        located = start.instability_in(records)
+        instability = start.instability_in(records)
     except CaseError:
         if lost_reason:
             raise lost_reason from None
         if start.text:
             raise
         return {"label": "", "mode": ""}
-    state = located.point.state
+    state = instability.point.state
     outcome = {
-        "label": located.label,
-        "mode": located.mode,
-        "amplitude": located.amplitude,
-        "step": located.step,
-        "value": state.mu[located.amplitude],
-        "row": _load(located.amplitude, state.mu[located.amplitude], scene.problem),
+        "label": instability.label,
+        "mode": instability.mode,
+        "amplitude": instability.amplitude,
+        "step": instability.step,
+        "value": state.mu[instability.amplitude],
+        "row": _load(instability.amplitude, state.mu[instability.amplitude], scene.problem),
         "u": text_of(state.u),
         "mu": state.mu,
         "factorisations": scene.newton.factorisation.count,
@@ -357,7 +414,31 @@ def _followed(
     part_journal: Journal,
     say: Say,
 ) -> dict[str, Any]:
-    """One direction of the boundary: its rows from the start, and why it stopped if it did."""
+    """Follow the boundary in one direction from its start.
+
+    Parameters
+    ----------
+    value
+        Value of the key at the start, in the unit of the range.
+    sense
+        Direction of the key: -1 falling, 1 growing.
+    begin
+        The instability at the start, see `_begin`.
+    part_journal
+        Journal that replays the solves of an interrupted boundary.
+
+    Returns
+    -------
+    `rows`: points from the start as in boundary.csv; `stopped`: reason for an early end, else "";
+    `alone`: whether one scene serves all values, as only amplitudes depend on the key.
+
+    Raises
+    ------
+    CaseError
+        If the key has no influence, or the instability cannot be followed.
+    Stopped
+        If not even the start is found.
+    """
     scene = Scene(_problem(source, span, make_case, value), MPI.COMM_SELF)
     u = vector_of(begin["u"])
     point = Point(State(u, begin["mu"]), 0.0, 0.0 * u, 0.0, 0, 0)
@@ -373,13 +454,14 @@ def _followed(
     start_time, end = time.perf_counter(), span.ends[sense > 0]
 
     def take(label: Label, locus: BoundaryPoint, mode: Boundary) -> None:
+        """Append a point of the boundary to `rows`, and say it with the remaining time."""
         row = _row(family, label, locus, mode, begin["name_of_mode"])
         rows.append(row)
         # of the way, which may turn back
-        part = max((row_of_curve["key"] - value) / (end - value) for row_of_curve in rows)
+        covered_part = max((row_of_curve["key"] - value) / (end - value) for row_of_curve in rows)
         remaining = (
-            remaining_time_text((time.perf_counter() - start_time) * (1 / part - 1))
-            if part > 0
+            remaining_time_text((time.perf_counter() - start_time) * (1 / covered_part - 1))
+            if covered_part > 0
             else ""
         )
         other_modes = f", {row['unstable']} other unstable" if row["unstable"] else ""
@@ -390,6 +472,7 @@ def _followed(
         )
 
     def curve(m: int, start_point: BoundaryPoint | None = None) -> Boundary:
+        """Return the boundary of modes with m waves around a meridian; 0: of the model itself."""
         kind = family.kind_of(m, start_point)
         return Boundary(
             family, family.name, kind, scales, part_journal.recorded, m, family.excludes
@@ -415,17 +498,28 @@ def _followed(
 def _row(
     family: SceneFamily, label: Label, locus: BoundaryPoint, mode: Boundary, name_of_mode: str
 ) -> dict[str, Any]:
-    """A row of boundary.csv; the model's own mode has its name in path.csv of the case, also on the
-    whole."""
-    families = sorted({mode.m, locus.met} if label == "crossing" else {mode.m})
+    """Return a row of boundary.csv.
+
+    The model's own mode has its name in path.csv of the case, also if the whole shell is modelled.
+
+    Parameters
+    ----------
+    label
+        "start", or the label of the point on the boundary.
+    mode
+        The boundary that the point is on.
+    name_of_mode
+        Name of the model's own mode.
+    """
+    wave_numbers = sorted({mode.m, locus.met} if label == "crossing" else {mode.m})
     mode_name = "" if family.m else name_of_mode
-    if len(families) > 1 and not families[0]:
+    if len(wave_numbers) > 1 and not wave_numbers[0]:
         mode_name = family.kind_of(0, locus)
     return {
         "key": float(locus.p),
         **_load(family.name, locus.state.mu[family.name], family.problem(locus.p)),
         "kind": label if label in SPECIAL else mode.kind,
-        "mode": ", ".join(f"{WAVES}{m}" if m else mode_name for m in families),
+        "mode": ", ".join(f"{WAVES}{m}" if m else mode_name for m in wave_numbers),
         "error": float(locus.load_error),
         "unstable": int(
             locus.unstable - (locus.unstable_of(locus.met) if label == "crossing" else 0)
@@ -435,7 +529,7 @@ def _row(
 
 
 def _load(name: str, value: float, problem: Problem) -> dict[str, float]:
-    """A load, and what it is in the case's units if it has any, as columns."""
+    """Return the columns of a load: `load`, and the load in the case's units if it has any."""
     measured = sizes_in_units(problem).values({amplitude(name).column: value})
     return {"load": float(value), **{column: float(number) for column, number in measured.items()}}
 
@@ -447,19 +541,30 @@ def _put_together(
     name: str,
     settings: Sequence[str],
 ) -> StabilityBoundary:
-    """Join both directions of the boundary into one curve; return it with its description."""
+    """Join both directions of the boundary into one curve; return it with its description.
+
+    Parameters
+    ----------
+    outcomes
+        Direction (-1 or 1) -> what `_followed` returns.
+    begin
+        The instability at the start, see `_begin`.
+    name
+        Name of the case file.
+    """
     down, up = (outcomes.get(sense, {"rows": [], "stopped": ""}) for sense in (-1, 1))
     rows = [*reversed(down["rows"]), *up["rows"][1 if down["rows"] else 0 :]]
     special = [row for row in rows if row["kind"] in SPECIAL]
 
     def sentence(row: dict[str, Any]) -> str:
+        """Describe a special point in words."""
         place = f"{span.key} = {row['key']:.9g} {span.unit}".rstrip()
         words = CHANGED if "fold" in row["mode"] else WORDS_OF_KINDS[row["kind"]]
         modes = f", {row['mode']}" if row["kind"] == "crossing" else ""
         return f"{place}, {load_text(row, begin['amplitude'])}: {words}{modes}"
 
     sentences = [sentence(row) for row in special]
-    stopped = [part["stopped"] for part in (down, up) if part["stopped"]]
+    stopped = [outcome["stopped"] for outcome in (down, up) if outcome["stopped"]]
     key_range = min(row["key"] for row in rows), max(row["key"] for row in rows)
     for end, key in zip(sorted((span.first, span.last)), key_range, strict=True):
         if not stopped and abs(key - end) > END_TOLERANCE * abs(span.last - span.first):
@@ -491,6 +596,7 @@ def _put_together(
 
 
 def _write(stability_boundary: StabilityBoundary, folder: Path) -> None:
+    """Write boundary.json, boundary.csv and boundary.png."""
     extra_columns = [name for name in stability_boundary.rows[0] if name not in COLUMNS]
     write_object(folder / "boundary.json", stability_boundary.content)
     write_csv(stability_boundary.rows, (*COLUMNS, *extra_columns), folder / "boundary.csv")

@@ -18,9 +18,19 @@ PLAIN_DATA: TypeAdapter[dict[str, Any]] = TypeAdapter(dict[str, Any])
 
 
 class Journal:
-    """The results of the solves of a part of the boundary, a file each, and of the whole part.
+    """Results of a part of the boundary on disk: a file for each solve, and for the part.
 
-    `recorded` replays what these sources have kept of an interrupted one.
+    `recorded` replays the solves of an interrupted boundary, if the present sources have computed
+    them.
+
+    Parameters
+    ----------
+    folder
+        Folder of the files.
+    identity
+        Hash of case, range and start.
+    part
+        Name of the part: "start", "whole", "up" or "down".
     """
 
     def __init__(self, folder: Path, identity: str, part: str) -> None:
@@ -32,13 +42,16 @@ class Journal:
         return self._stored_outcome(self._name) or {}
 
     def finish(self, outcome: dict[str, Any]) -> None:
-        """Keep the whole part in place of its solves."""
+        """Keep the result of the whole part, and delete the files of its solves."""
         keep(self._folder / f"{self._name}.json", {"sources": code_version(), "outcome": outcome})
         for file in self._folder.glob(f"{self._name}-*.json"):
             file.unlink(missing_ok=True)
 
     def recorded(self, solve: Callable[[], BoundaryPoint | str]) -> BoundaryPoint | str:
-        """The result of a solve, or that of an interrupted boundary at this place."""
+        """Return the result of the next solve: stored, or computed by `solve` and kept.
+
+        A result is a point of the boundary, or the reason why there is none.
+        """
         name, self._count = f"{self._name}-{self._count:04d}", self._count + 1
         if (saved := self._stored_outcome(name)) is not None:
             return _locus(saved) if "state" in saved else str(saved["reason"])
@@ -48,20 +61,24 @@ class Journal:
         return solved
 
     def _stored_outcome(self, name: str) -> dict[str, Any] | None:
+        """Return the content of a file by its name; None unless these sources wrote it."""
         return stored_outcome(
             self._folder / f"{name}.json", PLAIN_DATA, "outcome", sources=code_version()
         )
 
 
 def text_of(v: Vector) -> str:
+    """Return a vector as text, bit by bit."""
     return base64.b64encode(np.ascontiguousarray(v).tobytes()).decode()
 
 
 def vector_of(text: str) -> Vector:
+    """Return the vector that `text_of` has written."""
     return np.frombuffer(base64.b64decode(text)).copy()
 
 
 def _as_data(locus: BoundaryPoint) -> dict[str, Any]:
+    """Return a point of the boundary as plain data, with vectors as text."""
     data = {attribute.name: getattr(locus, attribute.name) for attribute in fields(locus)}
     state = {"u": text_of(locus.state.u), "mu": locus.state.mu}
     tangent = {"du": text_of(locus.way.du), "dmu": locus.way.dmu, "dp": locus.way.dp}
@@ -69,6 +86,7 @@ def _as_data(locus: BoundaryPoint) -> dict[str, Any]:
 
 
 def _locus(data: dict[str, Any]) -> BoundaryPoint:
+    """Return the point of the boundary from the plain data of `_as_data`."""
     state = State(vector_of(data["state"]["u"]), data["state"]["mu"])
     tangent = CurveVector(vector_of(data["way"]["du"]), data["way"]["dmu"], data["way"]["dp"])
     return BoundaryPoint(**{**data, "state": state, "way": tangent, "phi": vector_of(data["phi"])})

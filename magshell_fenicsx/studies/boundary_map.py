@@ -28,12 +28,17 @@ FOLDER = Folder(
 
 
 def second_axis(text: str, first: str) -> Axis:
-    """Read the second `--over`.
+    """Read the second `--over` of a map.
+
+    Parameters
+    ----------
+    first
+        The key of the first `--over`.
 
     Raises
     ------
     CaseError
-        If it is no list of numbers of one other key, each once.
+        If the text is no list of numbers of one other key, each once.
     """
     axis = parse_axis(text)
     if (
@@ -48,11 +53,11 @@ def second_axis(text: str, first: str) -> Axis:
             "key.path=first:last:count or key.path=value,value,..."
         )
     numbers = [axis.number(value) for value in axis.values]
-    if twice := next(
+    if repeated := next(
         (value for i, value in enumerate(axis.values) if numbers[i] in numbers[:i]), None
     ):
         raise CaseError(
-            f"--over {text}: {twice} stands twice: each value of the second key has one boundary"
+            f"--over {text}: {repeated} stands twice: each value of the second key has one boundary"
         )
     return axis
 
@@ -68,8 +73,9 @@ def boundary_map(
     make_case: MakeCase,
     start: str | None = None,
 ) -> StabilityBoundary:
-    """Follow the instability of a case in one key, for each value of a second one if there is one;
-    collective.
+    """Follow the instability of a case in one key, for each value of a second one if there is one.
+
+    Collective.
 
     Parameters
     ----------
@@ -79,6 +85,10 @@ def boundary_map(
     out
         Folder of boundary.csv (with the columns `second` and `amplitude`, whose load it is),
         map.json, boundary.png and boundaries/, a folder for each value; what these have is kept.
+    make_case
+        Makes a case of its source.
+    start
+        See `boundary`; only for one key.
 
     Returns
     -------
@@ -104,11 +114,15 @@ def boundary_map(
     for setting in settings:
         if setting.partition("=")[0].strip() == axis.name:
             raise CaseError(f"--set {setting}: this key is swept by --over")
-    folder, once = user_folder(out), say if comm.rank == 0 else (lambda line: None)
-    rows, without, lines = list[dict[str, Any]](), dict[str, str](), dict[str, StabilityBoundary]()
+    folder, say_on_first_rank = user_folder(out), say if comm.rank == 0 else (lambda line: None)
+    rows, without, boundaries = (
+        list[dict[str, Any]](),
+        dict[str, str](),
+        dict[str, StabilityBoundary](),
+    )
     with FOLDER.locked(folder, comm, Path(file).name):
         for number, value in enumerate(axis.values, 1):
-            once(f"{axis.name} = {value}, {number} of {len(axis.values)}")
+            say_on_first_rank(f"{axis.name} = {value}, {number} of {len(axis.values)}")
             line_settings = [*settings, f"{axis.name}={value}"]
             try:
                 line_boundary = boundary(
@@ -122,13 +136,13 @@ def boundary_map(
                 )
             except (ExcludedInstability, NoInstability, Stopped) as e:
                 without[value] = str(e)
-                once(f"{axis.name} = {value}: no boundary: {e}")
+                say_on_first_rank(f"{axis.name} = {value}: no boundary: {e}")
                 continue
             except CaseError as e:
                 raise CaseError(
                     str(e).replace(f"--set {line_settings[-1]}", f"--over {line_settings[-1]}")
                 ) from None
-            lines[value] = line_boundary
+            boundaries[value] = line_boundary
             rows += [
                 {"second": axis.number(value), "amplitude": line_boundary.content["load"], **row}
                 for row in line_boundary.rows
@@ -137,11 +151,11 @@ def boundary_map(
             raise CaseError(
                 f"--over {overs[1]}: the case has an instability at none of these values"
             )
-        content = _content(file, settings, lines, without, axis)
+        content = _content(file, settings, boundaries, without, axis)
         stability_map = StabilityBoundary(rows, content)
         access_disk(comm, lambda: _write(stability_map, folder))
     for line in content["said"]:
-        once(line)
+        say_on_first_rank(line)
     return stability_map
 
 
@@ -152,14 +166,25 @@ def _content(
     without: dict[str, str],
     axis: Axis,
 ) -> dict[str, Any]:
-    first, loads = (
+    """Return the content of map.json.
+
+    Parameters
+    ----------
+    lines
+        Value of the second key as text -> its boundary.
+    without
+        Value of the second key as text -> why it has no boundary.
+    axis
+        The second key.
+    """
+    first_content, loads = (
         next(iter(lines.values())).content,
         [line.content["load"] for line in lines.values()],
     )
     special = [
-        {"second": axis.number(value), **each}
+        {"second": axis.number(value), **row}
         for value, line in lines.items()
-        for each in line.special
+        for row in line.special
     ]
     sentences = [
         f"{axis.name} = {value}: {text}"
@@ -169,9 +194,9 @@ def _content(
     return {
         "case": Path(file).name,
         "settings": list(settings),
-        "keys": [first["key"], axis.name],
-        "units": [first["unit"], axis.unit],
-        "range": [first["from"], first["to"]],
+        "keys": [first_content["key"], axis.name],
+        "units": [first_content["unit"], axis.unit],
+        "range": [first_content["from"], first_content["to"]],
         "values": [axis.number(value) for value in axis.values],
         "load": max(loads, key=loads.count),
         "kinds": {
@@ -188,6 +213,7 @@ def _content(
 
 
 def _write(stability_map: StabilityBoundary, folder: Path) -> None:
+    """Write map.json, boundary.csv and boundary.png; called on rank 0."""
     extra_columns = dict.fromkeys(
         name
         for row in stability_map.rows

@@ -30,12 +30,14 @@ Row = Mapping[str, Any]
 
 
 def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> None:
-    """Draw the curve, dashed where other modes are unstable already, and name what it divides.
+    """Draw the boundary, dashed where other modes are unstable already, and name what it divides.
 
     Parameters
     ----------
     rows, content
         As in boundary.csv and boundary.json.
+    file
+        Name of the picture file.
     """
     import matplotlib
 
@@ -44,8 +46,8 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
 
     rows, label = _in_units(rows, content["load"])
     figure, plot = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
-    parts = [part for _, part in _by_mode(rows)]
-    for smooth_part in parts:  # with a corner where two bifurcations cross
+    mode_parts = [part for _, part in _by_mode(rows)]
+    for smooth_part in mode_parts:  # with a corner where two bifurcations cross
         pairs = groupby(
             pairwise(smooth_part), key=lambda each: bool(each[0]["unstable"] or each[1]["unstable"])
         )
@@ -53,10 +55,10 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
             segments = [*group]
             line = [segments[0][0], *(upper_point for _, upper_point in segments)]
             _line(plot, line, color="C0", linestyle="--" if unstable else "-")
-    plot.margins(y=0.2 if len(parts) > 1 else None)
+    plot.margins(y=0.2 if len(mode_parts) > 1 else None)
     _marks(plot, "load", rows)
-    for x, y, words in _regions(rows, content, plot.get_ylim()):
-        plot.annotate(words, (x, y), ha="center", va="center", color="0.35")
+    for x, y, region_name in _regions(rows, content, plot.get_ylim()):
+        plot.annotate(region_name, (x, y), ha="center", va="center", color="0.35")
     arms = _arms(rows)
     if arms:
         low, high = arms
@@ -73,13 +75,16 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
 
 
 def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> None:
-    """Draw the boundaries in their own key, one line a value of the second, and cusps in the plane
-    of both keys.
+    """Draw the boundaries over their own key, a line for each value of the second key.
+
+    A second panel has cusps and other special points in the plane of both keys.
 
     Parameters
     ----------
     rows, content
         As in boundary.csv and map.json.
+    file
+        Name of the picture file.
     """
     import matplotlib
 
@@ -87,12 +92,14 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
     import matplotlib.pyplot as plt
 
     rows, label = _in_units(rows, content["load"])
-    others = [row for row in rows if row["amplitude"] != content["load"]]
-    empty = sorted(set(content["values"]) - {row["second"] for row in rows})
-    of_plane = bool(others or empty or any(row["kind"] in MARKS for row in rows))
-    width_inches = 10.2 if of_plane else 6.4
+    rows_of_other_loads = [row for row in rows if row["amplitude"] != content["load"]]
+    values_without_boundary = sorted(set(content["values"]) - {row["second"] for row in rows})
+    with_plane = bool(
+        rows_of_other_loads or values_without_boundary or any(row["kind"] in MARKS for row in rows)
+    )
+    width_inches = 10.2 if with_plane else 6.4
     figure, plots = plt.subplots(
-        1, 1 + of_plane, figsize=(width_inches, 4.4), layout="constrained", squeeze=False
+        1, 1 + with_plane, figsize=(width_inches, 4.4), layout="constrained", squeeze=False
     )
     plot, plane = plots[0, 0], plots[0, -1]
     names = [
@@ -101,14 +108,14 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
     shade = plt.Normalize(min(content["values"]), max(content["values"]))
     for value in sorted({row["second"] for row in rows}, reverse=True):
         line = [row for row in rows if row["second"] == value]
-        if line[0] not in others:
+        if line[0] not in rows_of_other_loads:
             text = f"{value:g}".replace("-", "−")
             _line(plot, line, color=plt.cm.viridis(0.9 * shade(value)), marked=True, label=text)
-    _marks(plot, "load", [row for row in rows if row not in others])
+    _marks(plot, "load", [row for row in rows if row not in rows_of_other_loads])
     plot.set(xlabel=names[0], ylabel=label, title=_title(content))
     plot.legend(**LEGEND, title=names[1], title_fontsize=8)
-    if of_plane:
-        _plane(plane, rows, content, empty)
+    if with_plane:
+        _plane(plane, rows, content, values_without_boundary)
         plane.set(xlabel=names[0], ylabel=names[1], title="where it loses its stability")
         plane.legend(**LEGEND)
     figure.savefig(file, dpi=200)
@@ -126,10 +133,21 @@ def _in_units(rows: Sequence[Row], load: str) -> tuple[list[Row], str]:
 def _plane(
     plane: Any, rows: Sequence[Row], content: Mapping[str, Any], empty: Sequence[float]
 ) -> None:
-    """Draw lines of both keys at which an instability occurs, by load, and marks without one."""
+    """Draw where the case is unstable in the plane of both keys, a line for each second value.
+
+    Lines are coloured by the load; dotted lines are values without an instability.
+
+    Parameters
+    ----------
+    plane
+        Axes of the picture.
+    empty
+        Values of the second key without a boundary.
+    """
     load_words = set[str]()
 
     def draw(x: Sequence[float], value: float, words: str, **style: Any) -> None:
+        """Draw a line at a value of the second key; each text is in the legend once."""
         plane.plot(
             [min(x), max(x)], [value] * 2, label="" if words in load_words else words, **style
         )
@@ -146,7 +164,13 @@ def _plane(
 
 
 def _marks(plot: Any, upwards: str, rows: Sequence[Row]) -> None:
-    """Cusps, turning points and second modes."""
+    """Draw marks at cusps, turning points and second modes.
+
+    Parameters
+    ----------
+    upwards
+        Column of the vertical axis.
+    """
     for kind, mark in MARKS.items():
         places = [(row["key"], row[upwards]) for row in rows if row["kind"] == kind]
         if places:
@@ -154,7 +178,7 @@ def _marks(plot: Any, upwards: str, rows: Sequence[Row]) -> None:
 
 
 def _line(plot: Any, rows: Sequence[Row], marked: bool = False, **style: Any) -> None:
-    """A smooth line through the points of a boundary, with dots where one is to see them."""
+    """Draw a smooth line through the points of a boundary, if wanted with a dot at each point."""
     x, y = _smoothed(
         [(row["key"], row["load"]) for row in rows], [row["kind"] in MARKS for row in rows]
     )
@@ -169,19 +193,29 @@ def _line(plot: Any, rows: Sequence[Row], marked: bool = False, **style: Any) ->
 
 
 def _smoothed(places: Sequence[tuple[float, float]], located: Sequence[bool] = ()) -> Any:
+    """Return x and y of a smooth curve through places (x, y).
+
+    Parameters
+    ----------
+    located
+        Whether each place is a special point, such as a cusp.
+    """
     x, y = zip(*places, strict=True)
     return smooth(x, y, located)
 
 
 def _title(content: Mapping[str, Any]) -> str:
-    """The case, and what is set in it."""
+    """Return the name of the case, and its settings."""
     return ", ".join([Path(content["case"]).stem.replace("_", " "), *content.get("settings", ())])
 
 
 def _arms(
     rows: Sequence[Row],
 ) -> tuple[list[tuple[float, float]], list[tuple[float, float]]] | None:
-    """The two folds of the first cusp, from it on; None without one."""
+    """Return the two folds that begin at the first cusp, each as places (key, load).
+
+    None if there is no cusp.
+    """
     cusp_row = next((i for i, row in enumerate(rows) if row["kind"] == "cusp"), None)
     if cusp_row is None:
         return None
@@ -195,19 +229,25 @@ def _arms(
 def _regions(
     rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[float, float]
 ) -> list[tuple[Any, ...]]:
-    """Places and names of the regions; beyond a boundary of several modes each has its own.
+    """Return the regions beside a boundary, each as key, load and name.
 
-    Where a bifurcation comes after other instabilities it divides nothing that is stable.
+    Beyond a boundary of several modes each has its own. A bifurcation after other instabilities
+    divides nothing that is stable, so it is left out.
+
+    Parameters
+    ----------
+    limits
+        Lower and upper limit of the load's axis.
     """
     rows = [row for row in rows if not row["unstable"]] or rows
-    parts, all_regions = _by_mode(rows), _regions_of_mode(rows, content, limits)
-    if len(parts) < 2:
+    mode_parts, all_regions = _by_mode(rows), _regions_of_mode(rows, content, limits)
+    if len(mode_parts) < 2:
         return all_regions
     extent, regions = (
         np.ptp([row["key"] for row in rows]),
         [region for region in all_regions if region[2] == "stable"],
     )
-    for mode, part in parts:
+    for mode, part in mode_parts:
         kind = next(
             (row["kind"] for row in part if row["kind"] in ("fold", "bifurcation")), content["kind"]
         )
@@ -224,12 +264,21 @@ def _regions(
 def _regions_of_mode(
     rows: Sequence[Row], content: Mapping[str, Any], limits: tuple[float, float]
 ) -> list[tuple[Any, ...]]:
-    """Places and names of the regions beside a boundary of one mode."""
+    """Return the regions beside a boundary of one mode, each as key, load and name.
+
+    They are above and below the middle of the boundary, and between its arms.
+
+    Parameters
+    ----------
+    limits
+        Lower and upper limit of the load's axis.
+    """
     instability_words = (
         "snaps" if content["kind"] == "fold" else f"buckles {_mode(content['mode'])}".rstrip()
     )
     x = float(np.mean([min(row["key"] for row in rows), max(row["key"] for row in rows)]))
-    crossed = sorted(
+    # loads of the boundary at the middle of its range of keys
+    loads_at_middle = sorted(
         lower_row["load"]
         + (x - lower_row["key"])
         / (upper_row["key"] - lower_row["key"])
@@ -238,30 +287,38 @@ def _regions_of_mode(
         if (lower_row["key"] - x) * (upper_row["key"] - x) <= 0
         and lower_row["key"] != upper_row["key"]
     )
-    if not crossed:
+    if not loads_at_middle:
         return []
-    up = np.mean(crossed) > 0  # loads are negative elsewhere
+    up = np.mean(loads_at_middle) > 0  # loads are negative elsewhere
     outer, inner = (limits[1], limits[0]) if up else (limits[0], limits[1])
-    last, first = (crossed[-1], crossed[0]) if up else (crossed[0], crossed[-1])
-    regions = [(x, (last + outer) / 2, instability_words), (x, (first + inner) / 2, "stable")]
-    if len(crossed) > 1:
+    outermost_load, innermost_load = (
+        (loads_at_middle[-1], loads_at_middle[0])
+        if up
+        else (loads_at_middle[0], loads_at_middle[-1])
+    )
+    regions = [
+        (x, (outermost_load + outer) / 2, instability_words),
+        (x, (innermost_load + inner) / 2, "stable"),
+    ]
+    if len(loads_at_middle) > 1:
         middle_words = "bistable" if content["kind"] == "fold" else instability_words
-        regions.append((x, (crossed[0] + crossed[-1]) / 2, middle_words))
+        regions.append((x, (loads_at_middle[0] + loads_at_middle[-1]) / 2, middle_words))
         if content["kind"] != "fold":
-            regions[0] = (x, (last + outer) / 2, "stable")
+            regions[0] = (x, (outermost_load + outer) / 2, "stable")
     return regions
 
 
 def _by_mode(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
-    """The modes one after the other, each with its rows and the crossings at their ends."""
-    ends = [i for i, row in enumerate(rows) if row["kind"] == "crossing"]
-    parts = ([*rows[a : b + 1]] for a, b in pairwise([0, *ends, len(rows) - 1]))
+    """Return the modes along the boundary, each with its rows and the crossings at their ends."""
+    crossing_numbers = [i for i, row in enumerate(rows) if row["kind"] == "crossing"]
+    row_groups = ([*rows[a : b + 1]] for a, b in pairwise([0, *crossing_numbers, len(rows) - 1]))
     mode_parts = (
-        (next((row["mode"] for row in part if row["kind"] != "crossing"), None), part)
-        for part in parts
+        (next((row["mode"] for row in row_group if row["kind"] != "crossing"), None), row_group)
+        for row_group in row_groups
     )
-    return [(mode, part) for mode, part in mode_parts if mode is not None]
+    return [(mode, row_group) for mode, row_group in mode_parts if mode is not None]
 
 
 def _mode(mode: str) -> str:
+    """Return the words "with m = ..." for a mode of waves around a meridian, else ""."""
     return f"with {mode}" if mode.startswith("m = ") else ""

@@ -29,11 +29,11 @@ class Start:
     Attributes
     ----------
     text
-        DIR:POINT as it is given; "" for the first instability of the last step.
+        DIR:POINT as given; "" for the first instability of the last step.
     point
-        Its number in the history; -1 without one.
+        Number of the point in the history; -1 for any number.
     load
-        At the point, as in its column of path.csv.
+        The load at the point, as in its column of path.csv.
     """
 
     text: str = ""
@@ -41,16 +41,19 @@ class Start:
     load: float = 0.0
 
     def complete(self, records: Sequence[Record]) -> bool:
-        """Whether no further records are needed."""
+        """Return whether the records reach the point, so that no further ones are needed."""
         return 0 <= self.point < len(records)
 
     def instability_in(self, records: Sequence[Record]) -> Record:
-        """The instability of a history.
+        """Return the record of the instability in a history.
+
+        It is the point with the number and the load; else the fold or bifurcation with the nearest
+        load, within a tolerance.
 
         Raises
         ------
         NoInstability
-            If it is not there.
+            If the history has no such point.
         """
         if not self.text:
             return first_instability(records)
@@ -66,30 +69,31 @@ class Start:
         return min(candidates, key=lambda r: abs(_load(r) - self.load))
 
     def anywhere(self) -> "Start":
-        """Return the same instability for a history with other points, such as that of the whole
-        shell.
-        """
+        """Return the same instability for a history of other points, as of the whole shell."""
         return replace(self, point=-1)
 
 
 def _load(record: Record) -> float:
+    """Return the load of a record, the amplitude that varies there."""
     return float(record.point.state.mu.get(record.amplitude, 0.0))
 
 
 def start_from(text: str | None, source: Source) -> tuple[Start, Source]:
-    """Read `--from`: which instability is meant, and the case of that run in place of a case.
+    """Read `--from`: return the instability, and the case of its run in place of a case.
+
+    Without a text the case is unchanged, and the instability is the first of the last step.
 
     Raises
     ------
     CaseError
-        If it has another form, or there is no such point.
+        If the text has another form, or there is no such point.
     """
     if not text:
         return Start(), source
-    parts = re.fullmatch(r"(.+):(\d+)", text)
-    if not parts:
+    start_match = re.fullmatch(r"(.+):(\d+)", text)
+    if not start_match:
         raise CaseError(f"--from {text}: {FORM}")
-    folder, point = Path(parts[1]), int(parts[2])
+    folder, point = Path(start_match[1]), int(start_match[2])
     try:
         data, rows = case_in(folder), read_rows(folder / "path.csv")
     except (Damaged, OSError) as e:

@@ -43,7 +43,7 @@ FOLDER = Folder(
 
 @dataclass(frozen=True)
 class ModelRun:
-    """The results of a run.
+    """The results of a run of a case with one model, shell or solid.
 
     Attributes
     ----------
@@ -90,10 +90,25 @@ def run_model(
 ) -> ModelRun:
     """Run a case with one of the models, unless the folder has that run by the same sources.
 
+    The run is a separate process.
+
+    Parameters
+    ----------
+    settings
+        Settings of the case, as for `--set`.
+    refinement
+        Value of mesh.refinement.
+    folder
+        Folder of this run; its usage.json has the request and the times.
+    say
+        Called with a line if a stored run is computed again.
+
     Raises
     ------
     NothingLeft
-        If there is nothing to compare.
+        If the run leaves no results.
+    CaseError
+        If the folder has a run of another case.
     """
     model_settings = [
         *settings,
@@ -106,43 +121,43 @@ def run_model(
         "settings": model_settings,
         "sources": code_version(),
     }
-    used, results, why = stored_outcome(folder / "usage.json", TypeAdapter(Used)), None, ""
-    if used and used.asked == request:
+    usage, results, reason = stored_outcome(folder / "usage.json", TypeAdapter(Used)), None, ""
+    if usage and usage.asked == request:
         try:
             results = read_summary(folder), read_lines(folder / "path.csv")
         except (OSError, Damaged) as e:
-            why = str(e)
-    elif used and used.asked | {"sources": request["sources"]} == request:
-        why = "the folder has results of other sources of magshell_fenicsx"
-    if why:
-        say(f"{model} at refinement {refinement:g}: computed again, {why}")
-    if not (used and results):
+            reason = str(e)
+    elif usage and usage.asked | {"sources": request["sources"]} == request:
+        reason = "the folder has results of other sources of magshell_fenicsx"
+    if reason:
+        say(f"{model} at refinement {refinement:g}: computed again, {reason}")
+    if not (usage and results):
         name = _case_in(folder)
         if name and Path(name).stem != case.stem:
             raise CaseError(
                 f"--out {folder.parent}: has a comparison of {name}, which is kept; give another "
                 "folder"
             )
-        sets = [part for setting in model_settings for part in ("--set", setting)]
+        arguments = [argument for setting in model_settings for argument in ("--set", setting)]
         measured = measure(
-            "magshell_fenicsx", ["run", str(case), *sets, "--out", str(folder), "--overwrite"]
+            "magshell_fenicsx", ["run", str(case), *arguments, "--out", str(folder), "--overwrite"]
         )
         if not (folder / "summary.json").exists() or measured.code not in (0, 3):
             raise NothingLeft(
                 f"model: {model}: {measured.last_error or f'exit code {measured.code}'}"
             )
         results = read_summary(folder), read_lines(folder / "path.csv")
-        used = Used({**request, "sources": results[0]["sources"]}, measured.cpu_s, measured.wall_s)
-        keep(folder / "usage.json", asdict(used))
+        usage = Used({**request, "sources": results[0]["sources"]}, measured.cpu_s, measured.wall_s)
+        keep(folder / "usage.json", asdict(usage))
     summary, rows = results
     compiling = float(summary["timing"]["jit_s"])
     return ModelRun(
-        model, refinement, summary, rows, used.cpu_s - compiling, used.wall_s - compiling
+        model, refinement, summary, rows, usage.cpu_s - compiling, usage.wall_s - compiling
     )
 
 
 def _case_in(folder: Path) -> str:
-    """The name of the case file whose run is in a folder; empty without."""
+    """Return the name of the case file whose run is in a folder; "" without a run."""
     with suppress(OSError, Damaged):
         return str(
             (identity_in(folder / NAME) or read_object(folder / "summary.json")).get(CASE_FILE, "")
@@ -155,7 +170,15 @@ W = "w"  # displacement of the mid-surface since the end of the field
 
 @dataclass(frozen=True)
 class Difference:
-    """Loads of both models at the same displacement."""
+    """The loads of both models at the same displacement.
+
+    Attributes
+    ----------
+    w_over_h
+        The displacement.
+    shell, solid
+        The loads.
+    """
 
     w_over_h: float
     shell: float
@@ -173,24 +196,30 @@ def amplitude_of(run: ModelRun) -> str:
 
 
 def curve(run: ModelRun) -> tuple[list[float], list[float]]:
-    """Displacements and loads of the last part of the path, without branches."""
+    """Return displacements w/h and loads of the last part of the path, without branches.
+
+    The last part is that in which the last amplitude varies. The displacement counts from its
+    begin.
+    """
     y = amplitude(amplitude_of(run)).column
     return [float(row[W]) for row in loaded(run)], [float(row[y]) for row in loaded(run)]
 
 
 def loaded(run: ModelRun) -> list[dict[str, str]]:
-    """The rows of the last part of the path and the row before it, with the displacement since that
-    row.
+    """Return the rows of path.csv of the last part of the path, and the row before it.
+
+    In the last part the last amplitude varies. The column `W` has the displacement since the row
+    before.
 
     The field displaces the mid-surface of a solid by nu lambda_m R/h more (of w/h), since it also
     stretches the thickness. The displacement since the end of the field excludes this.
     """
     load_name = amplitude_of(run)
     # the same point in both models
-    x = "w_point_over_h" if load_name == "force" else "w_pole_over_h"
+    displacement_column = "w_point_over_h" if load_name == "force" else "w_pole_over_h"
     first = next(i for i, row in enumerate(run.rows) if row["amplitude"] == load_name)
     row_before = run.rows[max(first - 1, 0)]
-    part = [
+    load_rows = [
         row_before,
         *(
             row
@@ -198,13 +227,17 @@ def loaded(run: ModelRun) -> list[dict[str, str]]:
             if row["amplitude"] == load_name and row["branch"] == "0"
         ),
     ]
-    return [{**row, W: repr(float(row[x]) - float(row_before[x]))} for row in part]
+    return [
+        {**row, W: repr(float(row[displacement_column]) - float(row_before[displacement_column]))}
+        for row in load_rows
+    ]
 
 
 def places(runs: Sequence[ModelRun]) -> list[float]:
-    """The displacements 1, 2, ... that all runs reach, or their last common one if it is below 1.
+    """Return the displacements w/h = 1, 2, ... that all runs reach.
 
-    Empty if a run has no targets: its steps are too long to interpolate between them.
+    If the last common displacement is below 1, the list has that alone. It is empty if a run has no
+    targets: its steps are too long to interpolate between them.
     """
     if not all(any(row["label"] == "target" for row in loaded(run)) for run in runs):
         return []
@@ -213,7 +246,7 @@ def places(runs: Sequence[ModelRun]) -> list[float]:
 
 
 def differences(shell: ModelRun, solid: ModelRun) -> list[Difference]:
-    """The differences at the displacements that both runs reach."""
+    """Return the differences of the loads at the displacements that both runs reach."""
     loads_at_places = (
         (place, load_at(shell, place), load_at(solid, place)) for place in places([shell, solid])
     )
@@ -225,16 +258,28 @@ def differences(shell: ModelRun, solid: ModelRun) -> list[Difference]:
 
 
 def load_at(run: ModelRun, w: float) -> float | None:
-    """The load at a displacement; None if the run does not reach it."""
+    """Return the load of a run at a displacement w/h; None if the run does not reach it."""
     return Scalar("", amplitude(amplitude_of(run)).column, W, w).value_in(run.summary, loaded(run))
 
 
 def judge(
     runs: Sequence[ModelRun], judged_place: float | None, scalar: Scalar | None
 ) -> tuple[str, Callable[[ModelRun], float | None]]:
-    """The name of the compared number, and what gives it of a run.
+    """Choose the number by which runs are compared.
 
-    That is what is asked for; else k_d if all runs have it, else the load at a displacement.
+    It is `scalar` if given; else k_d if all runs have it; else the load at `judged_place`.
+
+    Parameters
+    ----------
+    judged_place
+        Displacement w/h; None if there is none that all runs reach.
+
+    Returns
+    -------
+    name
+        Name of the number.
+    value_of
+        Function that returns the number of a run; None if a run lacks it.
     """
     if scalar is None and all(run.summary["knockdown"] is not None for run in runs):
         scalar = parse_scalar("knockdown")
@@ -249,18 +294,19 @@ def judge(
 
 
 def time_at(error: float, runs: Sequence[tuple[float, float]]) -> float | None:
-    """Run time in seconds for an error, interpolated between runs (error, seconds); None outside
-    their range.
+    """Return the run time in seconds that an error takes; None outside the range of the runs.
+
+    It is interpolated between runs (error, seconds), linearly in the logarithms.
 
     Examples
     --------
     >>> round(time_at(0.01, [(0.1, 1.0), (0.001, 100.0)]), 9)
     10.0
     """
-    ordered = sorted((e, s) for e, s in runs if e > 0)
-    if not ordered or not ordered[0][0] <= error <= ordered[-1][0]:
+    errors_and_seconds = sorted((e, s) for e, s in runs if e > 0)
+    if not errors_and_seconds or not errors_and_seconds[0][0] <= error <= errors_and_seconds[-1][0]:
         return None
-    e, s = np.log(np.array(ordered)).T
+    e, s = np.log(np.array(errors_and_seconds)).T
     return float(np.exp(np.interp(np.log(error), e, s)))
 
 
@@ -269,7 +315,7 @@ ONE_PERCENT = 0.01
 
 @dataclass(frozen=True)
 class Comparison:
-    """The result of a comparison.
+    """The result of a comparison of shell and solid.
 
     Attributes
     ----------
@@ -293,11 +339,10 @@ def compare(
     result: str | None = None,
     say: Say = print,
 ) -> Comparison:
-    """Run a case with both models; write compare.csv, compare.json and compare.png, and a folder
-    for each run.
+    """Run a case as a shell and as a solid, and compare the results.
 
-    Every run is a separate process. Runs of the same case and sources that are in the folder are
-    kept.
+    Writes compare.csv, compare.json and compare.png, and a folder for each run. Every run is a
+    separate process. Runs of the same case and sources that are in the folder are kept.
 
     Parameters
     ----------
@@ -332,6 +377,7 @@ def compare(
     runs: dict[ModelName, list[ModelRun]] = {model: [] for model in MODELS}
 
     def computed(task: tuple[ModelName, float]) -> Iterator[str]:
+        """Run a model at a refinement, append the run to `runs`, and yield a line of text."""
         model, refinement = task
         model_run = run_model(
             file, settings, model, refinement, folder / f"{model}_{refinement:g}", say
@@ -359,27 +405,28 @@ def compare(
             raise CaseError(
                 f"compare: the shell ended while {ends[0]} varied, the solid while {ends[1]} did"
             )
-        differing = differences(shell, solid)
+        curve_differences = differences(shell, solid)
         judged_place = max(places([run for model in MODELS for run in runs[model]]), default=None)
-        content = {"case": file.name, **_content(runs, judged_place, differing, scalar)}
-        access_disk(MPI.COMM_SELF, lambda: _write(content, differing, folder))
+        content = {"case": file.name, **_content(runs, judged_place, curve_differences, scalar)}
+        access_disk(MPI.COMM_SELF, lambda: _write(content, curve_differences, folder))
         errors: Errors = {
             model: [(run["error"], run["cpu_s"]) for run in content["runs"][model] if run["error"]]
             for model in MODELS
         }
         title = f"{file.name} {' '.join(settings)}".strip()
-        draw_comparison(shell, solid, differing, errors, title, folder / "compare.png")
-    return Comparison(differing, content)
+        draw_comparison(shell, solid, curve_differences, errors, title, folder / "compare.png")
+    return Comparison(curve_differences, content)
 
 
 def _write(content: Mapping[str, Any], differing: Sequence[Difference], folder: Path) -> None:
+    """Write compare.csv with the differences, and compare.json with the content."""
     rows = [{**asdict(d), "relative": d.relative} for d in differing]
     write_csv(rows, (*(f.name for f in fields(Difference)), "relative"), folder / "compare.csv")
     write_object(folder / "compare.json", content, indent=2)
 
 
 def parse_refinements(shell: str, solid: str) -> dict[ModelName, list[float]]:
-    """Read the options.
+    """Read the options `--shell` and `--solid`, lists of mesh refinements with commas.
 
     Raises
     ------
@@ -394,7 +441,7 @@ def parse_refinements(shell: str, solid: str) -> dict[ModelName, list[float]]:
     refinements: dict[ModelName, list[float]] = {}
     for model, text in zip(MODELS, (shell, solid), strict=True):
         try:
-            refinements[model] = [float(part) for part in text.split(",")]
+            refinements[model] = [float(number) for number in text.split(",")]
         except ValueError:
             refinements[model] = []
         if not refinements[model] or not all(0.1 <= r <= 20 for r in refinements[model]):
@@ -410,15 +457,28 @@ def _content(
     differing: Sequence[Difference],
     scalar: Scalar | None,
 ) -> dict[str, Any]:
+    """Return the content of compare.json without the name of the case.
+
+    Parameters
+    ----------
+    runs
+        Model -> its runs, from coarse to fine.
+    judged_place
+        Displacement w/h at which loads are compared; None if there is none.
+    differing
+        Differences between the curves of the finest runs.
+    scalar
+        The requested number; None for the default, see `judge`.
+    """
     accounts: dict[ModelName, list[dict[str, Any]]] = {}
     limits: dict[str, float | None] = {}
     seconds: dict[str, float | None] = {}
     name, value_of = judge(
-        [run for series in runs.values() for run in series], judged_place, scalar
+        [run for runs_of_model in runs.values() for run in runs_of_model], judged_place, scalar
     )
-    for model, series in runs.items():
-        values = [value_of(run) for run in series]
-        limit = extrapolated(values, [run.refinement for run in series])
+    for model, runs_of_model in runs.items():
+        values = [value_of(run) for run in runs_of_model]
+        limit = extrapolated(values, [run.refinement for run in runs_of_model])
         errors = [abs(v / limit - 1) if v is not None and limit else None for v in values]
         accounts[model] = [
             {
@@ -431,10 +491,12 @@ def _content(
                 "factorisations": run.summary["factorisations"],
                 "stopped": run.summary["stopped"],
             }
-            for run, value, error in zip(series, values, errors, strict=True)
+            for run, value, error in zip(runs_of_model, values, errors, strict=True)
         ]
         limits[model] = limit
-        measured = [(e, run.cpu_s) for e, run in zip(errors, series, strict=True) if e is not None]
+        measured = [
+            (e, run.cpu_s) for e, run in zip(errors, runs_of_model, strict=True) if e is not None
+        ]
         seconds[model] = time_at(ONE_PERCENT, measured)
     final_values = [accounts[model][-1]["value"] for model in MODELS]
     times = [seconds[model] for model in MODELS]
@@ -450,21 +512,31 @@ def _content(
 
 
 def extrapolated(values: Sequence[float | None], refinements: Sequence[float]) -> float | None:
-    """The limit of the last three values by Richardson extrapolation; None for fewer values.
+    """Return the limit of the last three values by Richardson extrapolation.
 
-    It is the last value if no order of convergence is observed.
+    None if there are fewer or one is missing; the last value if no order of convergence is
+    observed.
+
+    Parameters
+    ----------
+    values
+        A number of runs, from coarse to fine; None where a run lacks it.
+    refinements
+        Refinement of each run; the element size is proportional to its inverse.
 
     Examples
     --------
     >>> round(extrapolated([2.0, 1.25, 1.0625], [1.0, 2.0, 4.0]), 12)
     1.0
     """
-    last = [v for v in values[-3:] if v is not None]
-    if len(last) < 3:
+    last_values = [v for v in values[-3:] if v is not None]
+    if len(last_values) < 3:
         return None
-    error, order = estimated_error([1 / r for r in refinements[-3:]], last)
+    error, order = estimated_error([1 / r for r in refinements[-3:]], last_values)
     return (
-        last[2] if error is None or order is None else last[2] + copysign(error, last[2] - last[1])
+        last_values[2]
+        if error is None or order is None
+        else last_values[2] + copysign(error, last_values[2] - last_values[1])
     )
 
 
@@ -476,13 +548,15 @@ def draw_comparison(
     title: str,
     file: Path,
 ) -> None:
-    """Write the picture.
+    """Draw the curves of both finest runs, their differences and the errors over CPU time.
 
     Parameters
     ----------
     errors
         Model -> (relative error, CPU seconds) of its coarser runs; without any the panel is left
         out.
+    file
+        Name of the picture file.
     """
     from matplotlib.figure import Figure
 
@@ -493,7 +567,7 @@ def draw_comparison(
         f"{quantity('w_over_h').latex} {load_amplitude.place} since the field",
         quantity(load_amplitude.column).label,
     )
-    first, *others = figure.subplots(1, panels, squeeze=False)[0]
+    first, *other_panels = figure.subplots(1, panels, squeeze=False)[0]
     first.plot(
         *curve(shell),
         ".-",
@@ -513,19 +587,21 @@ def draw_comparison(
     first.set(xlabel=x_label, ylabel=y_label)
     first.legend(frameon=False, fontsize=8)
     if differing:
-        others[0].plot(
+        other_panels[0].plot(
             [d.w_over_h for d in differing], [100 * d.relative for d in differing], ".-", color="C3"
         )
-        others[0].axhline(0, color="0.8", linewidth=0.8, zorder=0)
-        others[0].set(xlabel=x_label, ylabel="solid over shell, difference (%)")
+        other_panels[0].axhline(0, color="0.8", linewidth=0.8, zorder=0)
+        other_panels[0].set(xlabel=x_label, ylabel="solid over shell, difference (%)")
     if any(errors.values()):
         for (model, points), color in zip(errors.items(), ("C0", "C3"), strict=True):
-            if ordered := sorted((s, e) for e, s in points):
-                others[-1].loglog(*zip(*ordered, strict=True), "o-", color=color, label=model)
-        others[-1].set(
+            if times_and_errors := sorted((s, e) for e, s in points):
+                other_panels[-1].loglog(
+                    *zip(*times_and_errors, strict=True), "o-", color=color, label=model
+                )
+        other_panels[-1].set(
             xlabel="CPU time of the process (s)", ylabel="relative error, of each model's own limit"
         )
-        others[-1].grid(which="both", color="0.92")
-        others[-1].legend(frameon=False, fontsize=8)
+        other_panels[-1].grid(which="both", color="0.92")
+        other_panels[-1].legend(frameon=False, fontsize=8)
     figure.suptitle(title, fontsize=9)
     figure.savefig(file)

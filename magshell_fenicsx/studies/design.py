@@ -1,8 +1,8 @@
-"""A design: an optimiser of SciPy over the cases of its variables; every evaluation is kept, the
-best is verified.
+"""A design: an optimiser of SciPy varies a case for a result.
 
-Evaluations are known by their variables: a design that is started again takes those in its folder,
-walks the same way, and goes on where it was interrupted.
+Every evaluation is kept, and the best case is verified on a finer mesh. Evaluations are known by
+their variables. A design that is started again takes the evaluations in its folder, follows the
+same course, and goes on where it was interrupted.
 """
 
 import hashlib
@@ -68,18 +68,20 @@ class Missed(RuntimeError):
 
 @dataclass
 class Design:
-    """A design in its folder.
+    """A search for a design, with its evaluations in a folder.
 
     Attributes
     ----------
+    variables, goal
+        What varies, and what is wanted.
     rows
-        Of design.csv: one per evaluation.
+        Rows of design.csv, one per evaluation.
     tried
-        The variables and the evaluations, in the same order; those of the present stage.
+        The variables and the evaluations of the present stage, in order.
     stage
-        Number of the wanted shape; 0 of the last.
+        Number of the wanted shape, from 1; 0 for the last.
     seconds
-        What each new evaluation took.
+        Wall time of each new evaluation.
     """
 
     variables: Variables
@@ -94,10 +96,10 @@ class Design:
     _scene: SceneReuse = field(default_factory=SceneReuse)
 
     def __call__(self, x: Array) -> DesignEvaluation:
-        """The evaluation of a vector, known or new; collective."""
+        """Return the evaluation of a vector of variables, stored or new; collective."""
         x = np.array(self.comm.bcast(x))
-        for tried, evaluated in reversed(self.tried):
-            if np.array_equal(tried, x):
+        for earlier_x, evaluated in reversed(self.tried):
+            if np.array_equal(earlier_x, x):
                 return evaluated
         stage = f"{self.stage}".encode() if self.stage else b""
         name = hashlib.sha256(x.tobytes() + stage).hexdigest()[:16]
@@ -118,12 +120,25 @@ class Design:
         return evaluation
 
     def begin(self, stage: int, targets: Sequence[Mapping[str, Target]]) -> None:
-        """Want the next of several shapes."""
+        """Begin a stage, counted from 0, whose targets are those of the next of several shapes.
+
+        Parameters
+        ----------
+        targets
+            For each stage: result -> map from undeformed to wanted places.
+        """
         self.stage = (stage + 1) % len(targets)
         self.goal.targets = targets[stage]
         self.tried.clear()
 
     def _evaluated_anew(self, x: Array, vectors: Path) -> DesignEvaluation:
+        """Compute the evaluation of a vector of variables; collective.
+
+        Parameters
+        ----------
+        vectors
+            File that gets the vectors of the remanence, if it varies.
+        """
         access_disk(self.comm, lambda: self.variables.write(x, vectors))
         case, goal = self.variables.case_of(x, vectors), self.goal
         evaluation = evaluate(
@@ -133,8 +148,9 @@ class Design:
 
     @cached_property
     def _identity(self) -> dict[str, str]:
-        """Header of every stored evaluation of this design: a hash of the design and the version of
-        the sources.
+        """Header of every stored evaluation: a hash of the design, and the version of the sources.
+
+        Iterations and the finer mesh of the verification do not count.
         """
         section_text = self.goal.section.model_dump_json(exclude={"iterations", "verify"})
         designed = hashlib.sha256(
@@ -143,6 +159,13 @@ class Design:
         return {"design": designed, "sources": code_version()}
 
     def _add(self, x: Array, evaluation: DesignEvaluation, name: str) -> None:
+        """Add an evaluation to the table design.csv, and say it; collective.
+
+        Parameters
+        ----------
+        name
+            Name of the evaluation's file in points/, without suffix.
+        """
         self.tried.append((x, evaluation))
         best, solved = self.best, bool(evaluation.values)
         row = {
@@ -170,7 +193,7 @@ class Design:
 
     @property
     def _time_left(self) -> str:
-        """How long the iterations that may follow take, if each is one evaluation."""
+        """Text of the time for the remaining iterations, one evaluation each; "" if short."""
         remaining_iterations = self.goal.section.iterations + 1 - len(self.rows)
         return (
             remaining_time_text(
@@ -181,6 +204,7 @@ class Design:
         )
 
     def _write(self) -> None:
+        """Write design.csv, unless no evaluation has results and there is an earlier table."""
         if (
             not any(evaluation.values for _, evaluation in self.tried)
             and (self.folder / "design.csv").exists()
@@ -191,7 +215,10 @@ class Design:
 
     @property
     def best(self) -> tuple[Array, DesignEvaluation] | None:
-        """The evaluation with the least objective of those that keep the constraints best."""
+        """Vector and evaluation of the best evaluation in this stage; None if none has results.
+
+        The least violation of the constraints counts first, then the objective.
+        """
         solved = [evaluated for evaluated in self.tried if evaluated[1].values]
         return min(solved, key=lambda evaluated: self.goal.merit(evaluated[1])) if solved else None
 
@@ -206,7 +233,7 @@ def design(
     comm: MPI.Intracomm = MPI.COMM_WORLD,
     say: Say = print_line,
 ) -> dict[str, Any]:
-    """Vary a case for a result; collective. Returns the content of summary.json.
+    """Vary a case for a result; collective.
 
     Parameters
     ----------
@@ -217,12 +244,16 @@ def design(
     make_case
         Makes a case of its source, the same on all ranks.
     resume
-        See that the folder has evaluations of this design.
+        Require that the folder has evaluations to go on from.
+
+    Returns
+    -------
+    The content of summary.json.
 
     Raises
     ------
     CaseError
-        If the case has no design, or a variable or a result is none.
+        If the case has no design, or a variable or a result does not exist.
     Missed
         After everything is written: if a target is not reached, a constraint not kept, or no
         optimum found.
@@ -232,7 +263,7 @@ def design(
     if case.design is None:
         raise CaseError(f"{file}: design: is missing: it says what varies and what is wanted")
     try:
-        vary, goal = (
+        design_variables, goal = (
             variables(source, case, case.design, make_case),
             design_goal_of(case, case.design),
         )
@@ -240,38 +271,58 @@ def design(
             if resume and not access_disk(comm, lambda: any((folder / "points").glob("*.json"))):
                 raise CaseError(f"{folder}: has no evaluation to resume")
             with heard(comm, say) as progress:
-                return _designed(Design(vary, goal, folder, comm, progress), Path(file), comm)
+                return _designed(
+                    Design(design_variables, goal, folder, comm, progress), Path(file), comm
+                )
     except CaseError as e:
         raise CaseError(case.with_place(str(e))) from None
 
 
 def _designed(search: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]:
+    """Search the best design, write it with tables and pictures, and verify it; collective.
+
+    Parameters
+    ----------
+    file
+        The case file.
+
+    Returns
+    -------
+    The content of summary.json.
+
+    Raises
+    ------
+    Missed
+        If a target is not reached, a constraint not kept, or a step has no result.
+    """
     vary, design_goal, section, folder = (
         search.variables,
         search.goal,
         search.goal.section,
         search.folder,
     )
-    first, best, x, ended = _optimised(search)
-    steps = section.remanence.steps if section.remanence else None
-    if steps:
-        x = vary.rounded(x, steps)
+    first_evaluation, best, x, ended = _optimised(search)
+    angle_steps = section.remanence.steps if section.remanence else None
+    if angle_steps:
+        x = vary.rounded(x, angle_steps)
         unrounded, best = best, search(x)
         if not best.values:
-            raise Missed(f"with angles in {steps} steps of a turn there is no result: {best.note}")
+            raise Missed(
+                f"with angles in {angle_steps} steps of a turn there is no result: {best.note}"
+            )
         search.say(
-            f"angles rounded to {steps} steps of a turn: {design_goal.words(unrounded)} -> "
+            f"angles rounded to {angle_steps} steps of a turn: {design_goal.words(unrounded)} -> "
             f"{design_goal.words(best)}"
         )
     access_disk(comm, partial(_write_best, search, x, file))
     content: dict[str, Any] = {
         "case": file.name,
         "objective": section.objective.model_dump(exclude_none=True),
-        "start": first.values | first.seen,
+        "start": first_evaluation.values | first_evaluation.seen,
         "best": best.values | best.seen,
         "numbers": vary.numbers(x),
         "ended": ended,
-        "without_influence": _without_influence(vary, first),
+        "without_influence": _without_influence(vary, first_evaluation),
         "evaluations": len(search.rows),
         "note": best.note,
         "violation": design_goal.violation(best),
@@ -297,11 +348,35 @@ def _designed(search: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]
 def _draw_reached(
     draw_result: Callable[[ReachedShape | None], None], folder: Path, target: Target | None
 ) -> None:
+    """Draw the picture with the shape that the run in a folder has reached; called on rank 0.
+
+    Parameters
+    ----------
+    draw_result
+        Draws the picture; None: without a shape.
+    target
+        Map from undeformed to wanted places; None without.
+    """
     draw_result(reached_shape(folder, target))
 
 
 def _optimised(search: Design) -> tuple[DesignEvaluation, DesignEvaluation, Array, str]:
-    """The first evaluation, the best one with its variables, and why the optimiser ended."""
+    """Search the best variables, one stage after another; collective.
+
+    Returns
+    -------
+    first, best
+        The first evaluation and the best one of the last stage.
+    x
+        Variables of the best evaluation.
+    ended
+        Message of the optimiser about its end.
+
+    Raises
+    ------
+    Missed
+        If the start has no result, or no variable has an influence.
+    """
     vary, goal, iterations = search.variables, search.goal, search.goal.section.iterations
     targets = [*goal.stages, goal.targets]
     search.begin(0, targets)
@@ -309,12 +384,12 @@ def _optimised(search: Design) -> tuple[DesignEvaluation, DesignEvaluation, Arra
     if not first.values:
         raise Missed(f"the case itself has no result to start from: {first.note}")
     goal.begin(first)
-    idle = _without_influence(vary, first)
-    for name in idle:
+    names_without_influence = _without_influence(vary, first)
+    for name in names_without_influence:
         search.say(
             f"warning: {name} has no influence on {', '.join(goal.results)} where the design starts"
         )
-    if len(idle) == len(vary.blocks):
+    if len(names_without_influence) == len(vary.blocks):
         raise Missed(
             f"no variable has an influence on {', '.join(goal.results)} where the design starts"
         )
@@ -322,9 +397,9 @@ def _optimised(search: Design) -> tuple[DesignEvaluation, DesignEvaluation, Arra
         if stage:
             search.begin(stage, targets)
             goal.begin(search(x))
-        last = stage == len(targets) - 1
+        is_last = stage == len(targets) - 1
         ended = search_optimum(
-            search, goal, vary, x, iterations if last else -(-iterations // STAGES_PART)
+            search, goal, vary, x, iterations if is_last else -(-iterations // STAGES_PART)
         )
         assert search.best
         x, best = search.best
@@ -332,17 +407,32 @@ def _optimised(search: Design) -> tuple[DesignEvaluation, DesignEvaluation, Arra
 
 
 def _without_influence(vary: Variables, first: DesignEvaluation) -> list[str]:
-    """The variables that change no result."""
+    """Return the names of the variables that change no result at the start.
+
+    Parameters
+    ----------
+    first
+        The first evaluation; its gradients are for the vector of variables.
+    """
     slopes = np.array([first.gradients[result] for result in first.values])
-    size = np.array([abs(value) or 1.0 for value in first.values.values()])
-    strongest = (np.abs(slopes) / size[:, None]).max(axis=0)
+    result_sizes = np.array([abs(value) or 1.0 for value in first.values.values()])
+    # (p,) largest relative change of a result by each variable
+    largest_changes = (np.abs(slopes) / result_sizes[:, None]).max(axis=0)
     return [
-        name for name, part in vary.blocks.items() if strongest[part].max() < INFLUENCE_TOLERANCE
+        name
+        for name, block in vary.blocks.items()
+        if largest_changes[block].max() < INFLUENCE_TOLERANCE
     ]
 
 
 def _write_best(search: Design, x: Array, file: Path) -> None:
-    """The best case as a file that `magshell run` takes, and its remanence beside it."""
+    """Write the best case as best.yaml, which `magshell run` takes, and its remanence as best.csv.
+
+    Parameters
+    ----------
+    file
+        The case file, from whose folder the case names further files.
+    """
     folder, data = search.folder, search.variables.data(x, "best.csv")
     search.variables.write(x, folder / "best.csv")
     _from_here(data, file.parent.absolute(), folder.absolute())
@@ -351,7 +441,10 @@ def _write_best(search: Design, x: Array, file: Path) -> None:
 
 
 def _from_here(part: Any, old: Path, new: Path) -> None:
-    """Let the files that a case names be found from another folder."""
+    """Rewrite names of files in plain data of a case, relative to a new folder instead of the old.
+
+    The data are changed in place.
+    """
     for key, value in (
         part.items()
         if isinstance(part, dict)
@@ -363,12 +456,21 @@ def _from_here(part: Any, old: Path, new: Path) -> None:
 
 
 def verified(search: Design, best: DesignEvaluation, comm: MPI.Intracomm) -> dict[str, Any]:
-    """The results of best.yaml by `run` into verified/, and what its excluded modes say;
-    collective.
+    """Run best.yaml on a finer mesh into verified/, and compare the results; collective.
+
+    Parameters
+    ----------
+    best
+        The evaluation of the best design.
+
+    Returns
+    -------
+    The results of the run, its settings and its excluded modes, as in summary.json.
     """
     goal, say, file, settings = search.goal, search.say, search.folder / "best.yaml", list[str]()
 
     def best_case() -> Case:
+        """Read best.yaml with the present settings."""
         return search.variables.make_case(on_first_rank(comm, lambda: read_source(file, settings)))
 
     case = best_case()
@@ -402,6 +504,7 @@ def verified(search: Design, best: DesignEvaluation, comm: MPI.Intracomm) -> dic
     modes = [f"{p['kind']} {p['mode']}".strip() for p in result.limit_points if p["mode"]]
     if modes and not any(name in FOLDS for name in goal.results):
         say(f"warning: the run sees modes that the design did not: {', '.join(modes)}")
+    # unstable modes that the reduced model of the design does not have
     excluded = int(result.rows[-1]["excluded_pivots"]) if result.rows else 0
     return {
         "settings": settings,
@@ -413,7 +516,11 @@ def verified(search: Design, best: DesignEvaluation, comm: MPI.Intracomm) -> dic
 
 
 def _value(result: Result, name: str) -> float | None:
-    """A result of a run: the first instability of a fold's amplitude, excluded modes too."""
+    """Return a result of a run; None if the run lacks it.
+
+    For a fold it is the first instability of its amplitude, excluded modes too, in the result's
+    unit.
+    """
     if name == MASS:
         return mass(result.scene).value
     if name in FOLDS:
@@ -435,7 +542,7 @@ def _value(result: Result, name: str) -> float | None:
 
 
 def _difference_words(relative_difference: float) -> str:
-    """A relative difference in words.
+    """Return a relative difference in words.
 
     Examples
     --------

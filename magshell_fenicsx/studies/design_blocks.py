@@ -21,7 +21,7 @@ GradientsByName = Mapping[str, Any]  # the gradients of a result, numbers and th
 
 @dataclass(frozen=True)
 class Bounded:
-    """Values whose variables run from 0 to 1 between their bounds.
+    """Values with bounds as design variables, which run from 0 to 1 between the bounds.
 
     Attributes
     ----------
@@ -29,6 +29,8 @@ class Bounded:
         The key of the case, or the field.
     start
         The values of the case itself.
+    bounds
+        Lower and upper bound of all values.
     """
 
     name: str
@@ -46,14 +48,14 @@ class Bounded:
         return [(0.0, 1.0)] * self.start.size
 
     def values(self, x: Array) -> Array:
-        """The values of variables, in the shape of `start`."""
+        """Return the values for variables x, in the shape of `start`."""
         low, high = self.bounds
         return np.asarray(low + x * (high - low)).reshape(self.start.shape)
 
 
 @dataclass(frozen=True)
 class NumberVariable(Bounded):
-    """A number of the case, in a unit."""
+    """A number of the case as a design variable; start and bounds are in its unit."""
 
     unit: str
 
@@ -63,24 +65,38 @@ class NumberVariable(Bounded):
         return f"{self.name} [{self.unit}]" if self.unit else self.name
 
     def gradient(self, x: Array, scene: Scene, gradients: GradientsByName) -> Array:
+        """Return the gradient (1,) of a result by the variable.
+
+        Parameters
+        ----------
+        gradients
+            Key -> derivative by the number in SI units; a missing one is zero.
+        """
         slope = gradients.get(self.name, 0.0)
         return np.array([slope * si_size(self.unit) * (self.bounds[1] - self.bounds[0])])
 
     def put(self, data: dict[str, Any], x: Array) -> None:
+        """Set the number in plain data of the case."""
         section: Any = data
-        *names, last = self.name.split(".")
+        *names, last_word = self.name.split(".")
         for name in names:
             section = (
                 section[int(name)] if isinstance(section, list) else section.setdefault(name, {})
             )
         value = float(self.values(x)[0])
-        section[int(last) if isinstance(section, list) else last] = (
+        section[int(last_word) if isinstance(section, list) else last_word] = (
             f"{value:.15g} {self.unit}" if self.unit else value
         )
 
 
 def by_components(scene: Scene, field_gradient: FieldGradient) -> Array:
-    """The derivatives by the components of the remanence at its points; collective."""
+    """Return the derivatives (n, 3 | 2) of a result by the remanence's vectors; collective.
+
+    Parameters
+    ----------
+    field_gradient
+        Gradient by the remanence as a field on the mesh.
+    """
     loads = scene.problem.loads
     magnetic = loads.magnetic or loads.remanence
     assert magnetic
@@ -94,17 +110,20 @@ def by_components(scene: Scene, field_gradient: FieldGradient) -> Array:
 
 @dataclass(frozen=True)
 class Vectors:
-    """The remanence at points, of which each place has the mean.
+    """The remanence at control points as design variables; each place of the shell has their mean.
 
-    Each vector has a polar angle, an azimuth where it is not kept in a plane, and its length where
-    that varies, from 0 to 1 between its bounds.
+    The variables of each vector are its polar angle, its azimuth unless it stays in a plane, and
+    its length if this varies, from 0 to 1 between the bounds. All polar angles come first, then
+    azimuths, then lengths.
 
     Attributes
     ----------
+    controls
+        The control points.
     start
-        (n, 3), or (n, 2) on a meridian.
+        (n, 3), or (n, 2) on a meridian: vectors of the case itself, over |B^r|.
     lengths
-        Least and largest length; None: they stay as they are.
+        Least and largest length; None: lengths stay as they are.
     """
 
     controls: ControlPoints
@@ -119,22 +138,26 @@ class Vectors:
 
     @property
     def angles(self) -> int:
-        """How many of its variables are angles; they come first."""
+        """Number of variables that are angles; they come first."""
         return len(self.start) * (1 if self.planar else 2)
 
     @property
     def start_values(self) -> Array:
+        """Variables at the start: angles in radians, then scaled lengths."""
         horizontal = self.start[:, 0] if self.planar else np.hypot(*self.start[:, :2].T)
-        parts = [np.arctan2(horizontal, self.start[:, -1])]
+        angles_and_lengths = [np.arctan2(horizontal, self.start[:, -1])]
         if not self.planar:
-            parts.append(np.arctan2(self.start[:, 1], self.start[:, 0]))
+            angles_and_lengths.append(np.arctan2(self.start[:, 1], self.start[:, 0]))
         if self.lengths:
-            size = np.linalg.norm(self.start, axis=1)
-            parts.append((size - self.lengths[0]) / (self.lengths[1] - self.lengths[0]))
-        return np.concatenate(parts)
+            length = np.linalg.norm(self.start, axis=1)
+            angles_and_lengths.append(
+                (length - self.lengths[0]) / (self.lengths[1] - self.lengths[0])
+            )
+        return np.concatenate(angles_and_lengths)
 
     @property
     def limits(self) -> list[Limits]:
+        """Bounds of the variables: none for angles, 0 and 1 for lengths."""
         return [(None, None)] * self.angles + [(0.0, 1.0)] * (
             len(self.start) if self.lengths else 0
         )
@@ -144,6 +167,15 @@ class Vectors:
         return self._polar(x)[0]
 
     def gradient(self, x: Array, scene: Scene, gradients: GradientsByName) -> Array:
+        """Return the gradient of a result by the variables; collective.
+
+        Parameters
+        ----------
+        x
+            The variables.
+        gradients
+            Name of a field -> `FieldGradient`; without "remanence" the gradient is zero.
+        """
         if not isinstance(field_gradient := gradients.get(self.name), FieldGradient):
             return np.zeros(len(x))
         forces = by_components(scene, field_gradient)
@@ -152,30 +184,35 @@ class Vectors:
         )
 
     def _polar(self, x: Array) -> tuple[Array, list[Array]]:
-        """Vectors, and their derivatives by each of their variables."""
+        """Return vectors (n, 3 | 2), and their derivatives (n, 3 | 2) by angles and lengths."""
         polar, *other_variables = x.reshape(-1, len(self.start))
         s, c = np.sin(polar), np.cos(polar)
-        size, grows = np.linalg.norm(self.start, axis=1), 0.0
+        length, length_range = np.linalg.norm(self.start, axis=1), 0.0
         if self.lengths:
-            grows = self.lengths[1] - self.lengths[0]
-            size = self.lengths[0] + other_variables[-1] * grows
-        lengths = size[:, None]
+            length_range = self.lengths[1] - self.lengths[0]
+            length = self.lengths[0] + other_variables[-1] * length_range
+        length_column = length[:, None]
         if self.planar:
+            # in the plane of x and z the vectors have y = 0; on a meridian no y at all
             no_component = [] if self.controls.is_axisymmetric else [0 * s]
             unit, polar_derivative = (
                 np.stack(v, axis=1) for v in ([s, *no_component, c], [c, *no_component, -s])
             )
-            derivatives = [lengths * polar_derivative]
+            derivatives = [length_column * polar_derivative]
         else:
             a, b = np.cos(other_variables[0]), np.sin(other_variables[0])
             unit = np.stack([s * a, s * b, c], axis=1)
             derivatives = [
-                lengths * np.stack([c * a, c * b, -s], axis=1),
-                lengths * np.stack([-s * b, s * a, 0 * s], axis=1),
+                length_column * np.stack([c * a, c * b, -s], axis=1),
+                length_column * np.stack([-s * b, s * a, 0 * s], axis=1),
             ]
-        return lengths * unit, [*derivatives, *([grows * unit] if self.lengths else [])]
+        return length_column * unit, [
+            *derivatives,
+            *([length_range * unit] if self.lengths else []),
+        ]
 
     def put(self, data: dict[str, Any], x: Array) -> None:
+        """Let the case have a remanence of kind `points`, whose file is named later."""
         remanent = data["magnetic"].get("remanent") or {}
         flux_density = (
             {"flux_density": remanent["flux_density"]} if "flux_density" in remanent else {}
@@ -190,18 +227,20 @@ class Vectors:
 
 @dataclass(frozen=True)
 class ControlPointField(Bounded):
-    """The values (n, components) of a scalar field at points, of which each place has the mean.
+    """A scalar field at control points as design variables; each place has their weighted mean.
 
-    They are factors of h, curvatures 11 and 22 over 1/R, or deviations over h. In the case such a
-    field is a formula, with the weights of `models.shell.control_points`: it needs no file, and its
-    symmetry is recognised by its values.
+    The values (n, components) are factors of h, curvatures 11 and 22 over 1/R, or deviations over
+    h. In the case such a field is a formula, with the weights of `models.shell.control_points`: it
+    needs no file, and its symmetry is recognised by its values.
 
     Attributes
     ----------
+    controls
+        The control points, over R.
     length
         R in the unit of the case's formulas, of a curvature.
     shells
-        Of several: the place of each, and its thickness over h.
+        Name of one of several shells -> its pose, and its thickness over h.
     """
 
     controls: ControlPoints
@@ -209,6 +248,13 @@ class ControlPointField(Bounded):
     shells: Mapping[str, tuple[ShellPose, float]] = field(default_factory=dict)
 
     def gradient(self, x: Array, scene: Scene, gradients: GradientsByName) -> Array:
+        """Return the gradient of a result by the variables; collective.
+
+        Parameters
+        ----------
+        gradients
+            Name of a field -> `FieldGradient`; without this field's name the gradient is zero.
+        """
         if not isinstance(field_gradient := gradients.get(self.name), FieldGradient):
             return np.zeros(len(x))
         places = field_gradient.places.reshape(-1, 3) @ rotation(scene.problem.azimuth)
@@ -216,47 +262,64 @@ class ControlPointField(Bounded):
         if self.name == "thickness" and self.shells:
             forces = forces * self._shell_ratios(scene, field_gradient.forces.shape[:2])
         comm = field_gradient.field.function_space.mesh.comm
-        pulled = comm.allreduce(np.asarray(self.controls.weights(places).T @ forces))
-        unit = scene.problem.material.h if self.name == "deviation" else 1.0
-        return np.asarray(pulled * unit * (self.bounds[1] - self.bounds[0])).ravel()
+        # transposed interpolation: from places on the mesh to control points
+        gradient_at_points = comm.allreduce(np.asarray(self.controls.weights(places).T @ forces))
+        length_unit = scene.problem.material.h if self.name == "deviation" else 1.0
+        return np.asarray(
+            gradient_at_points * length_unit * (self.bounds[1] - self.bounds[0])
+        ).ravel()
 
     def put(self, data: dict[str, Any], x: Array) -> None:
+        """Write the field as a formula into plain data of the case, for each shell."""
         values = self.values(x).T
         if self.name == "curvature":
-            texts = [self._formula(component, self.controls, self.length) for component in values]
-            data["natural"] = {**(data.get("natural") or {}), "curvature": [*texts, 0]}
+            formulas = [
+                self._formula(component, self.controls, self.length) for component in values
+            ]
+            data["natural"] = {**(data.get("natural") or {}), "curvature": [*formulas, 0]}
             return
-        alone = {"": (data["shell"], self.controls, 1.0)} if not self.shells else {}
-        of_several = {
+        single_shell = {"": (data["shell"], self.controls, 1.0)} if not self.shells else {}
+        several_shells = {
             name: (data["shells"][name]["shell"], *self._controls_on_shell(*pose_and_ratio))
             for name, pose_and_ratio in self.shells.items()
         }
-        for shell, controls, ratio in (alone | of_several).values():
+        for shell, controls, ratio in (single_shell | several_shells).values():
             if self.name == "thickness":
                 shell["thickness_factor"] = self._formula(values[0], controls)
                 continue
             defect = [shell.pop("defect")] if shell.get("defect") else []
-            new = {"kind": "formula", "w0": self._formula(values[0] / ratio, controls)}
-            shell["imperfections"] = [*defect, *(shell.get("imperfections") or ()), new]
+            imperfection = {"kind": "formula", "w0": self._formula(values[0] / ratio, controls)}
+            shell["imperfections"] = [*defect, *(shell.get("imperfections") or ()), imperfection]
 
     def _controls_on_shell(self, place: ShellPose, ratio: float) -> tuple[ControlPoints, float]:
-        """The points in the frame of one of several shells, over its own length."""
+        """Return the control points in the frame of one of several shells, over its own length.
+
+        The second value is the shell's thickness over h.
+        """
         control_points = self.controls.places
-        x = place.to_shell_frame(
+        places_in_shell = place.to_shell_frame(
             np.insert(control_points, 1, 0.0, axis=1)
             if self.controls.is_axisymmetric
             else control_points
         )
         points_of_shell = (
-            np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]])
+            np.column_stack(
+                [np.hypot(places_in_shell[:, 0], places_in_shell[:, 1]), places_in_shell[:, 2]]
+            )
             if self.controls.is_axisymmetric
-            else x
+            else places_in_shell
         )
         return ControlPoints(points_of_shell, self.controls.width / place.scale), ratio
 
     def _shell_ratios(self, scene: Scene, shape: tuple[int, ...]) -> Array:
-        """Derivative (nodes of cells, 1) of the thickness over h by the factor of the thickness of
-        each point's own shell.
+        """Return the thickness over h of each node's shell, (nodes of cells, 1).
+
+        It is the derivative of a thickness over h by the factor of its shell.
+
+        Parameters
+        ----------
+        shape
+            Numbers of cells and of nodes per cell.
         """
         surface = scene.model.meridian if scene.model.axisymmetric else scene.model.midsurface
         assert surface
@@ -266,8 +329,12 @@ class ControlPointField(Bounded):
         return ratios.reshape(-1, 1)
 
     def _formula(self, values: Array, controls: ControlPoints, R: float = 1.0) -> str:
-        """Formula of the field for values at the control points, with lengths over R except for a
-        curvature.
+        """Return the formula of the field for values (n,) at the control points.
+
+        Parameters
+        ----------
+        R
+            Length R in the unit of the formula's coordinates; values are over 1/R then.
         """
         if np.ptp(values) == 0:
             return repr(float(values[0] / R))
@@ -275,10 +342,11 @@ class ControlPointField(Bounded):
         weights = [
             f"exp(-({self._square(place * R)})/{squared_width})" for place in controls.places
         ]
-        parts = (f"{float(v / R)!r}*{w}" for v, w in zip(values, weights, strict=True))
-        return f"({' + '.join(parts)})/({' + '.join(weights)})"
+        terms = (f"{float(v / R)!r}*{w}" for v, w in zip(values, weights, strict=True))
+        return f"({' + '.join(terms)})/({' + '.join(weights)})"
 
     def _square(self, place: Array) -> str:
+        """Return the formula of the squared distance from a place."""
         names = ("sqrt(x**2 + y**2)", "z") if self.controls.is_axisymmetric else ("x", "y", "z")
         return " + ".join(
             f"({name} - {float(c)!r})**2" for name, c in zip(names, place, strict=True)

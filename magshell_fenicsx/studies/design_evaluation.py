@@ -43,12 +43,12 @@ LOWEST = (*FOLDS, *FIRST_FREQUENCIES)  # results that others of their kind may c
 
 @dataclass(frozen=True)
 class DesignEvaluation:
-    """The results of one vector of variables.
+    """The results of one vector of design variables.
 
     Attributes
     ----------
     values, gradients
-        By result; empty if the path was lost.
+        Result -> its value and its gradient (p,); empty if the path was lost.
     beside
         Result -> values and gradients of the instabilities next to the lowest one, which is the
         result.
@@ -76,7 +76,20 @@ def evaluate(
 ) -> DesignEvaluation:
     """Follow the path of a case, and differentiate its results; collective.
 
-    `known` is of the case before.
+    Parameters
+    ----------
+    x
+        Design variables (p,) of the case.
+    results
+        Names of the results; a key of `targets` is the mean square distance from that shape.
+    targets
+        Name of a shape -> map from undeformed to wanted places.
+    scene_cache
+        Keeps the scene, a model with its solver, for the next case.
+
+    Returns
+    -------
+    Values and gradients; a note without values if the case cannot be meshed or has no such result.
     """
     try:
         scene = scene_cache.scene_for(case.problem(variables.smooth), comm)
@@ -88,6 +101,7 @@ def evaluate(
     notes = [f"the path is lost: {path.lost_reason}"] if path.lost_reason else []
 
     def slope(gradients: Mapping[str, float | FieldGradient]) -> list[float]:
+        """Return the gradient (p,) by the variables from those by names of numbers and fields."""
         return [float(v) for v in variables.gradient(x, scene, gradients)]
 
     try:
@@ -118,7 +132,17 @@ def evaluate(
 
 @dataclass
 class _ComputedPath:
-    """The records of a path as far as results need it, and why it was lost, if it was."""
+    """The records of a path as far as results need them.
+
+    Attributes
+    ----------
+    records
+        Points of the path with their origin.
+    history
+        The same records, with those at which steps begin.
+    lost_reason
+        Why the path was lost; "" if it was not.
+    """
 
     records: list[Record] = field(default_factory=list)
     history: History = field(default_factory=History)
@@ -128,6 +152,13 @@ class _ComputedPath:
 def _refuse_missing_results(
     scene: Scene, variables: Variables, results: Sequence[str], targets: Mapping[str, Target]
 ) -> None:
+    """Check that the case has all results with gradients.
+
+    Raises
+    ------
+    CaseError
+        With the key of a result that the case does not have.
+    """
     named_sections = variables.case.design.named_results
     for result in results:
         if result != MASS and result not in targets:
@@ -135,7 +166,10 @@ def _refuse_missing_results(
 
 
 def _follow_until_enough(scene: Scene, results: Sequence[str]) -> _ComputedPath:
-    """Follow the path of a scene as far as the results need it; collective."""
+    """Follow the path of a scene as far as the results need it; collective.
+
+    A path that is lost keeps its records, and the reason.
+    """
     path, remarks = _ComputedPath(), list[str]()
     try:
         for record in follow_alone(scene, remark=remarks.append):
@@ -156,7 +190,13 @@ def _add_mass(
     variables: Variables,
     slope: Callable[[Mapping[str, float | FieldGradient]], list[float]],
 ) -> None:
-    """Add the mass of the shell, with its gradient, to an evaluation."""
+    """Add the mass of the shell, with its gradient, to an evaluation.
+
+    Parameters
+    ----------
+    slope
+        Gradient (p,) by the variables from derivatives by names of numbers and fields.
+    """
     functional = mass(scene)
     keys = [name for name in variables.names if name in WITH_MASS or "shell." in name]
     derivatives = {name: derivative(functional, name) for name in keys if functional.forms}
@@ -166,7 +206,15 @@ def _add_mass(
 def _adjoints(
     scene: Scene, path: _ComputedPath, result: str, targets: Mapping[str, Target]
 ) -> tuple[list[tuple[str, Adjoint]], str]:
-    """Return the adjoints of a result, or of its lowest modes, and a note about them."""
+    """Return the adjoints of a result, by which it is differentiated.
+
+    Returns
+    -------
+    adjoints
+        Kind of the mode and its adjoint; of `LOWEST` results several, the lowest first.
+    note
+        Text about the modes; "" without.
+    """
     if result in LOWEST:
         adjoints = _lowest(scene, path.records, result, path.history.begins)
         modes = (
@@ -183,7 +231,13 @@ def _adjoints(
 def _lowest(
     scene: Scene, records: Sequence[Record], result: str, begins: Begins
 ) -> list[tuple[str, Adjoint]]:
-    """The lowest instabilities or vibrations, and what their derivatives are contracted with."""
+    """Return the lowest instabilities or vibrations of a result: name of the mode, and its adjoint.
+
+    Parameters
+    ----------
+    begins
+        Number of a step -> the last record before it.
+    """
     if result in FOLDS:
         return instabilities(scene, records, result, begins=begins)
     return adjoints_of_vibrations(
@@ -197,7 +251,11 @@ def _lowest(
 
 
 def _enough(records: Sequence[Record], results: Sequence[str]) -> bool:
-    """Whether the path is known as far as the results need it."""
+    """Return whether the path is known as far as the results need it.
+
+    Folds of one load need the path up to `MAX_LOAD_RATIO` times the lowest instability. All other
+    results need the whole path.
+    """
     amplitudes = {FOLDS.get(result) for result in results if result != MASS}
     if None in amplitudes or len(amplitudes) > 1:
         return False

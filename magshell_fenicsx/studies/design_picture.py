@@ -1,6 +1,4 @@
-"""design.png: the results over the evaluations, the wanted shape, the remanence, and the fields
-that vary.
-"""
+"""design.png: results over the evaluations, the wanted shape, the remanence and varying fields."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -33,10 +31,16 @@ MARGINS = (-0.03, 0.03)  # beyond the bounds
 
 @dataclass(frozen=True)
 class ReachedShape:
-    """The one that is reached, and if there is one the wanted: places (n, 3) along the middle of
-    the shell.
+    """The shape that a run has reached, along the middle of the shell (y = 0), over R.
 
-    `edges`: those of the undeformed shell (m, 3), with nan between them.
+    Attributes
+    ----------
+    target
+        (n, 3) wanted places; None if no shape is wanted.
+    points, undeformed
+        (n, 3) reached and undeformed places.
+    edges
+        (m, 3) lines of the undeformed shell's edges, with nan between them.
     """
 
     target: Array | None
@@ -46,8 +50,16 @@ class ReachedShape:
 
 
 def reached_shape(folder: Path, target: Callable[[Array], Array] | None) -> ReachedShape | None:
-    """The shape at a run's last point, along the shell's nodes in the plane y = 0; None without any
-    point.
+    """Return the shape at the last stored point of a run; None if no point is stored.
+
+    It has the nodes of the shell nearest to the plane y = 0, in the order of x.
+
+    Parameters
+    ----------
+    folder
+        Folder of the run, with the subfolder fields/.
+    target
+        Map from undeformed places (n, 3) over R to wanted places; None without.
     """
     numbers = sorted(
         int(file.stem.removeprefix("point_")) for file in (folder / "fields").glob("point_*.vtu")
@@ -55,8 +67,8 @@ def reached_shape(folder: Path, target: Callable[[Array], Array] | None) -> Reac
     if not numbers:
         return None
     surface, _ = read_point(folder / "fields", numbers[-1])
-    off = np.abs(surface.r0[:, 1])
-    points_in_plane = np.flatnonzero(off <= off.min() + IN_PLANE)
+    distance_from_plane = np.abs(surface.r0[:, 1])
+    points_in_plane = np.flatnonzero(distance_from_plane <= distance_from_plane.min() + IN_PLANE)
     points_in_plane = points_in_plane[np.argsort(surface.r0[points_in_plane, 0], kind="stable")]
     target_points, edges = (
         target(surface.r0[points_in_plane]) if target else None,
@@ -76,14 +88,22 @@ def draw_design(
     target_values: Mapping[str, float] | None = None,
     shape: ReachedShape | None = None,
 ) -> None:
-    """Write the picture.
+    """Draw the history of the results, the reached shape, the remanence and the fields of a design.
 
     Parameters
     ----------
+    rows
+        Rows of design.csv.
+    results
+        Names of the results that are drawn.
+    vary, x
+        The design variables, and their best values (p,).
+    file
+        Name of the picture file.
     target_values
-        Result -> the value that is wanted.
+        Result -> the wanted value.
     shape
-        The shape that is reached, if it is known.
+        The reached shape; None if it is not known.
     """
     from matplotlib.figure import Figure
 
@@ -111,12 +131,14 @@ def draw_design(
         previous_axes.tick_params(labelbottom=i == len(units) - 1)
     previous_axes.set_xlabel("evaluation (line: the best so far)")
     previous_axes.xaxis.get_major_locator().set_params(integer=True)
-    others = [figure.add_subplot(grid[:, i]) for i in range(1, panels)]
+    further_axes = [figure.add_subplot(grid[:, i]) for i in range(1, panels)]
     if shape is not None and shape.target is not None:
-        _draw_shape(others.pop(0), shape, shape.target)
+        _draw_shape(further_axes.pop(0), shape, shape.target)
     if vary.controls and vary.remanence:
-        _draw_remanence(others[0], vary, x, shape)
-    for axes, field in zip(others[len(others) - len(vary.fields) :], vary.fields, strict=True):
+        _draw_remanence(further_axes[0], vary, x, shape)
+    for axes, field in zip(
+        further_axes[len(further_axes) - len(vary.fields) :], vary.fields, strict=True
+    ):
         _draw_field(axes, field, field.values(x[vary.blocks[field.name]]))
     figure.savefig(file)
 
@@ -128,8 +150,18 @@ def _draw_history(
     unit: str,
     target_values: Mapping[str, float],
 ) -> None:
-    """Results of one unit over the evaluations: all that were tried as faint dots, the best so far
-    as a line.
+    """Draw results of one unit over the evaluations.
+
+    All tried values are faint dots; the best so far is a line.
+
+    Parameters
+    ----------
+    rows
+        Rows of design.csv.
+    results
+        Names of the results of this unit.
+    target_values
+        Result -> the wanted value, a dotted line.
     """
     number, best = (
         np.array([row[key] for row in rows], dtype=kind)
@@ -143,10 +175,10 @@ def _draw_history(
         # lines that lie on each other are all seen
         colour, line_width = f"C{i}", 1.6 + 1.6 * (len(results) - 1 - i)
         axes.plot(number, values, "o", color=colour, markersize=4, alpha=0.4, markeredgewidth=0)
-        until = np.append(number[best], number[-1:] if best.any() else [])
+        evaluation_numbers = np.append(number[best], number[-1:] if best.any() else [])
         best_values = np.append(values[best], values[best][-1:])
         axes.plot(
-            until,
+            evaluation_numbers,
             best_values,
             "-",
             drawstyle="steps-post",
@@ -161,18 +193,18 @@ def _draw_history(
     if axes.get_yscale() == "linear":
         axes.yaxis.set_major_formatter(number_format())
     unit_text = unit if unit in {"Hz", *endings().values()} else ""
-    several = unit_text or _common([result_words(result) for result in results])
+    axis_words = unit_text or _common([result_words(result) for result in results])
     axes.set_ylabel(
         result_words(results[0]) + (f"  ({unit_text})" if unit_text else "")
         if len(results) == 1
-        else several
+        else axis_words
     )
     if len(results) > 1:
         axes.legend(frameon=False, fontsize=8)
 
 
 def _common(words: Sequence[str]) -> str:
-    """Common words of results of several points, which stand before the points' names.
+    """Return the common words of results of several points, which stand before the points' names.
 
     Examples
     --------
@@ -184,7 +216,7 @@ def _common(words: Sequence[str]) -> str:
 
 
 def _draw_shape(axes: Any, shape: ReachedShape, target_points: Array) -> None:
-    """The wanted and the reached shape from the side."""
+    """Draw the wanted and the reached shape from the side, z over x."""
     axes.plot(*shape.undeformed[:, ::2].T, "--", color="0.6", linewidth=0.8, label="undeformed")
     axes.plot(*target_points[:, ::2].T, color="C1", linewidth=3.5, alpha=0.5, label="wanted")
     axes.plot(*shape.points[:, ::2].T, color="C0", linewidth=1.3, label="reached")
@@ -194,7 +226,17 @@ def _draw_shape(axes: Any, shape: ReachedShape, target_points: Array) -> None:
 
 
 def _draw_remanence(axes: Any, vary: Variables, x: Array, shape: ReachedShape | None) -> None:
-    """Draw the vectors at their places on the undeformed shell and its edges."""
+    """Draw the vectors of the remanence at their places on the undeformed shell, with its edges.
+
+    They are drawn in the plane in which the points extend most.
+
+    Parameters
+    ----------
+    x
+        Design variables (p,).
+    shape
+        Has the edges of the shell; None: no edges.
+    """
     assert vary.controls
     places, vectors = vary.controls.places, vary.vectors(x)
     names = (r"\rho", "z") if vary.controls.is_axisymmetric else ("x", "y", "z")
@@ -229,7 +271,7 @@ def _draw_remanence(axes: Any, vary: Variables, x: Array, shape: ReachedShape | 
 
 
 def _unit(result: str) -> str:
-    """The unit of a result: equal where one axis may show both.
+    """Return the unit of a result; results with the same unit may share an axis.
 
     Examples
     --------
@@ -251,7 +293,15 @@ def _unit(result: str) -> str:
 
 
 def _draw_field(axes: Any, field: ControlPointField, values: Array) -> None:
-    """Draw values at the points: along a meridian or strip as lines, else as colours from above."""
+    """Draw a scalar field at its control points.
+
+    Along a meridian or strip it is a line for each component, else colours seen from above.
+
+    Parameters
+    ----------
+    values
+        (n, components) values at the control points.
+    """
     places, title = field.controls.places, TITLES[field.name]
     if field.controls.is_axisymmetric or not places[:, 1:].any():
         arc_length = np.concatenate(

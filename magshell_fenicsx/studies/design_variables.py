@@ -38,20 +38,24 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Variables:
-    """All design variables as one vector: numbers, then the remanence, then scalar fields.
+    """All design variables as one vector (p,): numbers, then the remanence, then scalar fields.
 
-    Every part has a name, its variables at the start (`first`) and their bounds (`limits`); it
-    takes its gradient from those of `simulate.gradients` (`gradient`) and gives plain data of the
-    case what variables stand for (`put`).
+    Each part has a name, its variables at the start (`start_values`) and their bounds (`limits`).
+    It converts gradients by the case's numbers and fields to gradients by its variables
+    (`gradient`), and writes its values into plain data of the case (`put`).
 
     Attributes
     ----------
-    case
-        At the start.
+    source, case
+        The case at the start.
     make_case
         Makes a case of its source.
+    scalars
+        Numbers that vary.
     remanence
-        None if it stays as it is.
+        Vectors of the remanence; None if they do not vary.
+    fields
+        Scalar fields that vary.
     """
 
     source: Source
@@ -63,6 +67,7 @@ class Variables:
 
     @property
     def parts(self) -> Sequence[NumberVariable | Vectors | ControlPointField]:
+        """Numbers, remanence and fields in the order of the vector."""
         return [*self.scalars, *([self.remanence] if self.remanence else []), *self.fields]
 
     @property
@@ -88,8 +93,10 @@ class Variables:
 
     @property
     def smooth(self) -> list[str]:
-        """Keys whose formulas are means over the distance of points: there is nothing between
-        samples to look for.
+        """Keys of the case whose formulas have no details between samples of the surface.
+
+        The fields are means over the distance of their control points, unless a filter is given. So
+        no narrow details need to be searched for; see `Case.problem`.
         """
         smooth_fields = [
             name
@@ -101,23 +108,27 @@ class Variables:
 
     @property
     def limits(self) -> list[Limits]:
-        """Bounds of the vector."""
+        """Lower and upper bound of each variable; None where there is none."""
         return [limit for part in self.parts for limit in part.limits]
 
     def numbers(self, x: Array) -> dict[str, float]:
-        """Key, with its unit if it has one -> value."""
+        """Return key, with its unit if it has one -> value, of the numbers that vary."""
         return {
             part.label: float(part.values(x[i : i + 1])[0]) for i, part in enumerate(self.scalars)
         }
 
     def vectors(self, x: Array) -> Array:
-        """The remanence at its points, (n, 3) or (n, 2)."""
+        """Return the remanence at its control points, (n, 3) or (n, 2), over |B^r|."""
         assert self.remanence
         return self.remanence.vectors(x[self.blocks["remanence"]])
 
     def gradient(self, x: Array, scene: Scene, gradients: GradientsByName) -> Array:
-        """A gradient by the vector from those of `simulate.gradients`; by what is not among them it
-        is zero.
+        """Convert gradients of a result to its gradient (p,) by the variables; collective.
+
+        Parameters
+        ----------
+        gradients
+            Name of a number or field -> the gradient by it; a missing one is zero.
         """
         blocks = self.blocks
         return np.concatenate(
@@ -125,7 +136,13 @@ class Variables:
         )
 
     def rounded(self, x: Array, steps: int) -> Array:
-        """The vector with angles of the remanence at the nearest of so many steps of a turn."""
+        """Return the vector with the angles of the remanence rounded.
+
+        Parameters
+        ----------
+        steps
+            Number of steps of a full turn, to which angles are rounded.
+        """
         assert self.remanence
         x, begin = np.array(x), len(self.scalars)
         angles = slice(begin, begin + self.remanence.angles)
@@ -133,12 +150,18 @@ class Variables:
         return x
 
     def write(self, x: Array, file: Path) -> None:
-        """Write the vectors of the remanence."""
+        """Write the vectors of the remanence into a file; nothing if they do not vary."""
         if self.remanence:
             write_vectors(file, self.remanence.controls.places, self.vectors(x))
 
     def data(self, x: Array, vectors: str) -> dict[str, Any]:
-        """The case of a vector as plain data; `vectors` is the file of the remanence."""
+        """Return the case for a vector of variables as plain data, without its design.
+
+        Parameters
+        ----------
+        vectors
+            Name of the file with the vectors of the remanence.
+        """
         data, blocks = copy.deepcopy(self.source.data), self.blocks
         data.pop("design", None)
         for part in self.parts:
@@ -148,13 +171,21 @@ class Variables:
         return data
 
     def case_of(self, x: Array, vectors: Path) -> Case:
-        """The case of a vector, whose remanence is in a file."""
+        """Return the case for a vector of variables.
+
+        Parameters
+        ----------
+        vectors
+            File with the vectors of the remanence.
+        """
         data = self.data(x, str(vectors.absolute()))
         return self.make_case(Source(self.source.name, data, folder=self.source.folder))
 
 
 def variables(source: Source, case: Case, design: DesignSection, make_case: MakeCase) -> Variables:
     """Build the design variables of a case.
+
+    If the remanence does not stay in a plane, the case becomes that of the whole shell.
 
     Raises
     ------
@@ -174,7 +205,7 @@ def variables(source: Source, case: Case, design: DesignSection, make_case: Make
 def refuse_unfit_numbers(
     source: Source, case: Case, design: DesignSection
 ) -> tuple[NumberVariable, ...]:
-    """The numbers of a design.
+    """Return the numbers that a design varies, with their starts and bounds.
 
     Raises
     ------
@@ -210,8 +241,15 @@ def refuse_unfit_numbers(
 
 
 def _fields(case: Case, design: DesignSection) -> tuple[ControlPointField, ...]:
-    """The scalar fields with their points and values at the start."""
+    """Return the scalar fields that a design varies, with control points and values at the start.
+
+    Raises
+    ------
+    CaseError
+        If a field starts beyond its bounds, or several shells have thickness factors of their own.
+    """
     fields, problem, several = [], case.problem(), case.several
+    # name of a shell -> its pose, and its thickness over h
     shells = (
         {part.name: (several.place(part), several.ratio(part)) for part in several.parts}
         if several
@@ -219,15 +257,15 @@ def _fields(case: Case, design: DesignSection) -> tuple[ControlPointField, ...]:
     )
     for name, section in design.fields.items():
         places, width = _spread(case, problem, section.points, section.filter)
-        varies = (
+        shells_with_factor = (
             [part.name for part in several.parts if part.case.thickness_factor is not None]
             if several
             else []
         )
-        if name == "thickness" and varies:
+        if name == "thickness" and shells_with_factor:
             raise CaseError(
                 f"design.thickness: starts even: leave out "
-                f"shells.{varies[0]}.shell.thickness_factor"
+                f"shells.{shells_with_factor[0]}.shell.thickness_factor"
             )
         start: Array
         if name == "thickness":  # that of several shells is 1 but for their patches
@@ -258,7 +296,13 @@ def _fields(case: Case, design: DesignSection) -> tuple[ControlPointField, ...]:
 
 
 def _curvatures(problem: Problem, places: Array) -> Array:
-    """The natural curvatures 11 and 22 of the case at places of its surface, (n, 2) over 1/R."""
+    """Return the natural curvatures 11 and 22 of the case at places (n, 3), (n, 2) over 1/R.
+
+    Raises
+    ------
+    CaseError
+        If the natural curvature is given by patches or as a user's field.
+    """
     natural_curvature = problem.loads.natural.curvature if problem.loads.natural else None
     if isinstance(natural_curvature, Mapping | UserField):
         raise CaseError(
@@ -272,18 +316,30 @@ def _curvatures(problem: Problem, places: Array) -> Array:
 
 
 def _spread(case: Case, problem: Problem, count: int, width: float | None) -> tuple[Array, float]:
-    """Points of the case's surface, and the filter or their distance."""
+    """Return control points (n, 3) on the surface, and the filter width.
+
+    Parameters
+    ----------
+    width
+        Filter width over R; None: the median distance of neighbouring points.
+    """
     places = _places(case, problem, count)
     return places, width or float(np.median(scipy.spatial.cKDTree(places).query(places, [2])[0]))
 
 
 def _remanence(case: Case, section: RemanenceVariables) -> Vectors:
-    """The vectors of the remanence that vary."""
+    """Return the vectors of the remanence as variables, with their control points.
+
+    Raises
+    ------
+    CaseError
+        If the vectors start with lengths beyond the bounds.
+    """
     controls, start = controls_of(case, section.points, section.filter, "design.remanence")
-    sizes, lengths = np.linalg.norm(start, axis=1), section.magnitude
-    if lengths is None:
+    sizes, length_bounds = np.linalg.norm(start, axis=1), section.magnitude
+    if length_bounds is None:
         return Vectors(controls, start, None)
-    low, high = lengths
+    low, high = length_bounds
     if not (low - 1e-9 <= sizes.min() and sizes.max() <= high + 1e-9):
         raise CaseError(
             f"design.remanence.magnitude: the vectors start with lengths {sizes.min():g} to "
@@ -296,13 +352,28 @@ def _remanence(case: Case, section: RemanenceVariables) -> Vectors:
 def controls_of(
     case: Case, count: int | None, width: float | None, key: str
 ) -> tuple[ControlPoints, Array]:
-    """The points of the remanence, and its vectors there as the case has them.
+    """Return the control points of the remanence, and the vectors of the case at these points.
+
+    Parameters
+    ----------
+    count
+        Number of points; None: the points of a remanence of kind `points`.
+    width
+        Filter width over R; None: that of the remanence, or the distance of the points.
+    key
+        Key with which messages begin.
+
+    Returns
+    -------
+    controls
+        The points.
+    vectors
+        (n, 3), or (n, 2) on a meridian, over |B^r|.
 
     Raises
     ------
     CaseError
-        If there is no remanence, or none at points where no number of points is given; it begins
-        with the key `key`.
+        If no remanence has an influence, or `count` is None and there are no points.
     """
     magnetic = case.magnetic
     needs_space = case.sensors or (magnetic and magnetic.interaction != "none")
@@ -327,6 +398,7 @@ def controls_of(
             f"{key}.points: the remanence starts by patches of a mesh: start from another kind"
         )
     if callable(field.remanent):
+        # outward directions of the points from the origin
         normals = places / np.maximum(np.linalg.norm(places, axis=1, keepdims=True), 1e-300)
         vectors = np.array(field.remanent(places[:, None], normals[:, None])[:, 0])
     else:
@@ -337,7 +409,7 @@ def controls_of(
 
 
 def _places(case: Case, problem: Problem, count: int) -> Array:
-    """Points (n, 3) along a meridian or a strip, or far from each other on the surface."""
+    """Return points (n, 3) along a meridian or a strip, or far from each other on the surface."""
     if problem.meridian:
         sample = problem.meridian.sample()
         return np.asarray(
@@ -348,6 +420,7 @@ def _places(case: Case, problem: Problem, count: int) -> Array:
         return np.column_stack([parameters, 0 * parameters, 0 * parameters])
     sample = outline(case.shell).sample()
     chosen_points, distances = [0], np.full(len(sample), np.inf)
+    # farthest-point sampling: next is the point farthest from all chosen points
     while len(chosen_points) < min(count, len(sample)):
         distances = np.minimum(
             distances, np.linalg.norm(sample - sample[chosen_points[-1]], axis=1)

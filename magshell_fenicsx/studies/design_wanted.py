@@ -1,5 +1,6 @@
-"""The goal of a design: an objective to be minimised, constraints that must not be negative; and
-its search by SciPy's optimisers.
+"""The goal of a design, and the search for the best variables by SciPy's optimisers.
+
+The goal is an objective to be minimised, and constraints that must not be negative.
 """
 
 import itertools
@@ -33,7 +34,18 @@ AT_ROOT = 1e-6
 
 @dataclass(frozen=True)
 class Limit:
-    """A result above (sign 1) or below (sign -1) a bound, or another result but for a margin."""
+    """An inequality constraint on a result.
+
+    Without `other` it is sign (result - bound) >= 0; with `other` it is sign (result - other's
+    value) + margin >= 0.
+
+    Attributes
+    ----------
+    of, other
+        Names of results; `other` is "" for a bound that is a number.
+    sign
+        1 for a lower bound, -1 for an upper one.
+    """
 
     of: str
     sign: float
@@ -42,25 +54,42 @@ class Limit:
     margin: float = 0.0
 
     def slack(self, values: Mapping[str, float]) -> float:
-        """How far it is from being broken."""
+        """Return the difference to the bound; negative if the constraint is violated.
+
+        Parameters
+        ----------
+        values
+            Name of a result -> its value.
+        """
         reference = values[self.other] if self.other else self.bound
         return self.sign * (values[self.of] - reference) + self.margin
 
     def slope(self, gradients: Mapping[str, Sequence[float]]) -> Array:
-        """The gradient of `slack`."""
+        """Return the gradient (p,) of `slack` by the variables.
+
+        Parameters
+        ----------
+        gradients
+            Name of a result -> its gradient (p,).
+        """
         reference_slope = np.array(gradients[self.other]) if self.other else 0.0
         return np.asarray(self.sign * (np.array(gradients[self.of]) - reference_slope))
 
     @property
     def words(self) -> str:
+        """The constraint in words."""
         if self.other:
             return f"{self.of} the same as {self.other}"
         return f"{self.of} {'at least' if self.sign > 0 else 'at most'} {self.bound:g}"
 
 
 def limits_of(section: LimitSection, scale: Mapping[str, float]) -> list[Limit]:
-    """Return the inequality constraints of a section; `scale` has the sizes of results at the
-    start.
+    """Return the inequality constraints of a section; an equality makes two with a margin.
+
+    Parameters
+    ----------
+    scale
+        Name of a result -> its absolute value at the start.
     """
     sides = ((section.least, 1.0), (section.most, -1.0))
     limits = [
@@ -79,7 +108,12 @@ def limits_of(section: LimitSection, scale: Mapping[str, float]) -> list[Limit]:
 
 
 def target_of(section: ShapeSection, case: Case, bent: float = 1.0) -> Target:
-    """Undeformed places (n, 3) over R -> wanted places; of a curve with a part of its curvature.
+    """Return the target of a shape: undeformed places (n, 3) over R -> wanted places (n, 3).
+
+    Parameters
+    ----------
+    bent
+        Part of the curvature of a wanted curve, from 0 to 1.
 
     Raises
     ------
@@ -101,41 +135,58 @@ def target_of(section: ShapeSection, case: Case, bent: float = 1.0) -> Target:
 
 
 class Curve:
-    """Spline through points, of length one, as the target of a strip: its places keep their
-    distance to the middle line along y.
+    """A spline through points, scaled to length one, as the target of the middle line of a strip.
+
+    Places beside the middle line keep their distance from it, along y. The call maps undeformed
+    places (n, 3) over R to wanted places (n, 3).
+
+    Parameters
+    ----------
+    points
+        (k, 3) from the root on, in any unit of length.
+    bent
+        Part of the curve's curvature that the target has.
     """
 
     def __init__(self, points: Array, bent: float = 1.0) -> None:
+        """Make the spline of the target over its arc length, from 0 at the root to 1 at the tip."""
         chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
         spline = scipy.interpolate.CubicSpline(chord, points)
         dense_points = spline(np.linspace(0.0, chord[-1], SPLINE_POINTS))
         dense_points = dense_points if bent == 1.0 else _with_part_of_curvature(dense_points, bent)
-        length = np.concatenate(
+        arc_length = np.concatenate(
             [[0.0], np.cumsum(np.linalg.norm(np.diff(dense_points, axis=0), axis=1))]
         )
-        self._at = scipy.interpolate.CubicSpline(length / length[-1], dense_points / length[-1])
+        self._at = scipy.interpolate.CubicSpline(
+            arc_length / arc_length[-1], dense_points / arc_length[-1]
+        )
 
     def __call__(self, x: Array) -> Array:
+        """Return the wanted places (n, 3) of undeformed places (n, 3) over R."""
         return np.asarray(self._at(x[:, 0])) + x[:, 1:2] * [0.0, 1.0, 0.0]
 
 
 def _with_part_of_curvature(points: Array, part: float) -> Array:
-    """The curve with the same first tangent and lengths, and a part of its curvature, in a frame
-    without twist.
+    """Return the curve (n, 3) with a part of its curvature, and the same first tangent and lengths.
+
+    Each turn between successive tangents is scaled by the part, in a frame that moves along the
+    curve without twist.
     """
     steps = np.diff(points, axis=0)
     length = np.linalg.norm(steps, axis=1, keepdims=True)
     tangents = steps / length
     # from the frame of the curve to that of the bent one
     directions, rotation = [tangents[0]], np.eye(3)
-    for tangent, next_tangent in itertools.pairwise(tangents):
-        turn = np.cross(tangent, next_tangent)
-        angle = np.arctan2(np.linalg.norm(turn), tangent @ next_tangent)
-        axis = turn * (angle / max(float(np.linalg.norm(turn)), 1e-300))
-        inverse_turn = scipy.spatial.transform.Rotation.from_rotvec(-axis).as_matrix()
+    for direction, next_tangent in itertools.pairwise(tangents):
+        axis_times_sine = np.cross(direction, next_tangent)
+        angle = np.arctan2(np.linalg.norm(axis_times_sine), direction @ next_tangent)
+        rotation_vector = axis_times_sine * (
+            angle / max(float(np.linalg.norm(axis_times_sine)), 1e-300)
+        )
+        inverse_turn = scipy.spatial.transform.Rotation.from_rotvec(-rotation_vector).as_matrix()
         rotation = (
             rotation
-            @ scipy.spatial.transform.Rotation.from_rotvec(part * axis).as_matrix()
+            @ scipy.spatial.transform.Rotation.from_rotvec(part * rotation_vector).as_matrix()
             @ inverse_turn
         )
         directions.append(rotation @ next_tangent)
@@ -148,14 +199,14 @@ class DesignGoal:
 
     Attributes
     ----------
-    results
-        Names of the results that are needed, that of the objective first.
+    section
+        The section `design` of the case.
     targets
-        Target of the last stage: undeformed places -> places of the desired shape.
+        Name of a shape -> target of the last stage, a map from undeformed to wanted places.
     stages
-        Targets of the stages before it.
+        Such targets of the stages before the last.
     scale
-        Absolute values of the results at the start.
+        Name of a result -> its absolute value at the start.
     """
 
     section: DesignSection
@@ -165,6 +216,7 @@ class DesignGoal:
 
     @property
     def results(self) -> list[str]:
+        """Names of the needed results, that of the objective first."""
         return self.section.results
 
     def begin(self, first: DesignEvaluation) -> None:
@@ -176,12 +228,13 @@ class DesignGoal:
         return self._objective(evaluation)[0]
 
     def slope(self, evaluation: DesignEvaluation) -> Array:
-        """Gradient of the objective."""
+        """Return the gradient (p,) of the scaled objective by the variables."""
         return self._objective(evaluation)[1] * np.array(
             evaluation.gradients[self.section.objective.result]
         )
 
     def _objective(self, evaluation: DesignEvaluation) -> tuple[float, float]:
+        """Return the scaled objective, to be minimised, and its derivative by the result."""
         objective = self.section.objective
         value = min(evaluation.values[result] for result in objective.results)
         scale = self._scale or abs(value) or 1.0
@@ -195,16 +248,14 @@ class DesignGoal:
 
     @property
     def _scale(self) -> float:
-        """The largest of the objective's results at the start."""
+        """Largest absolute value of the objective's results at the start; 0 if unknown."""
         return max(
             (self.scale.get(result, 0.0) for result in self.section.objective.results), default=0.0
         )
 
     @property
     def lowest(self) -> bool:
-        """Whether the lowest of several values is to be raised: of results, instabilities or
-        frequencies.
-        """
+        """Whether the lowest of several results, instabilities or frequencies is maximised."""
         objective = self.section.objective
         return objective.maximise is not None and (
             len(objective.results) > 1 or objective.result in LOWEST
@@ -212,23 +263,30 @@ class DesignGoal:
 
     @property
     def crossed(self) -> bool:
-        """Whether values are raised that others cross, which may be of any number."""
+        """Whether the maximised values are instabilities or frequencies, which others may cross.
+
+        Their number may change from point to point.
+        """
         return self.lowest and any(result in LOWEST for result in self.section.objective.results)
 
     def lowest_values(self, evaluation: DesignEvaluation) -> Array:
-        """Values to be raised over the scale, always equally many: missing ones are replaced by an
-        upper bound.
+        """Return the values (n,) of which the lowest is maximised, over the scale.
+
+        Their number is constant: missing instabilities are replaced by an upper bound.
         """
         groups = [
             _value_and_close_ones(evaluation.values[result], evaluation.beside.get(result))
             for result in self.section.objective.results
         ]
         return np.asarray(
-            np.concatenate([[value for value, _ in several] for several in groups]) / self._scale
+            np.concatenate(
+                [[value for value, _ in values_and_slopes] for values_and_slopes in groups]
+            )
+            / self._scale
         )
 
     def lowest_slopes(self, evaluation: DesignEvaluation) -> Array:
-        """Return the gradients (values, variables) of `lowest_values`."""
+        """Return the gradients (n, p) of `lowest_values`."""
         results = self.section.objective.results
         groups = [
             _value_and_close_ones(
@@ -239,7 +297,10 @@ class DesignGoal:
             for result in results
         ]
         return np.asarray(
-            np.concatenate([[slope for _, slope in several] for several in groups]) / self._scale
+            np.concatenate(
+                [[slope for _, slope in values_and_slopes] for values_and_slopes in groups]
+            )
+            / self._scale
         )
 
     def constraints(self, evaluation: DesignEvaluation) -> Array:
@@ -256,7 +317,7 @@ class DesignGoal:
 
     @property
     def _limits(self) -> list[Limit]:
-        """The inequalities of all constraints."""
+        """The inequality constraints of all sections; their scale needs the values at the start."""
         return [
             limit
             for section in self.section.constraints
@@ -264,6 +325,7 @@ class DesignGoal:
         ]
 
     def _size(self, limit: Limit) -> float:
+        """Return the size that scales the slack of a constraint: bound or result at the start."""
         return (
             abs(limit.bound)
             or max(self.scale.get(result, 0.0) for result in (limit.of, limit.other))
@@ -275,8 +337,9 @@ class DesignGoal:
         return float(max([0.0, *(-self.constraints(evaluation))]))
 
     def merit(self, evaluation: DesignEvaluation) -> tuple[float, float]:
-        """Return the pair by which evaluations are compared: violation, then objective; the least
-        is best.
+        """Return violation and objective of an evaluation, by which evaluations are compared.
+
+        The least pair is the best; a violation within the tolerance counts as zero.
         """
         violation = self.violation(evaluation)
         return (violation if violation > CONSTRAINT_TOLERANCE else 0.0, self.objective(evaluation))
@@ -288,7 +351,7 @@ class DesignGoal:
         )
 
     def missed(self, evaluation: DesignEvaluation) -> str:
-        """Describe targets and constraints that an evaluation misses; empty if it misses none."""
+        """Return sentences about missed targets and constraints; "" if none is missed."""
         objective, sentences = self.section.objective, list[str]()
         if objective.value is not None and objective.reach:
             value = evaluation.values[objective.reach]
@@ -311,7 +374,20 @@ def _value_and_close_ones(
     close_values: Sequence[tuple[float, list[float]]] | None,
     slope: Sequence[float] = (),
 ) -> list[tuple[float, Sequence[float]]]:
-    """A result and those beside it with their slopes: MOST of what may cross others, else one."""
+    """Return a result and the values beside it, each with its gradient (p,).
+
+    Parameters
+    ----------
+    value, slope
+        The result and its gradient.
+    close_values
+        Values and gradients of further instabilities; None for a result that no other crosses.
+
+    Returns
+    -------
+    The result alone if nothing crosses it; else exactly `MAX_INSTABILITIES` pairs, of which missing
+    ones are an upper bound.
+    """
     if close_values is None:
         return [(value, slope)]
     upper_value = (MAX_LOAD_RATIO * value, [MAX_LOAD_RATIO * v for v in slope])
@@ -319,13 +395,15 @@ def _value_and_close_ones(
 
 
 def design_goal_of(case: Case, section: DesignSection) -> DesignGoal:
-    """Build the goal from the section of a case."""
+    """Build the goal of a design section, with a target for each stage of a wanted curve."""
     shape = section.objective.shape
     if shape is None:
         return DesignGoal(section, {})
-    parts = [(i + 1) / shape.stages for i in range(shape.stages)]
-    *stages, last = [{"shape": target_of(shape, case, part)} for part in parts]
-    return DesignGoal(section, last, stages)
+    curvature_parts = [(i + 1) / shape.stages for i in range(shape.stages)]
+    *stages, last_targets = [
+        {"shape": target_of(shape, case, curvature_part)} for curvature_part in curvature_parts
+    ]
+    return DesignGoal(section, last_targets, stages)
 
 
 def search_optimum(
@@ -335,7 +413,19 @@ def search_optimum(
     first: Array,
     iterations: int,
 ) -> str:
-    """Look for the best variables from the first on; why the optimiser ended."""
+    """Search the best variables; return the optimiser's message about its end.
+
+    Parameters
+    ----------
+    evaluated
+        Evaluates variables (p,); it has no values if the path is lost.
+    vary
+        The design variables with their bounds.
+    first
+        Variables (p,) at the start.
+    iterations
+        Largest number of the optimiser's steps.
+    """
     if goal.crossed:
         return raise_lowest(evaluated, goal, vary.limits, first, iterations)
     if goal.lowest:
@@ -343,8 +433,10 @@ def search_optimum(
     tried: list[tuple[Array, float]] = []
 
     def objective(x: Array) -> tuple[float, Array]:
+        """Return the objective and its gradient (p,)."""
         evaluation = evaluated(x)
         if not evaluation.values:
+            # a lost path counts as worse than all, uphill from the best point
             direction = x - min(tried, key=lambda evaluated_point: evaluated_point[1])[0]
             uphill = np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-300))
             return max(value for _, value in tried) + WORSE, uphill
@@ -353,25 +445,25 @@ def search_optimum(
         return value, goal.slope(evaluation)
 
     def constraint_values(x: Array) -> Array:
-        return goal.constraints(last(x)[0])
+        return goal.constraints(evaluate_or_last(x)[0])
 
     def constraint_gradients(x: Array) -> Array:
-        return goal.constraint_slopes(last(x)[0])
+        return goal.constraint_slopes(evaluate_or_last(x)[0])
 
-    last, how = _last_known(evaluated), dict[str, Any]()
+    evaluate_or_last, method_options = _last_known(evaluated), dict[str, Any]()
     if goal.section.constraints:
-        how = {
+        method_options = {
             "method": "SLSQP",
             "constraints": {"type": "ineq", "fun": constraint_values, "jac": constraint_gradients},
         }
     options = (
         {"maxiter": iterations, "ftol": 1e-9}
-        if how
+        if method_options
         else {"maxiter": iterations, "ftol": 1e-15, "gtol": 1e-9}
     )
-    how = how or {"method": "L-BFGS-B"}
+    method_options = method_options or {"method": "L-BFGS-B"}
     ended = scipy.optimize.minimize(
-        objective, first, jac=True, bounds=vary.limits, options=options, **how
+        objective, first, jac=True, bounds=vary.limits, options=options, **method_options
     )
     return str(ended.message)
 
@@ -383,24 +475,44 @@ def _raise_lowest_smooth(
     first: Array,
     iterations: int,
 ) -> str:
-    """Raise the lowest of several results: the largest t with all of them above t, for (x, t).
+    """Raise the lowest of several results: maximise t with all results above t, for (x, t).
 
-    Where two of them cross, their minimum has a corner, and this problem has none.
+    Where two results cross, their minimum has a corner, and this problem has none.
+
+    Parameters
+    ----------
+    evaluated
+        Evaluates variables (p,); it has no values if the path is lost.
+    first
+        Variables (p,) at the start.
+
+    Returns
+    -------
+    The optimiser's message about its end.
     """
-    last = _last_known(evaluated)
+    evaluate_or_last = _last_known(evaluated)
 
     def values_above_level(z: Array) -> Array:
-        evaluation, converged = last(z[:-1])
+        """Return results less t, then slacks of constraints, for z = (x, t)."""
+        evaluation, converged = evaluate_or_last(z[:-1])
         values: Array = np.concatenate(
             [goal.lowest_values(evaluation) - z[-1], goal.constraints(evaluation)]
         )
         return values if converged else np.full_like(values, -WORSE)
 
     def slopes(z: Array) -> Array:
-        evaluation, _ = last(z[:-1])
-        parts = ((goal.lowest_slopes(evaluation), -1.0), (goal.constraint_slopes(evaluation), 0.0))
+        """Return the gradients (n + constraints, p + 1) of `values_above_level`."""
+        evaluation, _ = evaluate_or_last(z[:-1])
+        gradients_by_x_and_t = (
+            (goal.lowest_slopes(evaluation), -1.0),
+            (goal.constraint_slopes(evaluation), 0.0),
+        )
         return np.vstack(
-            [np.column_stack([part, np.full(len(part), by_t)]) for part, by_t in parts if len(part)]
+            [
+                np.column_stack([gradients, np.full(len(gradients), by_t)])
+                for gradients, by_t in gradients_by_x_and_t
+                if len(gradients)
+            ]
         )
 
     start = np.append(first, goal.lowest_values(evaluated(first)).min())
@@ -420,10 +532,15 @@ def _raise_lowest_smooth(
 def _last_known(
     evaluated: Callable[[Array], DesignEvaluation],
 ) -> Callable[[Array], tuple[DesignEvaluation, bool]]:
-    """Wrap an evaluation so that a lost path gives the last known evaluation, and False."""
+    """Wrap an evaluation so that it always has values.
+
+    Where the path is lost, it returns the last evaluation with values, and False; else the new
+    evaluation, and True.
+    """
     last: list[DesignEvaluation] = []
 
     def evaluate_or_last(x: Array) -> tuple[DesignEvaluation, bool]:
+        """Return the evaluation at x and True; else the last one with values, and False."""
         evaluation = evaluated(x)
         if evaluation.values:
             last[:] = [evaluation]

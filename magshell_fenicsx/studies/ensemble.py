@@ -60,7 +60,15 @@ MOST_TRIES = 2  # points of the path from which the fold ahead is tried
 
 @dataclass(frozen=True)
 class Ensemble:
-    """A finished ensemble: the rows of samples.csv, and the content of summary.json."""
+    """A finished ensemble of random samples.
+
+    Attributes
+    ----------
+    rows
+        Rows of samples.csv.
+    content
+        The content of summary.json.
+    """
 
     rows: list[Row]
     content: dict[str, Any]
@@ -91,6 +99,10 @@ def ensemble(  # noqa: PLR0913 - what a user gives
 
     Parameters
     ----------
+    samples
+        Number of samples.
+    seed
+        Seed from which, with its number, each sample is drawn.
     make_case
         Makes a case of its source.
     result
@@ -107,15 +119,15 @@ def ensemble(  # noqa: PLR0913 - what a user gives
     delete_weakest
         Also compute each sample without so many of its defects, those with the least amplitudes.
     resume
-        See that the folder has samples of this ensemble.
+        Require that the folder has samples of this ensemble.
     say
         Called with one line per finished sample, on the rank that finished it.
 
     Raises
     ------
     CaseError
-        Before the first sample: if one is no valid case, an argument is wrong, or `out` cannot be
-        written.
+        Before the first sample: if a sample is no valid case, an argument is wrong, or `out` cannot
+        be written.
     DiskError
         If the tables cannot be written.
     """
@@ -123,6 +135,7 @@ def ensemble(  # noqa: PLR0913 - what a user gives
     ending = f"_{part.replace('/', '_of_')}" if part else ""
 
     def drawn_samples() -> list[list[Sample]]:
+        """Draw all samples, and with `delete_weakest` their variants without weak defects."""
         source = read_source(Path(file), settings)
         return [
             make_samples(source, seed, numbers, make_case, deleted)
@@ -132,10 +145,11 @@ def ensemble(  # noqa: PLR0913 - what a user gives
     variants = on_first_rank(comm, drawn_samples)
     samples_by_key = {sample.key: sample for variant in variants for sample in variant}
     folder, name = user_folder(out), Path(file).name
-    parts = [Path(place) for place in merge]
+    part_folders = [Path(place) for place in merge]
     if resume or merge:
         access_disk(
-            comm, lambda: _refuse_strange(parts or [folder], samples_by_key, merge=bool(merge))
+            comm,
+            lambda: _refuse_strange(part_folders or [folder], samples_by_key, merge=bool(merge)),
         )
     tables = (
         f"summary{ending}.json",
@@ -145,7 +159,7 @@ def ensemble(  # noqa: PLR0913 - what a user gives
     )
     Folder("an ensemble", tables, ("seed", "samples")).prepare(folder, comm, name)
     if merge:
-        access_disk(comm, lambda: _copy(samples_by_key, parts, folder))
+        access_disk(comm, lambda: _copy(samples_by_key, part_folders, folder))
     missing = (
         []
         if merge
@@ -159,6 +173,7 @@ def ensemble(  # noqa: PLR0913 - what a user gives
     folds = KnownFolds()
 
     def sample_computed(key: str) -> Iterator[str]:
+        """Compute a sample on this rank, keep its outcome, and yield a line of text."""
         sample = samples_by_key[key]
         outcome = solve(sample, scalar, folds)
         keep_outcome(outcome, sample.case, _file(folder, key))
@@ -168,9 +183,9 @@ def ensemble(  # noqa: PLR0913 - what a user gives
             if value is None
             else f"{scalar.name} = {value:.9g} ({outcome.found})"
         )
-        why = f", {outcome.stopped}" if outcome.stopped else ""
+        reason = f", {outcome.stopped}" if outcome.stopped else ""
         place = f"{missing.index(key) + 1:5d}/{len(missing)}"
-        yield f"{place}  sample {sample.number}: {outcome_text}{why}, {outcome.cpu_s:.1f} s CPU"
+        yield f"{place}  sample {sample.number}: {outcome_text}{reason}, {outcome.cpu_s:.1f} s CPU"
 
     compute(missing, sample_computed, comm, say)
     rows = [
@@ -192,7 +207,13 @@ def ensemble(  # noqa: PLR0913 - what a user gives
 
 
 def _numbers(samples: int, seed: int, part: str | None) -> range:
-    """The numbers of the samples to compute."""
+    """Return the numbers of the samples of a part: every n-th, from the i-th on.
+
+    Raises
+    ------
+    CaseError
+        If the number of samples, the seed or the part is not allowed.
+    """
     if not 1 <= samples <= MOST_SAMPLES:
         raise CaseError(f"--samples {samples}: must be 1 to {MOST_SAMPLES}")
     if seed < 0:
@@ -202,12 +223,14 @@ def _numbers(samples: int, seed: int, part: str | None) -> range:
 
 
 def _file(folder: Path, key: str) -> Path:
+    """Return the file of a sample's outcome."""
     return folder / "points" / f"{key}.json"
 
 
 def _is_known(folder: Path, key: str, scalar: Scalar) -> bool:
-    """Whether the folder has a usable outcome; an error may have been of the machine, and is tried
-    again.
+    """Return whether the folder has a usable outcome of a sample.
+
+    An outcome with an error is not usable: the error may have been one of the machine.
     """
     outcome = stored_outcome_of_case(_file(folder, key))
     return bool(
@@ -216,8 +239,21 @@ def _is_known(folder: Path, key: str, scalar: Scalar) -> bool:
 
 
 def _refuse_strange(places: Sequence[Path], keys: Mapping[str, Sample], *, merge: bool) -> None:
-    """Refuse a folder with samples of another ensemble; an ensemble that was killed before its
-    first sample begins again.
+    """Check that folders have samples of this ensemble.
+
+    An ensemble that was killed before its first sample may begin again.
+
+    Parameters
+    ----------
+    keys
+        Key of a sample -> the sample.
+    merge
+        Whether the folders are parts to be merged.
+
+    Raises
+    ------
+    CaseError
+        If a folder has none of the samples.
     """
     for place in places:
         points = place / "points"
@@ -230,17 +266,23 @@ def _refuse_strange(places: Sequence[Path], keys: Mapping[str, Sample], *, merge
 
 
 def _copy(keys: Mapping[str, Sample], places: Sequence[Path], folder: Path) -> None:
+    """Copy the outcomes of samples from the folders of parts into a folder; called on rank 0."""
     for key in keys:
-        source = next(
+        source_file = next(
             (file for place in places if stored_outcome_of_case(file := _file(place, key))), None
         )
-        if source and source.resolve() != _file(folder, key).resolve():
-            write_whole(_file(folder, key), source.read_bytes())
+        if source_file and source_file.resolve() != _file(folder, key).resolve():
+            write_whole(_file(folder, key), source_file.read_bytes())
 
 
 def _row(variants: Sequence[Sample], folder: Path, scalar: Scalar) -> Row:
-    """The row of a sample; with a second variant, the one without its weakest defects, also the
-    result of that.
+    """Return the row of a sample in samples.csv.
+
+    Parameters
+    ----------
+    variants
+        The sample; and if wanted its variant without the weakest defects, whose result is a further
+        column.
     """
     rows = [
         make_row(sample, stored_outcome_of_case(_file(folder, sample.key)), scalar)
@@ -258,6 +300,7 @@ def _row(variants: Sequence[Sample], folder: Path, scalar: Scalar) -> Row:
 
 
 def _write(rows: Sequence[Row], content: Mapping[str, Any], folder: Path, ending: str) -> None:
+    """Write table, summary, picture and report, with an ending in their names."""
     write_samples(rows, folder / f"samples{ending}.csv")
     write_object(folder / f"summary{ending}.json", content)
     draw_ensemble(rows, content["result"], folder / f"ensemble{ending}.png")
@@ -265,18 +308,25 @@ def _write(rows: Sequence[Row], content: Mapping[str, Any], folder: Path, ending
 
 
 def solve(sample: Sample, scalar: Scalar, folds: KnownFolds) -> Outcome:
-    """Compute a sample on this rank; an error ends the sample, not the ensemble."""
-    start, cpu = time.perf_counter(), time.process_time()
+    """Compute a sample on this rank; an error ends the sample, not the ensemble.
+
+    Parameters
+    ----------
+    folds
+        Folds of earlier samples on this rank, from which the fold of this sample may be found.
+    """
+    start_wall, start_cpu = time.perf_counter(), time.process_time()
     try:
         outcome = _solved(sample, scalar, folds)
     except Exception as e:  # whatever it is, the other samples go on, and the table names it
-        why = f"{FAILED}{'' if isinstance(e, MeshError) else f'{type(e).__name__}: '}{e}"
-        outcome = Outcome.failed(" ".join(why.split()))
-    wall_s, cpu_s = time.perf_counter() - start, time.process_time() - cpu
+        reason = f"{FAILED}{'' if isinstance(e, MeshError) else f'{type(e).__name__}: '}{e}"
+        outcome = Outcome.failed(" ".join(reason.split()))
+    wall_s, cpu_s = time.perf_counter() - start_wall, time.process_time() - start_cpu
     return replace(outcome, wall_s=round(wall_s, 3), cpu_s=round(cpu_s, 3))
 
 
 def _solved(sample: Sample, scalar: Scalar, folds: KnownFolds) -> Outcome:
+    """Compute a sample: a knockdown from a known fold if possible, else along the path."""
     problem = with_modes(sample.case.problem(), MPI.COMM_SELF)
     if scalar.name != "knockdown" or not has_knockdown(sample.case):
         return _outcome(run(problem, comm=MPI.COMM_SELF))
@@ -288,7 +338,11 @@ def _solved(sample: Sample, scalar: Scalar, folds: KnownFolds) -> Outcome:
 
 
 def _along_path(sample: Sample, scene: Scene, folds: KnownFolds) -> Outcome:
-    """The fold from the first point of the path that leads to it, or the end of the path."""
+    """Follow the path of a sample to its fold, or to the end.
+
+    The fold is tried from the first points of the path that lead to it. So the rest of the path
+    is not needed.
+    """
     result, row_maker, tries = Result(scene, scene.unloaded()), RowMaker(scene), MOST_TRIES
     try:
         for record in follow_alone(scene, search=True, remark=result.remarks.append):
@@ -307,6 +361,7 @@ def _along_path(sample: Sample, scene: Scene, folds: KnownFolds) -> Outcome:
                 fold = folds.refined(sample.values, scene, guess)
             except FoldLost:
                 continue
+            # the fold that is found lies ahead on this path
             if record.label == "fold" or fold.value > record.point.state.mu["pressure"]:
                 return _of_fold(scene, fold)
     except Stopped as e:
@@ -315,10 +370,12 @@ def _along_path(sample: Sample, scene: Scene, folds: KnownFolds) -> Outcome:
 
 
 def _of_fold(scene: Scene, fold: Fold) -> Outcome:
+    """Return the outcome of a fold that was found without its whole path."""
     return outcome_of(
         Result(scene, fold.state, [fold_row(scene, fold)]), "fold", scene.newton.factorisation.count
     )
 
 
 def _outcome(result: Result) -> Outcome:
+    """Return the outcome of a run along the whole path."""
     return outcome_of(result, "path", result.scene.newton.factorisation.count)

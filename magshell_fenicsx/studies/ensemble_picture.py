@@ -24,12 +24,16 @@ TAIL = 1e-3  # probability of the lowest value that a fitted curve shows
 
 
 def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
-    """Write the picture.
+    """Draw the distribution of a result over samples, and what it depends on most.
 
     Parameters
     ----------
+    rows
+        Rows of samples.csv.
     name
         The result, as `--result` names it.
+    file
+        Name of the picture file.
     """
     from matplotlib.figure import Figure
 
@@ -43,7 +47,7 @@ def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
     panels = 1 + with_density + (strongest is not None)
     figure = Figure(figsize=(4.2 * panels, 3.6), dpi=160, layout="constrained")
     *density, function = figure.subplots(1, panels, squeeze=False)[0][: 1 + with_density]
-    others = figure.axes[1 + with_density :]
+    further_axes = figure.axes[1 + with_density :]
     if density:
         density[0].set(xlabel=label, ylabel="probability density")
         _draw_density(density[0], values, weibull)
@@ -51,7 +55,7 @@ def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
         _draw_function(function, values, results(rows, WITHOUT), weibull)
     function.set(xlabel=label, ylabel="probability of a smaller value", ylim=(0, 1))
     if strongest:
-        _draw_correlation(others[0], rows, strongest[0], label)
+        _draw_correlation(further_axes[0], rows, strongest[0], label)
     for axes in figure.axes:
         axes.locator_params(axis="x", nbins=5)  # long numbers would touch
     figure.savefig(file)
@@ -65,7 +69,7 @@ def _places(values: Array, weibull: Weibull) -> Array:
 
 
 def _draw_density(density: Any, values: Array, weibull: Weibull | None) -> None:
-    """The histogram, a mark for each sample, and Weibull's distribution."""
+    """Draw the histogram, a mark for each sample, and the fitted Weibull density if any."""
     if len(values) >= MIN_SAMPLES_FOR_HISTOGRAM:
         density.hist(
             values, bins="auto" if np.ptp(values) > 0 else 1, density=True, color="C0", alpha=0.4
@@ -86,21 +90,29 @@ def _draw_density(density: Any, values: Array, weibull: Weibull | None) -> None:
 
 
 def _draw_function(function: Any, values: Array, without: Array, weibull: Weibull | None) -> None:
-    """The distribution function of the samples and of Weibull's distribution."""
-    ordered = np.sort(values)
-    part = np.arange(len(values) + 1) / len(values)
+    """Draw the distribution function of the samples, and of the fitted Weibull distribution.
+
+    Parameters
+    ----------
+    values
+        (n,) results.
+    without
+        Results without the weakest defects; empty if they were not computed.
+    """
+    sorted_values = np.sort(values)
+    probabilities = np.arange(len(values) + 1) / len(values)
     function.step(
-        np.append(ordered[:1], ordered),
-        part,
+        np.append(sorted_values[:1], sorted_values),
+        probabilities,
         where="post",
         color="C0",
         label=f"{len(values)} samples",
     )
     if len(values_without_weakest := np.sort(without)):
-        part = np.arange(1, len(values_without_weakest) + 1) / len(values_without_weakest)
+        probabilities = np.arange(1, len(values_without_weakest) + 1) / len(values_without_weakest)
         function.step(
             values_without_weakest,
-            part,
+            probabilities,
             where="post",
             color="C2",
             linewidth=1,
@@ -115,7 +127,15 @@ def _draw_function(function: Any, values: Array, without: Array, weibull: Weibul
 
 
 def _draw_correlation(axes: Any, rows: Sequence[Row], key: str, label: str) -> None:
-    """Draw the result over a column, with Spearman's correlation and its probability by chance."""
+    """Draw the result over a column, with Spearman's correlation and its probability by chance.
+
+    Parameters
+    ----------
+    key
+        The column of samples.csv.
+    label
+        Label of the result.
+    """
     pairs = np.array(
         [
             (row[key], row[RESULT])
@@ -125,15 +145,18 @@ def _draw_correlation(axes: Any, rows: Sequence[Row], key: str, label: str) -> N
     )
     rho, chance = correlation(*pairs.T)
     axes.plot(*pairs.T, ".", color="C0", markersize=5)
-    likely = "$p$ < 0.001" if chance < 1e-3 else f"$p$ = {chance:.2g}"
+    probability_text = "$p$ < 0.001" if chance < 1e-3 else f"$p$ = {chance:.2g}"
     number = f"{rho:.2f}".replace("-", "−")
     axes.set(xlabel=words(key), ylabel=label)
-    axes.set_title(f"Spearman's correlation {number}, $n$ = {len(pairs)}, {likely}", fontsize=9)
+    axes.set_title(
+        f"Spearman's correlation {number}, $n$ = {len(pairs)}, {probability_text}", fontsize=9
+    )
 
 
 def correlation(x: Array, y: Array) -> tuple[float, float]:
-    """Return Spearman's correlation, and its probability by chance: for few samples from
-    permutations.
+    """Return Spearman's correlation, and its probability by chance.
+
+    For few samples the probability is from permutations.
 
     Examples
     --------
@@ -146,19 +169,19 @@ def correlation(x: Array, y: Array) -> tuple[float, float]:
     rho, chance = spearmanr(x, y)
     if len(x) >= MIN_SAMPLES_FOR_HISTOGRAM or np.isnan(rho):
         return float(rho), float(chance)
-    ranks, other = (rankdata(sample) - (len(x) + 1) / 2 for sample in (x, y))
+    ranks, other_ranks = (rankdata(sample) - (len(x) + 1) / 2 for sample in (x, y))
 
-    def correlation_words(values: Array, axis: int = -1) -> Array:
-        return np.asarray(np.sum(values * other, axis=axis))
+    def rank_product(values: Array, axis: int = -1) -> Array:
+        return np.asarray(np.sum(values * other_ranks, axis=axis))
 
-    tried = permutation_test(
-        (ranks,), correlation_words, permutation_type="pairings", vectorized=True, random_state=1
+    test = permutation_test(
+        (ranks,), rank_product, permutation_type="pairings", vectorized=True, random_state=1
     )
-    return float(rho), float(tried.pvalue)
+    return float(rho), float(test.pvalue)
 
 
 def words(key: str) -> str:
-    """The label of a column of samples.csv, with its unit.
+    """Return the label of a column of samples.csv, with its unit.
 
     Examples
     --------
@@ -167,13 +190,13 @@ def words(key: str) -> str:
     >>> words("severest.amplitude")
     'amplitude over $h$ of the most severe defect'
     """
-    parent, _, last = key.rpartition(".")
-    name, _, ending = last.rpartition("_")
+    parent, _, last_word = key.rpartition(".")
+    name, _, ending = last_word.rpartition("_")
     name, unit = (
         (name, "mm")
         if ending == "mm"
-        else (last, "degrees" if last in ("polar", "azimuth") else "")
+        else (last_word, "degrees" if last_word in ("polar", "azimuth") else "")
     )
     name = "amplitude over $h$" if name == "amplitude" and not unit else name.replace("_", " ")
-    whose = " of the most severe defect" if parent.startswith("severest") else ""
-    return f"{name}{whose}" + (f"  ({unit})" if unit else "")
+    suffix = " of the most severe defect" if parent.startswith("severest") else ""
+    return f"{name}{suffix}" + (f"  ({unit})" if unit else "")

@@ -1,5 +1,6 @@
-"""Folds of the pressure, followed from case to case: along a parameter, or from the nearest case
-that is known.
+"""Folds of the pressure, followed from case to case.
+
+They are followed along a parameter, or from the nearest case whose fold is known.
 """
 
 import json
@@ -27,7 +28,7 @@ LEAST_COSINE = 0.5  # between successive null vectors; a smaller value means a j
 
 
 def has_knockdown(case: Case) -> bool:
-    """Whether its result is a fold of the pressure that can be followed to another case."""
+    """Return whether a case ends at a fold of the pressure that can be followed to others."""
     loading = case.loading
     # with a tolerance each point has its own mesh; a mesh file has no chart in which states are
     # transferred
@@ -44,15 +45,14 @@ def has_knockdown(case: Case) -> bool:
 
 
 def fold_row(scene: Scene, fold: Fold) -> Row:
-    """A fold as a row of path.csv."""
+    """Return a fold as a row of path.csv."""
     row: Row = {"label": "fold", "amplitude": fold.name, **scene.observe(fold.state)}
     row |= {"mode": "", "branch": 0, "load_error": 0.0}
     return {**row, **scene.sizes.values(row)}
 
 
 def refuse_later(scene: Scene, fold: Fold, reference_mode: Vector) -> None:
-    """Reject a fold that is not the first instability under growing pressure, as far as this state
-    shows.
+    """Check that a fold is the first instability under growing pressure, as far as its state shows.
 
     Parameters
     ----------
@@ -65,8 +65,10 @@ def refuse_later(scene: Scene, fold: Fold, reference_mode: Vector) -> None:
         If its null vector is another, it is no maximum, or the shell is unstable there in another
         direction.
     """
-    comm, a, b = scene.newton.system.comm, fold.phi, reference_mode
-    if dot(comm, a, b) < LEAST_COSINE * np.sqrt(dot(comm, a, a) * dot(comm, b, b)):
+    comm, fold_mode, mode = scene.newton.system.comm, fold.phi, reference_mode
+    if dot(comm, fold_mode, mode) < LEAST_COSINE * np.sqrt(
+        dot(comm, fold_mode, fold_mode) * dot(comm, mode, mode)
+    ):
         raise FoldLost("another fold was found")
     if fold.value <= 0 or fold.curvature >= 0:
         raise FoldLost("the fold is not a maximum of the pressure")
@@ -76,7 +78,7 @@ def refuse_later(scene: Scene, fold: Fold, reference_mode: Vector) -> None:
 
 
 def _held_amplitudes(scene: Scene) -> dict[str, float]:
-    """The amplitudes beside the pressure, the field in full."""
+    """Return name -> value of the amplitudes beside the pressure, with the full magnetic field."""
     amplitudes = dict(scene.unloaded().mu)
     return amplitudes | ({"lambda_m": scene.problem.lambda_m} if "lambda_m" in amplitudes else {})
 
@@ -84,13 +86,13 @@ def _held_amplitudes(scene: Scene) -> dict[str, float]:
 class Continuation:
     """Follows a fold of the pressure through a parameter p of the case.
 
-    All scenes have the same kind of model. The known folds are stored in the unknowns of the last
-    scene.
+    All scenes, models with their solvers, have the same kind of model. The known folds are stored
+    in the unknowns of the last scene.
 
     Parameters
     ----------
     p, scene, state
-        The first fold, located by a path; Newton's method refines it.
+        Parameter, scene and state of the first fold, located by a path; Newton's method refines it.
 
     Raises
     ------
@@ -104,7 +106,12 @@ class Continuation:
         self._known, self._scene = [(p, fold)], scene
 
     def follow(self, p: float, scene: Scene) -> Fold:
-        """The fold at another value of the parameter.
+        """Return the fold at another value of the parameter, and keep it for the next prediction.
+
+        Parameters
+        ----------
+        p, scene
+            The value, and the scene at this value.
 
         Raises
         ------
@@ -119,13 +126,13 @@ class Continuation:
         return fold
 
     def from_here(self) -> "Continuation":
-        """A continuation that knows the last fold only, in which another parameter may vary."""
+        """Return a continuation that knows the last fold only, for another parameter."""
         continued = copy(self)
         continued._known = self._known[-1:]
         return continued
 
     def has_mesh_of(self, scene: Scene) -> bool:
-        """Whether a scene has the mesh of the last one."""
+        """Return whether a scene has the mesh, and the kind of model, of the last scene."""
         same_model = (
             type(scene.model) is type(self._scene.model)
             and scene.problem.is_half == self._scene.problem.is_half
@@ -133,14 +140,25 @@ class Continuation:
         return same_model and same_mesh(self._scene, scene)
 
     def _transferred(self, fold: Fold, scene: Scene) -> Fold:
+        """Return a fold of the last scene, interpolated into the unknowns of another scene."""
         u, phi = (transfer(self._scene, scene, v) for v in (fold.state.u, fold.phi))
         return replace(fold, state=State(u, fold.state.mu), phi=phi)
 
 
 @dataclass(frozen=True)
 class _StoredFold:
-    """A fold without its scene: the drawn values, the nodes in the chart, displacement, pressure
-    and null vector.
+    """A fold of a sample without its scene.
+
+    Attributes
+    ----------
+    values
+        Key -> drawn value of the sample.
+    nodes
+        (n, d) chart coordinates of the nodes, to recognise the mesh.
+    u, phi
+        Displacement and null vector.
+    pressure
+        Pressure at the fold, over the classical one.
     """
 
     values: Values
@@ -151,8 +169,9 @@ class _StoredFold:
 
 
 class KnownFolds:
-    """Folds of the pressure of earlier samples on this rank, from which those of others on the same
-    mesh are found.
+    """Folds of the pressure of earlier samples on this rank.
+
+    From these the folds of other samples on the same mesh are found.
     """
 
     def __init__(self) -> None:
@@ -161,11 +180,16 @@ class KnownFolds:
     def refined(
         self, values: Values, scene: Scene, guess: FoldGuess, reference_mode: Vector | None = None
     ) -> Fold:
-        """The fold near a guess, to 1e-9; it is kept.
+        """Return the fold near a guess, to 1e-9, and keep it.
 
-        A guess from another sample has the null vector that the fold must resemble. One from the
-        path of this sample has a soft mode, which may be a mixture of the modes of several defects:
-        there the inertia decides.
+        Parameters
+        ----------
+        values
+            Key -> drawn value of the sample.
+        reference_mode
+            Null vector of another sample's fold, which the fold must resemble. None for a guess on
+            the path of this sample: its soft mode may be a mixture of the modes of several defects,
+            so the inertia alone decides.
 
         Raises
         ------
@@ -181,7 +205,14 @@ class KnownFolds:
         return fold
 
     def follow(self, values: Values, scene: Scene) -> Fold:
-        """The fold of a sample, from the nearest known one on its mesh.
+        """Return the fold of a sample, from the nearest known fold on its mesh.
+
+        Parameters
+        ----------
+        values
+            Key -> drawn value of the sample.
+        scene
+            The scene of the sample.
 
         Raises
         ------
@@ -195,13 +226,13 @@ class KnownFolds:
         for neighbour in sorted(
             self._known, key=lambda neighbour: self._distance(values, neighbour.values)
         ):
-            order = (
+            node_order = (
                 matching(neighbour.nodes, nodes) if neighbour.nodes.shape == nodes.shape else None
             )
-            if order is None:
+            if node_order is None:
                 continue
             u, phi = (
-                v.reshape(len(nodes), -1)[order].ravel() for v in (neighbour.u, neighbour.phi)
+                v.reshape(len(nodes), -1)[node_order].ravel() for v in (neighbour.u, neighbour.phi)
             )
             return self.refined(
                 values,
@@ -212,39 +243,47 @@ class KnownFolds:
         raise FoldLost("no fold is known on this mesh")
 
     def _distance(self, a: Values, b: Values) -> float:
-        """The distance of two samples, each number over its scatter; with other words infinite."""
+        """Return the squared distance of two samples; infinite if they differ in a word.
+
+        Each number counts over its standard deviation among the known samples.
+
+        Parameters
+        ----------
+        a, b
+            Key -> drawn value.
+        """
         total = 0.0
         for key in a.keys() | b.keys():
-            x, y = a.get(key), b.get(key)
-            if x == y:
+            value_a, value_b = a.get(key), b.get(key)
+            if value_a == value_b:
                 continue
-            if not isinstance(x, float | int) or not isinstance(y, float | int):
+            if not isinstance(value_a, float | int) or not isinstance(value_b, float | int):
                 return np.inf
-            numbers = [
+            known_numbers = [
                 v
                 for located in self._known
                 if isinstance(v := located.values.get(key), float | int)
             ]
-            total += ((x - y) / (float(np.std([*numbers, x])) or 1.0)) ** 2
+            total += ((value_a - value_b) / (float(np.std([*known_numbers, value_a])) or 1.0)) ** 2
         return total
 
 
 class Scenes:
-    """The scenes of a rank; cases that differ by the strength of the field alone share one.
+    """The scenes of a rank that were used last, each a model with its solver.
 
-    Those that were used last are kept.
+    Cases that differ by the strength of the field alone share one.
     """
 
     def __init__(self) -> None:
         self._kept: dict[str, Scene] = {}
 
     def scene_of(self, case: Case) -> Scene:
-        """The scene of a case, made anew if none is kept.
+        """Return the scene of a case, made anew if none is kept.
 
         Raises
         ------
         MeshError
-            If it cannot be meshed.
+            If the case cannot be meshed.
         """
         key = _apart_from_strength(case)
         earlier_scene = self._kept.pop(key, None)
@@ -253,6 +292,7 @@ class Scenes:
         else:
             scene = Scene(with_modes(case.problem(), MPI.COMM_SELF), MPI.COMM_SELF)
         self._kept[key] = scene
+        # the scenes that were used longest ago are dropped first
         while (
             sum(scene_in_use.newton.system.size for scene_in_use in self._kept.values())
             > MOST_UNKNOWNS
@@ -263,8 +303,9 @@ class Scenes:
 
 
 def _apart_from_strength(case: Case) -> str:
-    """Return a key of all that determines a scene, except the size of lambda_m, which is a load
-    amplitude.
+    """Return a key of all that determines a scene but the size of lambda_m.
+
+    That size is a load amplitude, which a scene can change.
     """
     data = case.model_dump(mode="json") | case.outside
     if magnetic := data.get("magnetic"):

@@ -69,9 +69,9 @@ class Identified:
     Attributes
     ----------
     content
-        As in identify.json.
+        The content of identify.json.
     fit
-        The parameters, in the units of the case.
+        The posterior of the parameters, in the units of the case.
     """
 
     content: dict[str, Any]
@@ -84,8 +84,9 @@ class Identified:
 
     @property
     def remanence(self) -> dict[str, Any] | None:
-        """The identified remanence field: places over R, values over |B^r|, deviations, bands and
-        its prior; None if no field was identified.
+        """The identified remanence field, as in identify.json; None if no field was identified.
+
+        Places are over R, values over |B^r|; it has their deviations, bands and prior.
         """
         field: dict[str, Any] | None = self.content["remanence"]
         return field
@@ -116,8 +117,8 @@ def identify(
     Raises
     ------
     CaseError
-        If the case looks for nothing, the data are none of its results or outside its path, a
-        parameter has no influence, or data and priors do not determine all of them.
+        If the case has no section `identify`, or data are no results of it or outside its path; if
+        a parameter has no influence, or data and priors do not determine all parameters.
     Stopped
         If the path of the case is lost.
     """
@@ -128,28 +129,32 @@ def identify(
         raise CaseError(f"{file}: identify: is missing: it says which parameters are looked for")
     try:
         parameters = parameters_of(source, case, section)
-        field, wider = field_of(source, case, section.remanence, len(parameters))
-        wider, rows, shape = on_first_rank(comm, lambda: with_shape(Path(data), wider))
-        case = make_case(wider)
+        field, extended_source = field_of(source, case, section.remanence, len(parameters))
+        extended_source, rows, shape = on_first_rank(
+            comm, lambda: with_shape(Path(data), extended_source)
+        )
+        case = make_case(extended_source)
         table = on_first_rank(comm, lambda: table_of(Path(data), case, section, rows, shape))
         names = ResultNames(case)
-        others = [
+        candidates = [
             candidate(names, item, f"identify.candidates.{i}")
             for i, item in enumerate(section.candidates)
         ]
         _refuse_few(table, parameters)
-        _refuse_priors(wider, parameters, make_case)
+        _refuse_priors(extended_source, parameters, make_case)
         programmes = [
-            programme(name, wider, parameters, item, make_case, with_field=field is not None)
+            programme(
+                name, extended_source, parameters, item, make_case, with_field=field is not None
+            )
             for name, item in section.predict.items()
         ]
         with FOLDER.locked(folder, comm, name):
-            once: Say = say if comm.rank == 0 else lambda line: None
-            mark = identity(make_case(_without_predictions(wider))) + repr(
+            say_on_first_rank: Say = say if comm.rank == 0 else lambda line: None
+            mark = identity(make_case(_without_predictions(extended_source))) + repr(
                 [item.key for item in parameters]
             )
             predictor = Predictor(
-                wider,
+                extended_source,
                 make_case,
                 parameters,
                 dict(table.readings),
@@ -160,7 +165,7 @@ def identify(
                 table.rows,
             )
             identified, draw_result = _fit_and_predict(
-                predictor, section, table, others, once, flux_density(case)
+                predictor, section, table, candidates, say_on_first_rank, flux_density(case)
             )
             identified.content.update(case=name, data=Path(data).name, settings=list(settings))
             for item in programmes:
@@ -171,12 +176,15 @@ def identify(
     except CaseError as e:
         raise CaseError(case.with_place(str(e))) from None
     for line in identified.content["said"]:
-        once(line)
+        say_on_first_rank(line)
     return identified
 
 
 def _without_predictions(source: Source) -> Source:
-    """The case as far as the fit depends on it: another prediction makes no evaluation new."""
+    """Return the case without `identify.predict`, on which the fit does not depend.
+
+    So another prediction leaves stored evaluations of the fit valid.
+    """
     section = {key: value for key, value in source.data["identify"].items() if key != "predict"}
     return replace(source, data={**source.data, "identify": section})
 
@@ -187,7 +195,8 @@ def _refuse_few(table: MeasuredTable, parameters: Sequence[Parameter]) -> None:
     Raises
     ------
     CaseError
-        If there are fewer than parameters without a prior, or too few to estimate their noise.
+        If data are fewer than parameters without a prior, or too few to estimate their noise; or if
+        a parameter is a key in the data.
     """
     bare = [parameter.key for parameter in parameters if np.isinf(parameter.deviation)]
     if len(table.data) < len(bare):
@@ -211,7 +220,7 @@ def _refuse_few(table: MeasuredTable, parameters: Sequence[Parameter]) -> None:
 
 
 def _refuse_priors(source: Source, parameters: Sequence[Parameter], make_case: MakeCase) -> None:
-    """Check that the mean of each prior makes a valid case: keys of the case have bounds.
+    """Check that the mean of each prior makes a valid case, within the bounds of its keys.
 
     Raises
     ------
@@ -228,6 +237,15 @@ def _refuse_priors(source: Source, parameters: Sequence[Parameter], make_case: M
 
 
 def _no_noise(table: MeasuredTable, column: int, parameters: int) -> CaseError:
+    """Return the error that the noise of a column cannot be estimated.
+
+    Parameters
+    ----------
+    column
+        Index of the column in the table.
+    parameters
+        Number of parameters.
+    """
     header, count = table.columns[column].header, int((table.column == column).sum())
     return CaseError(
         f"identify.noise: {header}: {count} data do not say the noise beside {parameters} "
@@ -243,18 +261,44 @@ def _fit_and_predict(
     say: Say,
     flux_scale: tuple[float, str],
 ) -> tuple[Identified, Callable[[Path], None]]:
+    """Fit the parameters, and predict data and candidates with their bands; collective.
+
+    Parameters
+    ----------
+    predictor
+        Predicts the readings of the data for a vector of parameters.
+    others
+        Candidates: reading, its unit, and the noise of such a measurement.
+    flux_scale
+        |B^r| and its unit, in which a remanence field is reported.
+
+    Returns
+    -------
+    identified
+        The posterior and the content of identify.json.
+    draw_result
+        Draws the picture into a file.
+
+    Raises
+    ------
+    CaseError
+        If the data do not determine parameters or noise, or the case is not valid.
+    Stopped
+        If the path of the case is lost at the start.
+    """
     parameters, field = predictor.parameters, predictor.field
-    numbers = field.start_values if field else np.zeros(0)
-    start = np.array([*(parameter.start for parameter in parameters), *numbers])
-    mean = np.array([*(parameter.mean for parameter in parameters), *numbers])
+    field_start = field.start_values if field else np.zeros(0)
+    start = np.array([*(parameter.start for parameter in parameters), *field_start])
+    mean = np.array([*(parameter.mean for parameter in parameters), *field_start])
     deviation = np.array(
-        [*(parameter.deviation for parameter in parameters), *np.full(numbers.size, np.inf)]
+        [*(parameter.deviation for parameter in parameters), *np.full(field_start.size, np.inf)]
     )
     noise = np.array([column.noise for column in table.columns])
     measured = Measured(
         table.data, table.column, noise, mean, deviation, field.smooth if field else None
     )
     finite = np.where(np.isfinite(deviation), deviation, np.abs(start))
+    # scale of each parameter, for well-conditioned steps
     size = np.where(finite > 0, finite, 1.0)
     size[len(parameters) :] = 1.0
     first = predictor(start)
@@ -265,6 +309,7 @@ def _fit_and_predict(
     _refuse_idle(np.array(first.slopes), np.array(first.values), size, parameters)
 
     def model(x: Array, *, slopes: bool = True) -> tuple[Array, Array] | None:
+        """Return values (n,) and slopes (n, p) at parameters (p,); None without a prediction."""
         prediction = predictor(x, slopes=slopes)
         if prediction.note:
             say(f"       {_parameters_text(parameters, x)}: {prediction.note}")
@@ -272,6 +317,7 @@ def _fit_and_predict(
         return np.array(prediction.values), np.array(prediction.slopes)
 
     def report_step(step: int, x: Array, misfit: float) -> None:
+        """Say a step of the fit, with parameters (p,) and the misfit over the number of data."""
         say(
             f"{step:5d}  misfit {misfit:.4g} of the noise squared, "
             f"{_parameters_text(parameters, x)}"
@@ -287,10 +333,10 @@ def _fit_and_predict(
         ) from None
     except NoNoise as e:
         raise _no_noise(table, e.column, len(parameters)) from None
-    bent, lost_count = nonlinearity(partial(model, slopes=False), posterior)
+    misfit_difference, lost_count = nonlinearity(partial(model, slopes=False), posterior)
     content = _content(predictor, table, posterior)
     content["remanence"] = field.summary(posterior, flux_scale) if field else None
-    content["normal"] = {"difference": bent, "lost": lost_count, "within": NORMAL}
+    content["normal"] = {"difference": misfit_difference, "lost": lost_count, "within": NORMAL}
     content["predicted"], content["next"] = _predict_candidates(
         predictor, section, posterior, others
     )
@@ -302,32 +348,41 @@ def _fit_and_predict(
 
 
 def _parameters_text(parameters: Sequence[Parameter], x: Array) -> str:
-    sentences = [
+    """Return a vector of parameters as text; of a field its root mean square."""
+    texts = [
         f"{short_key(p.key)} = {v:.6g} {p.unit}".rstrip()
         for p, v in zip(parameters, x, strict=False)
     ]
     if len(x) > len(parameters):
-        sentences.append(f"{NAME} of {np.sqrt(np.mean(x[len(parameters) :] ** 2)):.6g}")
-    return ", ".join(sentences)
+        texts.append(f"{NAME} of {np.sqrt(np.mean(x[len(parameters) :] ** 2)):.6g}")
+    return ", ".join(texts)
 
 
 def _refuse_idle(
     slopes: Array, values: Array, size: Array, parameters: Sequence[Parameter]
 ) -> None:
-    """Check that every parameter has an influence on the data.
+    """Check that every parameter, and the field if any, has an influence on the data.
+
+    Parameters
+    ----------
+    slopes, values
+        (n, p) and (n,), derivatives and predictions at the start.
+    size
+        (p,) scale of each parameter.
 
     Raises
     ------
     CaseError
-        With the name of one that does not.
+        With the names of parameters without influence.
     """
+    # (p,) largest change of a result by each parameter, relative to the largest result
     strongest = np.abs(slopes * size).max(axis=0) / (np.abs(values).max() or 1.0)
-    of_field = strongest[len(parameters) :]
+    field_changes = strongest[len(parameters) :]
     changes = [
         *zip([p.key for p in parameters], strongest, strict=False),
-        (NAME, of_field.max(initial=np.inf)),
+        (NAME, field_changes.max(initial=np.inf)),
     ]
-    changes = changes if of_field.size else changes[:-1]
+    changes = changes if field_changes.size else changes[:-1]
     if idle := [key for key, change in changes if change < INFLUENCE_TOLERANCE]:
         raise CaseError(
             f"identify.parameters: {', '.join(idle)}: has no influence on these data where the "
@@ -336,7 +391,7 @@ def _refuse_idle(
 
 
 def _content(predictor: Predictor, table: MeasuredTable, posterior: Posterior) -> dict[str, Any]:
-    """Return the identified parameters, noise and predictions as plain data."""
+    """Return the identified parameters, noise and predictions, as in identify.json."""
     measured = posterior.measured
     low, high = posterior.band
     quantiles = posterior.quantiles(np.eye(len(posterior.x)))
@@ -353,10 +408,13 @@ def _content(predictor: Predictor, table: MeasuredTable, posterior: Posterior) -
         }
         for i, p in enumerate(predictor.parameters)
     }
-    spread, s = posterior.spread(posterior.slopes), posterior.noise[table.column]
-    half = posterior.quantiles(posterior.slopes) * spread
-    half_measured = posterior.quantiles(posterior.slopes, table.column) * np.hypot(spread, s)
-    listed = [
+    spread, noise_of_data = posterior.spread(posterior.slopes), posterior.noise[table.column]
+    # half widths of the 95 % bands: of predictions, and of measurements with noise
+    half_width = posterior.quantiles(posterior.slopes) * spread
+    half_measured = posterior.quantiles(posterior.slopes, table.column) * np.hypot(
+        spread, noise_of_data
+    )
+    settings_and_readings = [
         (settings, reading) for settings, readings in table.readings.items() for reading in readings
     ]
     rows = [
@@ -367,13 +425,13 @@ def _content(predictor: Predictor, table: MeasuredTable, posterior: Posterior) -
             "at": "end" if reading.at is None else reading.at,
             "measured": float(table.data[i]),
             "predicted": float(posterior.y[i]),
-            "low": float(posterior.y[i] - half[i]),
-            "high": float(posterior.y[i] + half[i]),
-            "noise": float(s[i]),
+            "low": float(posterior.y[i] - half_width[i]),
+            "high": float(posterior.y[i] + half_width[i]),
+            "noise": float(noise_of_data[i]),
             "low_measured": float(posterior.y[i] - half_measured[i]),
             "high_measured": float(posterior.y[i] + half_measured[i]),
         }
-        for i, (settings, reading) in enumerate(listed)
+        for i, (settings, reading) in enumerate(settings_and_readings)
     ]
     noise = {
         column.header: {
@@ -394,7 +452,9 @@ def _content(predictor: Predictor, table: MeasuredTable, posterior: Posterior) -
         "places": table.places,
         "shape": dict(table.shape),
         "missing": dict(table.missing),
-        "misfit_over_noise": float(np.sqrt(np.mean(((measured.data - posterior.y) / s) ** 2))),
+        "misfit_over_noise": float(
+            np.sqrt(np.mean(((measured.data - posterior.y) / noise_of_data) ** 2))
+        ),
         "steps": posterior.steps,
         "ended": posterior.ended,
         "rows": rows,
@@ -408,17 +468,33 @@ def _predict_candidates(
     posterior: Posterior,
     others: Sequence[tuple[Reading, str, float]],
 ) -> tuple[list[dict[str, Any]], dict[str, Any] | None]:
-    """The candidates with their bands, and which of them narrows a parameter most."""
+    """Predict the candidates, and choose the next measurement; collective.
+
+    Parameters
+    ----------
+    others
+        Candidates: reading, its unit, and the noise of such a measurement.
+
+    Returns
+    -------
+    rows
+        A row for each candidate: value, band and deviations after its measurement; or a note why
+        there is no value.
+    next
+        The candidate that narrows a parameter most, and by how much; None without predicted ones.
+    """
     if not others:
         return [], None
     keys = [row_or_key.key for row_or_key in predictor.parameters]
     deviations = _deviations_by_key(keys, posterior.deviation)
     size = np.where(posterior.x != 0, np.abs(posterior.x), 1.0)
-    relative = {key: deviations[key] / size[i] for i, key in enumerate(keys)}
-    narrowed_key = section.narrow or (max(relative, key=relative.__getitem__) if keys else NAME)
+    relative_deviations = {key: deviations[key] / size[i] for i, key in enumerate(keys)}
+    narrowed_key = section.narrow or (
+        max(relative_deviations, key=relative_deviations.__getitem__) if keys else NAME
+    )
     rows = list[dict[str, Any]]()
     for reading, unit, noise in others:
-        alone = Predictor(
+        candidate_predictor = Predictor(
             predictor.source,
             predictor.make_case,
             predictor.parameters,
@@ -429,20 +505,20 @@ def _predict_candidates(
             predictor.field,
         )
         prediction, row = (
-            alone(posterior.x),
+            candidate_predictor(posterior.x),
             {"result": reading.of, "at": "end" if reading.at is None else reading.at, "unit": unit},
         )
-        predictor.count += alone.count
+        predictor.count += candidate_predictor.count
         if prediction.note:
             rows.append({**row, "note": prediction.note})
             continue
         slope = np.array(prediction.slopes[0])
-        value, half = (
+        value, half_width = (
             prediction.values[0],
             float((posterior.quantiles(slope[None]) * posterior.spread(slope[None]))[0]),
         )
         narrowed = _deviations_by_key(keys, posterior.narrowed(slope, noise))
-        low, high = value - half, value + half
+        low, high = value - half_width, value + half_width
         rows.append(
             {
                 **row,
@@ -457,25 +533,35 @@ def _predict_candidates(
     if not predicted_rows:
         return rows, None
     best = min(predicted_rows, key=lambda row_or_key: row_or_key["deviations_then"][narrowed_key])
-    how = {
+    narrowing = {
         "parameter": narrowed_key,
         "from": deviations[narrowed_key],
         "to": best["deviations_then"][narrowed_key],
     }
-    return rows, {"result": best["result"], "at": best["at"], "unit": best["unit"], **how}
+    return rows, {"result": best["result"], "at": best["at"], "unit": best["unit"], **narrowing}
 
 
 def _deviations_by_key(keys: Sequence[str], deviations: Array) -> dict[str, float]:
-    """Deviations by keys; of a field their root mean square."""
-    of_field = deviations[len(keys) :]
-    field_deviation = {NAME: float(np.sqrt(np.mean(of_field**2)))} if of_field.size else {}
+    """Return key -> standard deviation; of the numbers of a field their root mean square.
+
+    Parameters
+    ----------
+    keys
+        Keys of the parameters, which stand before the field.
+    deviations
+        (p,) standard deviations.
+    """
+    field_deviations = deviations[len(keys) :]
+    field_deviation = (
+        {NAME: float(np.sqrt(np.mean(field_deviations**2)))} if field_deviations.size else {}
+    )
     return {key: float(v) for key, v in zip(keys, deviations, strict=False)} | field_deviation
 
 
 def _curves(
     predictor: Predictor, table: MeasuredTable, posterior: Posterior
 ) -> dict[str, list[tuple[float, float]]]:
-    """Result -> the path at the fit, as far as data go."""
+    """Return result -> places and values along the path at the fit, up to the last datum."""
     prediction, curves = predictor(posterior.x), dict[str, list[tuple[float, float]]]()
     for result, curve in prediction.curves.items():
         if result.startswith(OF_POINTS):
@@ -486,11 +572,11 @@ def _curves(
             for r in readings
             if r.of == result and r.at is not None
         ]
-        upto = next(
+        end_index = next(
             (i for i in range(len(curve)) if i and abs(curve[i][0]) >= max(map(abs, places))),
             len(curve) - 1,
         )
-        curves[result] = curve[: upto + 1]
+        curves[result] = curve[: end_index + 1]
     return curves
 
 
@@ -501,11 +587,22 @@ def _write(
     predictor: Predictor,
     programmes: Sequence[Programme],
 ) -> None:
-    for predicted_case in programmes:
-        predicted = predicted_case.prediction(folder, identified.fit, identified.content["noise"])
-        identified.content["programmes"][predicted_case.name] = predicted.content
-        identified.content["said"] += predicted.said
-        predicted.write(folder)
+    """Write predictions of programmes, tables, pictures and identify.json; called on rank 0.
+
+    Parameters
+    ----------
+    identified
+        Gets the content and the sentences of the programmes.
+    draw_result
+        Draws the picture into a file.
+    """
+    for programme_of_case in programmes:
+        prediction = programme_of_case.prediction(
+            folder, identified.fit, identified.content["noise"]
+        )
+        identified.content["programmes"][programme_of_case.name] = prediction.content
+        identified.content["said"] += prediction.said
+        prediction.write(folder)
     write_object(folder / "identify.json", identified.content)
     rows = identified.content["rows"]
     write_csv(rows, list(rows[0]), folder / "identify.csv")

@@ -1,5 +1,7 @@
-"""Input of `magshell identify`: measured columns as readings of a case, and parameters with their
-priors.
+"""Input of `magshell identify`: measured columns as readings of a case, and parameters with priors.
+
+A reading (`simulate.readings.Reading`) is a result of the case at one place of its last step. A
+place is a value of the load or displacement that this step prescribes.
 """
 
 import re
@@ -42,12 +44,15 @@ OF_POINTS = "measured_"  # names of these places in the case
 
 @dataclass(frozen=True)
 class Parameter:
-    """A number that is looked for, in its unit.
+    """A number of the case that is to be identified, with its prior.
 
     Attributes
     ----------
+    number
+        Key, unit and value at the start.
     mean, deviation
-        Of its prior; without one the deviation is infinite.
+        Mean and standard deviation of the prior, in the unit of the number; without a prior the
+        deviation is infinite.
     """
 
     number: NumberVariable
@@ -56,25 +61,34 @@ class Parameter:
 
     @property
     def key(self) -> str:
+        """Dotted key of the number in the case file."""
         return self.number.name
 
     @property
     def unit(self) -> str:
+        """Unit in which the case gives the number; "" for a bare number."""
         return self.number.unit
 
     @property
     def start(self) -> float:
+        """Value in the case file, in `unit`."""
         return float(self.number.start[0])
 
 
 @dataclass(frozen=True)
 class MeasuredColumn:
-    """A measured result: its name in the file, and in the case's unit.
+    """A measured result: a column of the data file.
 
     Attributes
     ----------
+    header
+        Name in the file, without the unit.
+    of
+        Name of the result; for a displacement of a shape its ending after the point's name.
+    unit
+        Unit of the result in the case; "" if it has none.
     noise
-        Its standard deviation in the case's unit; nan if it is to be estimated.
+        Standard deviation of the noise in `unit`; nan if it is to be estimated.
     """
 
     header: str
@@ -90,20 +104,20 @@ class MeasuredTable:
     Attributes
     ----------
     columns
-        The results.
+        The measured results.
     readings
-        Settings of the case, as for `--set` -> readings, in the order of the data.
+        Settings of the case, as for `--set` -> readings, in the order of `data`.
     data, column
-        (n,) the numbers in the case's units, and which column each is of.
+        (n,) the measured numbers in the case's units, and the index in `columns` of each.
     places
-        The column of the places; "" without.
+        Name of the result that gives the places; "" without.
     shape
-        Name of a place of the shape -> where it is on the undeformed shell, in the unit of its
-        displacements.
+        Name of a point of the measured shape -> its coordinates (x, y, z) on the undeformed shell,
+        in the unit of its displacements.
     missing
-        Name of a column -> in how many rows it has no number.
+        Header of a column -> number of rows in which it is empty.
     rows
-        Settings -> the file and line of each reading, for messages.
+        Settings -> file and line of each reading, for messages.
     """
 
     columns: tuple[MeasuredColumn, ...]
@@ -117,9 +131,18 @@ class MeasuredTable:
 
 
 class ResultNames:
-    """The results of a case, and what its last step prescribes, by their names in a file."""
+    """Names of the results of a case, and of the quantity that its last step prescribes.
+
+    Attributes
+    ----------
+    scene
+        A scene without mesh, which knows names and units alone.
+    places
+        The load or displacement of the last step; None if there is none.
+    """
 
     def __init__(self, case: Case) -> None:
+        """Make a scene without mesh for a case, and find the quantity of its last step."""
         self.scene = NamesOnlyScene(case.problem())
         try:
             self.places: PrescribedQuantity | None = PrescribedQuantity(self.scene)
@@ -127,14 +150,31 @@ class ResultNames:
             self.places = None
 
     def result_of(self, name: str, unit: str | None, location: str) -> tuple[str, str, float]:
-        """The result of a name with a unit, the case's unit, and what one of that unit is in it.
+        """Find the result of the case that a name and a unit in the data mean.
+
+        Parameters
+        ----------
+        unit
+            Unit of the data; None for a bare number.
+        location
+            Key or file with which messages begin.
+
+        Returns
+        -------
+        result
+            Name of the result in the case, such as `w_mm` for `w` in m.
+        case_unit
+            Unit of the result; "" if it has none.
+        factor
+            Size of `unit` in `case_unit`, by which data are multiplied.
 
         Raises
         ------
         CaseError
-            If there is no such result, or a unit is missing.
+            If there is no such result, or a unit is missing or of another dimension.
         """
         scene = self.scene
+        # name of a result with a unit -> (its name without unit, its unit)
         units_by_result = {
             q.name: (base, q.si) for base in self._bare if (q := scene.sizes.column(base))
         }
@@ -143,6 +183,7 @@ class ResultNames:
         } | {"hertz_1": ("hertz_1", "Hz")}
         if unit is None:
             unknown = name not in self._bare and name not in FOLDS
+            # a result with a unit that the bare name may mean, for the message
             nearest = next(
                 (
                     result_name
@@ -185,6 +226,7 @@ class ResultNames:
 
     @property
     def _bare(self) -> list[str]:
+        """Names of all results without a unit; that of the place is first."""
         scene = self.scene
         place_names = [self.places.dimensionless_column] if self.places else []
         return [
@@ -193,12 +235,12 @@ class ResultNames:
         ]
 
     def refuse_strange(self, name: str, location: str) -> None:
-        """Check that a column of data names a result of the case, with or without its unit.
+        """Check that a name of a column of data is a result of the case, with or without its unit.
 
         Raises
         ------
         CaseError
-            If no result has it.
+            If no result has the name.
         """
         units = [q.name for base_name in self._bare if (q := self.scene.sizes.column(base_name))]
         names = [
@@ -214,12 +256,12 @@ class ResultNames:
             )
 
     def amount(self, amount: Amount, result: str, location: str) -> float:
-        """A number for a result, in its unit of the case.
+        """Return an amount (a number, or text with a unit) in the unit of a result in the case.
 
         Raises
         ------
         CaseError
-            If its unit is missing or another one.
+            If the unit is missing or of another dimension.
         """
         number, unit = number_and_unit(str(amount))
         _, case_unit, factor = (
@@ -234,6 +276,13 @@ class ResultNames:
         return float(number) * factor
 
     def _of_unit(self, result_name: str, unit: str, location: str) -> tuple[str, str, float]:
+        """Return what `result_of` does for a bare name of a result, but the factor for a unit.
+
+        Raises
+        ------
+        CaseError
+            If the result has no unit, or one of another dimension.
+        """
         result, case_unit, _ = self.result_of(result_name, None, location)
         if not case_unit:
             raise CaseError(
@@ -246,11 +295,17 @@ class ResultNames:
 
 
 def _text(amount: Amount) -> str:
+    """Return an amount as a text for messages."""
     return amount if isinstance(amount, str) else f"{amount:g}"
 
 
 def refuse_size(deviation: float, text: Amount, location: str) -> None:
     """Check that a standard deviation is positive and that its square is a floating-point number.
+
+    Parameters
+    ----------
+    text
+        The deviation as written in the case, for messages.
 
     Raises
     ------
@@ -267,7 +322,7 @@ def refuse_size(deviation: float, text: Amount, location: str) -> None:
 
 
 def parameters_of(source: Source, case: Case, section: IdentifySection) -> tuple[Parameter, ...]:
-    """The numbers that are looked for.
+    """Return the parameters of an `identify` section, with their starts and priors.
 
     Raises
     ------
@@ -296,13 +351,30 @@ def parameters_of(source: Source, case: Case, section: IdentifySection) -> tuple
 
 
 def _number_as_written(source: Source, case: Case, key: str) -> tuple[float, str]:
-    """A number of the case as it is written, and its unit."""
+    """Return the number at a key in the unit of the case file, and this unit ("" without).
+
+    A default, which the file does not give, is taken from the validated case.
+    """
     text = value_at(source.data, key.split("."))
     number, unit = number_and_unit(str(text))
     return (float(number), unit) if number else (number_at_key(case.context, key), "")
 
 
 def _in_unit_of(unit: str, amount: Amount | None, key: str) -> float:
+    """Return an amount of a prior in a unit; nan for None.
+
+    Parameters
+    ----------
+    unit
+        Unit of the number in the case; "" for a bare number.
+    key
+        Key of the number, for the message.
+
+    Raises
+    ------
+    CaseError
+        If the amount has no such unit.
+    """
     if amount is None:
         return np.nan
     try:
@@ -310,24 +382,30 @@ def _in_unit_of(unit: str, amount: Amount | None, key: str) -> float:
             raise ValueError
         return in_unit(str(amount), unit)
     except ValueError:
-        what = f"the unit {unit}" if unit else "no unit"
+        expected = f"the unit {unit}" if unit else "no unit"
         raise CaseError(
-            f"{_text(amount)}: the case gives {key} with {what}: so has its prior"
+            f"{_text(amount)}: the case gives {key} with {expected}: so has its prior"
         ) from None
 
 
 def with_shape(file: Path, source: Source) -> tuple[Source, list[str], dict[str, list[float]]]:
-    """The case with the places of a measured shape as named points.
+    """Return the case with the points of a measured shape among its named points.
+
+    Rows at the same point share one name.
 
     Returns
     -------
-    The case, the name of each row's place, and where these are in the file's unit; the case itself
-    and nothing without places.
+    source
+        The case; unchanged if the file has no columns x, y, z.
+    names
+        Name of the point of each row; empty without a shape.
+    shape
+        Name of a point -> its coordinates (x, y, z) in the file's units.
 
     Raises
     ------
     CaseError
-        If there are places without displacements, or these without places.
+        If coordinates lack displacements, or a coordinate is missing.
     """
     table = _rows_of(file)
     columns, units = table.columns, table.units
@@ -344,6 +422,7 @@ def with_shape(file: Path, source: Source) -> tuple[Source, list[str], dict[str,
     ]
     for axis in SHAPE:
         _refuse_missing(axis, columns[axis], table.lines, location)
+    # equal points get the number of their first row: reversed, it is written last
     point_names = {tuple(row): f"{OF_POINTS}{i}" for i, row in reversed(list(enumerate(rows, 1)))}
     shape = {point_names[tuple(row)]: row for row in rows}
     texts = {
@@ -358,6 +437,7 @@ def with_shape(file: Path, source: Source) -> tuple[Source, list[str], dict[str,
 
 
 def _rows_of(file: Path) -> TableRows:
+    """Read the rows of a data file; its `TableError` becomes a `CaseError` with the file's name."""
     try:
         return read_rows(file, Files())
     except TableError as e:
@@ -365,7 +445,22 @@ def _rows_of(file: Path) -> TableRows:
 
 
 def _refuse_missing(name: str, values: Array, lines: Sequence[int], location: str) -> None:
-    """Check that a column with places or keys has a number in every row."""
+    """Check that a column of places or keys has a number in every row.
+
+    Parameters
+    ----------
+    name, values
+        Header of the column, and its numbers; nan where a cell is empty.
+    lines
+        Line of each row in the file, for the message.
+    location
+        The data file, for the message.
+
+    Raises
+    ------
+    CaseError
+        With the first row without a number.
+    """
     for row in np.flatnonzero(np.isnan(values))[:1]:
         raise CaseError(f"{location}: line {lines[row]}: {name}: has a row without a number")
 
@@ -373,7 +468,14 @@ def _refuse_missing(name: str, values: Array, lines: Sequence[int], location: st
 def refuse_twice(
     header: str, result: str, earlier_headers: Mapping[str, str], location: str
 ) -> None:
-    """Check that a column is of another result, or key, than all earlier ones (result -> header).
+    """Check that a column is of another result, or key, than all earlier columns.
+
+    Parameters
+    ----------
+    header, result
+        Header of the column, and the result or key that it has.
+    earlier_headers
+        Result or key -> header, of the earlier columns.
 
     Raises
     ------
@@ -390,7 +492,7 @@ def refuse_twice(
 
 
 def quantity_of(result: str) -> str:
-    """Return one name of what several results are, in units or without: of a fold its load.
+    """Return one name for a result in all its units; of a fold the name of its load.
 
     Examples
     --------
@@ -401,9 +503,9 @@ def quantity_of(result: str) -> str:
         return f"fold of {FOLDS[result]}"
     if result.startswith("omega2_"):
         return result.replace("omega2_", "hertz_")
-    for each in QUANTITIES.values():
-        if any(result == in_units.name for in_units in each.in_units):
-            return each.name
+    for quantity in QUANTITIES.values():
+        if any(result == in_units.name for in_units in quantity.in_units):
+            return quantity.name
     ending = next((ending for ending in endings() if result.endswith(f"_{ending}")), "")
     return result.removesuffix(f"_{ending}")
 
@@ -415,12 +517,19 @@ def table_of(
     rows: Sequence[str] = (),
     shape: Mapping[str, list[float]] | None = None,
 ) -> MeasuredTable:
-    """The measured columns; the points of the rows and their places are those of `with_shape`.
+    """Read the measured columns of a data file as readings of a case.
+
+    Parameters
+    ----------
+    rows
+        Name of the point of each row, as of `with_shape`; empty without a measured shape.
+    shape
+        Name of a point -> its coordinates in the file's units, as of `with_shape`.
 
     Raises
     ------
     CaseError
-        If a column is no result, has no unit, or the section names one that is not there.
+        If a column is no result or has no unit, or if the section names a missing column.
     """
     rows_of_file = _rows_of(file)
     columns, units = rows_of_file.columns, rows_of_file.units
@@ -429,8 +538,11 @@ def table_of(
     keys, results = dict[str, tuple[str, Array]](), list[tuple[MeasuredColumn, Array]]()
     places = length = ""
     for header, values in columns.items():
-        parts = HEADER.fullmatch(header)
-        name, unit = (parts[1], parts[2] or units[header]) if parts else (header, None)
+        header_match = HEADER.fullmatch(header)
+        name, unit = (
+            (header_match[1], header_match[2] or units[header]) if header_match else (header, None)
+        )
+        # a dotted name is a key of the case: a setting of each row
         if "." in name:
             refuse_twice(header, name, headers_by_result, location)
             _refuse_missing(header, values, rows_of_file.lines, location)
@@ -463,7 +575,8 @@ def table_of(
     table = _listed(
         results, keys, place_values, places, section, location, rows, rows_of_file.lines
     )
-    sizes = (
+    # of the file's units of coordinates, in the unit of displacements
+    unit_factors = (
         [column_size(axis, units[axis] or length, length) if length else 1.0 for axis in SHAPE]
         if shape
         else []
@@ -471,7 +584,7 @@ def table_of(
     return replace(
         table,
         shape={
-            name: [a * b for a, b in zip(place_values, sizes, strict=True)]
+            name: [a * b for a, b in zip(place_values, unit_factors, strict=True)]
             for name, place_values in (shape or {}).items()
         },
     )
@@ -480,6 +593,18 @@ def table_of(
 def _refuse_unknown(
     section: IdentifySection, columns: Iterable[MeasuredColumn], location: str
 ) -> None:
+    """Check that the keys of `noise` and `changes` name columns of the data file.
+
+    Parameters
+    ----------
+    location
+        The data file, for the message.
+
+    Raises
+    ------
+    CaseError
+        If a name is no column.
+    """
     column_names = {name for column in columns for name in (column.header, column.of)}
     for key, items in (("noise", section.noise), ("changes", section.changes)):
         if unknown := next((name for name in items if name not in column_names), None):
@@ -499,9 +624,25 @@ def _listed(
     points: Sequence[str],
     lines: Sequence[int],
 ) -> MeasuredTable:
-    """Rows as readings, those of the same settings together; an empty cell was not measured.
+    """Collect the rows as readings, grouped by their settings; an empty cell was not measured.
 
-    `location` is the file, and `lines` are those of the rows in it, for messages.
+    Parameters
+    ----------
+    results
+        The measured columns, with their numbers (rows,) in the case's units.
+    keys
+        Key of the case -> its unit and its numbers (rows,).
+    place_values, places
+        (rows,) place of each row, and the name of that column; "" without places.
+    location, lines
+        The file, and the line of each row in it, for messages.
+    points
+        Name of the point of each row; empty without a measured shape.
+
+    Raises
+    ------
+    CaseError
+        If there are no numbers, too many, or not finite ones.
     """
     readings, data = dict[tuple[str, ...], list[Reading]](), dict[tuple[str, ...], list[float]]()
     column, rows = dict[tuple[str, ...], list[int]](), dict[tuple[str, ...], list[str]]()
@@ -514,6 +655,7 @@ def _listed(
             value = float(values[row])
             if np.isnan(value):
                 continue
+            # folds, frequencies and the barrier are numbers of a whole path
             at_place = (
                 place is not None
                 and measured_column.of not in FOLDS
@@ -525,6 +667,7 @@ def _listed(
             )
             result = (
                 f"{points[row]}{measured_column.of}"
+                # a displacement of the row's point
                 if measured_column.of.startswith("_")
                 else measured_column.of
             )
@@ -534,12 +677,14 @@ def _listed(
             data.setdefault(settings, []).append(value)
             column.setdefault(settings, []).append(number)
             rows.setdefault(settings, []).append(f"{location}: line {lines[row]}")
-    flat = np.array([value for group in data.values() for value in group])
-    if not 0 < len(flat) <= MOST_READINGS or not np.isfinite(flat).all():
+    numbers = np.array([value for group in data.values() for value in group])
+    if not 0 < len(numbers) <= MOST_READINGS or not np.isfinite(numbers).all():
         raise CaseError(
-            f"{location}: has {len(flat)} numbers; allowed are 1 to {MOST_READINGS}, all finite"
+            f"{location}: has {len(numbers)} numbers; allowed are 1 to {MOST_READINGS}, all finite"
         )
-    numbers = np.array([number for group in column.values() for number in group], dtype=np.int64)
+    column_numbers = np.array(
+        [number for group in column.values() for number in group], dtype=np.int64
+    )
     empty = {
         measured_column.header: int(np.isnan(values).sum()) for measured_column, values in results
     }
@@ -547,8 +692,8 @@ def _listed(
     return MeasuredTable(
         tuple(measured_column for measured_column, _ in results),
         readings,
-        flat,
         numbers,
+        column_numbers,
         places,
         missing=missing,
         rows=rows,
@@ -556,12 +701,14 @@ def _listed(
 
 
 def refuse_unfit_section(source: Source, case: Case, section: IdentifySection) -> None:
-    """Check all of a section that needs no data: parameters are numbers, and results exist.
+    """Check the parts of an `identify` section that need no data.
+
+    Parameters must be numbers of the case, and all named results must exist.
 
     Raises
     ------
     CaseError
-        With the key.
+        With the key that is wrong.
     """
     parameters_of(source, case, section)
     names = ResultNames(case)
@@ -575,12 +722,21 @@ def refuse_unfit_section(source: Source, case: Case, section: IdentifySection) -
 def candidate(
     names: ResultNames, section: CandidateSection, key: str
 ) -> tuple[Reading, str, float]:
-    """A further reading, its unit, and its noise.
+    """Return the reading of a candidate, a measurement that may be made next.
+
+    Returns
+    -------
+    reading
+        The result and its place.
+    unit
+        Unit of the result in the case; "" without.
+    noise
+        Standard deviation of such a measurement, in this unit.
 
     Raises
     ------
     CaseError
-        If it is none.
+        If there is no such result or place, or a unit is wrong.
     """
     result, unit, _ = names.result_of(section.of, None, f"{key}.of")
     noise = names.amount(section.noise, result, f"{key}.noise")

@@ -15,8 +15,9 @@ NORMAL = float(scipy.stats.norm.ppf((1 + BAND_PROBABILITY) / 2))
 
 
 def posterior_samples(posterior: Posterior, count: int) -> Array:
-    """Parameters (count, p) from the posterior, evenly along its principal axes, as wide as the
-    bands are.
+    """Return parameters (count, p) drawn from the posterior, by a Latin hypercube along its axes.
+
+    They scatter as widely as the 95 % bands, whose quantiles are Student's t.
     """
     size = posterior.deviation
     spread, axes = np.linalg.eigh(posterior.correlation)
@@ -25,16 +26,23 @@ def posterior_samples(posterior: Posterior, count: int) -> Array:
     # Latin hypercube: each axis has its quantiles
     stratified = [(rng.permutation(count) + 0.5) / count for _ in size]
     normal = _decorrelated(scipy.stats.norm.ppf(np.transpose(stratified)), np.argsort(-spread))
-    wider = (
+    # half widths of Student's t over those of a normal distribution
+    width_ratio = (
         posterior.quantiles(axes.T * np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0))
         / NORMAL
     )
-    return np.asarray(posterior.x + size * ((normal * np.sqrt(spread) * wider) @ axes.T))
+    return np.asarray(posterior.x + size * ((normal * np.sqrt(spread) * width_ratio) @ axes.T))
 
 
 def _decorrelated(normal: Array, longest: NDArray[np.int64]) -> Array:
-    """Normal numbers (count, p) without correlations among as many of their longest axes as they
-    can say.
+    """Return normal numbers (count, p) without correlations among the longest axes.
+
+    Only as many axes as half the number of samples can be treated.
+
+    Parameters
+    ----------
+    longest
+        (p,) axes, the longest first.
     """
     axes = longest[: len(normal) // 2]
     deviation = normal[:, axes].std(axis=0)
@@ -42,6 +50,7 @@ def _decorrelated(normal: Array, longest: NDArray[np.int64]) -> Array:
         np.corrcoef(normal[:, axes], rowvar=False).reshape(len(axes), len(axes))
     )
     uncorrelated = np.array(normal)
+    # times the inverse root of the correlation matrix
     uncorrelated[:, axes] = (
         normal[:, axes]
         / deviation
@@ -53,7 +62,17 @@ def _decorrelated(normal: Array, longest: NDArray[np.int64]) -> Array:
 
 
 def band_of(values: Array, samples: int) -> tuple[float, float] | None:
-    """Between which 95 % of the runs lie; None if too few of them have a value."""
+    """Return the ends of the range in which 95 % of the runs' values lie.
+
+    None if too few of the runs have a value.
+
+    Parameters
+    ----------
+    values
+        Values of the runs; nan where a run has none.
+    samples
+        Number of drawn runs.
+    """
     values = values[np.isfinite(values)]
     if values.size < ENOUGH * samples:
         return None

@@ -1,6 +1,4 @@
-"""The remanence as a field that is looked for: its numbers among the parameters, and what is found
-of it.
-"""
+"""The remanence as a field that is identified: its numbers, and what is reported of them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -31,14 +29,18 @@ MAX_FIELD_NUMBERS = 2_000  # numbers
 
 @dataclass(frozen=True)
 class RemanenceField:
-    """Components of the remanence at points, over |B^r|.
+    """The remanence as a field that is identified: components at control points, over |B^r|.
 
     Attributes
     ----------
+    controls
+        The control points; each place of the shell has their weighted mean.
     start
         (n, 3), or (n, 2) on a meridian: vectors of the case itself, the mean of their prior.
-    free
-        The components that are looked for; on a strip those in the plane of x and z.
+    free_components
+        Indices of the components that are identified; on a strip those in the plane of x and z.
+    smooth
+        The prior, under which the field is smooth.
     """
 
     controls: ControlPoints
@@ -48,50 +50,63 @@ class RemanenceField:
 
     @property
     def start_values(self) -> Array:
-        """The numbers of the case itself."""
+        """The identified components of the case itself, as a vector; components vary fastest."""
         return np.asarray(self.start[:, self.free_components]).ravel()
 
     @property
     def names(self) -> list[str]:
-        """The components that are looked for, as in a file of vectors."""
+        """Names of the identified components, as in a file of vectors."""
         return [VECTORS[self.start.shape[1]][i] for i in self.free_components]
 
     def derivatives(self, scene: Scene, gradient: FieldGradient) -> Array:
-        """The derivatives by the numbers; collective."""
+        """Return the derivatives of a result by the numbers of the field, as a vector; collective.
+
+        Parameters
+        ----------
+        gradient
+            Gradient of the result by the remanence as a field on the mesh.
+        """
         return np.asarray(by_components(scene, gradient)[:, self.free_components]).ravel()
 
     def vectors(self, x: Array) -> Array:
-        """All components at the points."""
+        """Return all components (n, 3 | 2) at the points for numbers x of the field."""
         components = np.array(self.start)
         components[:, self.free_components] = x.reshape(len(components), -1)
         return components
 
     def write(self, x: Array, file: Path) -> None:
-        """Write the vectors, as a remanence of kind: points takes them."""
+        """Write the vectors for numbers x, as a file for a remanence of kind `points`."""
         write_vectors(file, self.controls.places, self.vectors(x))
 
     def put(self, data: dict[str, Any], file: Path) -> None:
-        """Let a case have the vectors of a file."""
+        """Set the remanence in plain data of a case to the vectors of a file."""
         Vectors(self.controls, self.start, None).put(data, self.start)
         data["magnetic"]["remanent"]["file"] = str(file.absolute())
 
     def summary(self, posterior: Posterior, flux_scale: tuple[float, str]) -> dict[str, Any]:
-        """Return the identified field as plain data; `flux_scale` is |B^r| and its unit."""
+        """Return the identified field as plain data, as in identify.json.
+
+        Parameters
+        ----------
+        flux_scale
+            |B^r| and its unit.
+        """
         block, prior = self.smooth.block, posterior.measured.field
         assert prior
         shape = (len(self.start), len(self.free_components))
-        low, high = (v[block].reshape(shape) for v in posterior.band)
+        lower_ends, upper_ends = (v[block].reshape(shape) for v in posterior.band)
         fields_at_bounds = [
             name for name in prior.at_bounds() if np.isnan(getattr(self.smooth, name))
         ]
+        # trace of C Q: the number of values that the prior determines
         prior_share = np.trace(posterior.local[block, block] @ prior.rows.T @ prior.rows)
         return {
             "places": self.controls.places.tolist(),
             "components": self.names,
             "value": posterior.x[block].reshape(shape).tolist(),
             "deviation": posterior.deviation[block].reshape(shape).tolist(),
-            "low": low.tolist(),
-            "high": high.tolist(),
+            "low": lower_ends.tolist(),
+            "high": upper_ends.tolist(),
             "mean": self.start_values.reshape(shape).tolist(),
             "prior": {
                 "deviation": prior.deviation,
@@ -106,13 +121,16 @@ class RemanenceField:
 def field_of(
     source: Source, case: Case, section: RemanenceSection | None, first: int
 ) -> tuple[RemanenceField | None, Source]:
-    """The remanence that is looked for, as parameters from `first` on, and the case whose model has
-    room for it.
+    """Return the remanence that is identified, as parameters from index `first` on; and the case.
+
+    The case is that of the whole shell unless the vectors stay in a plane. Without a section the
+    field is None, and the case unchanged.
 
     Raises
     ------
     CaseError
-        If the case has no remanence in a field.
+        If the case has no remanence in a field, or its points are too many, too few or at one
+        place.
     """
     if section is None:
         return None, source
@@ -152,7 +170,13 @@ def field_of(
 
 
 def without_room(other: Mapping[str, Any], data: Mapping[str, Any]) -> str:
-    """Why a case has no place for the field of another one, both as plain data; "" if it has."""
+    """Return why a case has no place for the field of another case; "" if it has.
+
+    Parameters
+    ----------
+    other, data
+        Plain data of the case, and of the case whose field is identified.
+    """
     if not (other.get("magnetic") or {}).get("remanent"):
         return f"has no magnetic.remanent, and {FIELD_KEY} is looked for"
     other_geometry, geometry = (
@@ -166,7 +190,7 @@ def without_room(other: Mapping[str, Any], data: Mapping[str, Any]) -> str:
 
 
 def flux_density(case: Case) -> tuple[float, str]:
-    """|B^r| in mT; without units (1, "")."""
+    """Return |B^r| and its unit: a value in mT, or (1, "") for a case without units."""
     density = (
         case.magnetic.remanent.flux_density if case.magnetic and case.magnetic.remanent else None
     )
@@ -174,7 +198,7 @@ def flux_density(case: Case) -> tuple[float, str]:
 
 
 def words(field: Mapping[str, Any]) -> list[str]:
-    """Describe the identified field in words."""
+    """Return sentences about the identified field, whose content is as in identify.json."""
     flux_scale, prior = field["over"], field["prior"]
     unit = f" {flux_scale['unit']}" if flux_scale["unit"] else " |B^r|"
     deviation = flux_scale["value"] * np.array(field["deviation"])

@@ -1,6 +1,4 @@
-"""The picture of an identification: data and prediction with their bands, and what is known of the
-parameters.
-"""
+"""The pictures of an identification: data and predictions with their bands, and the parameters."""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -24,8 +22,9 @@ AXES = {"bx": "x", "by": "y", "bz": "z", "b_rho": r"\rho", "b_z": "z"}
 def draw_identified(
     content: Mapping[str, Any], curves: Mapping[str, Sequence[tuple[float, float]]], file: Path
 ) -> None:
-    """Draw each column of the data over its places, a shape from the side, a field with its bands,
-    and the parameters before and after.
+    """Draw the data with their fit, a measured shape, a remanence field, and the parameters.
+
+    Each column of the data, each component of the field, the shape and the parameters have a panel.
 
     Parameters
     ----------
@@ -33,6 +32,8 @@ def draw_identified(
         As in identify.json.
     curves
         Result -> places and values along the path.
+    file
+        Name of the picture file.
     """
     import matplotlib
 
@@ -41,12 +42,12 @@ def draw_identified(
 
     panels = list[Callable[[Any], None]]()
     rows, shape, field = content["rows"], content["shape"], content["remanence"]
-    of_shape = [row for row in rows if row["result"].startswith(OF_POINTS)]
-    if len({row["column"] for row in of_shape}) > 1:
-        panels.append(partial(_shape, rows=of_shape, shape=shape))
+    shape_rows = [row for row in rows if row["result"].startswith(OF_POINTS)]
+    if len({row["column"] for row in shape_rows}) > 1:
+        panels.append(partial(_shape, rows=shape_rows, shape=shape))
         rows = [row for row in rows if not row["result"].startswith(OF_POINTS)]
-    ordered = sorted(rows, key=lambda row: str(row["column"]))
-    for _, column_rows in groupby(ordered, key=lambda row: str(row["column"])):
+    sorted_rows = sorted(rows, key=lambda row: str(row["column"]))
+    for _, column_rows in groupby(sorted_rows, key=lambda row: str(row["column"])):
         column = list(column_rows)
         result = column[0]["result"].partition(OF_POINTS)[0] or column[0]["column"]
         panels.append(
@@ -69,13 +70,21 @@ def draw_identified(
 
 
 def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]]) -> None:
-    """Draw measured places of a shape in the two directions in which most of them move."""
+    """Draw measured and fitted places of a shape, in the two directions in which most of them move.
+
+    Parameters
+    ----------
+    rows
+        Rows of identify.csv for the displacements of the shape.
+    shape
+        Name of a point -> its undeformed coordinates (x, y, z).
+    """
     largest_by_axis = dict[str, float]()
     for row in rows:
         largest_by_axis[row["column"]] = max(
             largest_by_axis.get(row["column"], 0.0), abs(row["measured"])
         )
-    plane_axes, labelled = (
+    plane_axes, has_labels = (
         sorted(sorted(largest_by_axis, key=lambda name: -largest_by_axis[name])[:2]),
         False,
     )
@@ -93,17 +102,17 @@ def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]])
         ]
         for kind, style, colour in (("predicted", "-", "C0"), ("measured", ".", "C1")):
             u = [[rows_by_point[axis][name][kind] for name in points] for axis in plane_axes]
-            label = "" if labelled else "fitted" if kind == "predicted" else kind
-            line = style if _in_line(coordinates) else "."
+            label = "" if has_labels else "fitted" if kind == "predicted" else kind
+            point_style = style if _in_line(coordinates) else "."
             plot.plot(
                 *(np.array(coordinates) + np.array(u)),
-                line,
+                point_style,
                 color=colour,
                 label=label,
                 zorder=4,
                 lw=1.2,
             )
-        labelled = True
+        has_labels = True
     plot.plot(
         *coordinates,
         "--" if _in_line(coordinates) else ".",
@@ -120,18 +129,36 @@ def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]])
 
 
 def _which(row: Row) -> tuple[str, str]:
+    """Return settings and place of a row: the shape at one state."""
     return str(row["settings"]), str(row["at"])
 
 
 def _in_line(coordinates: Sequence[Sequence[float]]) -> bool:
+    """Return whether points may be joined by a line in their order.
+
+    They may if they lie on a line along an axis, and the other coordinate never falls.
+
+    Parameters
+    ----------
+    coordinates
+        Two coordinates of the points, each (n,).
+    """
     return any(np.ptp(v) == 0 for v in coordinates) and all(
         (np.diff(v) >= 0).all() for v in coordinates
     )
 
 
 def _field(plot: Any, field: Row, number: int) -> None:
-    """A component of the field over the arc length with its band; on a surface its colours, rings
-    for deviations.
+    """Draw a component of the remanence field, with its band over the arc length of a line.
+
+    On a surface it is drawn by colours; the area of a point shows its standard deviation.
+
+    Parameters
+    ----------
+    field
+        `remanence` of identify.json.
+    number
+        Index of the component.
     """
     flux_scale, places = field["over"], np.array(field["places"])
     value, deviation, low, high, mean = (
@@ -148,15 +175,17 @@ def _field(plot: Any, field: Row, number: int) -> None:
         arc_length = np.concatenate(
             [[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))]
         )
-        half = 1.96 * flux_scale["value"] * field["prior"]["deviation"]
+        half_width = 1.96 * flux_scale["value"] * field["prior"]["deviation"]
         plot.fill_between(
-            arc_length, mean - half, mean + half, color="0.9", lw=0, label="prior, 95 %"
+            arc_length, mean - half_width, mean + half_width, color="0.9", lw=0, label="prior, 95 %"
         )
         plot.fill_between(arc_length, low, high, color="C0", alpha=0.3, lw=0, label="95 %")
         plot.plot(arc_length, value, "o-", color="C0", ms=3, lw=1.2, label="fitted")
-        room = 0.3 * float(np.ptp([low, high]))
+        margin = 0.3 * float(np.ptp([low, high]))
         plot.set(
-            xlabel="arc length over $R$", ylabel=label, ylim=(low.min() - room, high.max() + room)
+            xlabel="arc length over $R$",
+            ylabel=label,
+            ylim=(low.min() - margin, high.max() + margin),
         )
         plot.legend(frameon=False, fontsize=8)
         return
@@ -174,15 +203,24 @@ def _field(plot: Any, field: Row, number: int) -> None:
 def _data(
     plot: Any, result: str, rows: Sequence[Row], curve: Sequence[tuple[float, float]], content: Row
 ) -> None:
+    """Draw a column of the data over its places, with the fit and 95 % bands.
+
+    Parameters
+    ----------
+    rows
+        Rows of identify.csv for the column.
+    curve
+        Places and values along the path at the fit; empty if there are none.
+    """
     has_places = all(row["at"] != "end" for row in rows)
     rows = sorted(rows, key=lambda row: (row["settings"], row["at"])) if has_places else rows
     x = np.array([row["at"] for row in rows]) if has_places else np.arange(1.0, len(rows) + 1)
-    alone = len({row["settings"] for row in rows}) == 1 and has_places
+    on_one_curve = len({row["settings"] for row in rows}) == 1 and has_places
 
     def get(name: str) -> Array:
         return np.array([row[name] for row in rows])
 
-    if alone:
+    if on_one_curve:
         plot.fill_between(
             x,
             get("low_measured"),
@@ -195,12 +233,15 @@ def _data(
         plot.fill_between(
             x, get("low"), get("high"), color="C0", alpha=0.35, lw=0, label="95 %, curve"
         )
-        line = [(a, b) for a, b in curve if min(x) <= a <= max(x)]
-        line = sorted([*line, *zip(x, get("predicted"), strict=True)])
-        plot.plot(*zip(*line, strict=True), color="C0", lw=1.2, label="fitted")
+        fitted_curve = [(a, b) for a, b in curve if min(x) <= a <= max(x)]
+        fitted_curve = sorted([*fitted_curve, *zip(x, get("predicted"), strict=True)])
+        plot.plot(*zip(*fitted_curve, strict=True), color="C0", lw=1.2, label="fitted")
     else:
-        half = [get("predicted") - get("low_measured"), get("high_measured") - get("predicted")]
-        plot.errorbar(x, get("predicted"), half, fmt="_", color="C0", label="fitted, 95 %")
+        error_bars = [
+            get("predicted") - get("low_measured"),
+            get("high_measured") - get("predicted"),
+        ]
+        plot.errorbar(x, get("predicted"), error_bars, fmt="_", color="C0", label="fitted, 95 %")
     plot.plot(x, get("measured"), ".", color="C1", label="measured", zorder=5)
     plot.set(
         xlabel=result_label(content["places"]) if has_places else "number",
@@ -210,18 +251,26 @@ def _data(
 
 
 def _parameters(plot: Any, parameters: Mapping[str, Row]) -> None:
-    """Bands over the value that fits best: before in grey, after in blue."""
+    """Draw 95 % bands of the parameters, relative to the fit: the prior in grey, data in blue.
+
+    Parameters
+    ----------
+    parameters
+        Key -> its value, band and prior, as in identify.json.
+    """
     widest = 0.0
     for i, parameter in enumerate(parameters.values()):
         size = abs(parameter["value"]) or 1.0
         prior = parameter["prior"]
         if prior:
-            middle, half = (
+            middle, half_width = (
                 prior["mean"] / size - np.sign(parameter["value"]),
                 1.96 * prior["deviation"] / size,
             )
-            plot.barh(i, 200 * half, left=100 * (middle - half), height=0.5, color="0.85")
-            widest = max(widest, abs(middle) + half)
+            plot.barh(
+                i, 200 * half_width, left=100 * (middle - half_width), height=0.5, color="0.85"
+            )
+            widest = max(widest, abs(middle) + half_width)
         low, high = ((parameter[name] - parameter["value"]) / size for name in ("low", "high"))
         plot.barh(i, 100 * (high - low), left=100 * low, height=0.25, color="C0")
         widest = max(widest, high)
@@ -237,15 +286,18 @@ def _parameters(plot: Any, parameters: Mapping[str, Row]) -> None:
 
 
 def draw_programme(rows: Sequence[Row], name: str, place: str, file: Path) -> None:
-    """Draw what is predicted of another history with its bands, and what was measured of it; a
-    panel for each column.
+    """Draw the prediction of another history with its bands and data; a panel for each column.
 
     Parameters
     ----------
     rows
         As in the table of the programme.
+    name
+        Name of the programme, the title.
     place
         The column of the places.
+    file
+        Name of the picture file.
     """
     import matplotlib
 
@@ -271,12 +323,26 @@ def draw_programme(rows: Sequence[Row], name: str, place: str, file: Path) -> No
 
 
 def _programme_of_step(plot: Any, rows: Sequence[Row], place: str, labels: set[str]) -> None:
+    """Draw prediction, bands and data of one column in one step.
+
+    Parameters
+    ----------
+    rows
+        Rows of the programme's table, sorted by place.
+    place
+        The column of the places.
+    labels
+        Labels that are not in the legend yet; those that are drawn are removed.
+    """
+
     def label(text: str) -> str:
+        """Return the text if the legend does not have it yet, else ""."""
         is_new = text in labels
         labels.discard(text)
         return text if is_new else ""
 
     def get(column: str) -> Array:
+        """Return a column of the rows; nan where it is empty."""
         return np.array([np.nan if row[column] == "" else row[column] for row in rows], dtype=float)
 
     x, bands = (

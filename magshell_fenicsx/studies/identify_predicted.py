@@ -39,9 +39,11 @@ class PredictedReadings:
     values, slopes
         (n,) and (n, p), in the units of data and parameters.
     curves
-        Result -> places and values along the path, of the case without settings of rows.
+        Result -> places and values along the path, of the first case.
+    note
+        Why nothing is predicted; "" otherwise.
     invalid
-        Whether there is nothing as data are outside the path, or the case is none.
+        Whether nothing is predicted because data are outside the path or the case is not valid.
     """
 
     values: list[float] = field_of(default_factory=list)
@@ -53,16 +55,24 @@ class PredictedReadings:
 
 @dataclass
 class Predictor:
-    """Predicts readings for vectors of parameters; collective.
+    """Predicts readings for vectors of parameters, and keeps the predictions; collective.
 
     Attributes
     ----------
+    source
+        The identified case.
     readings
-        Settings of the case -> what is read there.
+        Settings of the case -> results and places that are read.
+    folder
+        Folder of the identification.
+    mark
+        Text that determines the case, so that stored predictions of another case are not used.
     field
-        The remanence that is looked for; its numbers follow the parameters.
+        The remanence that is identified; its numbers follow the parameters.
     rows
         Settings of the case -> where each reading there stands in the data, for messages.
+    count
+        Number of predictions that were computed, not stored.
     """
 
     source: Source
@@ -77,15 +87,21 @@ class Predictor:
     count: int = 0
 
     def __call__(self, x: Array, *, slopes: bool = True) -> PredictedReadings:
-        """Return the prediction for parameters x, stored or newly computed."""
+        """Return the prediction for parameters x (p,), stored or newly computed; collective.
+
+        Parameters
+        ----------
+        slopes
+            Whether derivatives by the parameters are computed too.
+        """
         x = np.array(self.comm.bcast(x))
-        listed = json.dumps(
+        settings_and_readings = json.dumps(
             [
                 [settings, [asdict(reading) for reading in readings]]
                 for settings, readings in self.readings.items()
             ]
         )
-        text = f"{self.mark} {listed} {slopes}".encode()
+        text = f"{self.mark} {settings_and_readings} {slopes}".encode()
         file = (
             self.folder / "points" / f"{hashlib.sha256(x.tobytes() + text).hexdigest()[:16]}.json"
         )
@@ -110,13 +126,23 @@ class Predictor:
         return prediction
 
     def write(self, x: Array, vectors: Path) -> None:
-        """Write the vectors of a field."""
+        """Write the vectors of the remanence for parameters x into a file; called on rank 0."""
         assert self.field
         vectors.parent.mkdir(parents=True, exist_ok=True)
         self.field.write(x[len(self.parameters) :], vectors)
 
     def _predict(self, x: Array, slopes: bool, vectors: Path) -> PredictedReadings:
-        prediction, keys = PredictedReadings(), [parameter.key for parameter in self.parameters]
+        """Compute the readings for parameters x with all settings; collective.
+
+        Parameters
+        ----------
+        vectors
+            File with the vectors of the remanence, if a field is identified.
+        """
+        prediction, parameter_keys = (
+            PredictedReadings(),
+            [parameter.key for parameter in self.parameters],
+        )
         for settings, requested in self.readings.items():
             try:
                 scene = self._scene(x, settings, vectors)
@@ -126,7 +152,7 @@ class Predictor:
                     if field
                     else None
                 )
-                readings = read(scene, requested, keys, slopes=slopes, fields=fields)
+                readings = read(scene, requested, parameter_keys, slopes=slopes, fields=fields)
             except (LostResult, CaseError, MeshError) as e:
                 message_parts = [self._row_of(e, settings), ", ".join(settings), str(e)]
                 note = ": ".join(filter(None, message_parts))
@@ -140,9 +166,9 @@ class Predictor:
                 parameter.number.gradient(x, None, {parameter.key: 1.0})  # type: ignore[arg-type]
                 for parameter in self.parameters
             )
-            sizes = [float(slope[0]) for slope in slopes_of_keys]
-            sizes += [1.0] * (readings.slopes.shape[1] - len(sizes))
-            prediction.slopes += [list(map(float, row)) for row in readings.slopes * sizes]
+            unit_sizes = [float(slope[0]) for slope in slopes_of_keys]
+            unit_sizes += [1.0] * (readings.slopes.shape[1] - len(unit_sizes))
+            prediction.slopes += [list(map(float, row)) for row in readings.slopes * unit_sizes]
             prediction.curves = prediction.curves or readings.curves
         return prediction
 
@@ -154,7 +180,15 @@ class Predictor:
         return next((row for row, reading in rows if reading.at == error.place), "")
 
     def source_at(self, x: Array, base: Source, vectors: Path) -> Source:
-        """Return a case, this or another, with parameters x; vectors of a field are in a file."""
+        """Return a case with parameters x.
+
+        Parameters
+        ----------
+        base
+            The identified case, or another one with the same keys.
+        vectors
+            File with the vectors of the remanence, if a field is identified.
+        """
         source = source_with_numbers(
             base, [parameter.number for parameter in self.parameters], x[: len(self.parameters)]
         )
@@ -163,6 +197,7 @@ class Predictor:
         return source
 
     def _scene(self, x: Array, settings: Settings, vectors: Path) -> Scene:
+        """Return the scene, a model with its solver, for parameters x and settings; collective."""
         source = self.source_at(x, self.source, vectors)
         for setting in settings:
             override(source, setting)
@@ -170,7 +205,13 @@ class Predictor:
 
 
 def source_with_numbers(source: Source, numbers: Sequence[NumberVariable], x: Array) -> Source:
-    """The source of a case with other numbers."""
+    """Return the source of a case with other values of some numbers, and without `identify`.
+
+    Parameters
+    ----------
+    x
+        Values in the order and in the units of `numbers`.
+    """
     data = json.loads(json.dumps(source.data))
     data.pop("identify", None)
     for number, value in zip(numbers, x, strict=True):

@@ -1,9 +1,8 @@
-"""Another history of the sample, predicted with what an identification has found: runs of the
-posterior, as bands.
+"""Prediction of another history of the sample from an identification, with bands.
 
 The case is run at the fit, and for parameters drawn from the posterior. Between the quantiles of
-these runs lie 95 % of them; so a snap that comes earlier in some of them makes a wide band there,
-where slopes would say nothing.
+these runs lie 95 % of them. If a snap comes earlier in some runs, the band is wide there, where
+slopes would say nothing.
 """
 
 import copy
@@ -51,8 +50,18 @@ ALWAYS = ("step", "branch", "mode", "amplitude")
 
 @dataclass(frozen=True)
 class PathColumn:
-    """A result along a step: its name in the data, its column of path.csv, and the data in the unit
-    of that.
+    """A result that is predicted along a step.
+
+    Attributes
+    ----------
+    header
+        Its name in the data, or in `of` of the section.
+    of
+        Its column of path.csv, in units if the case has them.
+    data
+        (n,) measured values in the unit of this column; empty if nothing was measured.
+    change
+        Whether the values are changes since the step began.
     """
 
     header: str
@@ -63,7 +72,17 @@ class PathColumn:
 
 @dataclass(frozen=True)
 class Prediction:
-    """Prediction of a programme: as in identify.json, in words, and as rows of its table."""
+    """The prediction of a programme.
+
+    Attributes
+    ----------
+    content
+        Its part of identify.json.
+    said
+        The sentences that are printed.
+    rows
+        Rows of its table identify_NAME.csv.
+    """
 
     name: str
     content: dict[str, Any]
@@ -71,7 +90,7 @@ class Prediction:
     rows: list[dict[str, Any]]
 
     def write(self, folder: Path) -> None:
-        """Write table and picture."""
+        """Write table and picture into a folder; nothing if there are no rows."""
         if self.rows:
             write_csv(self.rows, list(self.rows[0]), folder / f"identify_{self.name}.csv")
             draw_programme(
@@ -81,17 +100,27 @@ class Prediction:
 
 @dataclass
 class Programme:
-    """A case that is predicted.
+    """A case whose history is predicted.
 
     Attributes
     ----------
     source
         The case, with its own settings.
+    samples
+        Number of parameter vectors drawn from the posterior.
+    last
+        Number of the last step of the case, counted from 1.
+    place
+        Column of path.csv that gives the places, the load or displacement of a step.
     places, steps
-        Column of path.csv, what it is at each place of the data, and the steps of these; without
-        data these are all points of the last step.
+        (n,) place of each datum in this column, and the step that it is in. Without data `places`
+        is None: the places are all points of the last step.
+    columns
+        Results along the steps.
+    scalars
+        Numbers of a whole run.
     keys
-        Of the runs, that of the fit first; "" where drawn parameters make no case.
+        Keys of the runs' files, that of the fit first; "" where drawn parameters make no case.
     """
 
     name: str
@@ -107,8 +136,19 @@ class Programme:
     keys: list[str] = field(default_factory=list)
 
     def compute(self, predictor: Predictor, posterior: Posterior, say: Say) -> None:
-        """Run the case at the fit and for drawn parameters; collective, and every rank computes
-        runs of its own.
+        """Run the case at the fit and for drawn parameters; keep the outcomes, and fill `keys`.
+
+        Collective. The ranks share the runs, each of which is on one rank.
+
+        Parameters
+        ----------
+        predictor
+            Makes the case for a vector of parameters, and has the folder of the outcomes.
+
+        Raises
+        ------
+        CaseError
+            If the parameters of the fit make no valid case.
         """
         cases = dict[str, Case]()
         for number, x in enumerate([posterior.x, *posterior_samples(posterior, self.samples)]):
@@ -116,6 +156,7 @@ class Programme:
             if predictor.field:
                 predictor.comm.Barrier()
                 if predictor.comm.rank == 0:
+                    # all ranks read this file, after the second barrier
                     predictor.write(x, vectors)
                 predictor.comm.Barrier()
             try:
@@ -136,17 +177,22 @@ class Programme:
             say(f"{self.name}: {len(cases)} runs, {len(missing)} to compute")
 
         def computed(key: str) -> Iterator[str]:
+            """Compute a run on this rank, keep its outcome, and yield a line of text."""
             outcome = self._run(cases[key])
             keep_outcome(outcome, cases[key], _file(folder, key))
-            why = f", {outcome.stopped}" if outcome.stopped else ""
+            reason = f", {outcome.stopped}" if outcome.stopped else ""
             number = missing.index(key) + 1
             points = f"{len(outcome.curve)} points"
-            yield f"{number:5d}/{len(missing)}  {self.name}: {points}{why}"
+            yield f"{number:5d}/{len(missing)}  {self.name}: {points}{reason}"
 
         compute(missing, computed, predictor.comm, say)
         predictor.count += len(missing)
 
     def _run(self, case: Case) -> Outcome:
+        """Run a case on this rank; any exception becomes a failed outcome.
+
+        The curve of the outcome keeps only the needed columns.
+        """
         start_time = time.perf_counter()
         try:
             result = run(case.problem(), comm=MPI.COMM_SELF)
@@ -162,6 +208,7 @@ class Programme:
 
     @property
     def _needed(self) -> dict[str, None]:
+        """Columns of path.csv that the prediction reads, as keys of a dict in order."""
         place_and_results = [self.place, *(item.of for item in self.columns)]
         names = [
             *ALWAYS,
@@ -171,8 +218,10 @@ class Programme:
         return dict.fromkeys(name for name in names if name not in ("", "end"))
 
     def _outcome(self, folder: Path, key: str) -> Outcome | None:
-        """Return the stored outcome of a run; None after an error, which may have been one of the
-        machine, so that it is tried again.
+        """Return the stored outcome of a run; None if it is to be computed.
+
+        It is computed again after an error, which may have been one of the machine, and if columns
+        are missing.
         """
         outcome = stored_outcome_of_case(_file(folder, key))
         if outcome is None or (outcome.stopped or "").startswith(FAILED):
@@ -185,6 +234,13 @@ class Programme:
     ) -> Prediction:
         """Return the prediction with its bands from the stored runs.
 
+        Parameters
+        ----------
+        folder
+            Folder of the identification.
+        noise
+            Column -> its noise, as in identify.json; `deviation` is the standard deviation.
+
         Raises
         ------
         CaseError
@@ -193,14 +249,14 @@ class Programme:
         outcomes = [
             stored_outcome_of_case(_file(folder, key)) if key else None for key in self.keys
         ]
-        first, drawn_ones = outcomes[0], outcomes[1:]
-        assert first
-        if not first.curve:
+        fit_run, drawn_outcomes = outcomes[0], outcomes[1:]
+        assert fit_run
+        if not fit_run.curve:
             raise CaseError(
-                f"identify.predict.{self.name}: nothing is predicted at the fit: {first.stopped}"
+                f"identify.predict.{self.name}: nothing is predicted at the fit: {fit_run.stopped}"
             )
-        runs = [item for item in drawn_ones if item and item.curve]
-        curves = [_PathCurve(item.curve, self.place) for item in (first, *runs)]
+        runs = [item for item in drawn_outcomes if item and item.curve]
+        curves = [_PathCurve(item.curve, self.place) for item in (fit_run, *runs)]
         places, steps = self.places, self.steps
         if places is None:
             places = np.array(curves[0].along_step(self.last)[0])
@@ -209,23 +265,24 @@ class Programme:
             row
             for column in self.columns
             for row in self._rows(
-                column, places, steps, curves, self._noise(column, noise), len(drawn_ones)
+                column, places, steps, curves, self._noise(column, noise), len(drawn_outcomes)
             )
         ]
         numbers = {
-            item.name: self._number(item, first, runs, len(drawn_ones)) for item in self.scalars
+            item.name: self._number(item, fit_run, runs, len(drawn_outcomes))
+            for item in self.scalars
         }
         measured = [row for row in rows if row["measured"] != "" and row["low_measured"] != ""]
         count_inside = int(
             sum(row["low_measured"] <= row["measured"] <= row["high_measured"] for row in measured)
         )
         stopped = [item.stopped for item in runs if item.stopped]
-        lost_count = len(drawn_ones) - len(runs)
+        lost_count = len(drawn_outcomes) - len(runs)
         content = {
-            "samples": len(drawn_ones),
+            "samples": len(drawn_outcomes),
             "without_path": lost_count,
             "stopped_early": len(stopped),
-            "stopped": first.stopped,
+            "stopped": fit_run.stopped,
             "places": self.place,
             "measured": len(measured),
             "inside": count_inside,
@@ -234,6 +291,13 @@ class Programme:
         return Prediction(self.name, content, self._sentences(content), rows)
 
     def _sentences(self, content: Mapping[str, Any]) -> list[str]:
+        """Return the sentences that are printed about a prediction.
+
+        Parameters
+        ----------
+        content
+            Its part of identify.json.
+        """
         sentences = []
         if content["measured"]:
             sentences.append(
@@ -262,7 +326,13 @@ class Programme:
         return sentences
 
     def _noise(self, column: PathColumn, noise: Mapping[str, Mapping[str, Any]]) -> float:
-        """The standard deviation of such a measurement, where the identification knows it."""
+        """Return the standard deviation of the noise of a column; 0 if the identification has none.
+
+        Parameters
+        ----------
+        noise
+            Column or header -> its noise, as in identify.json.
+        """
         return next(
             (
                 float(noise[name]["deviation"])
@@ -281,9 +351,25 @@ class Programme:
         noise: float,
         samples: int,
     ) -> Iterator[dict[str, Any]]:
-        values = np.array([curve.values_at(column, places, steps) for curve in curves])
+        """Yield the rows of a column in the table of the prediction, one for each place.
+
+        A missing number is "". The bands of measured values add the noise to the runs' quantiles.
+
+        Parameters
+        ----------
+        places, steps
+            (n,) places and their steps.
+        curves
+            The run at the fit, then those of drawn parameters.
+        noise
+            Standard deviation of a measurement of the column.
+        samples
+            Number of drawn parameter vectors, with those whose run has failed.
+        """
+        # (runs, places), the fit first
+        predicted_values = np.array([curve.values_at(column, places, steps) for curve in curves])
         for i, place in enumerate(places):
-            value, band = values[0, i], band_of(values[1:, i], samples)
+            value, band = predicted_values[0, i], band_of(predicted_values[1:, i], samples)
             low, high = band or (np.nan, np.nan)
             row = {
                 "step": int(steps[i]),
@@ -309,6 +395,17 @@ class Programme:
     def _number(
         scalar: Scalar, first: Outcome, runs: Sequence[Outcome], samples: int
     ) -> dict[str, Any]:
+        """Return a number of the run at the fit, its 95 % band and the number of runs that have it.
+
+        Parameters
+        ----------
+        first
+            Outcome at the fit.
+        runs
+            Outcomes of drawn parameters that have a path.
+        samples
+            Number of drawn parameter vectors, with those whose run has failed.
+        """
         values = np.array(
             [np.nan if (v := outcome.value(scalar)) is None else v for outcome in runs]
         )
@@ -323,14 +420,23 @@ class Programme:
 
 
 class _PathCurve:
-    """The curve of a run, read step by step."""
+    """The curve of a run, read step by step; branches and other modes are left out.
+
+    Parameters
+    ----------
+    place
+        Column of path.csv that gives the places.
+    """
 
     def __init__(self, rows: Sequence[Row], place: str) -> None:
         self._rows = [row for row in rows if row["branch"] == 0 and row["mode"] in OWN_MODES]
         self._place = place
 
     def along_step(self, step: int, column: str = "") -> tuple[list[float], list[float]]:
-        """Places and values of a column in a step, from the point where it begins."""
+        """Return places and values of a column in a step, from the point where the step begins.
+
+        Without a column the values are the places. Both are empty if the run has no such step.
+        """
         rows_of_step = [i for i, row in enumerate(self._rows) if row["step"] == step]
         rows = (
             self._rows[max(rows_of_step[0] - 1, 0) : rows_of_step[-1] + 1] if rows_of_step else []
@@ -340,8 +446,10 @@ class _PathCurve:
         ]
 
     def values_at(self, column: PathColumn, places: Array, steps: NDArray[np.int64]) -> Array:
-        """Return a column where the path first passes each place in its step; nan where it does
-        not.
+        """Return the values (n,) of a column at places (n,) in their steps (n,).
+
+        Between two points of the path the column is linear. Where a path passes a place several
+        times, the first counts; nan where the path does not pass.
         """
         values = np.full(len(places), np.nan)
         for step in np.unique(steps):
@@ -352,6 +460,7 @@ class _PathCurve:
             slack = 1e-9 * np.ptp(x)
             for i in np.flatnonzero(steps == step):
                 low, high = np.minimum(x[:-1], x[1:]) - slack, np.maximum(x[:-1], x[1:]) + slack
+                # intervals of the path that have the place within
                 passed = np.flatnonzero(
                     (low <= places[i]) & (places[i] <= high) & (x[1:] != x[:-1])
                 )
@@ -364,6 +473,7 @@ class _PathCurve:
 
 
 def _file(folder: Path, key: str) -> Path:
+    """Return the file of a run's outcome in the folder of the identification."""
     return folder / "points" / f"{key}.json"
 
 
@@ -376,13 +486,21 @@ def programme(
     *,
     with_field: bool = False,
 ) -> Programme:
-    """Build the programme of a section; collective. If a field is identified, the case must have
-    room for its points.
+    """Build the programme of a section of `identify.predict`; collective.
+
+    Parameters
+    ----------
+    name
+        Name of the section.
+    source
+        The identified case, whose place the section's own case can take.
+    with_field
+        Whether a remanence field is identified; the case must then have room for its points.
 
     Raises
     ------
     CaseError
-        If the case or a setting is none, lacks a parameter, or has no such result.
+        If the case or a setting is not valid, a parameter is missing, or there is no such result.
     """
     location = f"identify.predict.{name}"
     base = copy.deepcopy(source)
@@ -403,14 +521,16 @@ def programme(
     except CaseError as e:
         raise CaseError(f"{location}: {e}") from None
     names = _PathColumnNames(problem)
-    last = len(problem.programme)
-    load_column = names.in_case_units(amplitude(problem.programme[-1].name).column) if last else ""
+    last_step = len(problem.programme)
+    load_column = (
+        names.in_case_units(amplitude(problem.programme[-1].name).column) if last_step else ""
+    )
     place, columns = load_column, list[PathColumn]()
     places: Array | None = None
     steps: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
     if section.data:
         place, places, steps, columns = _measured(
-            source.folder / section.data, names, last, f"{location}.data"
+            source.folder / section.data, names, last_step, f"{location}.data"
         )
     measured = {key.of for key in columns}
     for result in section.of:
@@ -441,7 +561,7 @@ def programme(
         replace(key, change=bool({key.header, key.of} & {*section.changes})) for key in columns
     ]
     return Programme(
-        name, base, section.samples, make_case, last, place, places, steps, columns, scalars
+        name, base, section.samples, make_case, last_step, place, places, steps, columns, scalars
     )
 
 
@@ -453,7 +573,7 @@ def refuse_unfit_programmes(
     Raises
     ------
     CaseError
-        See `programme`.
+        If the case or a setting of a prediction is not valid, or it has no such result.
     """
     parameters = parameters_of(source, case, section) if section.predict else ()
     for name, programme_section in section.predict.items():
@@ -468,6 +588,13 @@ def refuse_unfit_programmes(
 
 
 def _scalar(result: str, location: str) -> Scalar:
+    """Read the name of a number of a run; see `parse_scalar`.
+
+    Raises
+    ------
+    CaseError
+        If it has another form; the message begins with the location.
+    """
     try:
         return parse_scalar(result)
     except CaseError as e:
@@ -475,7 +602,15 @@ def _scalar(result: str, location: str) -> Scalar:
 
 
 class _PathColumnNames:
-    """The columns of path.csv that a case has."""
+    """Names of the numeric columns of path.csv that a case has.
+
+    Attributes
+    ----------
+    all
+        The names without units, as keys of a dict in order.
+    sizes
+        Sizes of the case's units, which give the columns in units.
+    """
 
     def __init__(self, problem: Any) -> None:
         self.sizes = sizes_in_units(problem)
@@ -483,17 +618,31 @@ class _PathColumnNames:
         self.all = dict.fromkeys(numbers)
 
     def in_case_units(self, name: str) -> str:
-        """The column in units of a column, or itself."""
+        """Return the name of a column in the units of the case; without units its own name."""
         in_units = self.sizes.column(name)
         return in_units.name if in_units else name
 
     def column_of(self, name: str, unit: str | None, location: str) -> tuple[str, float]:
-        """The column of a name with a unit, and what one of that unit is in it.
+        """Find the column of path.csv that a name and a unit in the data mean.
+
+        Parameters
+        ----------
+        unit
+            Unit of the data; None for a bare number.
+        location
+            Key and file with which messages begin.
+
+        Returns
+        -------
+        column
+            Name of the column.
+        factor
+            Size of `unit` in the unit of the column, by which data are multiplied.
 
         Raises
         ------
         CaseError
-            If there is none, or a unit is missing.
+            If there is no such column, or a unit is missing or of another dimension.
         """
         in_units = {q.name: q.si for base in self.all if (q := self.sizes.column(base))}
         if unit is None:
@@ -519,7 +668,31 @@ class _PathColumnNames:
 def _measured(
     file: Path, names: _PathColumnNames, last: int, location: str
 ) -> tuple[str, Array, NDArray[np.int64], list[PathColumn]]:
-    """The place, what it is in each row, the rows' steps, and the columns."""
+    """Read the data of a prediction: places in the first column, then measured columns.
+
+    Parameters
+    ----------
+    names
+        Columns of path.csv that the case has.
+    last
+        Number of the last step, in which rows without a column `step` are.
+    location
+        Key with which messages begin.
+
+    Returns
+    -------
+    place
+        Column of path.csv that gives the places.
+    places, steps
+        (n,) place and step of each row.
+    columns
+        The measured results.
+
+    Raises
+    ------
+    CaseError
+        If there is no measured column, or a row has no place or no valid step.
+    """
     try:
         rows = read_rows(file, Files())
     except TableError as e:
@@ -538,7 +711,7 @@ def _measured(
     for header, result, _, _ in measured:
         refuse_twice(header, result, headers_by_result, location)
         headers_by_result[result] = header
-    (_, place, factor, place_values), *others = measured
+    (_, place, factor, place_values), *measured_results = measured
     steps = np.asarray(columns.get("step", np.full(place_values.size, last)))
     for row in np.flatnonzero(np.isnan(place_values) | ~np.isin(steps, np.arange(1, last + 1)))[:1]:
         raise CaseError(
@@ -548,5 +721,5 @@ def _measured(
         place,
         place_values * factor,
         steps.astype(np.int64),
-        [PathColumn(h, result, v * f, change=False) for h, result, f, v in others],
+        [PathColumn(h, result, v * f, change=False) for h, result, f, v in measured_results],
     )

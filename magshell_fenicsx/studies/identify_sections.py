@@ -25,6 +25,7 @@ class ParameterSection(Section):
 
     @model_validator(mode="after")
     def _prior_with_deviation(self) -> Self:
+        """Check that mean and deviation of a prior are given together."""
         if (self.prior is None) != (self.deviation is None):
             raise ValueError("prior and deviation belong together")
         return self
@@ -95,6 +96,7 @@ class ProgrammeSection(Section):
 
     @model_validator(mode="after")
     def _something_is_predicted(self) -> Self:
+        """Check that a prediction has data or results."""
         if not (self.data or self.of):
             raise ValueError("give data, of, or both: nothing is predicted")
         return self
@@ -136,12 +138,14 @@ class IdentifySection(Section):
 
     @model_validator(mode="after")
     def _something_is_looked_for(self) -> Self:
+        """Check that a parameter or a field is to be identified."""
         if not (self.parameters or self.remanence):
             raise ValueError("give parameters, remanence, or both: nothing is looked for")
         return self
 
     @model_validator(mode="after")
     def _names_are_words(self) -> Self:
+        """Check that names of predictions can be parts of file names."""
         if invalid := next((name for name in self.predict if not re.fullmatch(r"\w+", name)), None):
             raise ValueError(
                 f"predict: {invalid}: a name has letters, digits and _ alone, as files have it"
@@ -150,6 +154,7 @@ class IdentifySection(Section):
 
     @model_validator(mode="after")
     def _narrowed_one_is_looked_for(self) -> Self:
+        """Check that `narrow` names a parameter or the field."""
         allowed = [*self.parameters, *(["remanence"] if self.remanence else [])]
         if self.narrow is not None and self.narrow not in allowed:
             raise ValueError(

@@ -15,7 +15,15 @@ UNLIKELY = 1e-3  # probability of so large a misfit, if the noise is as given
 
 
 def sentences(content: dict[str, Any], posterior: Posterior, table: MeasuredTable) -> list[str]:
-    """Describe the results of an identification in sentences."""
+    """Describe the results of an identification in sentences.
+
+    Parameters
+    ----------
+    content
+        The content of identify.json.
+    table
+        The measured data.
+    """
     lines = _sentences_of_parameters(content)
     if content["remanence"]:
         lines += words(content["remanence"])
@@ -29,6 +37,7 @@ def sentences(content: dict[str, Any], posterior: Posterior, table: MeasuredTabl
 
 
 def _sentences_of_parameters(content: dict[str, Any]) -> list[str]:
+    """Return value and band of each parameter, and whether the data add little to its prior."""
     lines = list[str]()
     for key, entry in content["parameters"].items():
         unit = f" {entry['unit']}" if entry["unit"] else ""
@@ -42,6 +51,7 @@ def _sentences_of_parameters(content: dict[str, Any]) -> list[str]:
 
 
 def _sentences_of_correlations(keys: list[str], posterior: Posterior) -> list[str]:
+    """Return a sentence for each pair of parameters that the data hardly tell apart."""
     lines = list[str]()
     for i, j in zip(*np.triu_indices(len(keys), 1), strict=True):
         correlation = float(posterior.correlation[i, j])
@@ -54,11 +64,12 @@ def _sentences_of_correlations(keys: list[str], posterior: Posterior) -> list[st
 
 
 def _sentences_of_noise(content: dict[str, Any], table: MeasuredTable) -> list[str]:
+    """Return the noise of each column, and the number of rows that are left out."""
     lines = list[str]()
     for header, entry in content["noise"].items():
-        how = "estimated" if entry["estimated"] else "given"
+        origin = "estimated" if entry["estimated"] else "given"
         lines.append(
-            f"noise of {header}: {entry['deviation']:.4g} {entry['unit']}".rstrip() + f", {how}"
+            f"noise of {header}: {entry['deviation']:.4g} {entry['unit']}".rstrip() + f", {origin}"
         )
     for header, count in table.missing.items():
         lines.append(f"{header}: rows without a number, left out: {count}")
@@ -66,7 +77,7 @@ def _sentences_of_noise(content: dict[str, Any], table: MeasuredTable) -> list[s
 
 
 def _warnings(content: dict[str, Any], posterior: Posterior, table: MeasuredTable) -> list[str]:
-    """Warn of a misfit beyond the noise, of rough bands, and of a fit that has not converged."""
+    """Return warnings of a misfit beyond the noise, of rough bands, and of a fit not converged."""
     measured, lines = posterior.measured, list[str]()
     if not np.isnan(measured.noise).any():
         deviations = (measured.data - posterior.y) / posterior.noise[table.column]
@@ -90,7 +101,7 @@ def _warnings(content: dict[str, Any], posterior: Posterior, table: MeasuredTabl
 
 
 def _sentences_of_predictions(content: dict[str, Any]) -> list[str]:
-    """Describe what is predicted, and the next measurement that narrows a band most."""
+    """Return value and band of each candidate, and the measurement that narrows a band most."""
     lines = list[str]()
     for entry in content["predicted"]:
         place = f" at {entry['at']:g}" if entry["at"] != "end" else ""

@@ -1,7 +1,7 @@
-"""Parameters from measured numbers: Gauss-Newton on exact slopes, the posterior by Laplace, what to
-measure next.
+"""Parameters from measured numbers: the fit, its posterior, and the next measurement.
 
-With data d, their noise s and priors m +- t, the fit is least in
+The fit is by Gauss-Newton on exact slopes, the posterior by Laplace's approximation. With data d,
+their noise s and priors m +- t, the fit is least in
 
     F(x) = sum ((d - y(x))/s)^2 + sum ((x - m)/t)^2,
 
@@ -69,7 +69,7 @@ class Measured:
     data
         (n,) measured numbers.
     group
-        (n,) number of the column of each.
+        (n,) index of the column of each number.
     noise
         Standard deviation of the noise of each column; nan where it is to be estimated.
     mean, deviation
@@ -87,8 +87,10 @@ class Measured:
 
     @property
     def prior(self) -> Array:
-        """(p, p) W, whose product with mean - x is normal with deviations of one; zero rows without
-        a prior.
+        """Matrix W (p, p) of the priors; zero rows without a prior.
+
+        If parameters x have their prior distribution, W (mean - x) has independent components with
+        standard deviation one.
         """
         W = np.diag(1 / self.deviation)
         if self.field:
@@ -96,10 +98,22 @@ class Measured:
         return np.asarray(W)
 
     def rows(self, y: Array, J: Array, x: Array, noise: Array) -> tuple[Array, Array]:
-        """Residuals and slopes over their deviations, data first."""
-        s, W = noise[self.group], self.prior
-        rest = np.concatenate([(self.data - y) / s, W @ (self.mean - x)])
-        return rest, np.vstack([J / s[:, None], W])
+        """Return residuals (n + p,) and slopes (n + p, p) over standard deviations.
+
+        The rows of the data are first, then those of the priors.
+
+        Parameters
+        ----------
+        y, J
+            (n,) and (n, p), prediction and its derivatives.
+        x
+            (p,) parameters.
+        noise
+            Standard deviation of the noise of each column.
+        """
+        noise_of_data, W = noise[self.group], self.prior
+        residuals = np.concatenate([(self.data - y) / noise_of_data, W @ (self.mean - x)])
+        return residuals, np.vstack([J / noise_of_data[:, None], W])
 
 
 @dataclass(frozen=True)
@@ -109,9 +123,9 @@ class Posterior:
     Attributes
     ----------
     x, y, slopes
-        The parameters (p,), what is predicted there (n,), and its derivatives (n, p).
+        Parameters (p,), the prediction there (n,), and its derivatives (n, p).
     group
-        (n,) number of the column of each.
+        (n,) index of the column of each datum.
     noise, freedom
         Standard deviation of the noise of each column, and the degrees of freedom from which it is
         estimated (infinite if it is given).
@@ -123,8 +137,8 @@ class Posterior:
         Number of Gauss-Newton steps.
     ended
         Reason why the iteration ended.
-    known
-        With the prior of a field as strong as the data have chosen it.
+    measured
+        Data and priors, with the prior of a field as strong as the data have chosen it.
     """
 
     x: Array
@@ -141,12 +155,15 @@ class Posterior:
 
     @property
     def deviation(self) -> Array:
-        """(p,) standard deviations."""
+        """Standard deviations (p,) of the parameters."""
         return np.sqrt(np.diag(self.covariance))
 
     @property
     def local(self) -> Array:
-        """(p, p) covariance for noise and strengths of a field as they are at the fit."""
+        """Covariance (p, p) at the noise and the field's strengths of the fit.
+
+        Unlike `covariance` it ignores that these strengths are uncertain.
+        """
         if not self.measured.field:
             return self.covariance
         return _covariance(
@@ -159,47 +176,65 @@ class Posterior:
         return np.asarray(self.covariance / np.outer(self.deviation, self.deviation))
 
     def quantiles(self, slopes: Array, column: NDArray[np.int64] | None = None) -> Array:
-        """(k,) half the widths of 95 % bands over standard deviations, of numbers with these slopes
-        (k, p).
+        """Return half widths of 95 % bands over standard deviations, (k,) quantiles of Student's t.
+
+        The degrees of freedom are Satterthwaite's, from the parts that the columns have in the
+        variance.
 
         Parameters
         ----------
+        slopes
+            (k, p) derivatives of k numbers by the parameters.
         column
-            (k,) the columns whose noise they have too, as measured numbers.
+            (k,) index of the column whose noise each number has too, as a measured number does.
         """
-        of_data = (slopes @ self.covariance @ self.slopes.T / self.noise[self.group]) ** 2
+        # (k, n) part of each datum's noise in the variance of each number
+        data_variances = (slopes @ self.covariance @ self.slopes.T / self.noise[self.group]) ** 2
         columns = np.arange(len(self.noise))
-        parts = np.array([of_data[:, self.group == number].sum(axis=1) for number in columns]).T
+        column_variances = np.array(
+            [data_variances[:, self.group == number].sum(axis=1) for number in columns]
+        ).T
         variance = self.spread(slopes) ** 2
         if column is not None:
             noise_variance = self.noise[column] ** 2
-            parts, variance = (
-                parts + noise_variance[:, None] * (column[:, None] == columns),
+            column_variances, variance = (
+                column_variances + noise_variance[:, None] * (column[:, None] == columns),
                 variance + noise_variance,
             )
-        share = parts / np.where(variance > 0, variance, 1.0)[:, None]
+        # of each column, (k, columns)
+        variance_shares = column_variances / np.where(variance > 0, variance, 1.0)[:, None]
         with np.errstate(divide="ignore"):
-            freedom = 1 / (share**2 / self.freedom).sum(axis=1)
+            freedom = 1 / (variance_shares**2 / self.freedom).sum(axis=1)
         return np.asarray(scipy.stats.t.ppf((1 + BAND_PROBABILITY) / 2, freedom))
 
     @property
     def band(self) -> tuple[Array, Array]:
-        """The 95 % bands of the parameters."""
-        half = self.quantiles(np.eye(len(self.x))) * self.deviation
-        return self.x - half, self.x + half
+        """Lower and upper ends (p,) of the 95 % bands of the parameters."""
+        half_width = self.quantiles(np.eye(len(self.x))) * self.deviation
+        return self.x - half_width, self.x + half_width
 
     def spread(self, slopes: Array) -> Array:
-        """(k,) standard deviations of numbers with these slopes (k, p), without noise."""
+        """Return standard deviations (k,) of numbers with slopes (k, p), without noise."""
         return np.asarray(np.sqrt(np.einsum("ki,ij,kj->k", slopes, self.covariance, slopes)))
 
     def narrowed(self, slope: Array, noise: float) -> Array:
-        """(p,) standard deviations after one more measurement of a number with this slope (p,) and
-        noise.
+        """Return the standard deviations (p,) of the parameters after one more measurement.
+
+        Parameters
+        ----------
+        slope, noise
+            (p,) derivatives of the measured number, and the standard deviation of its noise.
         """
-        g = self.covariance @ slope
-        gain = noise**2 + slope @ g
+        slope_covariance = self.covariance @ slope
+        # variance of the measured number; C - g g^T/gain is the new covariance
+        gain = noise**2 + slope @ slope_covariance
         return np.asarray(
-            np.sqrt(np.maximum(np.diag(self.covariance) - (g**2 / gain if gain > 0 else 0.0), 0.0))
+            np.sqrt(
+                np.maximum(
+                    np.diag(self.covariance) - (slope_covariance**2 / gain if gain > 0 else 0.0),
+                    0.0,
+                )
+            )
         )
 
 
@@ -211,14 +246,14 @@ def fit_posterior(
     max_steps: int,
     report_step: Callable[[int, Array, float], None],
 ) -> Posterior:
-    """The fit by Gauss-Newton; steps are halved until the misfit falls.
+    """Fit the parameters by Gauss-Newton; steps are halved until the misfit falls.
 
     Parameters
     ----------
     start, size
-        Where it starts (p,), and what a change of each parameter is small against.
+        (p,) where the iteration starts, and the scale of each parameter, for conditioning.
     max_steps
-        Steps.
+        Largest number of steps.
     report_step
         Called with the number of each step, its parameters and the misfit over the number of data.
 
@@ -229,35 +264,35 @@ def fit_posterior(
     NoNoise
         If the noise of a column is to be estimated, and the parameters follow its data.
     """
-    first = model(start)
-    assert first, "there is a prediction at the start"
-    x, (y, J), initial = np.array(start), first, measured
+    first_prediction = model(start)
+    assert first_prediction, "there is a prediction at the start"
+    x, (y, J), initial = np.array(start), first_prediction, measured
     measured, noise, freedom = _weighed(initial, measured, x, y, J, _guessed(measured, y), size)
     ended = f"{max_steps} steps"
     for step in range(max_steps + 1):
-        rest, A = measured.rows(y, J, x, noise)
+        scaled_residuals, A = measured.rows(y, J, x, noise)
         _refuse_unseen(A * size)
-        misfit = float(rest @ rest)
+        misfit = float(scaled_residuals @ scaled_residuals)
         report_step(step, x, misfit / len(measured.data))
         if step == max_steps:
             break
-        dx = size * np.linalg.lstsq(A * size, rest, rcond=None)[0]
+        dx = size * np.linalg.lstsq(A * size, scaled_residuals, rcond=None)[0]
         covariance = _covariance(A, size)
         deviation = np.sqrt(np.diag(covariance))
         if (np.abs(dx) < CONVERGED * deviation).all():
             ended = "converged"
             break
         for halved in range(HALVINGS):
-            tried = x + dx / 2**halved
-            prediction = model(tried)
+            next_x = x + dx / 2**halved
+            prediction = model(next_x)
             if prediction is not None:
-                residuals = measured.rows(*prediction, tried, noise)[0]
+                residuals = measured.rows(*prediction, next_x, noise)[0]
                 if residuals @ residuals < misfit:
                     break
         else:
             ended = "no step lowers the misfit"
             break
-        x, (y, J) = tried, prediction
+        x, (y, J) = next_x, prediction
         measured, noise, freedom = _weighed(initial, measured, x, y, J, noise, size)
     if (silent := np.flatnonzero(freedom < MIN_NOISE_FREEDOM)).size:
         raise NoNoise(int(silent[0]))
@@ -280,23 +315,44 @@ def fit_posterior(
 
 
 def _covariance(A: Array, size: Array) -> Array:
+    """Return (A^T A)^-1, (p, p), by the singular values of A.
+
+    Parameters
+    ----------
+    A
+        (rows, p) slopes over standard deviations, see `Measured.rows`.
+    size
+        (p,) scale of each parameter, for conditioning.
+    """
     _, s, V = np.linalg.svd(A * size, full_matrices=False)
-    half = size[:, None] * V.T / s
-    return np.asarray(half @ half.T)
+    root = size[:, None] * V.T / s
+    return np.asarray(root @ root.T)
 
 
 def _refuse_unseen(A: Array) -> None:
-    """Check that every combination of parameters has an influence on data or priors."""
+    """Check that every combination of parameters has an influence on data or priors.
+
+    Parameters
+    ----------
+    A
+        (rows, p) slopes over standard deviations, of scaled parameters.
+
+    Raises
+    ------
+    NotSeen
+        With the parameters of a combination without influence.
+    """
     length = np.linalg.norm(A, axis=0)
     if (idle := np.flatnonzero(length == 0)).size:
         raise NotSeen(idle)
+    # the last row of V is the combination with the least influence
     _, s, V = np.linalg.svd(A / length, full_matrices=False)
     if len(s) < A.shape[1] or s[-1] < RANK_TOLERANCE * s[0]:
         raise NotSeen(np.flatnonzero(np.abs(V[-1]) > MIN_NAMED_COMPONENT))
 
 
 def _guessed(measured: Measured, y: Array) -> Array:
-    """Initial noise of the columns: as given, or the root mean square of the residuals."""
+    """Return the initial noise of the columns: as given, or the deviation of the residuals."""
     noise = np.array(measured.noise)
     for column in np.flatnonzero(np.isnan(noise)):
         noise[column] = np.sqrt(np.mean((measured.data - y)[measured.group == column] ** 2)) or 1.0
@@ -306,8 +362,25 @@ def _guessed(measured: Measured, y: Array) -> Array:
 def _weighed(
     initial: Measured, measured: Measured, x: Array, y: Array, J: Array, noise: Array, size: Array
 ) -> tuple[Measured, Array, Array]:
-    """Return data and prior with the strength that the data choose for a field's prior; the noise,
-    and its degrees of freedom.
+    """Choose the strength of a field's prior, and estimate noise that is not given.
+
+    Parameters
+    ----------
+    initial
+        Data and priors as given, with nan for unknown strengths.
+    measured, noise
+        Data and priors, and noise of each column, where the search begins.
+    x, y, J
+        Parameters (p,), prediction (n,) and its derivatives (n, p).
+    size
+        (p,) scale of each parameter.
+
+    Returns
+    -------
+    measured
+        With the strength of a field's prior that the data choose; unchanged without a field.
+    noise, freedom
+        Noise of each column, and its degrees of freedom.
     """
     if measured.field:
         measured, noise = _Strength(initial, measured, x, y, J, noise, size).best()
@@ -317,11 +390,22 @@ def _weighed(
 
 @dataclass(frozen=True)
 class _Strength:
-    """Deviation and length of a field's prior and the noise of columns, where they are not given;
-    z: their logarithms.
+    """Search for strengths of a field's prior, its deviation and length, and for noise of columns.
 
-    `given` is what is known at first, `known` and `noise` where the search begins; see the module
-    `smooth`.
+    Only those that are not given vary; z has their logarithms: strengths first, then noises. See
+    the module `smooth`.
+
+    Attributes
+    ----------
+    initial
+        Data and priors as given, with nan for what is unknown.
+    measured, noise
+        Data and priors, and noise of each column, where the search begins.
+    x, y, J
+        Parameters (p,), prediction (n,) and its derivatives (n, p), about which the model is
+        linear.
+    size
+        (p,) scale of each parameter.
     """
 
     initial: Measured
@@ -334,13 +418,14 @@ class _Strength:
 
     @property
     def fields_of_priors(self) -> tuple[Smooth, Smooth]:
+        """The field's prior as given, and where the search begins."""
         assert self.initial.field
         assert self.measured.field
         return self.initial.field, self.measured.field
 
     @property
     def unknown_strengths(self) -> NDArray[np.int64]:
-        """Indices of those of deviation (0) and length (1) that are not given."""
+        """Indices of the strengths that are not given: 0 deviation, 1 length."""
         return np.flatnonzero(
             np.isnan([self.fields_of_priors[0].deviation, self.fields_of_priors[0].length])
         )
@@ -351,55 +436,61 @@ class _Strength:
         return np.flatnonzero(np.isnan(self.initial.noise))
 
     def z(self, deviation: float, length: float) -> Array:
-        """Logarithms of the unknown deviation and length, and of the unknown noise where the search
-        begins.
-        """
+        """Return the logarithms of unknown strengths, and of the unknown noise at the begin."""
         return np.log(
             [*np.array([deviation, length])[self.unknown_strengths], *self.noise[self.unknown]]
         )
 
     def weighed(self, z: Array) -> tuple[Measured, Array]:
-        """Return data with the prior of strengths z, and the noise of z."""
-        first, _ = self.fields_of_priors
-        values, noise = np.array([first.deviation, first.length]), np.array(self.noise)
-        values[self.unknown_strengths], noise[self.unknown] = (
+        """Return data and priors with the strengths of z, and the noise of each column of z."""
+        given_prior, _ = self.fields_of_priors
+        strengths, noise = (
+            np.array([given_prior.deviation, given_prior.length]),
+            np.array(self.noise),
+        )
+        strengths[self.unknown_strengths], noise[self.unknown] = (
             np.exp(z[: len(self.unknown_strengths)]),
             np.exp(z[len(self.unknown_strengths) :]),
         )
         return replace(
-            self.measured, field=first.with_strength(float(values[0]), float(values[1]))
+            self.measured, field=given_prior.with_strength(float(strengths[0]), float(strengths[1]))
         ), noise
 
     def surprise(self, z: Array) -> float:
-        """Return -2 ln p(d), with p(d) the evidence of the data for strengths z."""
-        (measured, noise), (rest, A) = self.weighed(z), self._rows(z)
+        """Return -2 ln p(d), up to a constant, with p(d) the evidence of the data for strengths z.
+
+        The parameters are integrated over; see the module `smooth`.
+        """
+        (measured, noise), (residuals, A) = self.weighed(z), self._rows(z)
         assert measured.field
+        # A = Q R: its determinant is that of R, the misfit is what Q does not span
         Q, R = np.linalg.qr(A * self.size)
-        smallest_misfit = rest @ rest - np.sum((Q.T @ rest) ** 2)
-        of_noise = 2 * np.log(noise[measured.group]).sum()
+        smallest_misfit = residuals @ residuals - np.sum((Q.T @ residuals) ** 2)
+        noise_term = 2 * np.log(noise[measured.group]).sum()
         return float(
-            of_noise
+            noise_term
             - measured.field.determinant
             + 2 * np.log(np.abs(np.diag(R))).sum()
             + smallest_misfit
         )
 
     def _rows(self, z: Array) -> tuple[Array, Array]:
+        """Return residuals and slopes over their standard deviations for strengths z."""
         measured, noise = self.weighed(z)
         return measured.rows(self.y, self.J, self.x, noise)
 
     def best(self) -> tuple[Measured, Array]:
-        """Return data, prior and noise with the most likely strengths."""
-        first, last = self.fields_of_priors
-        z = min((self.z(*start) for start in last.starts(first)), key=self.surprise)
+        """Return data and priors, and the noise of each column, for the most likely strengths."""
+        given_prior, start_prior = self.fields_of_priors
+        z = min((self.z(*start) for start in start_prior.starts(given_prior)), key=self.surprise)
         if len(z):
-            bounds = [first.bounds[i] for i in self.unknown_strengths]
+            bounds = [given_prior.bounds[i] for i in self.unknown_strengths]
             smallest_noise = MIN_RELATIVE_NOISE * float(np.abs(self.measured.data).max())
             bounds += [(smallest_noise, 1e3 * float(self.noise[i])) for i in self.unknown]
             limits = np.log(bounds)
-            steps = np.vstack([z, z + 0.5 * np.eye(len(z))]).clip(*limits.T)
+            simplex = np.vstack([z, z + 0.5 * np.eye(len(z))]).clip(*limits.T)
             options = {
-                "initial_simplex": steps,
+                "initial_simplex": simplex,
                 "xatol": 1e-4,
                 "fatol": 1e-6,
                 "maxiter": 400 * len(z),
@@ -410,31 +501,34 @@ class _Strength:
         return self.weighed(z)
 
     def covariance(self) -> Array:
-        """Covariance (p, p) of the posterior, over all strengths and noises as likely as they are:
-        by weighted samples about the best (H. Rue, S. Martino and N. Chopin, J. R. Stat. Soc. B 71,
-        319, 2009, section 3).
+        """Return the posterior covariance (p, p), averaged over strengths and noises by likelihood.
+
+        The average is over weighted samples about the best strengths (H. Rue, S. Martino and N.
+        Chopin, J. R. Stat. Soc. B 71, 319, 2009, section 3).
         """
-        _, last = self.fields_of_priors
+        _, start_prior = self.fields_of_priors
         z, count = (
-            self.z(last.deviation, last.length),
+            self.z(start_prior.deviation, start_prior.length),
             len(self.unknown_strengths) + len(self.unknown),
         )
         if not count:
             return _covariance(self._rows(z)[1], self.size)
 
-        def mixed(a: Array, b: Array) -> float:
+        def second_difference(a: Array, b: Array) -> float:
+            """Return the second derivative of -ln p(d) along the steps a and b, by differences."""
             differences = [
                 sa * sb * self.surprise(z + sa * a + sb * b) for sa in (-1, 1) for sb in (-1, 1)
             ]
             return sum(differences) / (8 * LOG_STRENGTH_STEP**2)
 
         step = LOG_STRENGTH_STEP * np.eye(count)
-        curvatures, axes = np.linalg.eigh([[mixed(a, b) for b in step] for a in step])
+        curvatures, axes = np.linalg.eigh([[second_difference(a, b) for b in step] for a in step])
         scaled_axes = axes * WIDER / np.sqrt(np.maximum(curvatures, SUREST))
         normal_samples = scipy.stats.norm.ppf(
             scipy.stats.qmc.Halton(count, scramble=False).random(SAMPLES + 1)[1:]
         )
         samples = z + normal_samples @ scaled_axes.T
+        # importance weights: likelihood over the density of the samples
         logarithms = (
             np.array([-self.surprise(sample) / 2 for sample in samples])
             + (normal_samples**2).sum(axis=1) / 2
@@ -442,8 +536,9 @@ class _Strength:
         weights = np.exp(logarithms - logarithms.max())
         total = np.zeros((len(self.x), len(self.x)))
         for weight, sample in zip(weights / weights.sum(), samples, strict=True):
-            rest, A = self._rows(sample)
-            offset = self.size * np.linalg.lstsq(A * self.size, rest, rcond=None)[0]
+            residuals, A = self._rows(sample)
+            offset = self.size * np.linalg.lstsq(A * self.size, residuals, rcond=None)[0]
+            # scatter within a sample, and of its best parameters about x
             total += weight * (_covariance(A, self.size) + np.outer(offset, offset))
         return total
 
@@ -451,20 +546,35 @@ class _Strength:
 def _estimated(
     measured: Measured, y: Array, J: Array, noise: Array, size: Array
 ) -> tuple[Array, Array]:
-    """The noise of the columns, and the degrees of freedom of those that are estimated.
+    """Estimate the noise of columns where it is not given, and its degrees of freedom.
 
-    A number takes as many degrees as its share in the parameters, the diagonal of J C J^T/s^2.
+    The freedom of a column is the number of its data, less their share in determining the
+    parameters: the diagonal of J C J^T/s^2. It is infinite where noise is given.
+
+    Parameters
+    ----------
+    y, J
+        (n,) and (n, p), prediction and its derivatives.
+    noise
+        Noise of each column at the last step, for the shares.
+    size
+        (p,) scale of each parameter.
+
+    Returns
+    -------
+    noise, freedom
+        Of each column.
     """
-    estimated, freedom, s = (
+    estimated, freedom, noise_of_data = (
         np.array(measured.noise),
         np.full(len(noise), np.inf),
         noise[measured.group],
     )
-    C = _covariance(np.vstack([J / s[:, None], measured.prior]), size)
-    share = np.einsum("ni,ij,nj->n", J, C, J) / s**2
+    C = _covariance(np.vstack([J / noise_of_data[:, None], measured.prior]), size)
+    shares = np.einsum("ni,ij,nj->n", J, C, J) / noise_of_data**2
     for column in np.flatnonzero(np.isnan(measured.noise)):
         in_column = measured.group == column
-        freedom[column] = in_column.sum() - share[in_column].sum()
+        freedom[column] = in_column.sum() - shares[in_column].sum()
         estimated[column] = max(
             np.sqrt(
                 ((measured.data - y)[in_column] ** 2).sum() / max(freedom[column], MIN_FREEDOM)
@@ -475,12 +585,16 @@ def _estimated(
 
 
 def nonlinearity(model: Model, posterior: Posterior) -> tuple[float, int]:
-    """The largest relative difference of the misfit from its parabola, at the ends of bands along
-    the longest axes.
+    """Compare the misfit with its parabola, at the ends of bands along the longest axes.
+
+    If the difference is small, the posterior is normal, and the bands are right.
 
     Returns
     -------
-    It, and at how many of these places nothing is predicted.
+    worst
+        Largest relative difference.
+    lost_count
+        Number of these ends at which nothing is predicted.
     """
     posterior = replace(posterior, covariance=posterior.local)
     size = posterior.deviation
@@ -495,6 +609,9 @@ def nonlinearity(model: Model, posterior: Posterior) -> tuple[float, int]:
             if prediction is None:
                 lost_count += 1
                 continue
-            rest = posterior.measured.rows(*prediction, x, posterior.noise)[0]
-            worst = max(worst, abs(float(rest @ rest - posterior.misfit) / quantile**2 - 1))
+            residuals = posterior.measured.rows(*prediction, x, posterior.noise)[0]
+            # at the end of a band the parabola is higher by quantile^2 than at the fit
+            worst = max(
+                worst, abs(float(residuals @ residuals - posterior.misfit) / quantile**2 - 1)
+            )
     return worst, lost_count

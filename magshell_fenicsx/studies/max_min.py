@@ -34,8 +34,9 @@ MIN_GAIN = 1e-5  # smallest predicted gain, over the value at the start
 
 
 class MaxMinGoal(Protocol):
-    """Values to be raised and constraints that must not be negative, scaled with their sizes at the
-    start.
+    """What `raise_lowest` needs of a goal: values whose lowest is raised, and constraints.
+
+    Constraints must not be negative. All are scaled with their sizes at the start.
     """
 
     def lowest_values(self, evaluation: DesignEvaluation) -> Array: ...
@@ -46,12 +47,16 @@ class MaxMinGoal(Protocol):
 
 @dataclass(frozen=True)
 class _EvaluatedPoint:
-    """Values (n,), constraints (m,) and their slopes at a point.
+    """A point of the search, at which values define planes.
 
     Attributes
     ----------
     y
-        (p,) variables over half their ranges, by which slopes (n, p) and (m, p) are derivatives.
+        (p,) variables over half their ranges.
+    values, constraints
+        (n,) and (m,).
+    slopes, constraint_slopes
+        (n, p) and (m, p) derivatives by y.
     """
 
     y: Array
@@ -61,7 +66,7 @@ class _EvaluatedPoint:
     constraint_slopes: Array
 
     def height(self, penalty: float) -> float:
-        """The lowest value less the penalty of the largest violation of a constraint."""
+        """Return the lowest value less the penalty of the largest violation of a constraint."""
         return float(self.values.min() + penalty * self.constraints.min(initial=0.0))
 
 
@@ -90,6 +95,7 @@ def raise_lowest(
     span = np.where(np.isfinite(high - low) & (high > low), (high - low) / 2, 1.0)
 
     def evaluate_point(x: Array) -> _EvaluatedPoint | None:
+        """Return values and slopes at variables x (p,); None if the path is lost."""
         evaluation = evaluated(x)
         if not evaluation.values:
             return None
@@ -102,28 +108,30 @@ def raise_lowest(
 
     best, size, (penalty, max_penalty) = evaluate_point(first), FIRST_BOX_SIZE, PENALTY_RANGE
     assert best
-    others: list[_EvaluatedPoint] = []
+    earlier_points: list[_EvaluatedPoint] = []
     for _ in range(iterations):
         box = np.maximum(low / span - best.y, -size), np.minimum(high / span - best.y, size)
-        step, gain, violation = _predicted_step(best, others[-MAX_PLANES:], box, penalty)
+        step, gain, violation = _predicted_step(best, earlier_points[-MAX_PLANES:], box, penalty)
         while violation > CONSTRAINT_TOLERANCE and penalty < max_penalty:
-            further = _predicted_step(best, others[-MAX_PLANES:], box, 10 * penalty)
+            penalised_step = _predicted_step(best, earlier_points[-MAX_PLANES:], box, 10 * penalty)
             # a larger penalty hardly lowers the violation within the box
-            if further[2] > violation / 2:
+            if penalised_step[2] > violation / 2:
                 break
-            penalty, (step, gain, violation) = 10 * penalty, further
+            penalty, (step, gain, violation) = 10 * penalty, penalised_step
         if gain < MIN_GAIN:
             box_text = f"within {size:.2g} of the variables' ranges"
             return (
                 f"no more than {MIN_GAIN:g} of the value at the start is foreseen to be gained "
                 f"{box_text}"
             )
-        tried = evaluate_point(np.clip(span * (best.y + step), low, high))
-        gain_ratio = (tried.height(penalty) - best.height(penalty)) / gain if tried else -np.inf
+        next_point = evaluate_point(np.clip(span * (best.y + step), low, high))
+        gain_ratio = (
+            (next_point.height(penalty) - best.height(penalty)) / gain if next_point else -np.inf
+        )
         if gain_ratio > ACCEPTED_GAIN_RATIO:
-            assert tried
-            best, tried = tried, best
-        others += [tried] if tried else []
+            assert next_point
+            best, next_point = next_point, best
+        earlier_points += [next_point] if next_point else []
         if gain_ratio > GROWING_GAIN_RATIO:
             size = min(2 * size, MAX_BOX_SIZE)
         elif gain_ratio <= ACCEPTED_GAIN_RATIO:
@@ -137,12 +145,30 @@ def _predicted_step(
     box: tuple[Array, Array],
     penalty: float,
 ) -> tuple[Array, float, float]:
-    """Return the step to the highest point under all planes, the predicted gain of
-    `_EvaluatedPoint.height`, and the remaining violation of constraints.
+    """Predict the step to the highest point under all planes, by linear programming.
+
+    Parameters
+    ----------
+    others
+        Earlier points, whose planes count too.
+    box
+        Least and largest step, (p,) each.
+    penalty
+        Factor of the largest violation of a constraint.
+
+    Returns
+    -------
+    step
+        (p,) in scaled variables.
+    gain
+        Predicted gain of `_EvaluatedPoint.height`.
+    violation
+        Largest violation of constraints that remains.
     """
     planes, slopes = [best.values], [best.slopes]
     for other in others:
         offset = best.y - other.y
+        # an old plane counts at least as high as the bound of curvature
         lowest = best.values.min() + CURVATURE_BOUND * offset @ offset
         planes.append(np.maximum(other.values + other.slopes @ offset, lowest))
         slopes.append(other.slopes)

@@ -21,7 +21,7 @@ Sample = dict[str, float | None]
 
 @dataclass
 class Timings:
-    """The measurements of a point.
+    """The measurements of a point of a study on a number of ranks.
 
     Attributes
     ----------
@@ -55,7 +55,15 @@ Origin = Mapping[str, str | None]
 
 
 def load(file: Path, machine: dict[str, Any], origin: Origin) -> Timings:
-    """The usable measurements of an earlier study on this machine; empty without any."""
+    """Return the usable measurements of an earlier study in a file; empty ones without any.
+
+    Parameters
+    ----------
+    machine
+        Fingerprint of this machine, which must have measured them.
+    origin
+        Keys of summary.json -> values that they must have: sources and mesh file.
+    """
     content = _read(file)
     usable = (
         content
@@ -67,7 +75,7 @@ def load(file: Path, machine: dict[str, Any], origin: Origin) -> Timings:
 
 
 def of_others(file: Path, origin: Origin) -> bool:
-    """Whether the file has measurements of other sources, which cannot be used."""
+    """Return whether a file has measurements of other sources, which cannot be used."""
     content = _read(file)
     return (
         content is not None and content.summary is not None and not _is_of(origin, content.summary)
@@ -75,6 +83,7 @@ def of_others(file: Path, origin: Origin) -> bool:
 
 
 def _read(file: Path) -> Timings | None:
+    """Return the measurements in a file; None if there are none, or they lack times."""
     timings = stored_outcome(file, TypeAdapter(Timings))
     return (
         timings
@@ -84,18 +93,27 @@ def _read(file: Path) -> Timings | None:
 
 
 def _is_of(origin: Origin, summary: Mapping[str, Any] | None) -> bool:
+    """Return whether summary.json is of these sources and mesh file."""
     return summary is not None and all(summary.get(key) == value for key, value in origin.items())
 
 
 def complete(
     measured: Timings, arguments: Sequence[str], ranks: int, repeat: int, file: Path, origin: Origin
 ) -> None:
-    """Run until there are `repeat` samples; every run is on disk before the next.
+    """Run a point until it has `repeat` samples; every run is on disk before the next.
 
     Parameters
     ----------
+    measured
+        The measurements so far, which are changed in place.
     arguments
         The case and its settings, as for `magshell run`.
+    ranks
+        Number of MPI ranks.
+    file
+        File that keeps the measurements.
+    origin
+        Sources and mesh file; if they change during the study, it is a failure.
 
     Raises
     ------
@@ -115,19 +133,23 @@ def complete(
 
 
 def _run_once(measured: Timings, arguments: Sequence[str], ranks: int) -> Sample:
+    """Run a case in a process of its own, and return its times.
+
+    Sets summary and rows of the measurements; without results it sets the failure.
+    """
     with TemporaryDirectory() as scratch:
         out = Path(scratch) / "run"
-        used = measure("magshell_fenicsx", ["run", *arguments, "--out", str(out)], ranks)
+        usage = measure("magshell_fenicsx", ["run", *arguments, "--out", str(out)], ranks)
         try:
             measured.summary = json.loads((out / "summary.json").read_text(encoding="utf-8"))
             measured.rows = read_csv(out / "path.csv", dict)
         except OSError:
             measured.summary, measured.rows = None, []
-            measured.failure = f"exit code {used.code}: {used.last_error or 'no message'}"
+            measured.failure = f"exit code {usage.code}: {usage.last_error or 'no message'}"
     timing: dict[str, float] = (measured.summary or {}).get("timing", {})
     return {
-        "wall_s": used.wall_s,
-        "cpu_s": used.cpu_s,
-        "peak_mb": used.peak_mb,
+        "wall_s": usage.wall_s,
+        "cpu_s": usage.cpu_s,
+        "peak_mb": usage.peak_mb,
         **{key: timing.get(key) for key in PHASES},
     }

@@ -17,7 +17,14 @@ NAMES = {  # words and symbol of keys
 
 
 def key_words(key: str, unit: str = "") -> str:
-    """The name of a key on an axis: that of a field says whose it is, and that of a step which one.
+    """Return the name of a key on an axis.
+
+    The name of a magnetic field says whose it is, and that of a step which step.
+
+    Parameters
+    ----------
+    unit
+        Unit of the values; "" without.
 
     Examples
     --------
@@ -35,35 +42,42 @@ def key_words(key: str, unit: str = "") -> str:
         return "  ".join(part for part in NAMES[name] if part)
     if name == "amplitude" and not unit:
         return "amplitude over $h$"
-    *_, parent, last = ("", *key.split("."))
-    words = f"{parent} {last}" if last == "flux_density" or last.isdigit() else name
-    if last in UNITS:
-        words = f"{last} angle of {parent}" if parent else f"{last} angle"
+    *_, parent, last_word = ("", *key.split("."))
+    words = f"{parent} {last_word}" if last_word == "flux_density" or last_word.isdigit() else name
+    if last_word in UNITS:
+        words = f"{last_word} angle of {parent}" if parent else f"{last_word} angle"
     words = re.sub(r"^position ([012])$", lambda axis: f"position {'xyz'[int(axis[1])]}", words)
     step = re.match(r"loading\.(\d+)\.", key)
     return words.replace("_", " ") + (f" of step {int(step[1]) + 1}" if step else "")
 
 
 def key_label(key: str, unit: str = "") -> str:
-    """A key and its unit on an axis."""
+    """Return a key and its unit as the label of an axis."""
     unit = unit or UNITS.get(key.split(".")[-1], "")
     return key_words(key, unit) + (f"  ({unit})" if unit else "")
 
 
 def key_symbol(key: str) -> str:
-    """A key before its value: its symbol with a sign of equality, or its words.
+    r"""Return the text of a key before its value: its symbol with a sign of equality, or its words.
 
     Examples
     --------
     >>> key_symbol("magnetic.lambda_m"), key_symbol("mesh.degree")
-    ('$\\\\lambda_\\\\mathrm{m}$ = ', 'degree ')
+    ('$\\lambda_\\mathrm{m}$ = ', 'degree ')
     """
     symbol = NAMES.get(short_key(key), ("", ""))[1]
     return f"{symbol} = " if symbol else f"{key_words(key)} "
 
 
 def load_text(row: Mapping[str, Any], name: str) -> str:
-    """The load of a row of a boundary in words, in the case's units if the row has it in these.
+    """Return the load of a row of a boundary as text, in the case's units if the row has them.
+
+    Parameters
+    ----------
+    row
+        Row of boundary.csv.
+    name
+        The amplitude of the load.
 
     Examples
     --------
@@ -79,8 +93,9 @@ def load_text(row: Mapping[str, Any], name: str) -> str:
 
 
 def split_unit(result: str) -> tuple[str, str] | None:
-    """The name of a result in a unit without its ending, and the unit; the longest ending first:
-    N_m before m.
+    """Return the name of a result without its unit, and the unit; None without a unit.
+
+    The longest ending counts: N_m before m.
     """
     units = endings()
     for ending in sorted(units, key=len, reverse=True):
@@ -90,14 +105,14 @@ def split_unit(result: str) -> tuple[str, str] | None:
 
 
 def result_words(result: str) -> str:
-    """A result in words or symbols, without its unit.
+    r"""Return a result in words or symbols, without its unit.
 
     Examples
     --------
     >>> result_words("tip_fz"), result_words("omega2_1")
-    ('$f_z$ of tip', '$\\\\omega_{1}^2 \\\\rho R^2/E$')
+    ('$f_z$ of tip', '$\\omega_{1}^2 \\rho R^2/E$')
     >>> result_words("hertz_2"), result_words("knockdown")
-    ('frequency 2', 'knockdown factor  $k_\\\\mathrm{d}$')
+    ('frequency 2', 'knockdown factor  $k_\\mathrm{d}$')
     >>> result_words("tip_uz_mm"), result_words("buckling_pressure_Pa")
     ('$u_z$ of tip', 'buckling pressure')
     """
@@ -116,12 +131,12 @@ def result_words(result: str) -> str:
 
 
 def result_label(result: str) -> str:
-    """A result and its unit on an axis, as the curve of a run names it.
+    r"""Return a result and its unit as the label of an axis, as the curve of a run names it.
 
     Examples
     --------
     >>> result_label("applied_mT"), result_label("tip_uz_mm"), result_label("hertz_1")
-    ('applied field  $B_\\\\mathrm{a}$  (mT)', '$u_z$ of tip  (mm)', 'frequency 1  (Hz)')
+    ('applied field  $B_\\mathrm{a}$  (mT)', '$u_z$ of tip  (mm)', 'frequency 1  (Hz)')
     """
     for column_quantity in QUANTITIES.values():
         for column in (column_quantity, *column_quantity.in_units):

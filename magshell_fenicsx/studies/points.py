@@ -26,12 +26,12 @@ FORMS = "write it as key.path=start:stop:count or key.path=value,value,..."
 
 @dataclass(frozen=True)
 class Axis:
-    """One direction of a sweep.
+    """One direction of a sweep: keys of the case that take the same values.
 
     Attributes
     ----------
     keys
-        Keys that take the same value; several keys are tied.
+        Keys that are tied: they take the same value.
     values
         Values as in the case file.
     """
@@ -46,29 +46,32 @@ class Axis:
 
     @cached_property
     def unit(self) -> str:
-        """The unit of its values, that of the first which has one."""
+        """Unit of the first value that has one; "" without."""
         return next(filter(None, (number_and_unit(value)[1] for value in self.values)), "")
 
     @cached_property
     def numbers(self) -> list[float] | None:
-        """The values as numbers, in its unit; None if one of them is a word."""
+        """The values as numbers in the axis's unit; None if one of them is a word."""
         try:
             return [self.number(value) for value in self.values]
         except ValueError:
             return None
 
     def number(self, value: str) -> float:
-        """A value in its unit."""
+        """Return a value as a number in the axis's unit; a word raises ValueError."""
         return in_unit(value, self.unit)
 
 
 def last_numeric_axis(axes: Sequence[Axis]) -> Axis | None:
-    """The last axis with numbers; curves are drawn and folds are followed along it."""
+    """Return the last axis with numbers, along which curves are drawn and folds are followed.
+
+    None if there is none.
+    """
     return next((axis for axis in reversed(axes) if axis.numbers), None)
 
 
 def parse_axes(texts: Sequence[str]) -> list[Axis]:
-    """Read all `--over` of a command line.
+    """Read all texts of `--over` as the axes of a sweep.
 
     Raises
     ------
@@ -86,7 +89,12 @@ def parse_axes(texts: Sequence[str]) -> list[Axis]:
 
 
 def parse_axis(text: str) -> Axis:
-    """Read one `--over`.
+    """Read one text of `--over` as an axis of a sweep.
+
+    Raises
+    ------
+    CaseError
+        If it has another form.
 
     Examples
     --------
@@ -105,8 +113,19 @@ def parse_axis(text: str) -> Axis:
 
 
 def _range(text: str, values: str) -> tuple[str, ...]:
-    """start:stop:count, equidistant with both ends; the values are in the unit of the first end
-    that has one.
+    """Return the values of start:stop:count, equidistant with both ends.
+
+    They are in the unit of the first end that has one.
+
+    Parameters
+    ----------
+    text
+        The whole argument of `--over`, for messages.
+
+    Raises
+    ------
+    CaseError
+        If the values have another form.
     """
     try:
         first, last, number = values.split(":")
@@ -126,6 +145,18 @@ def _range(text: str, values: str) -> tuple[str, ...]:
 
 
 def _list(text: str, values: str) -> tuple[str, ...]:
+    """Return the values of a list with commas, stripped.
+
+    Parameters
+    ----------
+    text
+        The whole argument of `--over`, for messages.
+
+    Raises
+    ------
+    CaseError
+        If a value is missing, or is a section or a list.
+    """
     items = tuple(value.strip() for value in values.split(","))
     if not all(items):
         raise CaseError(f"--over {text}: a value is missing; {FORMS}")
@@ -138,12 +169,14 @@ def _list(text: str, values: str) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class SweepPoint:
-    """One point.
+    """One point of a sweep: a case with a value for each axis.
 
     Attributes
     ----------
     values
         Swept key -> its value at this point, as text.
+    case
+        The validated case.
     key
         Hash of the problem; equal problems have equal keys in any sweep and version.
     """
@@ -159,7 +192,7 @@ class SweepPoint:
 
 
 def make_points(source: Source, axes: Sequence[Axis], make_case: MakeCase) -> list[SweepPoint]:
-    """All points, in the order of the product, the last axis fastest.
+    """Return all points, in the order of the product, the last axis fastest.
 
     Raises
     ------
@@ -176,12 +209,12 @@ def make_points(source: Source, axes: Sequence[Axis], make_case: MakeCase) -> li
 
 
 def swept_source(file: Path, axes: Sequence[Axis], settings: Sequence[str]) -> Source:
-    """The case that is swept, with the settings.
+    """Return the source of the case that is swept, with its settings.
 
     Raises
     ------
     CaseError
-        If it cannot be read, or a setting is of a swept key.
+        If the case cannot be read, or a setting is of a swept key.
     """
     source = read_source(file)
     for setting in settings:
@@ -194,7 +227,13 @@ def swept_source(file: Path, axes: Sequence[Axis], settings: Sequence[str]) -> S
 def make_point(
     source: Source, axes: Sequence[Axis], values: Sequence[str], make_case: MakeCase
 ) -> SweepPoint:
-    """The point with one value for each axis."""
+    """Return the point with one value for each axis.
+
+    Raises
+    ------
+    CaseError
+        If it is not a valid case, or needs more memory than there is; the message names the point.
+    """
     point_source = copy.deepcopy(source)
     values_by_key = {
         key: value for axis, value in zip(axes, values, strict=True) for key in axis.keys
@@ -214,7 +253,7 @@ def make_point(
 
 
 def identity(case: Case) -> str:
-    """Hash of the problem: the resolved case, without a zero field, and its mesh file."""
+    """Return a hash of the problem: the resolved case, without a zero field, and its mesh file."""
     data = case.model_dump(mode="json") | case.outside
     magnetic = case.magnetic
     if not (
@@ -234,12 +273,16 @@ def short_key(key: str) -> str:
 
 
 def value_at(data: Any, path: Sequence[str]) -> Any:
-    """Return the value of a key, given by its words, in plain data of a case; None if there is no
-    such key.
+    """Return the value of a key in plain data of a case; None if there is no such key.
+
+    Parameters
+    ----------
+    path
+        The words of the key; a number is the index of an item.
     """
-    for name in path:
+    for word in path:
         try:
-            data = data[int(name)] if isinstance(data, list) else data[name]
+            data = data[int(word)] if isinstance(data, list) else data[word]
         except (LookupError, ValueError, TypeError):
             return None
     return data

@@ -24,15 +24,15 @@ FORMS = (
 
 @dataclass(frozen=True)
 class Scalar:
-    """A named number of a run.
+    """A named number of a run, such as the knockdown factor or a column at a place of the path.
 
     Attributes
     ----------
     name
         The text of `--result`.
     column, at, value
-        For a number of the path: its column, and the column and value at which it is taken, or
-        "end".
+        For a number of the path: its column, and the column and value at which it is taken. `at` is
+        "end" for the last point.
     """
 
     name: str
@@ -43,7 +43,7 @@ class Scalar:
     def value_in(
         self, summary: Mapping[str, Any], rows: Sequence[Mapping[str, str]]
     ) -> float | None:
-        """The number; None if the run does not have it.
+        """Return the number; None if the run does not have it.
 
         Parameters
         ----------
@@ -60,8 +60,10 @@ class Scalar:
             )
             return _number(next(points, None))
         if self.name in OF_SNAPS:
-            first: Mapping[str, float] = next(iter(summary.get("snaps", ())), {})
-            return _number(first.get(OF_SNAPS[self.name]))  # earlier versions have `time` alone
+            first_snap: Mapping[str, float] = next(iter(summary.get("snaps", ())), {})
+            return _number(
+                first_snap.get(OF_SNAPS[self.name])
+            )  # earlier versions have `time` alone
         path = [row for row in rows if row["branch"] == "0" and row["mode"] in OWN_MODES]
         if not path or not {self.column, self.at} - {"end"} <= set(path[0]):
             return None
@@ -71,7 +73,7 @@ class Scalar:
 
 
 def parse_scalar(text: str) -> Scalar:
-    """Read `--result`.
+    """Read `--result`, the name of a number of a run.
 
     Raises
     ------
@@ -114,23 +116,28 @@ def parse_scalar(text: str) -> Scalar:
 def _crossing(
     path: Sequence[Mapping[str, str]], column: str, place_column: str, value: float
 ) -> float | None:
-    """Return a column where `place_column` first has a value, by cubic interpolation.
+    """Return a column where `place_column` first has a value, by cubic interpolation; None without.
 
     The interpolation uses points of one load, because the curve has a corner at the end of the
     field. At a requested point of the path the result is the number in its row.
+
+    Parameters
+    ----------
+    path
+        Rows of path.csv without branches.
     """
-    x = [float(row[place_column]) for row in path]
+    places = [float(row[place_column]) for row in path]
     i = next(
         (
             i
-            for i in range(len(x) - 1)
-            if (x[i] - value) * (x[i + 1] - value) <= 0 and x[i] != x[i + 1]
+            for i in range(len(places) - 1)
+            if (places[i] - value) * (places[i + 1] - value) <= 0 and places[i] != places[i + 1]
         ),
         None,
     )
     if i is None:
         # a target is reached within the solver's tolerance
-        target_reached = bool(x) and math.isclose(x[-1], value, rel_tol=1e-9)
+        target_reached = bool(places) and math.isclose(places[-1], value, rel_tol=1e-9)
         return float(path[-1][column]) if target_reached else None
     first, last = i, i + 1
     if i and path[i]["amplitude"] == path[i + 1]["amplitude"]:
@@ -138,17 +145,20 @@ def _crossing(
     if i + 2 < len(path) and path[i + 2]["amplitude"] == path[i + 1]["amplitude"]:
         last += 1
     window = slice(first, last + 1)
-    if not _monotone(x[window]):
+    # linear between the two points around the place
+    if not _monotone(places[window]):
         window = slice(i, i + 2)
     return float(
-        barycentric_interpolate(x[window], [float(row[column]) for row in path[window]], value)
+        barycentric_interpolate(places[window], [float(row[column]) for row in path[window]], value)
     )
 
 
 def _monotone(x: Sequence[float]) -> bool:
+    """Return whether numbers only grow, or only fall."""
     steps = [b - a for a, b in pairwise(x)]
     return all(step > 0 for step in steps) or all(step < 0 for step in steps)
 
 
 def _number(value: float | None) -> float | None:
+    """Return a number as a float; None stays None."""
     return None if value is None else float(value)

@@ -51,21 +51,20 @@ SECONDS_BETWEEN_LINES = terminal.STATUS_SECONDS  # s
 
 @dataclass(frozen=True)
 class Folder:
-    """The files of a kind of study in its folder.
+    """The files of a kind of study, such as a sweep, in its folder.
 
     Attributes
     ----------
     what
         Its name in messages: "an ensemble".
     tables
-        The files that it writes; the first is a JSON object.
+        Names of the files that the study writes; the first is a JSON object.
     keys
-        What that object has.
+        Keys of that object, by which a folder of such a study is recognised.
     points
-        The folder within, of the outcomes.
+        Subfolder of the outcomes.
     first
-        A table that is there from the start, empty, so that a folder which cannot be written is
-        refused.
+        A table that is created empty at the start, so that an unwritable folder is refused at once.
     """
 
     what: str
@@ -75,12 +74,22 @@ class Folder:
     first: str = ""
 
     def prepare(self, out: Path, comm: MPI.Comm, case: str = "") -> Path:
-        """Make it, unless it has files of others, or tables of another case file; several jobs may.
+        """Make the folder, and return its path; collective. Several jobs may prepare the same one.
 
-        Collective.
+        Parameters
+        ----------
+        case
+            Name of the case file; "" if it does not matter.
+
+        Raises
+        ------
+        CaseError
+            On every rank, if the folder has files of others or tables of another case file, or
+            cannot be written.
         """
 
         def make(folder: Path) -> None:
+            """Check the folder and make it; called on rank 0."""
             refuse_other_tables(folder, self.tables, self.keys, self.what, case)
             for directory in (folder, folder / self.points):
                 directory.mkdir(parents=True, exist_ok=True)
@@ -98,8 +107,9 @@ class Folder:
 
 
 def keep(file: Path, content: Mapping[str, Any]) -> None:
-    """Write an outcome; a killed study leaves the complete file or none, and two may write the same
-    one.
+    """Write an outcome as a JSON file.
+
+    A killed study leaves the complete file or none. Two processes may write the same file.
 
     Raises
     ------
@@ -117,9 +127,16 @@ def keep(file: Path, content: Mapping[str, Any]) -> None:
 def stored_outcome(
     file: Path, kind: TypeAdapter[OutcomeType], key: str = "", **same: Any
 ) -> OutcomeType | None:
-    """The outcome in a file.
+    """Return the outcome in a JSON file, validated as `kind`.
 
-    None if there is none, it is damaged, or the file has other values than `same`.
+    None if there is no file, it is damaged, or it has other values than `same`.
+
+    Parameters
+    ----------
+    key
+        Key of the outcome in the file; "" for the whole content.
+    same
+        Keys of the file with the values that they must have.
     """
     try:
         content = json.loads(file.read_text(encoding="utf-8"))
@@ -131,7 +148,19 @@ def stored_outcome(
 
 
 def part_of(part: str | None, count: int, items: str) -> tuple[int, int]:
-    """The numbers i and n of a part "i/n", one of n jobs.
+    """Return the numbers i and n of a part "i/n", one of n jobs; None is the only part of one job.
+
+    Parameters
+    ----------
+    count
+        Number of items that the jobs share; n must not be larger.
+    items
+        Name of the items, for the message.
+
+    Raises
+    ------
+    CaseError
+        If the text has another form.
 
     Examples
     --------
@@ -157,16 +186,22 @@ def compute(
     comm: MPI.Intracomm,
     say: Say = lambda line: None,
 ) -> None:
-    """Deal tasks to the ranks; collective.
+    """Compute tasks, each on the next free rank; collective.
+
+    An error on one of several ranks ends all ranks.
 
     Parameters
     ----------
     do
-        Computes a task, keeps the outcome of each of its runs, and yields a line of text for it.
+        Called with a task, on one rank. It computes the task, keeps the outcome of each of its
+        runs, and yields a line of text for each.
+    say
+        Called with each line and the remaining time, on the rank of the task.
     """
     start_time, done_count = time.perf_counter(), 0
 
     def remaining_text() -> str:
+        """Return the remaining time in words; "" before the first outcome."""
         return (
             _remaining_by_count(time.perf_counter() - start_time, done_count, len(tasks))
             if done_count
@@ -181,12 +216,16 @@ def compute(
 
 
 class Heard:
-    """Says lines; and while it is silent for long inside `with`, that work goes on.
+    """Passes lines on; after a long silence it says that the work goes on.
+
+    Reminders are written by `remind`, which runs in a thread of its own.
 
     Parameters
     ----------
-    rest
-        What is added then: the rest of the time in words.
+    say
+        Called with each line.
+    remaining_text
+        Returns the remaining time in words, for a reminder.
     """
 
     def __init__(self, say: Say, remaining_text: Callable[[], str] = str) -> None:
@@ -194,11 +233,12 @@ class Heard:
         self._begun = self._last = time.perf_counter()
 
     def __call__(self, line: str) -> None:
+        """Say a line, from which the silence counts anew."""
         self._last = time.perf_counter()
         self._say(line)
 
     def remind(self) -> None:
-        """Until `end`."""
+        """Say a reminder after each long silence, until `end` is called."""
         while not self._ended.wait(
             max(0.01, self._last + SECONDS_BETWEEN_LINES - time.perf_counter())
         ):
@@ -206,12 +246,16 @@ class Heard:
                 self(f"still computing, {clock(time_now - self._begun)} so far{self._rest()}")
 
     def end(self) -> None:
+        """End the reminders."""
         self._ended.set()
 
 
 @contextmanager
 def heard(comm: MPI.Comm, say: Say, remaining_text: Callable[[], str] = str) -> Iterator[Say]:
-    """A `Heard`, whose reminders rank 0 says; what is one already stays the only one."""
+    """Yield a `Heard`, which reminds on rank 0 alone while the `with` block runs.
+
+    On other ranks, and if `say` is a `Heard` already, `say` itself is yielded.
+    """
     if isinstance(say, Heard) or comm.rank:
         yield say
         return
@@ -226,7 +270,14 @@ def heard(comm: MPI.Comm, say: Say, remaining_text: Callable[[], str] = str) -> 
 
 
 def remaining_time_text(seconds: float, prefix: str = "about ") -> str:
-    """The rest of the time in words; empty if it is short.
+    """Return the remaining time in words; "" if it is short.
+
+    Parameters
+    ----------
+    seconds
+        The remaining time.
+    prefix
+        Words before the time.
 
     Examples
     --------
@@ -244,7 +295,12 @@ def remaining_time_text(seconds: float, prefix: str = "about ") -> str:
 
 
 def _remaining_by_count(seconds: float, done_count: int, count: int) -> str:
-    """How long the others take if they go on as those before.
+    """Return the remaining time in words, if each remaining item takes as long as those before.
+
+    Parameters
+    ----------
+    seconds
+        Time that the first `done_count` of `count` items took.
 
     Examples
     --------
@@ -257,9 +313,9 @@ def _remaining_by_count(seconds: float, done_count: int, count: int) -> str:
 
 
 def deal(count: int, comm: MPI.Intracomm) -> Iterator[int]:
-    """Distribute the numbers 0 to count - 1; the next free rank gets the next number. Collective.
+    """Yield numbers from 0 to count - 1, each on one rank: the next free rank gets the next number.
 
-    All ranks increase a counter in the memory of rank 0, which works like the others.
+    Collective. All ranks increase a counter in the memory of rank 0, which works like the others.
     """
     if comm.size == 1:
         yield from range(count)
@@ -282,8 +338,9 @@ def deal(count: int, comm: MPI.Intracomm) -> Iterator[int]:
 
 @contextmanager
 def _wait_for_all(comm: MPI.Intracomm) -> Iterator[None]:
-    """Wait at the end for all ranks; an error on one of several ends all, which would wait for it
-    for ever.
+    """Wait for all ranks at the end of the `with` block; collective.
+
+    An error on one of several ranks aborts all ranks, since the others would wait for ever.
     """
     try:
         yield
@@ -302,19 +359,21 @@ def _wait_for_all(comm: MPI.Intracomm) -> Iterator[None]:
 
 @dataclass(frozen=True)
 class Outcome:
-    """The outcome of a run.
+    """The outcome of a run, or of a fold that was followed from another run.
 
     Attributes
     ----------
     knockdown
         k_d; None if there is no instability under pressure.
-    barrier
-        The energy barrier over E h R²; None if the case does not ask for one.
     limit
         The first limit point (the one of k_d) as in summary.json, or the event that ends a motion;
         None without.
     stopped
         Why the run ended before its target; None if it reached it.
+    dofs
+        Number of unknowns; None for a run that failed.
+    wall_s
+        Wall time.
     curve
         Every accepted point, with the columns of path.csv.
     found
@@ -323,6 +382,8 @@ class Outcome:
     factorisations
         Factorisations of the model's tangent, including failed attempts; without those for excluded
         modes.
+    barrier
+        The energy barrier over E h R²; None if the case does not ask for one.
     cpu_s
         CPU time of a sample of an ensemble.
     in_units
@@ -346,11 +407,11 @@ class Outcome:
 
     @classmethod
     def failed(cls, why: str, wall_s: float = 0.0, factorisations: int = 0) -> "Outcome":
-        """Return the outcome of a run without a result."""
+        """Return the outcome of a run without a result, for a reason."""
         return cls(None, None, why, None, wall_s, [], "path", factorisations)
 
     def value(self, scalar: Scalar) -> float | None:
-        """A named number of the run; None if it does not have it."""
+        """Return a named number of the run; None if the run does not have it."""
         if not self.curve:
             return None
         limits = [self.limit] if self.limit else []
@@ -365,7 +426,10 @@ class Outcome:
         )
 
     def serves(self, scalar: Scalar) -> bool:
-        """Whether it has what a number needs: of a fold alone only the knockdown is known."""
+        """Return whether the outcome is enough for a number.
+
+        A fold alone has the knockdown only. A path must have the columns of the number.
+        """
         needed = {scalar.column, scalar.at} & set(COLUMNS)
         has_path = self.found == "path" and (not self.curve or needed <= self.curve[0].keys())
         return has_path or scalar.name == "knockdown"
@@ -381,17 +445,23 @@ def outcome_of(
     wall_s: float = 0.0,
     columns: Sequence[str] = COLUMNS,
 ) -> Outcome:
-    """The outcome of a run, or of a fold in the form of a run; its curve has some columns of every
-    run, and its own.
+    """Return the outcome of a run, or of a fold in the form of a run.
+
+    Parameters
+    ----------
+    origin
+        "path" for a run, "fold" for a fold that was followed.
+    columns
+        Columns of path.csv that the curve keeps, beside those that the scene adds.
     """
-    limits = sorted(
+    limit_points = sorted(
         result.limit_points,
         key=lambda p: p["amplitude"] != "pressure" or p["value"] != result.knockdown,
     )
     kept_columns = dict.fromkeys((*columns, *result.scene.extra_columns))
     return Outcome(
         knockdown=result.knockdown,
-        limit=next(iter(limits), None) or _event(result),
+        limit=next(iter(limit_points), None) or _event(result),
         stopped=result.stopped,
         dofs=result.scene.model.system.dofs,
         wall_s=round(wall_s, 3),
@@ -412,19 +482,20 @@ def outcome_of(
 
 
 def _event(result: Result) -> dict[str, Any] | None:
-    """The point at which a motion has ended by an event or an instability, in the form of a limit
-    point.
+    """Return the point at which an event or an instability ended a motion, as a limit point.
+
+    None if the run ended otherwise.
     """
-    last, steps = result.rows[-1], result.scene.problem.programme
+    last_row, steps = result.rows[-1], result.scene.problem.programme
     until = getattr(steps[-1].load, "until", "") if steps else ""
-    if result.stopped or last["amplitude"] != "time" or until not in ("event", "instability"):
+    if result.stopped or last_row["amplitude"] != "time" or until not in ("event", "instability"):
         return None
-    common = {key: last[key] for key in ("p_over_pc", "w_pole_over_h", "amplitude")}
-    return {**common, "kind": until, "mode": "", "value": last["time"]}
+    common = {key: last_row[key] for key in ("p_over_pc", "w_pole_over_h", "amplitude")}
+    return {**common, "kind": until, "mode": "", "value": last_row["time"]}
 
 
 def keep_outcome(outcome: Outcome, case: Case, file: Path) -> None:
-    """Write the outcome of a case."""
+    """Write the outcome of a case, with the case and the version of the sources."""
     origin = {
         "case": case.model_dump(mode="json", exclude_none=True),
         **case.outside,
@@ -434,5 +505,5 @@ def keep_outcome(outcome: Outcome, case: Case, file: Path) -> None:
 
 
 def stored_outcome_of_case(file: Path) -> Outcome | None:
-    """The outcome of a case in a file, if these sources have computed it; see `stored_outcome`."""
+    """Return the outcome in a file of a case; None unless the present sources have computed it."""
     return stored_outcome(file, OUTCOME, "outcome", sources=code_version())

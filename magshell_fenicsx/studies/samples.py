@@ -18,16 +18,18 @@ Values = dict[str, Any]
 
 @dataclass(frozen=True)
 class Sample:
-    """A sample.
+    """A random sample of a case.
 
     Attributes
     ----------
     number
-        From 0.
+        Number of the sample, from 0.
     values
         Key -> its drawn value; also of the keys of each random defect.
     severest
         Amplitude, width and place of the defect with the largest amplitude; empty without defects.
+    case
+        The validated case.
     key
         Hash of the problem, see `identity`.
     """
@@ -48,6 +50,8 @@ def make_samples(
     ----------
     source
         The case file, with its settings applied.
+    numbers
+        Numbers of the samples, from 0; a sample depends on the seed and its number alone.
     deleted
         Number of defects to delete from each sample, the ones with the least amplitude.
 
@@ -87,6 +91,20 @@ def make_samples(
 def _sample(
     source: Source, number: int, drawn_texts: Mapping[str, str], make_case: MakeCase, deleted: int
 ) -> Sample:
+    """Make a sample from its drawn values.
+
+    Parameters
+    ----------
+    drawn_texts
+        Key -> drawn value, as in `--set`.
+    deleted
+        Number of the weakest defects that are deleted.
+
+    Raises
+    ------
+    CaseError
+        If it is no valid case, or has no more defects than are deleted.
+    """
     drawn_source = copy.deepcopy(source)
     del drawn_source.data["ensemble"]
     for key, text in drawn_texts.items():
@@ -117,7 +135,15 @@ def _sample(
 
 
 def _flat(path: str, part: Any) -> Iterator[tuple[str, Any]]:
-    """The keys below a part of a case, without kinds; a value itself."""
+    """Yield key and value of all numbers and words in a part of a case, without kinds.
+
+    Parameters
+    ----------
+    path
+        Key of the part, with dots.
+    part
+        A section, a list or a value.
+    """
     if isinstance(part, dict | list):
         for key, value in part.items() if isinstance(part, dict) else enumerate(part):
             if key != "kind":
@@ -127,23 +153,24 @@ def _flat(path: str, part: Any) -> Iterator[tuple[str, Any]]:
 
 
 def _defects(data: Any, case: Case) -> list[dict[str, Any]]:
-    """The defects with an amplitude as the case has them, the weakest first; amplitudes with units
-    count over h.
+    """Return the defects with an amplitude as plain data of the case, the weakest first.
+
+    They are ordered by their amplitudes over h, so amplitudes with units can be compared.
     """
-    sized = list[tuple[float, dict[str, Any]]]()
+    sizes_and_defects = list[tuple[float, dict[str, Any]]]()
     for shell, section in _shells(data, case):
-        listed = shell.get("imperfections") or ([shell["defect"]] if shell.get("defect") else [])
-        single = getattr(section, "defect", None)
-        sections = section.imperfections or ([single] if single else [])
+        defects = shell.get("imperfections") or ([shell["defect"]] if shell.get("defect") else [])
+        single_defect = getattr(section, "defect", None)
+        sections = section.imperfections or ([single_defect] if single_defect else [])
         sizes = [getattr(section_of_defect, "amplitude", None) for section_of_defect in sections]
-        sized += [
-            (abs(size), item) for size, item in zip(sizes, listed, strict=True) if size is not None
+        sizes_and_defects += [
+            (abs(size), item) for size, item in zip(sizes, defects, strict=True) if size is not None
         ]
-    return [item for _, item in sorted(sized, key=lambda pair: pair[0])]
+    return [item for _, item in sorted(sizes_and_defects, key=lambda pair: pair[0])]
 
 
 def _shells(data: Any, case: Case) -> list[tuple[dict[str, Any], Any]]:
-    """The data and the section of each shell."""
+    """Return plain data and section of each shell of the case."""
     if case.shells:
         return [
             (data["shells"][name]["shell"], member.shell) for name, member in case.shells.items()
@@ -156,37 +183,44 @@ OF_KEYS = ("extra_forbidden", "model_type", "model_attributes_type", "list_type"
 
 
 def refuse_unknown_keys(source: Source, section: EnsembleSection, make_case: MakeCase) -> None:
-    """Refuse random keys that the case cannot have, whatever their values: before any sample is
-    drawn.
+    """Check, before any sample is drawn, that the case can have the random keys.
+
+    The case is tried with the medians. Errors about values do not count.
 
     Raises
     ------
     CaseError
         One message with every such key.
     """
-    middle, refused = (
+    medians, messages = (
         {key: json.dumps(distribution.quantile(0.5)) for key, distribution in section.keys.items()},
         list[str](),
     )
-    changed = copy.deepcopy(source)
-    del changed.data["ensemble"]
-    for key, text in middle.items():
+    source_with_medians = copy.deepcopy(source)
+    del source_with_medians.data["ensemble"]
+    for key, text in medians.items():
         try:
-            override(changed, f"{key}={text}")
+            override(source_with_medians, f"{key}={text}")
         except CaseError as e:
-            refused.append(str(e))
+            messages.append(str(e))
     try:
-        make_case(changed)
+        make_case(source_with_medians)
     except InvalidCase as e:
-        refused += e.lines_of_kinds(*OF_KEYS)
+        messages += e.lines_of_kinds(*OF_KEYS)
     except CaseError:
         pass  # a matter of the values
-    if refused:
-        raise CaseError(in_the_file("\n".join(refused), source, middle))
+    if messages:
+        raise CaseError(in_the_file("\n".join(messages), source, medians))
 
 
 def in_the_file(message: str, source: Source, drawn_texts: Mapping[str, str]) -> str:
-    """A message about settings that were drawn, with the places of their distributions."""
+    """Return a message about drawn settings with the places of their distributions.
+
+    Parameters
+    ----------
+    drawn_texts
+        Key -> drawn value, as in `--set`.
+    """
     for key, text in drawn_texts.items():
         place = f"{source.place(('ensemble', 'keys', key))}: ensemble.keys: "
         message = message.replace(f"--set {key}={text}: {key}: ", f"{place}{key}: ")

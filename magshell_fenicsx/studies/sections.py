@@ -1,5 +1,6 @@
-"""The sections of studies in a case: what a design varies and wants, and what is random in an
-ensemble.
+"""The sections of studies in a case: `design` and `ensemble`.
+
+They say what a design varies and wants, and what is random in an ensemble.
 """
 
 import json
@@ -36,6 +37,7 @@ class ShapeSection(Section):
 
     @model_validator(mode="after")
     def _one_of_them(self) -> Self:
+        """Check that either components or a curve are given, and stages only with a curve."""
         if (self.components is None) == (self.curve is None):
             raise ValueError("give components or curve")
         if self.stages > 1 and self.curve is None:
@@ -70,6 +72,7 @@ class ObjectiveSection(Section):
 
     @model_validator(mode="after")
     def _one_of_them(self) -> Self:
+        """Check that exactly one objective is given, and `value` with `reach` alone."""
         given_keys = [key for key in OBJECTIVE_KEYS if getattr(self, key) is not None]
         if len(given_keys) != 1:
             raise ValueError(
@@ -82,12 +85,12 @@ class ObjectiveSection(Section):
 
     @property
     def result(self) -> str:
-        """Its name; "shape" of a shape."""
+        """Name of the first result; "shape" for a shape."""
         return self.results[0]
 
     @property
     def results(self) -> list[str]:
-        """All names of `maximise`, or the one."""
+        """Names of all results of the objective; several for `maximise` alone."""
         if isinstance(self.maximise, list):
             return self.maximise
         return [self.maximise or self.minimise or self.reach or "shape"]
@@ -107,13 +110,14 @@ class LimitSection(Section):
 
     @model_validator(mode="after")
     def _bounds(self) -> Self:
+        """Check that a limit has a bound."""
         if self.least is None and self.most is None and self.same_as is None:
             raise ValueError(f"of: {self.of}: give least, most, both, or same_as")
         return self
 
     @property
     def names(self) -> tuple[str, ...]:
-        """The results that it limits."""
+        """Names of the results that are limited."""
         return (self.of, self.same_as) if self.same_as else (self.of,)
 
 
@@ -138,6 +142,7 @@ class RemanenceVariables(Section):
 
     @model_validator(mode="after")
     def _magnitudes(self) -> Self:
+        """Check the bounds of the lengths."""
         if self.magnitude and not 0 < self.magnitude[0] < self.magnitude[1] <= 1:
             raise ValueError(f"magnitude: needs 0 < least < largest <= 1, here {self.magnitude}")
         return self
@@ -159,6 +164,7 @@ class FieldVariables(Section):
 
     @model_validator(mode="after")
     def _bounds(self) -> Self:
+        """Check that the bounds are ordered."""
         if not self.values[0] < self.values[1]:
             raise ValueError(f"values: the first must be less than the second, here {self.values}")
         return self
@@ -193,6 +199,7 @@ class DesignSection(Section):
 
     @model_validator(mode="after")
     def _something_varies(self) -> Self:
+        """Check that something varies, and that all bounds are ordered and in one unit."""
         if not self.numbers and self.remanence is None and not self.fields:
             raise ValueError(
                 "needs numbers, remanence, thickness, curvature or deviation: otherwise nothing "
@@ -213,7 +220,9 @@ class DesignSection(Section):
         return self
 
     def bounds(self, key: str) -> tuple[float, float, str]:
-        """The bounds of a number and their unit, that of the first one with a unit.
+        """Return lower and upper bound of a number, and their unit.
+
+        The unit is that of the first bound with a unit; "" without.
 
         Raises
         ------
@@ -231,7 +240,7 @@ class DesignSection(Section):
 
     @property
     def fields(self) -> dict[str, FieldVariables]:
-        """The scalar fields that vary."""
+        """Name -> section of the scalar fields that vary."""
         fields_that_vary = {
             "thickness": self.thickness,
             "curvature": self.curvature,
@@ -240,7 +249,7 @@ class DesignSection(Section):
         return {name: section for name, section in fields_that_vary.items() if section}
 
     def key_of(self, result: str) -> str:
-        """The first key below `design` that names a result."""
+        """Return the first key below `design` that names a result, such as `constraints.0.of`."""
         if result in self.objective.results:
             return next(
                 f"objective.{key}"
@@ -256,7 +265,7 @@ class DesignSection(Section):
 
     @property
     def named_results(self) -> dict[str, str]:
-        """Results but a wanted shape -> the keys that name them."""
+        """Name -> key in the case, of all results but a wanted shape."""
         shape = ["shape"] if self.objective.shape else []
         return {
             result: f"design.{self.key_of(result)}"
@@ -266,7 +275,7 @@ class DesignSection(Section):
 
     @property
     def results(self) -> list[str]:
-        """All that are computed: that of the objective first."""
+        """Names of all results that are computed; that of the objective is first."""
         limited = (name for limit in self.constraints for name in limit.names)
         return list(dict.fromkeys([*self.objective.results, *limited]))
 
@@ -307,6 +316,7 @@ class EnsembleSection(Section):
 
     @model_validator(mode="after")
     def _something_is_random(self) -> Self:
+        """Check that something is random, and that no key is one that random defects replace."""
         if not self.keys and self.defects is None:
             raise ValueError("needs keys or defects: otherwise nothing is random")
         reserved_keys = tuple(
@@ -322,6 +332,7 @@ class EnsembleSection(Section):
 
     @property
     def _listed(self) -> list[PlacedDefectsSection]:
+        """The sections of random defects, as a list."""
         return (
             self.defects
             if isinstance(self.defects, list)
@@ -332,10 +343,17 @@ class EnsembleSection(Section):
 
     @property
     def _shells_with_defects(self) -> list[str | None]:
+        """Names of the shells with random defects; None for defects on all shells."""
         return [defects.on for defects in self._listed]
 
     def refuse_unfit(self, shells: Collection[str]) -> None:
-        """See that the case has the shells that have defects; raises ValueError otherwise."""
+        """Check that the case has the shells on which defects are.
+
+        Raises
+        ------
+        ValueError
+            If there are no several shells, or none of that name.
+        """
         for name in self._shells_with_defects:
             if name and not shells:
                 raise ValueError("ensemble.defects.on: names one of several shells: leave it out")
@@ -345,14 +363,16 @@ class EnsembleSection(Section):
                 )
 
     def settings(self, seed: int, number: int, shells: Collection[str] = ()) -> dict[str, str]:
-        """The keys of a sample and their values, as in `--set`; they depend on seed and number
-        alone.
+        """Draw a sample: return key -> value as JSON text, as in `--set`.
 
-        Every key has random numbers of its own: another key more does not change the others. The
-        first shell with defects has those that it has alone.
+        The values depend on seed and number of the sample alone. Every key has random numbers of
+        its own, so a further key does not change the others. The first shell with defects has the
+        same defects as if it were alone.
 
         Parameters
         ----------
+        number
+            Number of the sample, from 0.
         shells
             Names of several shells.
 
@@ -373,10 +393,12 @@ class EnsembleSection(Section):
         ]
         for i, (defect_section, name) in enumerate(defects_by_shell):
             key = f"shells.{name}.{IMPERFECTIONS}" if name else IMPERFECTIONS
-            count_before = sum(other == name for _, other in defects_by_shell[:i])
-            of_its_own = (f"{key}.{count_before}" if count_before else key) if i else IMPERFECTIONS
+            earlier_count = sum(other_name == name for _, other_name in defects_by_shell[:i])
+            generator_key = (
+                (f"{key}.{earlier_count}" if earlier_count else key) if i else IMPERFECTIONS
+            )
             defects.setdefault(key, []).extend(
-                defect_section.draw(generator(seed, number, of_its_own))
+                defect_section.draw(generator(seed, number, generator_key))
             )
         drawn_values |= defects
         return {key: json.dumps(value) for key, value in drawn_values.items()}

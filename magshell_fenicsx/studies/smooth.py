@@ -1,5 +1,6 @@
-"""A field among the parameters: a prior under which it is smooth, as strong as the data make most
-likely.
+"""A smooth field among the parameters of a fit.
+
+Its prior is as strong as the data make most likely.
 
 The numbers B (n, c) of a field at n places are normal about their mean, c components alike and
 apart, with
@@ -34,14 +35,16 @@ EDGE = 1.01  # factor within which a bound is reached
 
 @dataclass(frozen=True)
 class Smooth:
-    """The prior of the parameters from `first` on.
+    """The prior of a field among the parameters, under which the field is smooth.
 
     Attributes
     ----------
+    first
+        Index of the field's first number in the vector of parameters.
     distances
-        (n, n) of the places.
+        (n, n) distances of the places.
     components
-        c.
+        Number c of components at each place.
     deviation, length
         s and l; nan where the data choose them.
     """
@@ -54,7 +57,7 @@ class Smooth:
 
     @property
     def size(self) -> int:
-        """How many numbers the field has."""
+        """Number of values of the field, n c."""
         return len(self.distances) * self.components
 
     @property
@@ -64,7 +67,10 @@ class Smooth:
 
     @property
     def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
-        """Least and largest s and l that are looked at; l from the distance of neighbours on."""
+        """Least and largest s, and least and largest l, of a search.
+
+        The least l is the median distance of neighbours.
+        """
         distances = self.distances + np.where(np.eye(len(self.distances)), np.inf, 0.0)
         return (WEAKEST, STRONGEST), (
             float(np.median(distances.min(axis=1))),
@@ -73,7 +79,7 @@ class Smooth:
 
     @cached_property
     def _factor(self) -> tuple[Array, float]:
-        """W with W^T W = Q, and ln det Q, of one component."""
+        """W (n, n) with W^T W = Q, and ln det Q, of one component."""
         r = np.sqrt(3) * self.distances / self.length
         K = (1 + r) * np.exp(-r) + JITTER * np.eye(len(r))
         L = self.deviation * np.linalg.cholesky(K)
@@ -83,7 +89,7 @@ class Smooth:
 
     @property
     def rows(self) -> Array:
-        """W of the whole field, (size, size)."""
+        """W (size, size) of the whole field, with W^T W = Q; components vary fastest."""
         return np.asarray(np.kron(self._factor[0], np.eye(self.components)))
 
     @property
@@ -92,7 +98,7 @@ class Smooth:
         return self.components * self._factor[1]
 
     def at_bounds(self) -> list[str]:
-        """Return those of deviation s and length l that have reached a bound."""
+        """Return the names of deviation s and length l, where they have reached a bound."""
         return [
             name
             for name, value, (low, high) in zip(
@@ -106,7 +112,16 @@ class Smooth:
         return replace(self, deviation=deviation, length=length)
 
     def starts(self, prior: "Smooth") -> list[tuple[float, float]]:
-        """Strengths that a search begins with; what is given is kept."""
+        """Return pairs (s, l) from which a search begins.
+
+        A known prior starts from its own values. Else values are spread between the bounds, and
+        given ones are kept.
+
+        Parameters
+        ----------
+        prior
+            The prior as given, with nan for unknown values.
+        """
         if np.isfinite(self.deviation):
             return [(self.deviation, self.length)]
         (_, _), (shortest, longest) = self.bounds

@@ -49,9 +49,17 @@ MOST_LISTED = 50
 
 
 def make_row(sample: Sample, outcome: Outcome | None, scalar: Scalar) -> Row:
-    """The row of a sample; None as outcome: it has not been computed."""
+    """Return the row of a sample in samples.csv.
+
+    Parameters
+    ----------
+    outcome
+        None if the sample has not been computed.
+    scalar
+        The number that is the result.
+    """
     result = outcome.value(scalar) if outcome else None
-    status, why = _status(outcome, result)
+    status, reason = _status(outcome, result)
     computed = ("found", "factorisations", "dofs", "cpu_s", "wall_s")
     return {
         "sample": sample.number,
@@ -60,23 +68,27 @@ def make_row(sample: Sample, outcome: Outcome | None, scalar: Scalar) -> Row:
         **_columns(sample.values),
         **_columns({f"{SEVEREST}{key}": number for key, number in sample.severest.items()}),
         **{name: getattr(outcome, name, None) for name in computed},
-        "why": f"no {scalar.name}" if status == "none" else why,
+        "why": f"no {scalar.name}" if status == "none" else reason,
         "point": sample.key,
     }
 
 
 def _status(outcome: Outcome | None, result: float | None) -> tuple[str, str | None]:
-    """A key of `STATUS`, and why there is no result."""
+    """Return a key of `STATUS`, and the reason why the run stopped early; None if it did not."""
     if outcome is None:
         return "missing", "not computed"
-    why = outcome.stopped
+    reason = outcome.stopped
     if result is not None:
-        return "found", why
-    return "none" if why is None else "failed" if why.startswith(FAILED) else "stopped", why
+        return "found", reason
+    return "none" if reason is None else "failed" if reason.startswith(
+        FAILED
+    ) else "stopped", reason
 
 
 def _columns(values: Mapping[str, Any]) -> Row:
-    """Values by the names of their columns; one with a unit is a number, and its name has the unit.
+    """Return column -> value, for keys of a case; a value with a unit becomes a number.
+
+    The name of its column has the unit as ending.
 
     Examples
     --------
@@ -91,18 +103,18 @@ def _columns(values: Mapping[str, Any]) -> Row:
 
 
 def severest_keys(rows: Sequence[Row]) -> list[str]:
-    """The columns of the most severe defect."""
+    """Return the columns of the most severe defect."""
     return list(dict.fromkeys(key for row in rows for key in row if key.startswith(SEVEREST)))
 
 
 def drawn_keys(rows: Sequence[Row]) -> list[str]:
-    """The columns of drawn values, in the order of the rows."""
-    others = {*FIRST_COLUMNS, *LAST_COLUMNS, *severest_keys(rows), WITHOUT}
-    return list(dict.fromkeys(key for row in rows for key in row if key not in others))
+    """Return the columns of drawn values, in the order of the rows."""
+    other_columns = {*FIRST_COLUMNS, *LAST_COLUMNS, *severest_keys(rows), WITHOUT}
+    return list(dict.fromkeys(key for row in rows for key in row if key not in other_columns))
 
 
 def write_samples(rows: Sequence[Row], file: Path) -> None:
-    """Write samples.csv."""
+    """Write samples.csv: result, defects and drawn values first, then the columns of the runs."""
     extra_columns = [WITHOUT] if any(WITHOUT in row for row in rows) else []
     write_csv(
         rows,
@@ -112,18 +124,22 @@ def write_samples(rows: Sequence[Row], file: Path) -> None:
 
 
 def results(rows: Sequence[Row], column: str = RESULT) -> Array:
-    """The results of the samples that have one."""
+    """Return the results (n,) of the samples that have one."""
     return np.array([row[column] for row in rows if row.get(column) is not None], dtype=float)
 
 
 def statistics(rows: Sequence[Row], seed: int) -> dict[str, Any]:
-    """Numbers of samples, moments, the Weibull fit, correlations, and the change without the
-    weakest defects.
+    """Return the statistics of an ensemble, as in summary.json.
+
+    They are counts of samples, moments, the Weibull fit with intervals, correlations, and the
+    change without the weakest defects.
 
     Parameters
     ----------
+    rows
+        Rows of samples.csv.
     seed
-        Of the resampling for intervals.
+        Seed of the resampling for intervals.
     """
     values = results(rows)
     return {
@@ -143,7 +159,7 @@ def statistics(rows: Sequence[Row], seed: int) -> dict[str, Any]:
 
 
 def counts(rows: Sequence[Row]) -> dict[str, int]:
-    """The number of samples, and of those with each status."""
+    """Return the number of samples, and of those with each status."""
     statuses = [row["status"] for row in rows]
     return {
         "samples": len(rows),
@@ -152,7 +168,7 @@ def counts(rows: Sequence[Row]) -> dict[str, int]:
 
 
 def moments(values: Array) -> dict[str, Any]:
-    """Mean, standard deviation, least, middle and largest value; None where there are too few."""
+    """Return mean, standard deviation, least, median and largest value; None for too few values."""
     if not len(values):
         return dict.fromkeys(("mean", "deviation", "least", "median", "largest"))
     return {
@@ -165,6 +181,7 @@ def moments(values: Array) -> dict[str, Any]:
 
 
 def _weibull(values: Array) -> dict[str, Any] | None:
+    """Return the fitted Weibull distribution as plain data; None if it cannot be fitted."""
     weibull = fit(values) if len(values) else None
     if weibull is None:
         return None
@@ -176,18 +193,24 @@ def _weibull(values: Array) -> dict[str, Any] | None:
 
 
 def correlations(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
-    """The correlation of the result with the most severe defect and with every key: Pearson's and
-    Spearman's.
+    """Return Pearson's and Spearman's correlations of the result with drawn numbers.
+
+    The numbers are those of the most severe defect and all random keys but those of defects.
+
+    Returns
+    -------
+    Column -> {"pearson", "spearman"}; columns with too few or equal values are left out.
     """
     from scipy.stats import pearsonr, spearmanr
 
     correlated = {}
-    place, keys = "at.polar", drawn_keys(rows)
-    of_defects = (
+    polar_key, keys = "at.polar", drawn_keys(rows)
+    # keys that each defect has for itself
+    defect_prefixes = (
         "shell.imperfections.",
-        *(key.removesuffix(place) for key in keys if key.endswith(f".{place}")),
+        *(key.removesuffix(polar_key) for key in keys if key.endswith(f".{polar_key}")),
     )
-    drawn_keys_only = [key for key in keys if not key.startswith(of_defects)]
+    drawn_keys_only = [key for key in keys if not key.startswith(defect_prefixes)]
     for key in (*severest_keys(rows), *drawn_keys_only):
         pairs = np.array(
             [
@@ -207,7 +230,10 @@ def correlations(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
 
 def _without(rows: Sequence[Row]) -> dict[str, Any] | None:
-    """The change of the result by deleting the weakest defects, over the samples that have both."""
+    """Return the change of the result by deleting the weakest defects; None without such results.
+
+    It is over the samples that have both results.
+    """
     value_pairs = [
         (row[RESULT], row[WITHOUT])
         for row in rows
@@ -227,10 +253,12 @@ def _without(rows: Sequence[Row]) -> dict[str, Any] | None:
 
 @dataclass(frozen=True)
 class Weibull:
-    """A fitted distribution.
+    """A fitted three-parameter Weibull distribution.
 
     Attributes
     ----------
+    shape, location, scale
+        P(x) = 1 - exp(-((x - location)/scale)^shape) for x > location.
     bounded
         Whether the best location is one of the bounds of the search, so that the sample does not
         determine it.
@@ -242,44 +270,55 @@ class Weibull:
     bounded: bool
 
     def probability_below(self, x: Array) -> Array:
-        """The probability of a smaller value."""
+        """Return the probability of a smaller value than each of x."""
         return np.asarray(weibull_min.cdf(x, self.shape, self.location, self.scale))
 
     def density(self, x: Array) -> Array:
+        """Return the probability density at each of x."""
         return np.asarray(weibull_min.pdf(x, self.shape, self.location, self.scale))
 
     def quantile(self, part: float) -> float:
-        """The value that is larger with the probability 1 - part."""
+        """Return the value below which a part of the probability lies."""
         return float(weibull_min.ppf(part, self.shape, self.location, self.scale))
 
 
 def fit(values: Sequence[float] | Array) -> Weibull | None:
-    """The most likely distribution; None with fewer than `LEAST_DIFFERENT` different values.
+    """Fit the Weibull distribution by maximum likelihood.
+
+    The location is searched on a grid in the logarithm of its distance below the least value. The
+    grid is refined around the best point.
 
     Parameters
     ----------
     values
         The sample (n,).
+
+    Returns
+    -------
+    The most likely distribution; None with fewer than `LEAST_DIFFERENT` different values.
     """
     x = np.sort(np.asarray(values, dtype=float))
     if len(np.unique(x)) < LEAST_DIFFERENT:
         return None
-    spread = float(x.std())
+    deviation = float(x.std())
     low, high = np.log(SPANS)
     ends, best = (low, high), 0.0
     for _ in range(ROUNDS):
-        tried = np.linspace(low, high, GRID)
-        best = float(tried[np.argmax(_likelihoods(x, x[0] - spread * np.exp(tried)))])
-        step = tried[1] - tried[0]
+        log_distances = np.linspace(low, high, GRID)
+        best = float(
+            log_distances[np.argmax(_likelihoods(x, x[0] - deviation * np.exp(log_distances)))]
+        )
+        step = log_distances[1] - log_distances[0]
         low, high = max(best - step, ends[0]), min(best + step, ends[1])
-    location = x[0] - spread * float(np.exp(best))
+    location = x[0] - deviation * float(np.exp(best))
     shape, scale = (float(v[0]) for v in _best_shape_and_scale(x, np.array([location])))
     return Weibull(shape, float(location), scale, best in ends or shape <= SHAPES[0])
 
 
 def distance(values: Array, weibull: Weibull) -> float:
-    """The largest difference between the empirical and the fitted distribution function (Kolmogorov
-    and Smirnov).
+    """Return the distance of Kolmogorov and Smirnov of a sample from a distribution.
+
+    It is the largest difference between the empirical and the fitted distribution function.
     """
     probabilities, n = weibull.probability_below(np.sort(values)), len(values)
     return float(
@@ -288,7 +327,10 @@ def distance(values: Array, weibull: Weibull) -> float:
 
 
 def _likelihoods(x: Array, locations: Array) -> Array:
-    """Mean logarithm of the density, at the best shape and scale of each location."""
+    """Return the mean log-likelihood (m,) of a sample x (n,) for locations (m,).
+
+    Shape and scale are the best ones for each location.
+    """
     shapes, scales = _best_shape_and_scale(x, locations)
     logs = np.log((x - locations[:, None]) / scales[:, None])
     powers = np.exp(shapes[:, None] * logs)
@@ -298,36 +340,43 @@ def _likelihoods(x: Array, locations: Array) -> Array:
 
 
 def _best_shape_and_scale(x: Array, locations: Array) -> tuple[Array, Array]:
-    """The best shape (m,) and scale (m,) for locations (m,).
+    """Return the best shape (m,) and scale (m,) of a sample x (n,) for locations (m,).
 
     The shape k solves 1/k = sum(y^k log y)/sum(y^k) - mean(log y) with y = x - location, by
     Newton's method for log k.
     """
     y = np.log(x - locations[:, None])
-    y, middle = y - y.mean(axis=1, keepdims=True), y.mean(axis=1)  # mean(log y) = 0 then
+    y, mean_log = y - y.mean(axis=1, keepdims=True), y.mean(axis=1)  # mean(log y) = 0 then
+    # log y of a Weibull distribution has the deviation 1.28/k
     k = 1.2 / np.maximum(y.std(axis=1), 1e-12)
     for _ in range(STEPS):
-        top = np.max(k[:, None] * y, axis=1, keepdims=True)
-        w = np.exp(k[:, None] * y - top)
+        largest_exponent = np.max(k[:, None] * y, axis=1, keepdims=True)
+        # y^k, scaled against overflow
+        w = np.exp(k[:, None] * y - largest_exponent)
         s0, s1, s2 = w.sum(axis=1), (w * y).sum(axis=1), (w * y**2).sum(axis=1)
         value, slope = s1 / s0 - 1 / k, s2 / s0 - (s1 / s0) ** 2 + 1 / k**2
         k = k * np.exp(np.clip(-value / (slope * k), -1.0, 1.0))
     k = np.clip(k, *SHAPES)
-    top = np.max(k[:, None] * y, axis=1, keepdims=True)
-    mean = np.log(np.mean(np.exp(k[:, None] * y - top), axis=1)) + top[:, 0]
-    return np.asarray(k), np.asarray(np.exp(middle + mean / k))
+    largest_exponent = np.max(k[:, None] * y, axis=1, keepdims=True)
+    mean = (
+        np.log(np.mean(np.exp(k[:, None] * y - largest_exponent), axis=1)) + largest_exponent[:, 0]
+    )
+    return np.asarray(k), np.asarray(np.exp(mean_log + mean / k))
 
 
 def intervals(
     values: Sequence[float] | Array, seed: int, count: int = 400
 ) -> dict[str, tuple[float, float]]:
-    """Percentile intervals of the parameters, of the mean and of the 1 % quantile, from resampled
-    values.
+    """Return bootstrap intervals of moments and Weibull parameters, by percentiles.
 
     Parameters
     ----------
     seed, count
-        Of the resampling, and its number.
+        Seed of the resampling, and the number of resamples.
+
+    Returns
+    -------
+    Name of the number -> its interval with the probability `LEVEL`.
     """
     x, rng = np.asarray(values, dtype=float), np.random.default_rng(seed)
     resampled: dict[str, list[float]] = {}
@@ -351,14 +400,16 @@ def intervals(
 
 
 def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") -> str:
-    """The text of report.md.
+    """Return the text of report.md.
 
     Parameters
     ----------
     content
         The content of summary.json.
+    rows
+        Rows of samples.csv.
     ending
-        Of the names of its table and its picture, in front of the suffix.
+        Ending of the names of table and picture, before the suffix.
     """
     table = f"samples{ending}.csv"
     counts, weibull = content["counts"], content["weibull"]
@@ -411,8 +462,8 @@ def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") ->
             "is "
             f"{100 * without_weakest['largest_change']:+.2f} %.",
         ]
-    without = [row for row in rows if row["status"] != "found"]
-    if without:
+    rows_without_result = [row for row in rows if row["status"] != "found"]
+    if rows_without_result:
         lines += [
             "",
             "Samples without the result:",
@@ -422,16 +473,25 @@ def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") ->
         ]
         lines += [
             f"| {row['sample']} | {row['status']} | {str(row['why']).replace('|', '/')} |"
-            for row in without[:MOST_LISTED]
+            for row in rows_without_result[:MOST_LISTED]
         ]
-        if len(without) > MOST_LISTED:
-            lines.append(f"| … | | {len(without) - MOST_LISTED} more in {table} |")
+        if len(rows_without_result) > MOST_LISTED:
+            lines.append(f"| … | | {len(rows_without_result) - MOST_LISTED} more in {table} |")
     return "\n".join(lines) + "\n"
 
 
 def _row(
     key: str, value: float | None, intervals: dict[str, tuple[float, float]], suffix: str = ""
 ) -> str:
+    """Return a line of the table in report.md: name, value and interval of a number.
+
+    Parameters
+    ----------
+    intervals
+        Name of a number -> its interval.
+    suffix
+        Text before the name.
+    """
     ends = intervals.get(key)
     value_text = "" if value is None else f"{value:.6g}"
     interval = f"{ends[0]:.5g} to {ends[1]:.5g}" if ends else ""

@@ -1,5 +1,6 @@
-"""Error against run time of a case over meshes, degrees, models and ranks; every run is a separate
-process.
+"""Error against run time of a case over meshes, degrees, models and ranks.
+
+Every run is a separate process.
 """
 
 from collections.abc import Iterator, Sequence
@@ -40,14 +41,14 @@ FOLDER = Folder(
 
 @dataclass(frozen=True)
 class Study:
-    """A finished study.
+    """A finished study of error against run time.
 
     Attributes
     ----------
     rows
         As in study.csv, the points in product order, the ranks fastest.
     reference
-        None if no run gave the result.
+        The value that errors are relative to; None if no run gave the result.
     """
 
     rows: list[Row]
@@ -89,6 +90,10 @@ def study(  # noqa: PLR0913 - what a user gives
         The exact value for the errors; None takes the finest run and estimates its own error.
     ranks
         Numbers of MPI ranks for every point.
+    repeat
+        Number of measured runs of each point, of which the median counts.
+    out
+        Folder of the tables and of points/.
     say
         Called with one line per run.
 
@@ -108,9 +113,9 @@ def study(  # noqa: PLR0913 - what a user gives
         counts = sorted(set(ranks))
         origins = [{"sources": code_version(), **point.case.outside} for point in points]
         files = {
-            (i, n): folder / "points" / f"{points[i].key}-{n}.json"
+            (i, rank_count): folder / "points" / f"{points[i].key}-{rank_count}.json"
             for i in range(len(points))
-            for n in counts
+            for rank_count in counts
         }
         if known_count := sum(of_others(file, origins[i]) for (i, _), file in files.items()):
             say(
@@ -118,12 +123,16 @@ def study(  # noqa: PLR0913 - what a user gives
                 "sources of magshell_fenicsx"
             )
         runs = {
-            (i, n): Run(points[i], n, load(kept_in, machine, origins[i]))
-            for (i, n), kept_in in files.items()
+            (i, rank_count): Run(points[i], rank_count, load(kept_in, machine, origins[i]))
+            for (i, rank_count), kept_in in files.items()
         }
 
         def point_measured(key: tuple[int, int]) -> Iterator[str]:
-            (i, n), run = key, runs[key]
+            """Measure a point on a number of ranks, and yield a line of text.
+
+            The key is the index of the point, and the number of ranks.
+            """
+            (i, rank_count), run = key, runs[key]
             run_settings = [
                 *settings,
                 *(f"{name}={value}" for name, value in run.point.values.items()),
@@ -132,7 +141,7 @@ def study(  # noqa: PLR0913 - what a user gives
                 str(file),
                 *(word for setting in run_settings for word in ("--set", setting)),
             ]
-            complete(run.measured, arguments, n, repeat, files[key], origins[i])
+            complete(run.measured, arguments, rank_count, repeat, files[key], origins[i])
             yield f"{i + 1:4d}/{len(points)}  {run.label}: {_outcome(run.measured, scalar)}"
 
         compute([*runs], point_measured, MPI.COMM_SELF, say)
@@ -156,7 +165,12 @@ def study(  # noqa: PLR0913 - what a user gives
 
 
 def parse_ranks(text: str) -> list[int]:
-    """Read `--ranks`.
+    """Read `--ranks`, numbers of MPI ranks with commas.
+
+    Raises
+    ------
+    CaseError
+        If one is no whole number.
 
     Examples
     --------
@@ -172,6 +186,13 @@ def parse_ranks(text: str) -> list[int]:
 
 
 def _check(reference: float | None, ranks: Sequence[int], repeat: int) -> None:
+    """Check the arguments of a study.
+
+    Raises
+    ------
+    CaseError
+        If one is not allowed, or the study itself runs under mpirun.
+    """
     if MPI.COMM_WORLD.size > 1:
         raise CaseError("a study starts its ranks itself: use --ranks instead of mpirun")
     if repeat < 1 or not ranks or min(ranks) < 1:
@@ -183,6 +204,7 @@ def _check(reference: float | None, ranks: Sequence[int], repeat: int) -> None:
 
 
 def _write(study_result: Study, keys: Sequence[str], content: dict[str, Any], folder: Path) -> None:
+    """Write study.json, study.csv, study.md and study.png; called on rank 0."""
     write_object(folder / "study.json", content)
     write_csv(study_result.rows, (*keys, *COLUMNS), folder / "study.csv")
     write_table(study_result.rows, keys, content, folder / "study.md")
@@ -196,6 +218,7 @@ def _write(study_result: Study, keys: Sequence[str], content: dict[str, Any], fo
 
 
 def _outcome(measured: Timings, scalar: Scalar) -> str:
+    """Describe the measurements of a point in words: the result and the typical wall time."""
     if measured.summary is None:
         return f"stopped early: {measured.failure}"
     value = scalar.value_in(measured.summary, measured.rows)

@@ -18,7 +18,7 @@ ORDERS = 0.05, 30.0  # range of credible observed orders
 
 @dataclass(frozen=True)
 class Reference:
-    """A value with its own error.
+    """A value that errors are relative to, with its own error.
 
     Attributes
     ----------
@@ -43,7 +43,9 @@ class Reference:
 def estimated_error(
     h: Sequence[float], values: Sequence[float]
 ) -> tuple[float | None, float | None]:
-    """Error of the last value, and the order p, from v(h) = v + C h^p (Richardson).
+    """Estimate the error of the last of several values by Richardson extrapolation.
+
+    With v(h) = v + C h^p the values give the error and the order p.
 
     Parameters
     ----------
@@ -55,8 +57,10 @@ def estimated_error(
 
     Returns
     -------
-    tuple
-        Absolute error, None for a single value; order, or None.
+    error
+        Absolute error; None for a single value.
+    order
+        The order p; None if there is none.
 
     Examples
     --------
@@ -66,16 +70,18 @@ def estimated_error(
     """
     if len(values) < 2:
         return None, None
-    last = abs(values[-1] - values[-2])
+    last_difference = abs(values[-1] - values[-2])
     p = observed_order(h[-3:], values[-3:]) if len(values) > 2 else None
     if p is None:
-        return last, None
-    return last * h[-1] ** p / (h[-2] ** p - h[-1] ** p), p
+        return last_difference, None
+    return last_difference * h[-1] ** p / (h[-2] ** p - h[-1] ** p), p
 
 
 def observed_order(h: Sequence[float], values: Sequence[float]) -> float | None:
-    """p with (v1 - v2)/(v2 - v3) = (h1^p - h2^p)/(h2^p - h3^p); None if there is none between
-    `ORDERS`.
+    """Return the order p of convergence of three values v(h) = v + C h^p.
+
+    It solves (v1 - v2)/(v2 - v3) = (h1^p - h2^p)/(h2^p - h3^p). None if the values are not
+    monotonic, or there is no root between `ORDERS`.
     """
     (a, b, c), (v1, v2, v3) = h, values
     if (v1 - v2) * (v2 - v3) <= 0:
@@ -110,7 +116,15 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True)
 class Run:
-    """The measurements of a point on a number of ranks."""
+    """The measurements of a point of a study on a number of ranks.
+
+    Attributes
+    ----------
+    point
+        Values of the swept keys with their case.
+    measured
+        Times and results of the repeated runs.
+    """
 
     point: SweepPoint
     ranks: int
@@ -124,10 +138,14 @@ class Run:
 def make_rows(
     runs: Sequence[Run], scalar: Scalar, reference_value: float | None
 ) -> tuple[list[Row], Reference | None]:
-    """All rows, in the order of the runs, and the reference of their errors.
+    """Return the rows of study.csv, in the order of the runs, and the reference of their errors.
+
+    The reference is None if no run has the result.
 
     Parameters
     ----------
+    scalar
+        The number whose error is studied.
     reference_value
         The reference; None takes the finest run, with an estimate of its error.
     """
@@ -154,6 +172,10 @@ def make_rows(
 
 
 def _row(run: Run, scalar: Scalar) -> Row:
+    """Return the row of study.csv for a run; `error` and `pareto` are None, to be filled in later.
+
+    Without results the row has only keys, ranks and the reason of the failure.
+    """
     measured, summary = run.measured, run.measured.summary
     row: Row = {
         **run.point.values,
@@ -175,36 +197,55 @@ def _row(run: Run, scalar: Scalar) -> Row:
 
 
 def _estimated(finest: Row, runs: Sequence[Run], rows: Sequence[Row]) -> Reference:
-    """The finest run as reference; its error comes from runs that differ only in the refinement."""
+    """Return the finest run as reference, with an estimate of its error.
+
+    The error is extrapolated from runs that differ from it in the refinement alone.
+    """
     fixed_keys = [key for key in runs[0].point.values if key != REFINEMENT] + ["ranks"]
-    series = {
+    results_by_refinement = {
         run.point.case.mesh.refinement: row["result"]
         for run, row in zip(runs, rows, strict=True)
         if row["result"] is not None
         and row["dofs"] <= finest["dofs"]
         and all(row[k] == finest[k] for k in fixed_keys)
     }
-    refinements = sorted(series)
-    error, order = estimated_error([1 / r for r in refinements], [series[r] for r in refinements])
+    refinements = sorted(results_by_refinement)
+    error, order = estimated_error(
+        [1 / r for r in refinements], [results_by_refinement[r] for r in refinements]
+    )
     value = finest["result"]
-    relative = None if error is None else error / (abs(value) or 1.0)
+    relative_error = None if error is None else error / (abs(value) or 1.0)
     return Reference(
-        value, relative, order, f"finest run: degree {finest['degree']}, {finest['dofs']} dofs"
+        value,
+        relative_error,
+        order,
+        f"finest run: degree {finest['degree']}, {finest['dofs']} dofs",
     )
 
 
 def clock(rows: Sequence[Row]) -> str:
-    """The time that compares runs: CPU time for one rank, because other processes affect it less;
-    else wall time.
+    """Return the column of the time that compares runs.
+
+    It is CPU time if all runs have one rank, because other processes affect it less; else wall
+    time.
     """
-    alone = all(row["ranks"] == 1 for row in rows) and any(row["cpu_s"] is not None for row in rows)
-    return "cpu_s" if alone else "wall_s"
+    on_one_rank = all(row["ranks"] == 1 for row in rows) and any(
+        row["cpu_s"] is not None for row in rows
+    )
+    return "cpu_s" if on_one_rank else "wall_s"
 
 
 def _beats(a: Row, b: Row, cost_column: str) -> bool:
-    """Whether a is at least as good as b in both time and error, and better in one."""
-    mine, theirs = (a[cost_column], a["error"]), (b[cost_column], b["error"])
-    return mine != theirs and mine[0] <= theirs[0] and mine[1] <= theirs[1]
+    """Return whether row a is at least as good as b in time and in error, and better in one."""
+    time_and_error_of_a, time_and_error_of_b = (
+        (a[cost_column], a["error"]),
+        (b[cost_column], b["error"]),
+    )
+    return (
+        time_and_error_of_a != time_and_error_of_b
+        and time_and_error_of_a[0] <= time_and_error_of_b[0]
+        and time_and_error_of_a[1] <= time_and_error_of_b[1]
+    )
 
 
 FORMS = {
@@ -242,14 +283,18 @@ faster and more accurate.
 def write_table(
     rows: Sequence[Row], keys: Sequence[str], content: dict[str, Any], file: Path
 ) -> None:
-    """Write study.md.
+    """Write study.md, a table with the main columns of all rows.
 
     Parameters
     ----------
+    rows
+        Rows of study.csv.
     keys
         The swept keys.
     content
         The content of study.json.
+    file
+        Path of study.md.
     """
     head = [
         *map(short_key, keys),
@@ -271,7 +316,7 @@ def write_table(
 
 
 def repeated(repeat: int) -> str:
-    """How often each point was run.
+    """Return a phrase that says how often each point was run.
 
     Examples
     --------
@@ -282,7 +327,7 @@ def repeated(repeat: int) -> str:
 
 
 def reference_sentence(reference: Reference | None) -> str:
-    """The reference of the errors, as a sentence."""
+    """Return a sentence about the reference of the errors; None: no run gave the result."""
     if reference is None:
         return "No run gave the result."
     value = f"Errors are relative to {reference.value:.10g} ({reference.source}"
@@ -290,18 +335,19 @@ def reference_sentence(reference: Reference | None) -> str:
         return f"{value})."
     if reference.error is None:
         return f"{value}; its own error is not known: it has no coarser mesh to compare with)."
-    how = (
+    estimate = (
         f"observed order {reference.order:.2g}"
         if reference.order
         else "the last difference: no order was observed"
     )
     return (
-        f"{value}; its own error is estimated at {reference.error:.1e}, {how}): "
+        f"{value}; its own error is estimated at {reference.error:.1e}, {estimate}): "
         "smaller errors mean nothing."
     )
 
 
 def _cell(row: Row, key: str) -> str:
+    """Return the text of a column of a row for the table; empty for None."""
     value = row[key]
     if value is None:
         return ""
@@ -331,14 +377,20 @@ LEAST_SPREAD = (
 def draw_study(
     rows: Sequence[Row], keys: Sequence[str], title: str, own_error: float | None, file: Path
 ) -> None:
-    """Write study.png; runs without an error are left out.
+    """Draw study.png: errors over time, unknowns and memory, and the shares of the phases.
+
+    Runs without an error are left out.
 
     Parameters
     ----------
+    rows
+        Rows of study.csv.
     keys
         The swept keys; the runs of a series differ only in the refinement.
     own_error
-        Error of the reference, drawn as a line; smaller errors are meaningless.
+        Error of the reference, drawn as a line; smaller errors are meaningless. None without.
+    file
+        Path of study.png.
     """
     import matplotlib
 
@@ -364,7 +416,10 @@ def draw_study(
 
 
 def _series(rows: Sequence[Row], keys: Sequence[str]) -> dict[str, list[Row]]:
-    """Series of rows that differ only in the mesh size, by a label of their common values."""
+    """Return series of rows that differ in the mesh refinement alone, each by growing unknowns.
+
+    The key of a series is a label of the values that other series do not share.
+    """
     names = [*(key for key in keys if key != REFINEMENT), "ranks"]
     varying_names = [name for name in names if len({row[name] for row in rows}) > 1]
     series: dict[str, list[Row]] = {}
@@ -378,16 +433,25 @@ def _series(rows: Sequence[Row], keys: Sequence[str]) -> dict[str, list[Row]]:
 def _errors(
     axes: Any, series: dict[str, list[Row]], quantity: str, own_error: float | None
 ) -> None:
+    """Draw error over a quantity for each series, with double logarithmic axes.
+
+    Parameters
+    ----------
+    quantity
+        Column of the horizontal axis; over a time the Pareto front is drawn too.
+    own_error
+        Error of the reference, drawn as a line; None without.
+    """
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
     for (label, rows), marker in zip(series.items(), cycle(MARKERS), strict=False):
         x, error = ([row[key] for row in rows] for key in (quantity, "error"))
         axes.plot(x, error, marker=marker, markersize=4, linewidth=1, label=label)
-    best = sorted(
+    pareto_points = sorted(
         (row[quantity], row["error"]) for rows in series.values() for row in rows if row["pareto"]
     )
-    if quantity in CLOCKS and best:
-        x, error = map(list, zip(*best, strict=True))
+    if quantity in CLOCKS and pareto_points:
+        x, error = map(list, zip(*pareto_points, strict=True))
         axes.step(
             x,
             error,
@@ -410,8 +474,8 @@ def _errors(
     axes.set(xscale="log", yscale="log")
     if values := [row[quantity] for rows in series.values() for row in rows]:
         middle = (min(values) * max(values)) ** 0.5
-        spread = max(LEAST_SPREAD, 1.1 * (max(values) / min(values)) ** 0.5)
-        axes.set_xlim(middle / spread, middle * spread)
+        half_range = max(LEAST_SPREAD, 1.1 * (max(values) / min(values)) ** 0.5)
+        axes.set_xlim(middle / half_range, middle * half_range)
     axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
     axes.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     axes.xaxis.set_minor_formatter(NullFormatter())
@@ -435,12 +499,13 @@ def _draw_phase_shares(axes: Any, series: dict[str, list[Row]]) -> None:
         ("total_s", "0.6", "the rest of the run"),
         ("wall_s", "0.85", "start and end of the process"),
     ):
-        rest = [
+        # from the sum of the phases up to this time
+        remainder = [
             max((row[end] or 0.0) / row["wall_s"] - b, 0.0)
             for row, b in zip(rows, bottom, strict=True)
         ]
-        axes.bar(places, rest, bottom=bottom, color=colour, label=label)
-        bottom = [b + h for b, h in zip(bottom, rest, strict=True)]
+        axes.bar(places, remainder, bottom=bottom, color=colour, label=label)
+        bottom = [b + h for b, h in zip(bottom, remainder, strict=True)]
     axes.set_xticks(places, [f"{row['error']:.0e}\n{row['dofs']}" for row in rows], fontsize=7)
     axes.set(
         xlabel="error and unknowns of the Pareto front's runs",

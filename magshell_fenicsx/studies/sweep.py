@@ -76,8 +76,14 @@ CURVE = (
 
 @dataclass(frozen=True)
 class Sweep:
-    """A finished sweep: its points in product order, their outcomes, and their results where one
-    was asked for.
+    """A finished sweep.
+
+    Attributes
+    ----------
+    points, outcomes
+        The points in product order, the last axis fastest, and the outcome of each.
+    results
+        The requested number at each point, None where a run lacks it; empty if none was requested.
     """
 
     axes: list[Axis]
@@ -104,11 +110,10 @@ def sweep(  # noqa: PLR0913 - what a user gives
     full_paths: bool = False,
     part: str | None = None,
 ) -> Sweep:
-    """Run a case at all points of a product; collective, and every rank works.
+    """Run a case at all points of a product of axes; collective, and every rank works.
 
     If the result is a knockdown (`loading: {kind: pressure, until: limit}`), one path is computed
-    up to its fold, and then the fold is followed along the last axis with numbers; see
-    `Continuation`.
+    up to its fold. The fold is then followed along the last axis with numbers; see `Continuation`.
 
     Parameters
     ----------
@@ -122,13 +127,16 @@ def sweep(  # noqa: PLR0913 - what a user gives
     make_case
         Makes a case of its source.
     result
-        A number of each point as of `magshell study`, beside those that every sweep has; see
-        `parse_scalar`.
+        A further number of each point, as of `magshell study`; see `parse_scalar`.
     full_paths
         Compute the full path at every point.
     part
         "i/n": compute only the i-th of n equal shares of the points; several jobs may share one
-        folder.
+        folder. None: compute all.
+
+    Returns
+    -------
+    The requested points of this part that have outcomes, on every rank.
 
     Raises
     ------
@@ -155,9 +163,9 @@ def sweep(  # noqa: PLR0913 - what a user gives
     if part:
         missing = [number for number in missing if number - earlier_count in share]
     if comm.rank == 0:
-        also = f" and {earlier_count} there" if earlier_count else ""
+        earlier_text = f" and {earlier_count} there" if earlier_count else ""
         say(
-            f"{len(requested)} points{also}, {len(missing)} to compute on {comm.size} "
+            f"{len(requested)} points{earlier_text}, {len(missing)} to compute on {comm.size} "
             f"rank{'s' * (comm.size > 1)}"
         )
         if known_count := sum(files[number].exists() for number in missing):
@@ -168,6 +176,7 @@ def sweep(  # noqa: PLR0913 - what a user gives
     cache = SweepCache(columns=COLUMNS if scalar else CURVE)
 
     def chain_computed(chain: Chain) -> Iterator[str]:
+        """Compute a chain on this rank, keep each outcome, and yield a line of text for each."""
         for number, outcome in run_chain(chain, cache):
             keep_outcome(outcome, points[number].case, files[number])
             place = f"{missing.index(number) + 1:4d}/{len(missing)}"
@@ -188,9 +197,10 @@ def sweep(  # noqa: PLR0913 - what a user gives
         )
     if outcomes_of_points:
         access_disk(comm, lambda: _write(axes, outcomes_of_points, scalar, folder))
-    mine = {id(point) for i, point in enumerate(requested) if not part or i in share}
+    # the requested points of this part, without those of earlier sweeps
+    own_points = {id(point) for i, point in enumerate(requested) if not part or i in share}
     requested_outcomes = [
-        (point, outcome) for point, outcome in outcomes_of_points if id(point) in mine
+        (point, outcome) for point, outcome in outcomes_of_points if id(point) in own_points
     ]
     values = [outcome.value(scalar) for _, outcome in requested_outcomes] if scalar else []
     return Sweep(
@@ -202,7 +212,9 @@ def sweep(  # noqa: PLR0913 - what a user gives
 
 
 def share_of(part: str | None, count: int) -> range:
-    """The numbers of the points of a part "i/n": neighbours, whose folds can be followed.
+    """Return the numbers of the points of a part "i/n"; all for None.
+
+    They are neighbours, so that folds can be followed from one to the next.
 
     Examples
     --------
@@ -214,12 +226,13 @@ def share_of(part: str | None, count: int) -> range:
 
 
 def _is_known(file: Path, scalar: Scalar | None) -> bool:
+    """Return whether a file has the outcome of these sources, with the requested number if any."""
     outcome = stored_outcome_of_case(file)
     return outcome is not None and (scalar is None or outcome.serves(scalar))
 
 
 def _words(outcome: Outcome, scalar: Scalar | None) -> str:
-    """Describe the result of a point in words."""
+    """Return the result of a point in words: the requested number, else its main result."""
     result_text = "no limit point"
     if scalar and scalar.name != "knockdown":
         value = outcome.value(scalar)
@@ -238,7 +251,17 @@ def _words(outcome: Outcome, scalar: Scalar | None) -> str:
 
 @dataclass(frozen=True)
 class Link:
-    """A point of a chain: its number in the sweep, its value on the axis, and its case."""
+    """A point of a chain.
+
+    Attributes
+    ----------
+    number
+        Index of the point in the sweep.
+    at
+        Its value on the axis of the chain, in the axis's unit.
+    case
+        The validated case of the point.
+    """
 
     number: int
     at: float
@@ -251,18 +274,21 @@ Chain = list[Link]
 def make_chains(
     axes: Sequence[Axis], points: Sequence[SweepPoint], missing: Sequence[int], *, full_paths: bool
 ) -> list[Chain]:
-    """Put the missing points into chains.
+    """Arrange the missing points in chains along the last axis with numbers.
 
     Parameters
     ----------
+    points
+        All points of the sweep.
     missing
-        Numbers of the points to compute.
+        Indices in `points` of those to compute.
     full_paths
-        Put each point into a separate chain, as also happens if folds cannot be followed.
+        Put each point into a chain of its own. The same happens if folds cannot be followed.
     """
     axis = last_numeric_axis(axes)
     if full_paths or axis is None:
         return [[Link(number, 0.0, points[number].case)] for number in missing]
+    # values of the other axes -> points along the axis
     lines: dict[tuple[str, ...], list[int]] = {}
     for number, point in enumerate(points):
         lines.setdefault(
@@ -276,7 +302,17 @@ def make_chains(
 def _chains_of(
     line: list[int], axis: Axis, points: Sequence[SweepPoint], missing: set[int]
 ) -> list[Chain]:
-    """The missing points along the axis, as one chain if their folds can be followed."""
+    """Return the missing points of a line along the axis, as one chain if folds can be followed.
+
+    All cases of a chain get the lowest symmetry among the points of the line.
+
+    Parameters
+    ----------
+    line
+        Indices in `points` of all points along the axis, with the same values on other axes.
+    missing
+        Indices of the points to compute.
+    """
     key = axis.keys[0]
     links = [
         Link(n, axis.number(points[n].values[key]), points[n].case) for n in line if n in missing
@@ -295,6 +331,7 @@ def _chains_of(
 
 
 def _symmetry(case: Case) -> str:
+    """Return the symmetry of the model of a case, one of `SYMMETRIES`."""
     problem = case.problem()
     return "axisymmetric" if problem.axisymmetric else "half" if problem.is_half else "none"
 
@@ -303,13 +340,15 @@ def _symmetry(case: Case) -> str:
 class SweepCache:
     """Scenes and folds that the chains of one rank share.
 
+    A scene is the model of a case with its solver.
+
     Attributes
     ----------
     columns
-        Those of every run that outcomes keep.
+        Columns of path.csv that the outcomes of all runs keep.
     first
-        The first fold of the last chain, from which that of the next one is followed if it has the
-        same mesh.
+        Continuation from the first fold of the last chain. The first fold of the next chain is
+        followed from it, if both have the same mesh.
     """
 
     columns: Sequence[str] = CURVE
@@ -318,17 +357,24 @@ class SweepCache:
 
 
 def run_chain(chain: Chain, folds: SweepCache) -> Iterator[tuple[int, Outcome]]:
-    """Compute a chain on this rank; number and outcome of each point."""
+    """Compute a chain on this rank; yield index in the sweep and outcome of each point.
+
+    The fold of a point is followed from the point before. Where this fails, the full path is
+    computed.
+    """
     continuation = folds.first if len(chain) > 1 else None
     for link in chain:
         is_first = link is chain[0]
-        start, factorisations, outcome = time.perf_counter(), 0, None
+        start_time, factorisations, outcome = time.perf_counter(), 0, None
         if continuation:
-            outcome, factorisations = _by_fold(continuation, link, folds, start, same_mesh=is_first)
+            outcome, factorisations = _by_fold(
+                continuation, link, folds, start_time, same_mesh=is_first
+            )
         if not outcome:
             outcome, continuation = _by_path(
-                link, folds.columns, factorisations, start, go_on=link is not chain[-1]
+                link, folds.columns, factorisations, start_time, go_on=link is not chain[-1]
             )
+        # the next chain starts from the first fold of this one
         if is_first:
             folds.first = continuation = continuation and continuation.from_here()
         yield link.number, outcome
@@ -337,7 +383,22 @@ def run_chain(chain: Chain, folds: SweepCache) -> Iterator[tuple[int, Outcome]]:
 def _by_fold(
     continuation: Continuation, link: Link, folds: SweepCache, start: float, *, same_mesh: bool
 ) -> tuple[Outcome | None, int]:
-    """The outcome, or None if the fold cannot be followed; and the number of factorisations."""
+    """Follow a known fold to a point of a chain.
+
+    Parameters
+    ----------
+    start
+        Time at which the point was begun, of `time.perf_counter`.
+    same_mesh
+        Whether the fold is followed only if the point has the mesh of the continuation.
+
+    Returns
+    -------
+    outcome
+        The outcome; None if the fold cannot be followed.
+    work
+        Number of factorisations, of failed attempts too.
+    """
     try:
         scene = folds.scenes.scene_of(link.case)
     except MeshError:
@@ -360,7 +421,24 @@ def _by_fold(
 def _by_path(
     link: Link, columns: Sequence[str], factorisations: int, start: float, *, go_on: bool
 ) -> tuple[Outcome, Continuation | None]:
-    """The outcome of a full path, and the continuation from its fold if there is one."""
+    """Compute the full path of a point of a chain.
+
+    Parameters
+    ----------
+    factorisations
+        Number of factorisations that earlier attempts at the point took.
+    start
+        Time at which the point was begun, of `time.perf_counter`.
+    go_on
+        Whether a continuation from the fold is wanted.
+
+    Returns
+    -------
+    outcome
+        The outcome; a failed one if the case cannot be meshed.
+    continuation
+        Continuation from the fold; None if not wanted or without a fold to follow.
+    """
     try:
         result = run(link.case.problem(), comm=MPI.COMM_SELF)
     except MeshError as e:
@@ -371,11 +449,15 @@ def _by_path(
 
 
 def _continuation_from(parameter: float, result: Result) -> Continuation | None:
-    last = result.rows[result.end]
+    """Return a continuation from the fold at which a run ended, for the parameter's value there.
+
+    None if the run has not ended at the fold of its knockdown, or the fold is not found again.
+    """
+    last_row = result.rows[result.end]
     if (
-        last["label"] != "fold"
-        or last["amplitude"] != "pressure"
-        or last["p_over_pc"] != result.knockdown
+        last_row["label"] != "fold"
+        or last_row["amplitude"] != "pressure"
+        or last_row["p_over_pc"] != result.knockdown
     ):
         return None
     try:
@@ -391,7 +473,14 @@ def with_earlier(
     points: Sequence[SweepPoint],
     make_case: MakeCase,
 ) -> list[SweepPoint]:
-    """The points of the folder's sweep and the new ones among `points`; writes down all.
+    """Return the points of the folder's earlier sweep and the new points; sweep.json gets all.
+
+    Called on rank 0.
+
+    Parameters
+    ----------
+    points
+        The new points, which follow the earlier ones. An equal earlier point is dropped.
 
     Raises
     ------
@@ -400,17 +489,18 @@ def with_earlier(
     """
     keys, base = [list(axis.keys) for axis in axes], _base(source, axes)
     earlier = _earlier(folder, keys, base)
-    requested = [[point.values[axis.keys[0]] for axis in axes] for point in points]
+    new_values = [[point.values[axis.keys[0]] for axis in axes] for point in points]
+    # with all values, so that equal numbers in different units are found
     all_axes = [
-        Axis(axis.keys, tuple(v[i] for v in (*requested, *earlier))) for i, axis in enumerate(axes)
+        Axis(axis.keys, tuple(v[i] for v in (*new_values, *earlier))) for i, axis in enumerate(axes)
     ]
-    places = {_place(values, all_axes) for values in requested}
-    earlier_only = [values for values in earlier if _place(values, all_axes) not in places]
-    if (count := len(earlier_only) + len(requested)) > MOST_POINTS:
+    new_places = {_place(values, all_axes) for values in new_values}
+    earlier_only = [values for values in earlier if _place(values, all_axes) not in new_places]
+    if (count := len(earlier_only) + len(new_values)) > MOST_POINTS:
         raise CaseError(
             f"--out {folder}: {count} points with those there; allowed at most {MOST_POINTS}"
         )
-    write_object(folder / NAME, asdict(Listed(keys, base, [*earlier_only, *requested])))
+    write_object(folder / NAME, asdict(Listed(keys, base, [*earlier_only, *new_values])))
     return [*(make_point(source, axes, values, make_case) for values in earlier_only), *points]
 
 
@@ -422,8 +512,16 @@ def _place(values: Sequence[str], axes: Sequence[Axis]) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Listed:
-    """Content of sweep.json: the swept keys, a hash of the case without them, and the values of all
-    points.
+    """Content of sweep.json.
+
+    Attributes
+    ----------
+    keys
+        The swept keys of each axis.
+    base
+        Hash of the case without the swept keys.
+    points
+        For each point its value on each axis, as text.
     """
 
     keys: list[list[str]]
@@ -432,7 +530,22 @@ class Listed:
 
 
 def _earlier(folder: Path, keys: list[list[str]], base: str) -> list[list[str]]:
-    """The values of the points of the folder's sweep."""
+    """Return the values of the points of the folder's sweep, for each the texts along the axes.
+
+    Empty without a sweep.
+
+    Parameters
+    ----------
+    keys, base
+        Swept keys of each axis, and hash of the case, which the folder's sweep must share.
+
+    Raises
+    ------
+    CaseError
+        If the folder has a sweep over other keys, of another case or of an earlier version.
+    Damaged
+        If sweep.json has no sweep.
+    """
     file = folder / NAME
     if not file.exists():
         if (folder / TABLE).exists() and (folder / TABLE).stat().st_size:
@@ -441,35 +554,37 @@ def _earlier(folder: Path, keys: list[list[str]], base: str) -> list[list[str]]:
             )
         return []
     try:
-        listed = TypeAdapter(Listed).validate_python(read_object(file))
+        stored_sweep = TypeAdapter(Listed).validate_python(read_object(file))
     except ValidationError:
-        listed = None
-    if listed is None or any(len(values) != len(listed.keys) for values in listed.points):
+        stored_sweep = None
+    if stored_sweep is None or any(
+        len(values) != len(stored_sweep.keys) for values in stored_sweep.points
+    ):
         raise Damaged(f"{file}: is damaged: no keys, base and points of a sweep")
-    if listed.keys != keys:
-        keys_text = " and ".join("+".join(axis_keys) for axis_keys in listed.keys)
+    if stored_sweep.keys != keys:
+        keys_text = " and ".join("+".join(axis_keys) for axis_keys in stored_sweep.keys)
         raise CaseError(
             f"--out {folder}: has a sweep over {keys_text}, which is kept; give another folder for "
             "other keys"
         )
-    if listed.base != base:
+    if stored_sweep.base != base:
         raise CaseError(
             f"--out {folder}: has a sweep of another case or other --set, which is kept; give "
             "another folder"
         )
-    return listed.points
+    return stored_sweep.points
 
 
 def _base(source: Source, axes: Sequence[Axis]) -> str:
-    """Hash of the case as it is written, without the swept keys."""
+    """Return a hash of the case as written, without the swept keys."""
     data = copy.deepcopy(source.data)
     for key in (key for axis in axes for key in axis.keys):
-        *sections, last = key.split(".")
-        part = value_at(data, sections)
-        if isinstance(part, dict):
-            part.pop(last, None)
-        elif isinstance(part, list) and last.isdecimal() and int(last) < len(part):
-            part[int(last)] = None
+        *sections, last_word = key.split(".")
+        section = value_at(data, sections)
+        if isinstance(section, dict):
+            section.pop(last_word, None)
+        elif isinstance(section, list) and last_word.isdecimal() and int(last_word) < len(section):
+            section[int(last_word)] = None
     return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
@@ -479,10 +594,15 @@ def _write(
     scalar: Scalar | None,
     folder: Path,
 ) -> None:
-    """Write the tables and the picture.
+    """Write sweep.csv, curves.csv and the picture.
 
     In sweep.csv values with units are columns of numbers too, and so are the results of a case with
     units.
+
+    Parameters
+    ----------
+    scalar
+        The requested number; None without.
     """
     points, outcomes = (
         [point for point, _ in outcomes_of_points],
@@ -536,19 +656,19 @@ def _write(
 
 
 def _numbers(axes: Sequence[Axis], point: SweepPoint) -> dict[str, float]:
-    """Key_unit -> number, of the values with units."""
+    """Return `key_unit` -> number, for the values of a point that have units."""
     swept = [(axis, key) for axis in axes if axis.unit and axis.numbers for key in axis.keys]
     return {f"{key}_{axis.unit}": axis.number(point.values[key]) for axis, key in swept}
 
 
 def _in_units(outcome: Outcome) -> dict[str, Any]:
-    """The columns in units of its limit point, and the numbers of the case."""
+    """Return the columns with units of the limit point, and the numbers of the case with units."""
     units, limit = tuple(f"_{ending}" for ending in endings()), outcome.limit or {}
     return {key: v for key, v in limit.items() if key.endswith(units)} | outcome.in_units
 
 
 def sweep_row(outcome: Outcome) -> Mapping[str, Any]:
-    """The row of sweep.csv for an outcome; missing values are None."""
+    """Return the row of sweep.csv for an outcome, without swept keys; missing values are None."""
     limit = outcome.limit or {}
     names = ("stopped", "found", "factorisations", "dofs", "wall_s", "barrier")
     return {

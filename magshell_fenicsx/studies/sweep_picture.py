@@ -30,13 +30,17 @@ KNOCKDOWN, BARRIER = r"knockdown factor  $k_\mathrm{d}$", r"energy barrier  ($E 
 
 @dataclass(frozen=True)
 class Results:
-    """One number of each point, and what it is.
+    """A number of each point of a sweep, for the picture.
 
     Attributes
     ----------
+    values
+        The number at each point; None where a point lacks it.
+    label
+        Label of the axis.
     size, measured
-        A second scale in the case's units: its factor, and its label; 0 if there is none for all
-        points.
+        Factor and label of a second scale in the case's units; the factor is 0 if the points do not
+        share one.
     """
 
     values: Sequence[float | None]
@@ -52,8 +56,10 @@ def draw_sweep(
     file: Path,
     requested: tuple[str, Sequence[float | None]] | None = None,
 ) -> None:
-    """Draw one line for each combination of the values that are not on the horizontal axis, or a
-    map.
+    """Draw the results of a sweep: a map over two keys, or lines over the last key with numbers.
+
+    Without results it draws the curves of all points. There is one line for each combination of the
+    values that are not on the horizontal axis.
 
     Parameters
     ----------
@@ -71,8 +77,8 @@ def draw_sweep(
         for axis in axes
     ]
     figure, plot = plt.subplots(figsize=(7.2, 4.2), layout="constrained")
-    results, mapped = _results(outcomes, requested), _is_map(axes)
-    if mapped:
+    results, is_map = _results(outcomes, requested), _is_map(axes)
+    if is_map:
         _map(plot, axes, points, results or _ends(outcomes))
     elif results:
         _values(plot, axes, points, results)
@@ -88,27 +94,28 @@ def draw_sweep(
 
 
 def _fixed(axes: Sequence[Axis], points: Sequence[SweepPoint]) -> str:
-    """R/h and Poisson's ratio, where all points have the same."""
-    parts = []
+    """Return R/h and Poisson's ratio as text, if all points have the same."""
+    texts = []
     for symbol, values in (
         ("$R/h$", {round(case_sizes(point.case.shell).R_over_h, 9) for point in points}),
         (r"$\nu$", {point.case.shell.poisson_ratio for point in points}),
     ):
         if len(values) == 1:
-            parts.append(f"{symbol} = {next(iter(values)):.6g}")
-    return ", ".join(parts)
+            texts.append(f"{symbol} = {next(iter(values)):.6g}")
+    return ", ".join(texts)
 
 
 def _is_map(axes: Sequence[Axis]) -> bool:
-    """Whether two numbers are swept, both over enough values."""
+    """Return whether two keys with numbers are swept, both over enough values for a map."""
     return len(axes) == 2 and all(len(set(axis.numbers or ())) >= MAPPED for axis in axes)
 
 
 def _results(
     outcomes: Sequence[Outcome], requested: tuple[str, Sequence[float | None]] | None
 ) -> Results | None:
-    """The result that is asked for; else energy barriers or knockdown factors, with a second scale;
-    None without.
+    """Return the requested result; else energy barriers or knockdown factors; None without any.
+
+    Barriers and knockdowns have a second scale if all points share its units.
     """
     if requested and requested[0] not in ("knockdown", "barrier"):
         return Results(requested[1], requested[0])
@@ -124,27 +131,28 @@ def _results(
 
 
 def _common(outcomes: Sequence[Outcome], name: str) -> float:
-    """A number in units that all points share; 0 if they do not."""
+    """Return a number of the case in units, which all points share; 0 if they do not."""
     sizes = [outcome.in_units.get(name, 0.0) for outcome in outcomes]
     return sizes[0] if np.allclose(sizes, sizes[0], rtol=1e-9, atol=0) else 0.0
 
 
 def _ends(outcomes: Sequence[Outcome]) -> Results:
-    """Return values at the last point of each curve: its load, or its displacement where all loads
-    are the same.
-    """
-    last = [outcome.curve[-1] if outcome.curve else {} for outcome in outcomes]
-    last_row = next((row for row in last if row), {})
+    """Return the last load of each curve; the last displacement if all loads are the same."""
+    last_rows = [outcome.curve[-1] if outcome.curve else {} for outcome in outcomes]
+    last_row = next((row for row in last_rows if row), {})
     x, y = axes_of(str(last_row.get("amplitude", "")) or "force", last_row)
-    drawn_quantity = y if np.ptp([y.on_axis(row) for row in last if y.name in row]) > 0 else x
+    drawn_quantity = y if np.ptp([y.on_axis(row) for row in last_rows if y.name in row]) > 0 else x
     return Results(
-        [drawn_quantity.on_axis(row) if drawn_quantity.name in row else None for row in last],
+        [drawn_quantity.on_axis(row) if drawn_quantity.name in row else None for row in last_rows],
         f"{drawn_quantity.label} at the end",
     )
 
 
 def _map(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results: Results) -> None:
-    """Draw colours and contours over both swept numbers, with crosses where there is no result."""
+    """Draw colours and contours over both swept numbers, with crosses where there is no result.
+
+    A map with few values has cells with their numbers instead of contours.
+    """
     from matplotlib.ticker import MaxNLocator
 
     rows, columns = axes
@@ -156,7 +164,7 @@ def _map(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results:
             x.index(columns.number(point.values[columns.keys[0]])),
         )
         grid[i, j] = np.nan if value is None else value
-    hole = np.isnan(grid)
+    is_missing = np.isnan(grid)
     if min(grid.shape) < SMOOTH:
         filled = plot.pcolormesh(x, y, grid, cmap="viridis", shading="nearest")
         _write_values(plot, x, y, grid)
@@ -172,23 +180,31 @@ def _map(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results:
         (True, {"marker": "x", "color": "0.5"}),
     ):
         plot.plot(
-            *places[hole == is_hidden].T,
+            *places[is_missing == is_hidden].T,
             linestyle="",
             markersize=4,
             clip_on=False,
             zorder=5,
             **style,
         )
-    bar = plot.figure.colorbar(filled, ax=plot, label=results.label)
+    colorbar = plot.figure.colorbar(filled, ax=plot, label=results.label)
     if results.size:
-        second = bar.ax.secondary_yaxis("left", functions=_scales(results.size))
+        second = colorbar.ax.secondary_yaxis("left", functions=_scales(results.size))
         second.set_ylabel(results.measured)
     plot.set(xlabel=_axis_label(columns), ylabel=_axis_label(rows))
     plot.locator_params(axis="x", nbins=6)  # long numbers would touch
 
 
 def _write_values(plot: Any, x: Sequence[float], y: Sequence[float], grid: Any) -> None:
-    """Write the value into each cell of a coarse map, light on dark."""
+    """Write the value into each cell of a coarse map, light on dark; nothing if there is no room.
+
+    Parameters
+    ----------
+    x, y
+        Centres of the cells along both axes.
+    grid
+        (y, x) values; nan where there is none.
+    """
     low, high = np.nanmin(grid), np.nanmax(grid)
     digits = max(0, 2 - int(np.floor(np.log10(max(abs(low), abs(high)) or 1.0))))
     if len(x) > WRITTEN or digits > LONGEST:
@@ -211,7 +227,7 @@ def _write_values(plot: Any, x: Sequence[float], y: Sequence[float], grid: Any) 
 def _values(
     plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results: Results
 ) -> None:
-    """Draw a number of each point over the last numeric axis; points without it are left out."""
+    """Draw a number of each point over the last axis with numbers; missing ones are left out."""
     axis = last_numeric_axis(axes) or axes[-1]
     lines: dict[str, list[tuple[float | str, float]]] = {}
     for point, value in zip(points, results.values, strict=True):
@@ -233,38 +249,43 @@ def _values(
 
 
 def _scales(size: float) -> tuple[Any, Any]:
+    """Return the functions from values to the second scale, and back."""
     return lambda v: v * size, lambda v: v / size
 
 
 def _axis_label(axis: Axis) -> str:
-    *tied, last = axis.keys
-    return " = ".join([*(key_words(key, axis.unit) for key in tied), key_label(last, axis.unit)])
+    """Return the label of an axis, with all its tied keys."""
+    *tied_keys, last_key = axis.keys
+    return " = ".join(
+        [*(key_words(key, axis.unit) for key in tied_keys), key_label(last_key, axis.unit)]
+    )
 
 
 def _curves(plot: "Axes", points: Sequence[SweepPoint], outcomes: Sequence[Outcome]) -> None:
-    """Draw the last varied load over its displacement, for every point."""
+    """Draw the last varied load over its displacement, a curve for every point of the sweep."""
     amplitude = next((str(o.curve[-1]["amplitude"]) for o in outcomes if len(o.curve) > 1), "force")
     x, y = axes_of(amplitude, next((o.curve[-1] for o in outcomes if o.curve), ()))
     for point, outcome, style in zip(points, outcomes, cycle(STYLES), strict=False):
-        part = loaded(outcome.curve, amplitude)
-        places = ([quantity.on_axis(row) for row in part] for quantity in (x, y))
+        rows = loaded(outcome.curve, amplitude)
+        places = ([quantity.on_axis(row) for row in rows] for quantity in (x, y))
         plot.plot(*places, style, marker=".", label=_label(point, None))
     plot.axhline(0, color="0.8", linewidth=0.8, zorder=0)
     plot.set(xlabel=x.label, ylabel=y.label)
 
 
 def loaded(curve: Sequence["Row"], amplitude: str) -> list["Row"]:
-    """The part of a curve in which an amplitude varied, and the point before it.
+    """Return the part of a curve in which an amplitude varied, and the point before the part.
 
     Branches are left out, and so are instabilities of excluded modes, whose rows are not in the
     order of the path.
     """
     first = next((i for i, row in enumerate(curve) if row["amplitude"] == amplitude), len(curve))
-    part = curve[max(first - 1, 0) :] if first < len(curve) else []
-    return [row for row in part if row["mode"] in OWN_MODES and not row["branch"]]
+    rows = curve[max(first - 1, 0) :] if first < len(curve) else []
+    return [row for row in rows if row["mode"] in OWN_MODES and not row["branch"]]
 
 
 def _label(point: SweepPoint, without: Axis | None) -> str:
+    """Return the values of a point as text, without those of an axis."""
     hidden_keys = without.keys if without else ()
     return ", ".join(
         f"{key_symbol(key)}{value}" for key, value in point.values.items() if key not in hidden_keys

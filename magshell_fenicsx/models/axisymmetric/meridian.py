@@ -1,6 +1,4 @@
-"""The meridian of a surface of revolution: an interval mesh and, apart from it, the placement
-r0.
-"""
+"""The meridian of a surface of revolution: an interval mesh and, separately, the placement r0."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -43,7 +41,7 @@ class Meridian:
     curvature
         See `shape.meridian_chart.MeridianChart`.
     patches
-        Name of each of several shells -> which cells; none of one.
+        Name of each of several shells -> flags (cells,) of the cells in it; empty for one shell.
     tied
         Pairs of parameters that joints tie, see `shape.meridian_chart.MeridianChart`.
     """
@@ -87,38 +85,39 @@ class Meridian:
         return float(self._parameters_of(self.ends[end])[0])
 
     def begins(self, end: str) -> bool:
-        """Return whether the parameter grows from an end."""
+        """Return whether the parameter grows from an end into the surface."""
         return bool(np.isclose(self._cell_ends.min(axis=1), self.parameter(end)).any())
 
     def facets_at(self, point: str) -> NDArray[np.int32]:
-        """Return the facet on the axis at a named place, or next to it."""
+        """Return the facet on the axis that is nearest to a named place; empty without an axis."""
         distances = np.abs(self._parameters_of(self.axis) - self.points[point][0])
         return np.asarray(self.axis[distances == distances.min(initial=inf)][:1])
 
     @property
     def bodies(self) -> list[NDArray[np.bool_]]:
-        """Cells (as flags) of each shell, or of those that joints connect."""
+        """Flags (cells,) of each connected body: a shell, or several that joints connect."""
         bodies = [*self.patches.values()] or [np.ones(len(self._cell_ends), dtype=bool)]
         for tied_parameters in self.tied:
             begin = self._cell_ends[:, :1] - PARAMETER_TOLERANCE
             end = self._cell_ends[:, 1:] + PARAMETER_TOLERANCE
             touched_cells = ((begin < tied_parameters) & (tied_parameters < end)).any(axis=1)
             connected = [body for body in bodies if (body & touched_cells).any()]
-            others = [body for body in bodies if not (body & touched_cells).any()]
-            bodies = [*others, np.any(connected, axis=0)]
+            unconnected = [body for body in bodies if not (body & touched_cells).any()]
+            bodies = [*unconnected, np.any(connected, axis=0)]
         return bodies
 
     @property
     def joints(self) -> list[Array | None]:
-        """Marks (cells,) of each joint: 1 in the cell that ends there, -1 in that which begins,
-        else 0; None for a T-junction.
+        """For each joint, marks (cells,); None for a T-junction.
+
+        A mark is 1 in the cell that ends at the joint, -1 in the cell that begins there, else 0.
         """
         end_matches = [
             np.abs(self._cell_ends - first) < PARAMETER_TOLERANCE for first, _ in self.tied
         ]
         return [
-            1.0 * match[:, 1] - 1.0 * match[:, 0] if first == second else None
-            for match, (first, second) in zip(end_matches, self.tied, strict=True)
+            1.0 * ends_at_joint[:, 1] - 1.0 * ends_at_joint[:, 0] if first == second else None
+            for ends_at_joint, (first, second) in zip(end_matches, self.tied, strict=True)
         ]
 
     @property
@@ -127,7 +126,7 @@ class Meridian:
         return np.sort(self.mesh.geometry.x[compat.geometry_dofs(self.mesh), 0], axis=1)
 
     def _parameters_of(self, facets: NDArray[np.int32]) -> Array:
-        """Return the parameters of facets; dolfinx takes at least one."""
+        """Return the parameters (n,) of facets; dolfinx itself refuses an empty array."""
         if not len(facets):
             return np.empty(0)
         return np.asarray(
@@ -135,22 +134,29 @@ class Meridian:
         )
 
     def section(self, s: Array) -> Array:
-        """Return rho and z (n, 2) at some parameters."""
+        """Return rho and z (n, 2) over R at parameters s (n,)."""
         return np.asarray(self.embedding(np.column_stack([s, 0 * s]))[:, [0, 2]])
 
     def placement(self, V: fem.FunctionSpace) -> fem.Function:
-        """Return (rho, z) in the Lagrange space `V` of two components: axial motions are exact."""
+        """Return (rho, z) over R in the Lagrange space `V` of two components.
+
+        The placement is interpolated, so that axial motions are exact.
+        """
         s = V.tabulate_dof_coordinates()[:, 0]
         r0 = fem.Function(V, name="r0")
         r0.x.array[:] = self.section(s).ravel()
         return r0
 
     def largest_fold(self, r0: fem.Function) -> float:
-        """Return the largest angle (rad) between the undeformed normals at a joint of two edges."""
+        """Return the largest angle (rad) between the undeformed normals at a joint of two edges.
+
+        T-junctions do not count. The placement `r0` is that of the model.
+        """
         nodes, normals, angles = r0.function_space.dofmap.list, positions_and_normals(r0)[1], [0.0]
         for marks in self.joints:
             if marks is not None:
                 cells = [int(marks.argmax()), int(marks.argmin())]
+                # the node that both cells at the joint share, by its number in each
                 (i,), (j,) = np.nonzero(np.equal.outer(*nodes[cells]))
                 n, m = normals[cells, [i, j]]
                 angles.append(float(np.arctan2(np.linalg.norm(np.cross(n, m)), n @ m)))
@@ -176,28 +182,38 @@ def make_meridian(
     supported_ends: Collection[str] = (),
     tied: Sequence[tuple[float, float]] = (),
 ) -> Meridian:
-    """Mesh the meridian.
+    """Mesh a meridian.
 
     Parameters
     ----------
+    embedding
+        Chart (n, 2) -> surface (n, 3), of revolution about e3.
     vertices
-        (n,) ascending from 0.
+        (n,) parameters of the vertices, ascending from 0.
     names
-        Names of the ends, None for the axis.
+        Names of the ends along the meridian, None for the axis.
     points
-        See `Meridian`; by default "pole", at the parameter 0; of several shells the highest place,
-        and where that is held the highest on the axis.
+        See `Meridian`. By default there is "pole", at the parameter 0. Of several shells it is the
+        highest place or, where this is supported, the highest free one on the axis.
+    curvature
+        See `Meridian`.
     shell_intervals
-        Name and ends of each of several shells, between which are no cells.
+        Name and ends of each of several shells, between which there are no cells.
     supported_ends
-        Ends that supports hold.
+        Names of the ends that supports hold.
     tied
         See `Meridian`.
     """
     numbers = np.arange(len(vertices), dtype=np.int64)
-    parts = [ends for _, ends in shell_intervals] or [(float(vertices[0]), float(vertices[-1]))]
-    first = np.searchsorted([begin for begin, _ in parts], vertices[:-1] + PARAMETER_TOLERANCE)
-    is_cell = vertices[:-1] < np.array([end for _, end in parts])[first - 1] - PARAMETER_TOLERANCE
+    intervals = [ends for _, ends in shell_intervals] or [(float(vertices[0]), float(vertices[-1]))]
+    # a cell counts if it lies within the last interval that begins before it
+    interval_of_cell = np.searchsorted(
+        [begin for begin, _ in intervals], vertices[:-1] + PARAMETER_TOLERANCE
+    )
+    is_cell = (
+        vertices[:-1]
+        < np.array([end for _, end in intervals])[interval_of_cell - 1] - PARAMETER_TOLERANCE
+    )
     element = basix.ufl.element("Lagrange", "interval", 1, shape=(1,))
     domain = mesh.create_mesh(
         MPI.COMM_SELF,
@@ -210,7 +226,7 @@ def make_meridian(
         mesh.locate_entities_boundary(
             domain, 0, lambda x, end=end: np.abs(x[0] - end) < PARAMETER_TOLERANCE
         )
-        for ends in parts
+        for ends in intervals
         for end in ends
     ]
     poles = [facet for name, facet in zip(names, facets, strict=True) if not name]
@@ -219,7 +235,7 @@ def make_meridian(
     if points is None or (shell_intervals and "pole" not in points):
         supported = [
             float(end)
-            for name, end in zip(names, np.ravel(parts), strict=True)
+            for name, end in zip(names, np.ravel(intervals), strict=True)
             if name in supported_ends
         ]
         s = _highest_parameter(embedding, vertices, supported) if shell_intervals else 0.0
@@ -230,8 +246,10 @@ def make_meridian(
 
 
 def _highest_parameter(embedding: Embedding, vertices: Array, supported: Sequence[float]) -> float:
-    """Return the parameter of the highest vertex; if that is supported, of the highest free one, on
-    the axis if there is one.
+    """Return the parameter of the highest vertex.
+
+    If it is one of the `supported` parameters, return that of the highest free vertex, on the axis
+    if one is free there.
     """
     positions = embedding(np.column_stack([vertices, 0 * vertices]))
     distances = np.abs(np.subtract.outer(vertices, supported)).min(axis=1, initial=inf)
@@ -255,20 +273,24 @@ def graded_vertices(
     contact_size: tuple[float, float] | None = None,
     everywhere: float | None = None,
 ) -> Array:
-    """Return the vertices (n,) of a meridian: cells of a fraction of sqrt(h), finer on the axis, if
-    0 is there.
+    """Return the vertices (n,) of a meridian, with cells of a fraction of sqrt(h).
 
-    At degree 4 they give k_d to 1e-7.
+    They are finer on the axis, if the surface has a point there. At degree 4 such cells give k_d to
+    1e-7.
 
     Parameters
     ----------
     end
         Value of the parameter at the outer edge.
     circles
-        Parameters where the curvature jumps, and rims of dimples: a vertex is put there, one for
-        those that nearly meet.
+        Parameters where the curvature jumps, and rims of dimples. A vertex is put at each; those
+        that nearly coincide share one.
     h
         Thickness over R, or the smaller size of the cells on the axis.
+    refinement
+        Factor by which all cells are smaller, but for those on the axis.
+    axis
+        Whether the surface has a point on the axis.
     largest
         Largest size of the cells, whatever the thickness.
     contact_size
@@ -290,6 +312,7 @@ def graded_vertices(
     largest = min(0.2 * sqrt(h), largest) / refinement
 
     def size(s: Array) -> Array:
+        """Return the wanted size of cells at parameters s (n,)."""
         if everywhere is not None:
             return np.full_like(s, everywhere / refinement)
         sizes = np.minimum(smallest + growth * s, largest) if axis else np.full_like(s, largest)
@@ -305,24 +328,31 @@ def graded_vertices(
 
 
 def _equidistributed(corners: Sequence[float], size: Callable[[Array], Array]) -> Array:
-    """Vertices at the corners and, between them, with cells proportional to the size that is asked
-    for.
+    """Return vertices (n,) at the corners and between them, with cells in proportion to a size.
+
+    `size` maps parameters (n,) to the wanted sizes of cells there.
+
+    Raises
+    ------
+    MeshError
+        If there would be more than `MAX_CELLS` between two corners.
     """
     segments = []
     for a, b in pairwise(corners):
         s = np.linspace(a, b, 20001)
         with np.errstate(over="ignore", divide="ignore"):
-            cell_numbers = np.concatenate(
+            # the number of cells up to s is the integral of 1/size
+            cells_before = np.concatenate(
                 [[0.0], np.cumsum(np.diff(s) / size((s[:-1] + s[1:]) / 2))]
             )
-        if not cell_numbers[-1] < MAX_CELLS:
+        if not cells_before[-1] < MAX_CELLS:
             raise MeshError(
-                f"mesh: the meridian would have {cell_numbers[-1]:.2g} cells, allowed "
+                f"mesh: the meridian would have {cells_before[-1]:.2g} cells, allowed "
                 f"{MAX_CELLS:g}: take a larger "
                 "mesh.size, a lower mesh.refinement, or larger bodies"
             )
-        cells = int(np.ceil(cell_numbers[-1]))
-        segment = np.interp(np.linspace(0, cell_numbers[-1], cells + 1), cell_numbers, s)
+        cells = int(np.ceil(cells_before[-1]))
+        segment = np.interp(np.linspace(0, cells_before[-1], cells + 1), cells_before, s)
         segment[[0, -1]] = a, b
         segments.append(segment[:-1])
     return np.concatenate([*segments, corners[-1:]])

@@ -1,5 +1,6 @@
-"""The second variation of an axisymmetric shell along waves, from the densities' Hessians at points
-of the meridian.
+"""The second variation of an axisymmetric shell along waves.
+
+It is computed from the densities' Hessians at points of the meridian.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -34,14 +35,18 @@ _UPPER = tuple(
 
 
 class WaveHessians:
-    """The matrices of Q_m, without what is held.
+    """The matrices of the second variations Q_m along waves m, without supports.
 
     Parameters
     ----------
+    domain
+        The meridian with its placement.
     u
         The axisymmetric displacement.
     energies
         Energies that are not linear in the displacement.
+    log
+        Log of compiled kernels.
 
     Attributes
     ----------
@@ -68,32 +73,58 @@ class WaveHessians:
         ]
         nodes = [batch.nodes(self._nodes) for batch in self._batches]
         count = int(self._nodes.max()) + 1
-        pairs = [rows * count + columns for rows, columns in nodes]
+        # a pair of nodes as one number, rows * count + columns
+        pairs_of_batches = [rows * count + columns for rows, columns in nodes]
         upper_numbers = [
-            number[rows <= columns] for number, (rows, columns) in zip(pairs, nodes, strict=True)
+            pair_numbers[rows <= columns]
+            for pair_numbers, (rows, columns) in zip(pairs_of_batches, nodes, strict=True)
         ]
-        numbers = np.unique(np.concatenate(upper_numbers))
-        self.rows, self.columns = numbers // count, numbers % count
+        all_pair_numbers = np.unique(np.concatenate(upper_numbers))
+        self.rows, self.columns = all_pair_numbers // count, all_pair_numbers % count
         self._sums = [
-            _sum_of_blocks(np.searchsorted(numbers, number), rows <= columns, len(numbers))
-            for number, (rows, columns) in zip(pairs, nodes, strict=True)
+            _sum_of_blocks(
+                np.searchsorted(all_pair_numbers, pair_numbers),
+                rows <= columns,
+                len(all_pair_numbers),
+            )
+            for pair_numbers, (rows, columns) in zip(pairs_of_batches, nodes, strict=True)
         ]
 
     def entries(self, factors: Mapping[str | None, float], waves: Sequence[float]) -> Array:
-        """Return the entries (waves, pairs, 3, 3) at the present u; `factors` are those of the
-        energies' amplitudes.
+        """Return the entries (waves, pairs, 3, 3) of the matrices at the present u.
+
+        Parameters
+        ----------
+        factors
+            Amplitude of energies, or None for energies without one -> its value.
+        waves
+            Numbers m of circumferential waves.
         """
         total = np.zeros((len(waves), 9 * len(self.rows)))
         for batch, sums in zip(self._batches, self._sums, strict=True):
             if (blocks := batch.blocks(factors, waves)) is not None:
-                for entries, of_wave in zip(total, blocks, strict=True):
-                    entries += sums @ of_wave.ravel()
+                for entries, wave_blocks in zip(total, blocks, strict=True):
+                    entries += sums @ wave_blocks.ravel()
         return total.reshape(len(waves), -1, 3, 3)
 
 
 class _WaveBatch:
-    """Second variation of energies at the points of one batch: of the cells, of the vertices
-    between them, or of an end.
+    """Second variation of energies at the points of one batch of entities.
+
+    The entities are the cells, the vertices between them, or an end.
+
+    Parameters
+    ----------
+    domain
+        The meridian with its placement.
+    u
+        The axisymmetric displacement.
+    batch
+        The entities, with their points and geometry.
+    energies
+        Energies that are all integrated there.
+    log
+        Log of compiled kernels.
     """
 
     def __init__(
@@ -115,10 +146,10 @@ class _WaveBatch:
         self._geometry = points.field(2 * sides)
         fill(self._geometry, batch.geometry)
         if domain.initial_placement is None:
-            fixed = [domain.r0]
+            placements = [domain.r0]
         else:
-            fixed = [domain.r0, domain.initial_placement]
-        self._placed = Memo(self._place, lambda: tuple(field.x.array for field in fixed))
+            placements = [domain.r0, domain.initial_placement]
+        self._placed = Memo(self._place, lambda: tuple(field.x.array for field in placements))
         self._m = fem.Constant(points._mesh, 1.0)
         self._given = [
             parameters_at(points, e.density.parameters, sides) for e in energies if e.density
@@ -129,47 +160,64 @@ class _WaveBatch:
         ]
 
     def nodes(self, nodes: Ints) -> tuple[Ints, Ints]:
-        """Return the nodes of the rows and of the columns of each entity's matrix, both (entities,
-        functions, functions).
+        """Return the nodes of the rows and of the columns of each entity's matrix.
+
+        Both are (entities, functions, functions), with the functions of all cells at the entity.
+        `nodes` (cells, functions) are those of the cells.
         """
-        of_entities = np.hstack([nodes[cells] for cells in self._batch.cells])
-        rows, columns = np.broadcast_arrays(of_entities[:, :, None], of_entities[:, None])
+        entity_nodes = np.hstack([nodes[cells] for cells in self._batch.cells])
+        rows, columns = np.broadcast_arrays(entity_nodes[:, :, None], entity_nodes[:, None])
         return rows, columns
 
     def blocks(self, factors: Mapping[str | None, float], waves: Sequence[float]) -> Array | None:
-        """Return the matrices (waves, entities, pairs of components, pairs of functions), see
-        `_UPPER`; None if no energy acts.
+        """Return the matrices of the entities for each wave; None if no energy acts.
+
+        They are (waves, entities, pairs of components, pairs of functions), with the pairs of
+        components in `_UPPER`. `factors` and `waves` are as in `WaveHessians.entries`.
         """
-        present = [number for number, e in enumerate(self._energies) if factors[e.amplitude]]
-        if not present:
+        active_energies = [
+            number for number, e in enumerate(self._energies) if factors[e.amplitude]
+        ]
+        if not active_energies:
             return None
         fill(self._at_u, self._derivatives(self._u))
         self._placed.renew()
-        for number in present:
+        for number in active_energies:
             for target, values in self._varying[number]:
                 fill(target, values.renew()[0])
+        # upper triangles of the Hessians by the wave's jets; pi is the integral of cos² around e3
         upper = np.zeros((len(waves), *self._scales.shape))
         for wave_index, m in enumerate(waves):
             self._m.value = m
-            for number in present:
+            for number in active_energies:
                 factor = np.pi * factors[self._energies[number].amplitude]
                 upper[wave_index] += factor * self._points.evaluate(
                     self._kernels[number], self._batch.size
                 )
         upper = (upper * self._scales).reshape(len(waves), len(self._batch.cells[0]), -1)
-        stiff = upper.any(axis=(0, 2))  # a body touches few cells: the matrices of others are zero
+        has_stiffness = upper.any(
+            axis=(0, 2)
+        )  # a body touches few cells: the matrices of others are zero
         blocks = np.zeros((*upper.shape[:2], len(_UPPER), self._products.shape[1]))
-        ordered = upper[:, stiff][..., self._order].reshape(-1, len(self._products))
-        blocks[:, stiff] = (ordered @ self._products).reshape(len(waves), -1, *blocks.shape[2:])
+        ordered = upper[:, has_stiffness][..., self._order].reshape(-1, len(self._products))
+        blocks[:, has_stiffness] = (ordered @ self._products).reshape(
+            len(waves), -1, *blocks.shape[2:]
+        )
         return blocks
 
     def _place(self) -> None:
+        """Fill in the jets of the placement and of the initial placement."""
         fill(self._at_r0, self._derivatives(self._domain.r0))
         if self._domain.initial_placement is not None:
             fill(self._at_initial, self._derivatives(self._domain.initial_placement))
 
     @cached_property
     def _kernels(self) -> list[PointKernel]:
+        """A kernel for each energy: the Hessian by the jets of a wave's coefficients, at no wave.
+
+        The wave's cosine and sine parts of the jets are two displacements that add up. Each adds
+        its second variation.
+        """
         waves = [self._of_sides(self._wave, WAVE, side) for side in self._sides]
         jets_of_waves = [wave_jets_of(side_jets, self._m) for side_jets in waves]
         u, r0, initial_jets = (
@@ -177,9 +225,9 @@ class _WaveBatch:
             for field in (self._at_u, self._at_r0, self._at_initial)
         )
         kernels = []
-        for e, (parameters, _) in zip(self._energies, self._given, strict=True):
-            assert e.density
-            if self._counts_from_initial(e):
+        for energy, (parameters, _) in zip(self._energies, self._given, strict=True):
+            assert energy.density
+            if self._counts_from_initial(energy):
                 start, shift = (
                     initial_jets,
                     [a - b for a, b in zip(r0, initial_jets, strict=True)],
@@ -188,20 +236,21 @@ class _WaveBatch:
                 start, shift = (r0, None)
             displacements = [a + b for a, b in zip(u, shift, strict=True)] if shift else u
             W = ufl.zero()
-            for part in range(2):  # the cosine's and the sine's
-                v = [side_jets[part] for side_jets in jets_of_waves]
+            for phase in range(2):  # the cosine's and the sine's
+                wave_jets = [side_jets[phase] for side_jets in jets_of_waves]
                 W = W + _perturbed_density(
-                    e.density, start, displacements, v, self._edge(r0), parameters
+                    energy.density, start, displacements, wave_jets, self._edge(r0), parameters
                 )
-            kernels.append(full_hessian(f"{e.name} waves", W, self._wave, self._log))
+            kernels.append(full_hessian(f"{energy.name} waves", W, self._wave, self._log))
         return kernels
 
     def _counts_from_initial(self, e: Energy) -> bool:
         return e.from_initial and self._domain.initial_placement is not None
 
     def _edge(self, r0: Sequence[Jet]) -> tuple[list[Expr], Expr] | None:
-        """Return the covector on every side and the width, as an `IntegrationDomain` has them; None
-        in cells.
+        """Return the covector on every side and the width of an edge; None in cells.
+
+        They are those of an `IntegrationDomain`; `r0` has the placement's jet on every side.
         """
         density = self._energies[0].density
         if density is None or not density.on_edges:
@@ -214,6 +263,7 @@ class _WaveBatch:
         return covectors, sum(widths, ufl.zero()) / len(widths)
 
     def _of_sides(self, field: fem.Function, components: int, side: int) -> list[list[Expr]]:
+        """Return value and two derivatives of a field's components on one side of an entity."""
         first = components * DERIVATIVES * side
         return [
             [field[first + components * d + c] for c in range(components)]
@@ -221,8 +271,9 @@ class _WaveBatch:
         ]
 
     def _derivatives(self, field: fem.Function) -> Array:
-        """Return values and derivatives (points, sides, derivatives, components) of an axisymmetric
-        field.
+        """Return values and derivatives of an axisymmetric field at the points.
+
+        They are (points, sides, derivatives, components), by the coordinate of the meridian.
         """
         nodal = field.x.array.reshape(-1, PLANE)[self._u.function_space.dofmap.list]
         sides = [
@@ -238,16 +289,19 @@ class _WaveBatch:
 
     @cached_property
     def _reference(self) -> list[Array]:
-        """Shape functions (points of an entity, derivatives, functions) in the reference cell, on
-        each side.
+        """Shape functions in the reference cell, on each side.
+
+        They are (points of an entity, derivatives, functions).
         """
         element = self._u.function_space.element.basix_element
         return [element.tabulate(2, X)[..., 0].transpose(1, 0, 2) for X in self._batch.rule.points]
 
     @cached_property
     def _by_length(self) -> list[Array]:
-        """Factors (entities, derivatives) from derivatives in the reference cell to those by the
-        meridian's coordinate, on each side.
+        """Factors (entities, derivatives) of derivatives by the coordinate, on each side.
+
+        They multiply the derivatives in the reference cell and give those by the meridian's
+        coordinate.
         """
         lengths = _lengths(self._u.function_space)
         return [
@@ -256,27 +310,30 @@ class _WaveBatch:
 
     @cached_property
     def _products(self) -> Array:
-        """Products of shape functions (points of an entity and pairs of derivatives, pairs of
-        functions), with the functions of all sides.
+        """Products of two shape functions' derivatives, with the functions of all sides.
+
+        They are (points of an entity and pairs of derivatives, pairs of functions). A row of
+        Hessians times them gives a matrix of an entity.
         """
         points_per_entity, derivatives, functions = self._reference[0].shape
         count = len(self._sides)
-        of_sides = np.zeros((points_per_entity, count, derivatives, count, functions))
+        tables = np.zeros((points_per_entity, count, derivatives, count, functions))
         for side, table in enumerate(self._reference):
-            of_sides[:, side, :, side] = table
-        jets = of_sides.reshape(points_per_entity, count * derivatives, count * functions)
+            tables[:, side, :, side] = table
+        tables_of_all_sides = tables.reshape(
+            points_per_entity, count * derivatives, count * functions
+        )
         return np.asarray(
-            np.einsum("qin,qjm->qijnm", jets, jets).reshape(
-                points_per_entity * jets.shape[1] ** 2, -1
+            np.einsum("qin,qjm->qijnm", tables_of_all_sides, tables_of_all_sides).reshape(
+                points_per_entity * tables_of_all_sides.shape[1] ** 2, -1
             )
         )
 
     @cached_property
     def _order(self) -> Ints:
-        """Positions (pairs of components, points of an entity and pairs of derivatives) in the rows
-        of its Hessians.
+        """Positions in a row of an entity's Hessians that go with the rows of `_products`.
 
-        These pairs are those of `_UPPER`.
+        They are (pairs of components in `_UPPER`, points of an entity and pairs of derivatives).
         """
         derivatives = DERIVATIVES * len(self._sides)
         triangle = _triangle(WAVE * derivatives).reshape(derivatives, WAVE, derivatives, WAVE)
@@ -285,17 +342,18 @@ class _WaveBatch:
 
     @cached_property
     def _scales(self) -> Array:
-        """Weights (points, entries of the Hessians) of the integral, times the factors of
-        derivatives; the quadrature's weight is one at a vertex.
+        """Weights (points, entries of the Hessians) of the integral, times factors of derivatives.
+
+        The quadrature's weight is one at a vertex.
         """
         cells = self._batch.cells[0]
         weights = self._batch.rule.weights
         density = self._energies[0].density
         lengths = np.abs(_lengths(self._u.function_space)[cells])
         sizes = np.ones(len(cells)) if density and density.on_edges else lengths
-        of_jets = np.repeat(np.hstack(self._by_length), WAVE, axis=1)
-        rows, columns = np.triu_indices(of_jets.shape[1])
-        by_length = np.repeat(of_jets[:, rows] * of_jets[:, columns], len(weights), axis=0)
+        jet_factors = np.repeat(np.hstack(self._by_length), WAVE, axis=1)
+        rows, columns = np.triu_indices(jet_factors.shape[1])
+        by_length = np.repeat(jet_factors[:, rows] * jet_factors[:, columns], len(weights), axis=0)
         return np.asarray(np.outer(sizes, weights).reshape(-1, 1) * by_length)
 
 
@@ -307,8 +365,10 @@ def _perturbed_density(
     edge: tuple[Sequence[Expr], Expr] | None,
     parameters: Sequence[fem.Constant | fem.Function],
 ) -> Expr:
-    """Return a density whose Hessian in v, at v = 0, is that of the energy at u + v; see
-    `Energy.perturbed_form`.
+    """Return a density whose Hessian in v, at v = 0, is that of the energy at u + v.
+
+    Of a virtual work it is the symmetric part, as in `Energy.perturbed_form`. All jets are given on
+    every side; `edge` has the covectors and the width, or is None in cells.
     """
     u_plus_v = [a + b for a, b in zip(u, v, strict=True)]
     if density.work is None:
@@ -321,13 +381,14 @@ def _perturbed_density(
 
 
 def _sum_of_blocks(numbers: Ints, in_triangle: NDArray[np.bool_], count: int) -> csr_array:
-    """Return the sparse matrix (entries of all pairs of nodes, entries of a batch's blocks) that
-    adds up the blocks.
+    """Return the sparse matrix that adds up a batch's blocks into entries of pairs of nodes.
+
+    Its rows are the entries of all pairs, its columns those of the blocks.
 
     Parameters
     ----------
     numbers
-        (entities, functions, functions) of the pairs of nodes.
+        (entities, functions, functions) numbers of the pairs of nodes.
     in_triangle
         (entities, functions, functions) whether a pair is in the triangle that is assembled.
     count
@@ -340,6 +401,7 @@ def _sum_of_blocks(numbers: Ints, in_triangle: NDArray[np.bool_], count: int) ->
     for k, (c, d) in enumerate(_UPPER):
         rows.append(9 * numbers[in_triangle] + WAVE * c + d)
         columns.append(entries[:, k][in_triangle])
+        # the transposed pair of components follows by symmetry
         if c < d:
             rows.append(9 * numbers[in_triangle] + WAVE * d + c)
             columns.append(entries[:, k].transpose(0, 2, 1)[in_triangle])
@@ -348,8 +410,9 @@ def _sum_of_blocks(numbers: Ints, in_triangle: NDArray[np.bool_], count: int) ->
 
 
 def _support_of(e: Energy) -> tuple[int, int, tuple[int, ...]]:
-    """Return a key of the cells, vertices or end of a density; energies with the same key share
-    their points.
+    """Return a key of where an energy is integrated: sides, quadrature and facets.
+
+    Energies with the same key share their points.
     """
     assert e.density
     facets = () if e.density.facets is None else tuple(int(facet) for facet in e.density.facets)
@@ -357,8 +420,10 @@ def _support_of(e: Energy) -> tuple[int, int, tuple[int, ...]]:
 
 
 def _batches(domain: IntegrationDomain, density: Density | None) -> Iterable[EntityBatch]:
-    """Return the batches of points of a density; the geometry is the covector and the length of the
-    cell, by sides.
+    """Yield the batches of points of a density: cells, inner vertices, or ends.
+
+    The geometry (points, 2 for each side) is the covector and the length of the cell. Vertices are
+    grouped by their local numbers in the cells beside them.
     """
     V = domain.r0.function_space
     topology, lengths = V.mesh.topology, _lengths(V)
@@ -373,40 +438,41 @@ def _batches(domain: IntegrationDomain, density: Density | None) -> Iterable[Ent
         )
         return
     topology.create_connectivity(0, 1)
-    links, corners = topology.connectivity(0, 1), topology.connectivity(1, 0).array.reshape(-1, 2)
-    vertices: NDArray[np.integer] = np.flatnonzero(np.diff(links.offsets) == 2)
+    cells_of_vertices, vertices_of_cells = (
+        topology.connectivity(0, 1),
+        topology.connectivity(1, 0).array.reshape(-1, 2),
+    )
+    vertices: NDArray[np.integer] = np.flatnonzero(np.diff(cells_of_vertices.offsets) == 2)
     if density.facets is not None:
         vertices = density.facets
     cells_at_vertex = np.array(
-        [links.links(vertex) for vertex in vertices], dtype=np.int32
+        [cells_of_vertices.links(vertex) for vertex in vertices], dtype=np.int32
     ).reshape(len(vertices), -1)
-    local = (corners[cells_at_vertex] != np.asarray(vertices)[:, None, None]).argmin(
-        axis=2
-    )  # the vertex's number in each cell
-    for kind in np.unique(local, axis=0):
-        of_kind = (local == kind).all(axis=1)
-        cells = tuple(np.ascontiguousarray(side) for side in cells_at_vertex[of_kind].T)
+    local_vertices = (
+        vertices_of_cells[cells_at_vertex] != np.asarray(vertices)[:, None, None]
+    ).argmin(axis=2)  # the vertex's number in each cell
+    for local_numbers in np.unique(local_vertices, axis=0):
+        is_of_kind = (local_vertices == local_numbers).all(axis=1)
+        cells = tuple(np.ascontiguousarray(side) for side in cells_at_vertex[is_of_kind].T)
         outward = [
             np.sign(lengths[side]) * (1 if end else -1)
-            for side, end in zip(cells, kind, strict=True)
+            for side, end in zip(cells, local_numbers, strict=True)
         ]
         geometry = [
             np.column_stack([m, abs(lengths[side])]) for m, side in zip(outward, cells, strict=True)
         ]
-        rule = EntityRule(tuple(np.array([[float(end)]]) for end in kind), (), np.ones(1))
+        rule = EntityRule(tuple(np.array([[float(end)]]) for end in local_numbers), (), np.ones(1))
         yield EntityBatch(cells, rule, np.hstack(geometry))
 
 
 def _lengths(V: fem.FunctionSpace) -> Array:
-    """Return the coordinate's change (cells,) from the first to the second vertex."""
+    """Return the change (cells,) of the coordinate from the first to the second vertex."""
     ends = V.mesh.geometry.x[compat.geometry_dofs(V.mesh), 0]
     return np.asarray(ends[:, 1] - ends[:, 0])
 
 
 def _triangle(size: int) -> Ints:
-    """Return the positions (size, size) of a symmetric matrix's entries in the rows of its upper
-    triangle.
-    """
+    """Return positions (size, size) of a symmetric matrix's entries in its upper triangle."""
     positions = np.zeros((size, size), dtype=np.int64)
     rows, columns = np.triu_indices(size)
     positions[rows, columns] = positions[columns, rows] = np.arange(len(rows))

@@ -1,10 +1,9 @@
-"""Adaptive sampling: parts of cells in which formulas have values that samples do not show, however
-small these parts are.
+"""Adaptive sampling: find parts of cells where samples miss values of formulas, however small.
 
 The ranges of a formula and of its derivatives in a box (`input/enclosure.py`) are compared with
-values at a few places. A part is divided while what the ranges leave open between these may change
-the integral of the formula's variation. So a step or a Gaussian of any width is found, at a cost
-that grows like the logarithm of one over the width.
+values at a few places. A part is divided while the difference of both may change the integral of
+the formula's variation. So a step or a Gaussian of any width is found, at a cost that grows like
+the logarithm of one over the width.
 """
 
 from collections.abc import Callable, Sequence
@@ -44,7 +43,15 @@ CHILDREN: dict[int, list[tuple[tuple[float, ...], tuple[float, ...]]]] = {
 
 @dataclass(frozen=True)
 class SubCells:
-    """Parts of cells: images X = corner + sides * X' of the reference cell, each in a cell."""
+    """Parts of cells: images X = corner + sides * X' of the reference cell, each in a cell.
+
+    Attributes
+    ----------
+    cell
+        (parts,) number of the cell of each part.
+    corner, sides
+        (parts, d) place and signed size in the reference cell.
+    """
 
     cell: Numbers
     corner: Array
@@ -54,7 +61,7 @@ class SubCells:
         return SubCells(self.cell[which], self.corner[which], self.sides[which])
 
     def in_each_cell(self, cells: Numbers) -> "SubCells":
-        """Return these parts in each of some cells."""
+        """Return these parts in each of the cells (n,) with the given numbers: (n * parts)."""
         count = len(cells)
         numbers = np.repeat(cells, len(self.cell))
         return SubCells(numbers, np.tile(self.corner, (count, 1)), np.tile(self.sides, (count, 1)))
@@ -73,7 +80,7 @@ class SubCells:
         return [self[i : i + BATCH_SIZE] for i in range(0, len(self.cell), BATCH_SIZE)]
 
     def divided(self) -> "SubCells":
-        """Return the children of the first part, those of the second, and so on."""
+        """Return the children of all parts: first those of the first part, and so on."""
         children = CHILDREN[self.corner.shape[1]]
         corners, scales = (np.array(v, dtype=float) for v in zip(*children, strict=True))
         d = self.corner.shape[1]
@@ -85,7 +92,10 @@ class SubCells:
         )
 
     def rule(self, points: Array, weights: Array) -> tuple[Array, Array]:
-        """Return points (parts, q, d) and weights (parts, q) of a rule on each part."""
+        """Return points (parts, q, d) and weights (parts, q) of a rule on each part.
+
+        `points` (q, d) and `weights` (q,) are the rule on the reference cell.
+        """
         X = self.corner[:, None] + self.sides[:, None] * points
         return X, np.abs(self.sides.prod(axis=1))[:, None] * weights
 
@@ -96,8 +106,18 @@ PlacesOfParts = Callable[[SubCells], tuple[Array, Array]]
 
 @dataclass(frozen=True)
 class Lattice:
-    """Places in the reference cell (n, d), the corners first, and pairs of neighbours along each
-    axis (pairs, 2).
+    """Places in the reference cell at which formulas are sampled.
+
+    Attributes
+    ----------
+    places
+        (n, d), the corners first.
+    corners
+        Number of corners.
+    pairs
+        For each axis, numbers (pairs, 2) of neighbouring places along it.
+    count
+        Number of parts of each side.
     """
 
     places: Array
@@ -120,8 +140,10 @@ class Lattice:
         return cls(X, len(corners), pairs, count)
 
     def bent(self, f: Array) -> Array:
-        """Return the variation of the derivatives of values (parts, n, formulas), times the sides:
-        (parts, formulas).
+        """Return the variation (parts, formulas) of derivatives times sides, from values.
+
+        `f` (parts, n, formulas) are values at the places. The variation is the range of
+        differences, summed over the axes.
         """
         slopes = (self.count * (f[:, pairs[:, 1]] - f[:, pairs[:, 0]]) for pairs in self.pairs)
         return np.asarray(sum(np.ptp(slope, axis=1) for slope in slopes))
@@ -164,12 +186,23 @@ def refine_where_hidden(
 
     Parameters
     ----------
+    formulas
+        The formulas, with their ranges in boxes.
+    first_parts
+        Parts of this rank's cells.
     places_of
-        Function from parts to their places and areas.
+        Function from parts to their places (parts, q, 3), the corners first, and areas (parts,).
     lattice
         Places in each part.
     owned
         Number of this rank's own cells, which come first and alone count in sums.
+    comm
+        The ranks that share the cells.
+
+    Notes
+    -----
+    In each pass only the parts with the largest hidden integrals are divided. The search ends where
+    the sum of these is negligible, or at `MAX_PARTS`.
     """
     parts, samples = first_parts, _sample(formulas, first_parts, places_of, lattice)
     part_count = 0
@@ -183,13 +216,14 @@ def refine_where_hidden(
         size = np.linalg.norm(f, axis=-1)
         variation = comm.allreduce(float((area * size.mean(axis=1)).sum()))
         largest = comm.allreduce(float(np.abs(samples.values).max(initial=0.0)), MPI.MAX)
-        matters = (samples.hidden > VALUE_TOLERANCE * largest) & (samples.size > MIN_SIZE)
-        hidden_integrals = np.where(matters, samples.area * samples.hidden, 0.0)
+        can_hide = (samples.hidden > VALUE_TOLERANCE * largest) & (samples.size > MIN_SIZE)
+        hidden_integrals = np.where(can_hide, samples.area * samples.hidden, 0.0)
         largest_hidden = comm.allreduce(float(hidden_integrals[is_own].max(initial=0.0)), MPI.MAX)
         hidden_integral = comm.allreduce(float(hidden_integrals[is_own].sum()))
-        own_size = float(area @ np.linalg.norm(samples.values, axis=-1).mean(axis=1))
-        negligible = MAX_OPEN_INTEGRAL * comm.allreduce(own_size)
+        own_integral = float(area @ np.linalg.norm(samples.values, axis=-1).mean(axis=1))
+        negligible = MAX_OPEN_INTEGRAL * comm.allreduce(own_integral)
         threshold = MAX_OPEN_VARIATION * variation / max(comm.allreduce(int(is_own.sum())), 1)
+        # parts that hide more than their share, the worst of them first
         to_divide = (hidden_integrals > threshold) & (
             hidden_integrals >= DIVIDED_SHARE * min(largest_hidden, np.finfo(float).max)
         )
@@ -235,6 +269,7 @@ class _Samples:
     values: Array
 
     def select(self, selection: NDArray[np.bool_]) -> "_Samples":
+        """Return the samples of selected parts, by flags (parts,)."""
         return _Samples(*(getattr(self, name)[selection] for name in self.__dataclass_fields__))
 
     @classmethod
@@ -250,8 +285,10 @@ class _Samples:
 def _sample(
     formulas: FormulaGroup, parts: SubCells, places_of: PlacesOfParts, lattice: Lattice
 ) -> _Samples:
-    """Sample formulas in each part; ranges are those in the box of its places and of what bulges
-    between them.
+    """Sample formulas in each part, and estimate what the samples hide.
+
+    Ranges are those in the box of a part's places, enlarged by the bulge of a curved part.
+    `places_of` and `lattice` are as in `refine_where_hidden`.
     """
     x, area = places_of(parts)
     low, high = x.min(axis=1), x.max(axis=1)
@@ -263,6 +300,7 @@ def _sample(
     f = values.reshape(*x.shape[:2], values.shape[1])  # a rank may have no parts
     f = np.where(np.isfinite(f), f, 0.0)
     upper, lower = (np.clip(v, -MAX_VALUE, MAX_VALUE) for v in (upper, lower))
+    # ranges beyond most of the values' range, but not more than slopes allow between places
     hidden = np.minimum(
         np.maximum(upper - lower - STEP_SHARE * np.ptp(f, axis=1), 0.0), bent / lattice.count
     )

@@ -35,17 +35,19 @@ def antisymmetric_edge(  # noqa: PLR0913 - the arguments of a density with an ad
     law: Law,
     natural: Forms | None = None,
 ) -> Expr:
-    """Half the energy of an edge between the half with u + v and the mirror image of that with u -
-    v.
+    """Half the energy of an edge on a mirror plane, for an antisymmetric addition v.
 
-    The other parameters are those of `edges.symmetric`.
+    One half has the displacement u + v, the other is the mirror image of u - v. Parameters besides
+    v are those of `edges.symmetric`.
     """
     nu1, nu2, stretch = kin.conormal(r0, m)
 
     def mirrored(a: Expr) -> Expr:
+        """Return the mirror image of a vector."""
         return a - 2 * ufl.dot(a, mirror) * mirror
 
     def jump(inner: Jet, outer: Jet) -> Expr:
+        """Return -[n] . {r_nu} between a surface and the mirror image of another one."""
         outward, inward = (j.r1 * nu1 + j.r2 * nu2 for j in (inner, outer))
         r_nu = (outward - mirrored(inward)) / 2
         return -ufl.dot(mirrored(kin.normal(outer)) - kin.normal(inner), r_nu)
@@ -63,13 +65,14 @@ def antisymmetric_edge(  # noqa: PLR0913 - the arguments of a density with an ad
 
 
 class AntisymmetricModes:
-    """The tangent of the modes that a half model excludes; a
-    `continuation.stability_monitor.ModeFamily`.
+    """The tangent of the modes that a half model excludes.
+
+    It is a `ModeFamily` of `continuation.stability_monitor`; its methods are collective.
 
     Attributes
     ----------
     system
-        Whose tangent it is, at the displacements of the half model.
+        The system of the antisymmetric modes, at displacements of the half model.
     """
 
     label = "antisymmetric"
@@ -81,7 +84,10 @@ class AntisymmetricModes:
         self._factored: State | None = None
 
     def factor_at(self, state: State) -> Factorisation:
-        """Factor the tangent of the antisymmetric modes at a symmetric state."""
+        """Factor the tangent of the antisymmetric modes at a symmetric state; collective.
+
+        The factorisation of the last state is kept.
+        """
         if self._factored is not state:
             if not factor_with_lag(self.system, self._factorisation, state):
                 self._factorisation.factor(self.system.tangent(state.u, state.mu))
@@ -89,7 +95,7 @@ class AntisymmetricModes:
         return self._factorisation
 
     def is_unstable(self, state: State) -> bool:
-        """Whether an antisymmetric mode is unstable at a symmetric state."""
+        """Return whether an antisymmetric mode is unstable at a symmetric state; collective."""
         return self.factor_at(state).negative_pivots > 0
 
     @property
@@ -98,5 +104,5 @@ class AntisymmetricModes:
         return [self]
 
     def counts(self, state: State) -> Sequence[int]:
-        """The number of unstable directions at a symmetric state."""
+        """Return the number of unstable directions at a symmetric state, in a list; collective."""
         return [self.factor_at(state).negative_pivots]

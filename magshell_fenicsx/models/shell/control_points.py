@@ -1,5 +1,6 @@
-"""Control points: a field as a mean of their values, without a mesh, as designs vary it and
-measured points give it.
+"""Control points: a field as a weighted mean of values at points, without a mesh.
+
+Designs vary these values, and measured points give them.
 """
 
 from dataclasses import dataclass
@@ -39,7 +40,10 @@ class ControlPoints:
         return self.places.shape[1] == 2
 
     def weights(self, x: Array) -> "scipy.sparse.csr_matrix":
-        """w (m, n) at places (m, 3). Far from all points the nearest one counts alone."""
+        """Return the weights w (m, n) of the points at places x (m, 3) over R, as a sparse matrix.
+
+        Far from all points the nearest one counts alone.
+        """
         if self.is_axisymmetric:
             places = np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]])
         else:
@@ -50,6 +54,7 @@ class ControlPoints:
             distance, number = (
                 v.reshape(len(places), neighbour_count) for v in tree.query(places, neighbour_count)
             )
+            # relative to the nearest point, so that weights do not underflow far away
             w = np.exp((distance[:, :1] ** 2 - distance**2) / self.width**2)
             if neighbour_count == count or w[:, -1].max(initial=0.0) < MIN_RELATIVE_WEIGHT:
                 break
@@ -63,10 +68,17 @@ class ControlPoints:
 
 @dataclass(frozen=True)
 class ControlledPattern:
-    """A pattern of vectors: values (n, 3) at the points, or (n, 2) along e_rho and e_z of those
-    that turn.
+    """A pattern of vectors, from values at control points.
 
-    `frame` is as of `spatial_fields.Components`.
+    Attributes
+    ----------
+    controls
+        The points.
+    values
+        (n, 3) vectors at the points; (n, 2) along e_rho and e_z if the field turns about e3.
+    frame
+        (3, 3) axes of the points' frame as columns, see `spatial_fields.Components`; None for the
+        model's own frame.
     """
 
     controls: ControlPoints
@@ -74,6 +86,7 @@ class ControlledPattern:
     frame: Array | None = None
 
     def __call__(self, r0: Array, n0: Array) -> Array:
+        """Return the vectors at undeformed places r0 (..., 3); normals n0 are not used."""
         x = np.asarray(r0.reshape(-1, 3))
         x = x if self.frame is None else x @ self.frame
         vectors: Array = np.asarray(self.controls.weights(x) @ self.values)
@@ -85,8 +98,9 @@ class ControlledPattern:
         )
 
     def transposed(self, r0: Array, forces: Array) -> Array:
-        """Return the transposed map: factors of each value in sum(forces . B) over places (cells,
-        nodes, 3).
+        """Return derivatives of sum(forces . B) over places by each value, like `values`.
+
+        `r0` and `forces` are (cells, nodes, 3). It is the transpose of the map from values to B.
         """
         x, f = np.asarray(r0.reshape(-1, 3)), np.asarray(forces.reshape(-1, 3))
         if self.frame is not None:

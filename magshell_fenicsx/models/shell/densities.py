@@ -1,7 +1,8 @@
 """Energy densities of the shell as plain functions of jets: the one source of the physics.
 
-All in units of E h per undeformed area (lengths in R), so that the membrane energy is
-of order one. An energy is the integral of density times area_ratio(r0).
+All are in units of E h per undeformed area (lengths in R), so that the membrane energy is of order
+one. An energy is the integral of density times area_ratio(r0). The arguments r0 and u are the jets
+of placement and displacement, `natural` the natural forms, None for those of r0.
 """
 
 from collections.abc import Callable
@@ -26,8 +27,9 @@ MagneticDensity = Callable[
 
 
 def membrane(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr:
-    """Stretching density, paper Eq. (eqn:energy), first term; of the strain from the `natural`
-    forms.
+    """Stretching density, paper Eq. (eqn:energy), first term.
+
+    With `natural`, the strain is that from the natural forms.
     """
     E, law = kin.membrane_strain(r0, u), law_at(law, r0)
     if natural is None:
@@ -36,8 +38,10 @@ def membrane(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr
 
 
 def prestress(r0: Jet, u: Jet, v: Jet, E: Expr, *, law: Law, natural: Forms | None = None) -> Expr:
-    """S : (v_i . v_j)/2 with what a change E_11, E_12, E_22 of strain adds to S: what that adds to
-    the energy of v.
+    """Energy of v under the stress that a change of strain adds: S : (v_i . v_j)/2.
+
+    S is the stress of the strain of u plus the change E = (E_11, E_12, E_22), less that of u. `v`
+    is the jet of a further displacement.
     """
     strain = ufl.as_matrix([[E[0], E[1]], [E[1], E[2]]])
     present, law = kin.membrane_strain(r0, u), law_at(law, r0)
@@ -52,8 +56,9 @@ def prestress(r0: Jet, u: Jet, v: Jet, E: Expr, *, law: Law, natural: Forms | No
 
 
 def bending(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr:
-    """Bending density, paper Eq. (eqn:energy), second term; of the change from the `natural`
-    curvature.
+    """Bending density, paper Eq. (eqn:energy), second term.
+
+    With `natural`, the change of curvature is that from the natural curvature.
     """
     E, K, law = kin.membrane_strain(r0, u), kin.curvature_change(r0, u), law_at(law, r0)
     if natural is None:
@@ -66,13 +71,15 @@ def bending(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr:
 def normal_moment(
     r0: Jet, u: Jet, nu1: Expr, nu2: Expr, law: Law, natural: Forms | None = None
 ) -> tuple[Expr, Expr]:
-    """M_nunu for the unit conormal nu^1, nu^2, which works on b_nunu, and the stiffness of a
-    penalty.
+    """Return M_nunu, which works on b_nunu, and the stiffness of a penalty on edges.
+
+    nu1 and nu2 are the contravariant components of the undeformed unit conormal nu.
     """
     E, K, law = kin.membrane_strain(r0, u), kin.curvature_change(r0, u), law_at(law, r0)
     if natural is None:
         edge = kin.inverse_metric(r0), (nu1, nu2), 1
         return law.edge_moment(E, K, *edge), law.edge_stiffness(E, *edge)
+    # nu with index down by the undeformed metric, then up by the natural one
     covector = ufl.dot(kin.metric(r0), ufl.as_vector([nu1, nu2]))
     covector_up = ufl.dot(natural.up, covector)
     edge = natural.up, (covector_up[0], covector_up[1]), ufl.dot(covector_up, covector)
@@ -81,13 +88,14 @@ def normal_moment(
 
 
 def law_at(law: Law, r0: Jet) -> Law:
-    """Return the law at a place, on which directions of plies depend."""
+    """Return the law at a place with the jet r0, on which directions of plies depend."""
     return law.at_point(r0.r, r0.r1, r0.r2, kin.area_vector(r0))
 
 
 def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
-    """-Ba . (F - F0) Br, F = a_i (x) a0^i + n (x) n0; paper Eq. (eq:magenergy) without its
-    constant.
+    """-Ba . (F - F0) Br, F = a_i (x) a0^i + n (x) n0; paper Eq. (eq:magenergy).
+
+    The constant -Ba . F0 Br is left out. Br and Ba are vectors over their magnitudes.
     """
     up1, up2 = kin.dual_basis(r0)
     n, n0 = kin.normal(r0 + u), kin.normal(r0)
@@ -99,8 +107,9 @@ def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
 def magnetic_thinned(
     r0: Jet, u: Jet, Br: Expr, Ba: Expr, *, natural: Forms | None = None, thins: Expr | int = 1
 ) -> Expr:
-    """Magnetic density where the thickness follows from the area (`thins` is 1): in F n (x) n0 is
-    stretched so that the `natural` volume stays.
+    """Magnetic density where the thickness follows from the area (`thins` is 1).
+
+    In F the part n (x) n0 is stretched so that the volume stays, the `natural` one if given.
     """
     r, n0 = r0 + u, kin.normal(r0)
     thinned = kin.area_ratio(r0) / kin.area_ratio(r)
@@ -112,24 +121,27 @@ def magnetic_thinned(
 
 
 def in_gradient(law: MagneticDensity) -> MagneticDensity:
-    """The part of Ba = G r, of (r0, u, Br, G): -(G r) . F Br at the deformed position, without its
-    value at u = 0.
+    """Return the density of the part Ba = G r of the field, of (r0, u, Br, G).
 
-    `law` is `magnetic`, or has R in place of F.
+    It is -(G r) . F Br at the deformed position r, without its value at u = 0. `law` is `magnetic`,
+    or has the rotation R in place of F.
     """
 
     def magnetic_gradient(r0: Jet, u: Jet, Br: Expr, G: Expr, **options: Any) -> Expr:
+        """Return the density at the displacement's jet u in the field G r."""
         return law(r0, u, Br, ufl.dot(G, r0.r + u.r), **options) - ufl.dot(ufl.dot(G, u.r), Br)
 
     return magnetic_gradient
 
 
 def in_space(law: MagneticDensity) -> MagneticDensity:
-    """Return the density in a field known by values, of (r0, u, Br, P): P as in
-    `field_at_displacement`; `law` as in `in_gradient`.
+    """Return the density in a field known by values, of (r0, u, Br, P).
+
+    P is the field's polynomial as in `field_at_displacement`; `law` is as in `in_gradient`.
     """
 
     def magnetic_in_space(r0: Jet, u: Jet, Br: Expr, P: Expr, **options: Any) -> Expr:
+        """Return the density at the displacement's jet u in the field with the polynomial P."""
         B, change = field_at_displacement(P, u.r)
         return law(r0, u, Br, B, **options) - ufl.dot(change, Br)
 
@@ -152,8 +164,9 @@ def magnetic_torque(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
 
 
 def magnetic_tau(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
-    """Utau: torques from the surface gradient of u, q^c U_ac with a the derivative; paper Eq.
-    (eq:terms).
+    """Utau: torques from the surface gradient of u; paper Eq. (eq:terms).
+
+    It is q^c U_ac, with a the index of the derivative.
     """
     up1, up2 = kin.dual_basis(r0)
     q = rotation(r0, u)
@@ -162,10 +175,10 @@ def magnetic_tau(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
 
 
 def magnetic_couple(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
-    """Couple: the other term linear in u, zero where Br is parallel to Ba; not in the paper's U1
-    and U2.
+    """Couple: the further term linear in u, zero where Br is parallel to Ba.
 
-    With it, U1 + Uq + Utau is the second-order Taylor polynomial of the full energy.
+    It is not in the paper's U1 and U2. With it, U1 + Uq + Utau is the second-order Taylor
+    polynomial of the full energy.
     """
     n0 = kin.normal(r0)
     q = rotation(r0, u)
@@ -173,42 +186,48 @@ def magnetic_couple(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
 
 
 def rotation(r0: Jet, u: Jet) -> Expr:
-    """q^i a0_i with q_i = n0 . u,_i, tangent to the undeformed surface."""
+    """Return the rotation q^i a0_i with q_i = n0 . u,_i, tangent to the undeformed surface."""
     up1, up2 = kin.dual_basis(r0)
     n0 = kin.normal(r0)
     return ufl.dot(n0, u.r1) * up1 + ufl.dot(n0, u.r2) * up2
 
 
 def volume(r0: Jet, u: Jet, origin: Expr | None = None) -> Expr:
-    """(x . n dω - x0 . n0 dω0)/3 per area of the coordinates, x from the origin."""
+    """(x . n dω - x0 . n0 dω0)/3 per area of the coordinates: the change of the enclosed volume.
+
+    x is the deformed and x0 the undeformed place, both from `origin`; None for the origin of r0.
+    """
     r = r0 + u
     x, x0 = (r.r, r0.r) if origin is None else (r.r - origin, r0.r - origin)
     return (ufl.dot(x, kin.area_vector(r)) - ufl.dot(x0, kin.area_vector(r0))) / 3
 
 
 def swept_volume(r0: Jet, u: Jet, unit: Expr | float = 1.0) -> Expr:
-    """Volume that the surface sweeps when its points move straight to r0 + u; per area of the
-    coordinates.
+    """Volume that the surface sweeps when its points move straight to r0 + u.
 
-    It is the work of p = 1 in that unit, and its potential wherever there is one: whatever the
-    edges are, no origin and no faces that close the volume enter.
+    It is per area of the coordinates, times `unit`. It is the work of p = 1 in that unit, and its
+    potential wherever there is one: it needs no origin, and no faces that close the volume.
     """
     halfway = ufl.cross(r0.r1 + u.r1 / 2, r0.r2 + u.r2 / 2)
     return unit * ufl.dot(u.r, halfway + kin.area_vector(u) / 12)
 
 
 def follower_pressure_work(r0: Jet, u: Jet, v: Jet, unit: Expr | float = 1.0) -> Expr:
-    """v . n da: the virtual work of p = 1 in that unit; per area of the coordinates."""
+    """v . n da: the virtual work of p = 1 along v, per area of the coordinates, times `unit`."""
     return unit * ufl.dot(v.r, kin.area_vector(r0 + u))
 
 
 def field_at_displacement(P: Expr, u: Expr) -> tuple[Expr, Expr]:
-    """B at the displacement u from the polynomial P (`FIELD_POLYNOMIAL_SIZE`,), and less what it is
-    at u = 0.
+    """Return B at the displacement u, and its difference from B at u = 0.
+
+    B is the second-order polynomial P (`FIELD_POLYNOMIAL_SIZE`,) about the displacement in P[0:3].
+    P[3:6] is B at u = 0, P[6:9] the value at the centre, P[9:18] the gradient, P[18:36] halved
+    second derivatives by pairs j <= k.
     """
     d = u - ufl.as_vector([P[i] for i in range(3)])
 
     def component(i: int) -> Expr:
+        """Return component i of B at the displacement."""
         linear = sum(P[9 + 3 * i + j] * d[j] for j in range(3))
         pairs = enumerate(zip(*COMPONENT_PAIRS, strict=True))
         return (

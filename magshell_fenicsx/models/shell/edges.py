@@ -1,13 +1,12 @@
-"""The bending energy of edges: C0 interior penalty for a C0 displacement; how sharply undeformed
-cells meet.
+"""The bending energy of edges, by C0 interior penalty for a C0 displacement, and folds.
 
-A C0 surface has b_nunu = (-[n] . r_nu) delta on an edge. With the jump J of that
-quantity over its undeformed value, an edge contributes
+A C0 surface has b_nunu = (-[n] . r_nu) delta on an edge. With the jump J of that quantity over its
+undeformed value, an edge contributes
 
     {M_nunu} J + sigma D/(2 h_e) J^2        per undeformed length.
 
-It is one energy: derived twice it gives a symmetric tangent. Every expression is
-invariant under exchange of '+' and '-'.
+It is one energy: derived twice it gives a symmetric tangent. Every expression is invariant under
+exchange of '+' and '-'.
 """
 
 from typing import Any
@@ -30,14 +29,17 @@ FOLD_ANGLE = 0.02  # rad: below, the sine of an angle is the angle to 7e-5
 
 
 def edge_density(M: Expr, D: Expr, J: Expr, width: Expr, sigma: Expr) -> Expr:
-    """{M} J + sigma D/(2 h_e) J^2."""
+    """{M} J + sigma D/(2 h_e) J^2: moment M, penalty stiffness D, jump J, h_e the `width`."""
     return M * J + sigma * D / (2 * width) * J**2
 
 
 def fold_jump(
     plus: Jet, minus: Jet, nu_plus: tuple[Expr, Expr], nu_minus: tuple[Expr, Expr]
 ) -> Expr:
-    """-[n] . {r_nu}, nu out of '+', [n] = n- - n+."""
+    """-[n] . {r_nu} with [n] = n- - n+: the jump of the normal across an edge.
+
+    nu_plus and nu_minus are the components of the outward conormals; the mean {r_nu} is out of '+'.
+    """
     r_nu = (
         plus.r1 * nu_plus[0]
         + plus.r2 * nu_plus[1]
@@ -48,8 +50,9 @@ def fold_jump(
 
 
 def fold_angle(plus: Jet, minus: Jet, m_plus: Expr) -> tuple[Expr, Expr]:
-    """Sine and cosine of the angle between the normals about the edge; its sign is that of
-    `fold_jump`.
+    """Return sine and cosine of the angle between the normals about the edge.
+
+    The angle has the sign of `fold_jump`. `m_plus` is the edge's covector on the side '+'.
     """
     edge_tangent = kin.unit(plus.r2 * m_plus[0] - plus.r1 * m_plus[1])
     n_plus, n_minus = kin.normal(plus), kin.normal(minus)
@@ -67,16 +70,20 @@ def two_sided(
     law: tuple[Law, Law],
     natural: Shapes | None = None,
 ) -> Expr:
-    """Energy of an interior edge with that jump per length of its parameter.
+    """Energy of an interior edge with a jump J, per length of its parameter.
 
     Parameters
     ----------
+    J
+        Jump of b_nunu over its undeformed value.
     r0, u
         Jets on both sides, '+' first.
     m
         Covectors of the edge on both sides; see `kinematics.conormal`.
     width
         h_e: half the height of the flat triangles over the edge, averaged.
+    sigma
+        Penalty.
     law
         Laws of both sides.
     natural
@@ -100,8 +107,9 @@ def interior(
     law: tuple[Law, Law],
     natural: Shapes | None = None,
 ) -> Expr:
-    """Energy of an interior edge between cells that meet smoothly, or nearly so; `rest` as in
-    `two_sided`.
+    """Energy of an interior edge between cells that meet smoothly, or nearly so.
+
+    It is per length of the edge's parameter; `rest` are the width and sigma of `two_sided`.
     """
     nus = [kin.conormal(j, covector)[:2] for j, covector in zip(r0, m, strict=True)]
     J0 = fold_jump(*r0, *nus)
@@ -119,11 +127,11 @@ def fold(
     law: tuple[Law, Law],
     natural: Shapes | None = None,
 ) -> Expr:
-    """Energy of an interior edge across a fold of the undeformed surface: the jump is the change of
-    the angle, whatever its size.
+    """Energy of an interior edge across a fold of the undeformed surface.
 
-    b_nunu is the angle times the natural stretch across the fold, which a `natural` kink has as a
-    narrow bend has it.
+    The jump is the change of the angle, whatever its size. b_nunu is the angle times the natural
+    stretch across the fold: a natural kink is the limit of a narrow bend. `rest` are the width and
+    sigma of `two_sided`.
     """
     sine0, cosine0 = fold_angle(*r0, m[0])
     sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
@@ -133,22 +141,22 @@ def fold(
         stretch_across = (
             sum(ufl.sqrt(shape.along(*nu)) for shape, nu in zip(natural, nus, strict=True)) / 2
         )
-        bent = sum(shape.kink(*nu) for shape, nu in zip(natural, nus, strict=True)) / (
+        angle_ratio = sum(shape.kink(*nu) for shape, nu in zip(natural, nus, strict=True)) / (
             2 * stretch_across
         )
-        angle = bent * ufl.atan2(sine0, cosine0)
+        angle = angle_ratio * ufl.atan2(sine0, cosine0)
         sine0, cosine0 = ufl.sin(angle), ufl.cos(angle)
     J = stretch_across * ufl.atan2(sine * cosine0 - cosine * sine0, cosine * cosine0 + sine * sine0)
     return two_sided(J, r0, u, m, *rest, law=law, natural=natural)
 
 
 def turning(r0: Jet, u: Jet, m: Expr, width: Expr, intensity: Expr, reference_turn: Expr) -> Expr:
-    """-Pi of a moment per length about the edge's first tangent: intensity times the angle of the
-    normal.
+    """-Pi of a moment per length about the edge's first tangent.
 
-    The tangent runs with the surface on its left, so that a positive angle turns the normal
-    outward. The angle is that of the normal's part normal to the tangent; `reference_turn` (2,)
-    holds cosine and sine of the turn that it is counted from, so that it may grow beyond pi.
+    It is `intensity` times the angle of the normal. The tangent runs with the surface on its left,
+    so that a positive angle turns the normal outward. The angle is that of the normal's part normal
+    to the tangent. `reference_turn` (2,) holds cosine and sine of the turn from which the angle is
+    counted, so that it may grow beyond pi.
     """
     edge_tangent = r0.r2 * m[0] - r0.r1 * m[1]
     length = ufl.sqrt(ufl.dot(edge_tangent, edge_tangent))
@@ -168,8 +176,10 @@ def clamped(
     law: Law,
     natural: Forms | None = None,
 ) -> Expr:
-    """Energy of a clamped edge per length of its parameter: the outer normal is held at n0, or at
-    `turn` n0.
+    """Energy of a clamped edge per length of its parameter.
+
+    The outer normal is held at n0, or at `turn` n0 with a rotation (3, 3). Other parameters are
+    those of `two_sided`, on one side.
     """
     nu1, nu2, stretch = kin.conormal(r0, m)
     r, n0 = r0 + u, kin.normal(r0)
@@ -191,8 +201,10 @@ def symmetric(
     law: Law,
     natural: Forms | None = None,
 ) -> Expr:
-    """Energy of an edge on a mirror plane with that normal per length of its parameter: half of an
-    interior edge's.
+    """Energy of an edge on a mirror plane per length of its parameter: half of an interior edge's.
+
+    `mirror` is the unit normal of the plane; other parameters are those of `two_sided`, on one
+    side.
     """
     nu1, nu2, stretch = kin.conormal(r0, m)
 
@@ -205,7 +217,10 @@ def symmetric(
 
 
 def largest_fold(r0: fem.Function, degree: int) -> float:
-    """Largest angle (rad) between the undeformed normals of two cells at their edge; collective."""
+    """Return the largest angle (rad) between the undeformed normals of two cells at their edge.
+
+    It is compared at the points of a rule of the given degree. Collective.
+    """
     V = r0.function_space
     nodes, largest = r0.x.array.reshape(-1, 3), 0.0
     for batch in interior_batches(V, degree):

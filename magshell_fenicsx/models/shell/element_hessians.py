@@ -42,15 +42,27 @@ DERIVATIVE_RANK = (
 
 
 class HessianIntegral:
-    """Integral of the Hessians of terms that share their points: on cells, interior edges, or some
-    boundary edges.
+    """Integral of the Hessians of terms on the same entities: cells, interior or boundary edges.
 
     Parameters
     ----------
+    r0
+        The placement.
     batches
-        Batches of this rank, perhaps none.
+        Batches of this rank's entities, perhaps none.
     sides
-        2 for interior edges.
+        2 for interior edges, else 1.
+    terms
+        Terms with densities on these entities.
+    log
+        Log of compiled kernels.
+    prestress
+        Density of `densities.prestress`, for `replace_strain`; None without.
+
+    Attributes
+    ----------
+    coupling
+        The batches of interior edges, which couple two cells; else empty.
     """
 
     def __init__(
@@ -101,18 +113,19 @@ class HessianIntegral:
         element_matrices: Array,
         couple: Callable[[int, Array], None],
     ) -> None:
-        """Add the terms' element matrices.
+        """Add the terms' element matrices at the displacement u.
 
         Parameters
         ----------
         u
             (dofs,) with ghosts.
         factors
-            Factors of terms by name; others are left out.
+            Factors of terms by name; terms without a factor are left out.
         element_matrices
             (local cells, 9, pairs of functions), see `BlockMatrix.add_cells`.
         couple
-            Takes the number of each batch of interior edges and what couples the cells there.
+            Is called for each batch of interior edges, with its number and the matrices that couple
+            the two cells at its edges.
         """
         kernels = [
             (kernel, factors[name]) for name, kernel in self._kernels.items() if factors.get(name)
@@ -142,11 +155,19 @@ class HessianIntegral:
         weighted_displacements: Sequence[tuple[float, Array]],
         excepted_cells: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Take the weighted sum of other displacements' membrane strains in place of that of u, in
-        the next `add`.
+        """Replace the membrane strain of u in the membrane stress, for the next call of `add`.
 
-        Some local cells keep theirs: those whose nodes move, which the other displacements do not
-        know.
+        It is replaced by a weighted sum of the strains of other displacements.
+
+        Parameters
+        ----------
+        u
+            (dofs,) the displacement, with ghosts.
+        weighted_displacements
+            Weights and displacements (dofs,).
+        excepted_cells
+            Flags (local cells,) of cells that keep the strain of u: their nodes move, and the other
+            displacements do not know this motion.
         """
         if self._prestress is None:
             return
@@ -165,7 +186,7 @@ class HessianIntegral:
         self._replaced = True
 
     def _jets(self, batch: EntityBatch, field: Array) -> Array:
-        """Return the jets (points, sides, 6, 3) of a field."""
+        """Return the jets (points, sides, 6, 3) of a field (dofs,) at the points of a batch."""
         nodes = field.reshape(-1, 3)
         jets_of_sides = [
             t.jets(nodes[self._dofs[cells]])
@@ -175,7 +196,21 @@ class HessianIntegral:
 
 
 class Kernel:
-    """Kernel of the point Hessian of one term of an integral."""
+    """Kernel of the point Hessian of one term's density.
+
+    Parameters
+    ----------
+    name
+        Name of the term.
+    density
+        Its density.
+    points
+        Storage of the inputs at the points of a batch.
+    batches
+        Batches of entities.
+    of_v
+        Whether the Hessian is that in v at v = 0, of a density of u and v; else that in u.
+    """
 
     def __init__(
         self,
@@ -196,9 +231,20 @@ class Kernel:
     def begin(
         self, u: fem.Function, r0: fem.Function, geometry: fem.Function, sides: int, log: KernelLog
     ) -> None:
-        """Declare the kernel."""
+        """Declare the kernel; it is compiled at its first use.
+
+        Parameters
+        ----------
+        u, r0
+            Point fields with the jets of displacement and placement.
+        geometry
+            Point field with the covectors on all sides and the width of an edge.
+        sides
+            Number of cells beside a point.
+        """
         density, name, of_v = self._density, self._name, self._of_v
         self.pairs = _pairs(density)
+        # z is what the density is differentiated by: v, or the jets of u
         z = self._points.field(3 * JET_SIZE) if of_v else u
         jets = [
             [_jet(field, side) for side in range(sides)]
@@ -215,7 +261,7 @@ class Kernel:
         self._hessian = point_hessian(name, W, z, JET_SIZE, self.pairs, log, at_zero=of_v)
 
     def vary(self, number: int, values: Array) -> None:
-        """Give the first parameter that varies its values at the points of a batch."""
+        """Set the values of the first varying parameter at the points of batch `number`."""
         self._varying[0][1].renew()[number] = values
 
     def renew(self) -> None:
@@ -224,21 +270,22 @@ class Kernel:
             values.renew()
 
     def evaluate(self, number: int) -> Array:
-        """Return the Hessian's parts at the points of a batch."""
+        """Return the Hessian's blocks at the points of batch `number`, as in `point_hessian`."""
         for target, values in self._varying:
             fill(target, values.latest[number])
         return self._points.evaluate(self._hessian, self._batches[number].size)
 
 
 def _strain(r0: Array, u: Array) -> Array:
-    """Return E_11, E_12, E_22 (points, 3) from jets (..., 6, 3)."""
+    """Return E_11, E_12, E_22 (points, 3) of a displacement, from jets (..., 6, 3) of r0 and u."""
     first0, first = (np.moveaxis(jets.reshape(-1, JET_SIZE, 3)[:, 1:3], 1, 0) for jets in (r0, u))
     return np.stack(strain_components(first0, first, partial(np.einsum, "pc,pc->p")), axis=1)
 
 
 def _pairs(density: Density) -> BlockPairs:
-    """Return the pairs of jet parts that the density's Hessian has; those in which it is linear
-    have none.
+    """Return the pairs of jet parts of which the density's Hessian has a block.
+
+    There is none for two parts in which the density is linear. Parts are counted as in `JET_NAMES`.
     """
     parts = [JET_NAMES.index(name) for name in density.parts]
     linear = [JET_NAMES.index(name) for name in density.linear]
@@ -251,10 +298,12 @@ def _pairs(density: Density) -> BlockPairs:
 
 
 def _neighbours(pair: IndexPair) -> tuple[int, IndexPair]:
+    """Return a key that sorts pairs by highest derivative: a term's pairs are then adjacent."""
     return max(DERIVATIVE_RANK[pair[0]], DERIVATIVE_RANK[pair[1]]), pair
 
 
 def _jet(field: fem.Function, side: int) -> Jet:
+    """Return the jet on one side as UFL vectors, from a point field of jets on all sides."""
     parts = range(side * JET_SIZE, (side + 1) * JET_SIZE)
     return Jet(*(ufl.as_vector([field[3 * part + c] for c in range(3)]) for part in parts))
 
@@ -262,10 +311,15 @@ def _jet(field: fem.Function, side: int) -> Jet:
 def parameters_at(
     points: PointStorage, parameters: Sequence[Parameter], sides: int
 ) -> tuple[list[Parameter], list[tuple[fem.Function, fem.Function]]]:
-    """Return a density's parameters at points, and the pairs of points' fields to be filled and
-    fields that vary.
+    """Return a density's parameters at points, and the point fields that must be filled.
 
-    Where there are two sides, such a vector holds that of the one and then that of the other.
+    Returns
+    -------
+    at_points
+        A constant or a point field for each parameter. With two sides, a field holds the values of
+        the first side, then those of the second.
+    varying
+        Pairs of a point field and the field on the mesh that gives its values.
     """
     at_points = [
         points.constant(p) if isinstance(p, fem.Constant) else points.field(sides * p.ufl_shape[0])
@@ -276,11 +330,10 @@ def parameters_at(
 
 
 def at_points(field: fem.Function, X: Array, cells: NDArray[np.int32]) -> Array:
-    """Return the values (cells * points, components) of a field that varies over the cells, at
-    reference points (points, 2).
+    """Return the values (cells * points, components) of a field on cells, at reference points.
 
-    A `PointField` is known at its own points, in consecutive cells, and what is returned follows
-    it.
+    X (points, 2) are the same points in each of the cells. A `PointField` is known at its own
+    points alone, in consecutive cells; what is returned then follows its values.
     """
     if isinstance(field, PointField):
         return field.at_cells(cells)
@@ -293,7 +346,7 @@ def at_points(field: fem.Function, X: Array, cells: NDArray[np.int32]) -> Array:
 def on_batches(
     field: fem.Function, batches: Sequence[EntityBatch], sides: int = 1
 ) -> Memo[list[Array]]:
-    """Return the values of a field that varies over the cells, at the points of each batch."""
+    """Return a memo of a field's values (points, sides * components) on each batch."""
     return Memo(
         lambda: [_on_sides(field, batch, range(sides)) for batch in batches],
         lambda: (memo_input(field),),
@@ -301,13 +354,11 @@ def on_batches(
 
 
 def _on_sides(field: fem.Function, batch: EntityBatch, sides: range) -> Array:
-    """Return the values (points, sides * components) of a field on the edges, or in the cells, of a
-    batch.
-    """
+    """Return the values (points, sides * components) of a field at the points of a batch."""
     values = [at_points(field, batch.rule.points[side], batch.cells[side]) for side in sides]
     return np.hstack(values) if len(values) > 1 else values[0]
 
 
 def fill(field: fem.Function, values: Array) -> None:
-    """Fill in the values of the first points; the rest of the field is not used."""
+    """Copy values of the first points into a point field; other points are not used."""
     field.x.array[: values.size] = values.ravel()

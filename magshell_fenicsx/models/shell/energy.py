@@ -1,6 +1,4 @@
-"""A term of the shell: its density as a function of point quantities, its parameters, and the form
-made from it.
-"""
+"""A term of the shell: the density as a function of point quantities, its parameters, its form."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -29,24 +27,25 @@ Constants = dict[str, fem.Constant]
 
 @dataclass(frozen=True)
 class Density:
-    """An energy as a function of point quantities: the one source of its form and of its
-    derivatives at points.
+    """An energy as a function of point quantities.
+
+    Both its form and its derivatives at points are made from it.
 
     Attributes
     ----------
     function
-        The density as a function: on cells of (r0, u, *parameters), per area of the coordinates;
-        on boundary edges of (r0, u, m, width, *parameters), see `edges`; on interior edges the
-        same with pairs of jets and covectors.
+        The density as a function: on cells of (r0, u, *parameters), per area of the coordinates; on
+        boundary edges of (r0, u, m, width, *parameters), see `edges`; on interior edges the same
+        with pairs of jets and covectors.
     parameters
-        Numbers, or fields that vary over the surface; on interior edges `function` takes a field
-        as a pair.
+        Numbers, or fields that vary over the surface; on interior edges `function` takes a field as
+        a pair.
     parts
         Parts of the displacement's jet that the density depends on.
     linear
         Parts among these in which it is linear, all together.
     facets
-        Boundary edges that it is integrated on; None for cells and interior edges.
+        Boundary edges on which it is integrated; None for cells and interior edges.
     sides
         Number of cells beside a point: 2 on interior edges, else 1.
     work
@@ -70,13 +69,12 @@ class Density:
 
     @property
     def jet_parts(self) -> tuple[str, ...]:
-        """Parts of jets that must be known: those of the displacement, then further ones of the
-        placement.
-        """
+        """Parts of jets that must be known: first the displacement's, then the placement's."""
         return *self.parts, *self.reference_parts
 
     @property
     def on_edges(self) -> bool:
+        """Whether it is integrated over edges."""
         return self.facets is not None or self.sides == 2
 
     def value_at(
@@ -90,12 +88,12 @@ class Density:
         Parameters
         ----------
         jets
-            Jets of r0, u and what else the density takes, each on every side; with the jet of v
-            the value is the virtual work.
+            For each argument (r0, u, ...) its jets on every side. With a third one, the jet of v,
+            the value of a load without potential is its virtual work.
         edge
             The covector on every side and the width; None on cells.
         parameters
-            Values of the parameters; where there are two sides, a vector that varies holds both,
+            Values of the parameters. With two sides, a field that varies holds the values of both,
             one after the other.
         """
         arguments = [*jets, *(edge[:1] if edge else ())]
@@ -110,7 +108,7 @@ class Density:
 
 
 def _halves(field: fem.Function) -> tuple[Expr, Expr]:
-    """Return a vector of both sides of an edge, one after the other, as two vectors."""
+    """Return a field with the values of both sides of an edge as two vectors."""
     size = field.ufl_shape[0] // 2
     first, second = (
         ufl.as_vector([field[side * size + c] for c in range(size)]) for side in range(2)
@@ -119,7 +117,7 @@ def _halves(field: fem.Function) -> tuple[Expr, Expr]:
 
 
 def per_area(density: Callable[..., Expr]) -> Callable[..., Expr]:
-    """Return a density per undeformed area as one per area of the coordinates."""
+    """Turn a density per undeformed area into one per area of the coordinates."""
 
     def density_per_coordinates(r0: Jet, *rest: Any, **options: Any) -> Expr:
         return density(r0, *rest, **options) * kin.area_ratio(r0)
@@ -128,13 +126,14 @@ def per_area(density: Callable[..., Expr]) -> Callable[..., Expr]:
 
 
 def cell_quadrature(degree: int) -> int:
-    """Degree of the rule on cells."""
+    """Return the degree of the rule on cells, for elements of a degree."""
     return 2 * degree
 
 
 def edge_quadrature(degree: int) -> int:
-    """Two degrees below the cells' rule: F at w/h = 20 moves by 2e-5, the edges cost a fifth
-    less.
+    """Return the degree of the rule on edges, for elements of a degree.
+
+    It is two below that of the cells: F at w/h = 20 moves by 2e-5, and the edges cost a fifth less.
     """
     return 2 * degree - 2
 
@@ -143,8 +142,9 @@ class AtPoints(Protocol):
     """Computes energies without forms, see `residual.FastResidual`."""
 
     def energy(self, name: str) -> float:
-        """Return the energy of a term on this rank's part, at the present u; collective at
-        first.
+        """Return the energy of a term on this rank's part, at the present u.
+
+        The first call is collective: kernels are compiled.
         """
 
 
@@ -164,7 +164,18 @@ class MomentTerm(AngleTerm, ShellTerm):
 class HessianTerm:
     """A term that contributes only a tangent: the Hessian in v, at v = 0, of an energy of u and v.
 
-    Its density takes the jet of v after that of u.
+    Parameters
+    ----------
+    name
+        Name of the term.
+    density
+        Its density, which takes the jet of v after that of u.
+    energy
+        The same as a form.
+    v
+        The function that stands for v in the form.
+    log
+        Log of compiled kernels.
     """
 
     amplitude = None
@@ -192,25 +203,27 @@ class HessianTerm:
         """Compile nothing: the term has no residual."""
 
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
-        """Symmetric states are in equilibrium with antisymmetric forces."""
+        """Add nothing: symmetric states are in equilibrium with antisymmetric forces."""
 
     def compile_tangent(self) -> None:
         _ = self.tangent_form
 
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
+        """Add the tangent to K; `factor` is not used, since the term has no amplitude."""
         compat.add_matrix(K, self.tangent_form, clamped)
 
 
 def constants_of(
     term: OwnTerm, domain: mesh.Mesh, constants: Constants
 ) -> tuple[fem.Constant | fem.Function, ...]:
-    """Return the parameters of a term as constants; a free one has the same constant in all terms,
-    kept in `constants`.
+    """Return the parameters of a term as constants or functions on a mesh.
+
+    A free parameter has the same constant in all terms; it is kept in `constants` by its name.
 
     Raises
     ------
     MeshError
-        If one is a function on another mesh.
+        If a parameter is a function on another mesh.
     """
 
     def constant(value: float | NDArray[np.float64]) -> fem.Constant:
@@ -219,6 +232,7 @@ def constants_of(
     def constant_or_field(
         p: float | NDArray[np.float64] | Free | UserField | FormulaParameter | Coefficient,
     ) -> fem.Constant | fem.Function:
+        """Return a parameter as a constant, or as the function on the mesh that it is."""
         if isinstance(p, Free):
             return constants.setdefault(p.name, constant(p.value))
         if (

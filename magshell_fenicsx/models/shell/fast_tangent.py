@@ -1,6 +1,4 @@
-"""The tangent without compiled tangent forms, from the point Hessians of the terms' own
-densities.
-"""
+"""The tangent without compiled tangent forms, from the point Hessians of the terms' densities."""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -73,8 +71,8 @@ class FastTangent:
     constraints
         Constraints of components of u; those along other directions are the system's.
     moving
-        Local cells with nodes that move, and the integrals of the terms on these cells and their
-        edges alone.
+        Flags (local cells,) of cells with nodes that move, and integrals of the terms on these
+        cells and their edges alone; None without.
     """
 
     def __init__(
@@ -99,9 +97,11 @@ class FastTangent:
 
         Parameters
         ----------
+        factors
+            Factors of terms by name.
         stress
-            Displacements, ghosts included, with weights: the sum of their membrane strains makes
-            the membrane stress in place of the present strain.
+            Weights and displacements with ghosts. The weighted sum of their membrane strains gives
+            the membrane stress in place of the present strain; empty for the present strain.
         """
         self._element_matrices[:] = 0
         self._matrix.clear()
@@ -117,8 +117,10 @@ class FastTangent:
         return self._matrix.assemble()
 
     def times(self, v: Array, factors: Mapping[str, float]) -> Array:
-        """This rank's part of the matrix without supports times a vector with ghosts, exact where
-        nodes move.
+        """Return this rank's part of the matrix without supports times a vector v.
+
+        It has contributions of moving cells alone, so it is exact at nodes that move. `v` and the
+        product (dofs,) include ghosts.
         """
         product, x = np.zeros((len(v) // 3, 3)), v.reshape(-1, 3)
         element_matrices = np.zeros(self._element_matrices.shape)
@@ -135,6 +137,11 @@ class FastTangent:
         return product.ravel()
 
     def _couple(self, first: int, batch: int, K: Array) -> None:
+        """Add matrices K that couple two cells at the edges of a batch.
+
+        The batch is counted within its integral; `first` is the number of that integral's first
+        batch.
+        """
         self._matrix.add_coupling(first + batch, K)
 
 
@@ -146,10 +153,25 @@ def hessian_integrals(
     prestress: Density | None = None,
     cell_mask: CellMask = None,
 ) -> list[HessianIntegral]:
-    """Return the integrals of terms' Hessians: one of all cells, one of all interior edges, one of
-    each term's boundary edges. Collective.
+    """Return the integrals of terms' Hessians; collective.
 
-    `cell_mask` are the local cells that count, with their edges; None for all.
+    There is one for the cells of each quadrature, one for all interior edges, and one for each
+    term's boundary edges. Terms that are linear in the displacement have none.
+
+    Parameters
+    ----------
+    r0
+        The placement.
+    degree
+        Degree of the elements.
+    terms
+        Terms with a density, and others, which are left out.
+    log
+        Log of compiled kernels.
+    prestress
+        See `HessianIntegral`.
+    cell_mask
+        Flags (local cells,) of the cells that count, with their edges; None for all.
     """
     V = r0.function_space
     nonlinear = [t for t in terms if isinstance(t, ShellTerm | HessianTerm) and not t.linear]
@@ -157,9 +179,11 @@ def hessian_integrals(
     interior = [t for t in nonlinear if t.density.sides == 2]
     integrals = []
     for rule in dict.fromkeys(t.density.quadrature for t in cells):
-        of_rule = [t for t in cells if t.density.quadrature == rule]
+        terms_of_rule = [t for t in cells if t.density.quadrature == rule]
         batches = cell_batches(V, rule or cell_quadrature(degree), cell_mask)
-        integrals.append(HessianIntegral(r0, batches, 1, of_rule, log, None if rule else prestress))
+        integrals.append(
+            HessianIntegral(r0, batches, 1, terms_of_rule, log, None if rule else prestress)
+        )
     if interior:
         integrals.append(
             HessianIntegral(

@@ -1,8 +1,7 @@
-"""Formulas on cells: interpolated where they are smooth, else the polynomials with the same
-moments.
+"""Formulas on cells: interpolated where smooth, else the polynomials with the same moments.
 
 A formula that varies within a cell, or jumps there, is not what its values at the nodes show: a
-load on a disc between the nodes would be none. The polynomial p of the displacement's degree k with
+load on a disc between the nodes would vanish. The polynomial p of the displacement's degree k with
 
     integral of p q = integral of f q    over the cell, for each polynomial q of the degree k,
 
@@ -62,7 +61,9 @@ class CellGeometry:
         (cells, nodes, 3) of a surface, an edge (without normals) or a body, of whose cells the
         third axis is across; (cells, nodes, 2) of a meridian, rho and z.
     owned
-        How many are this rank's own; they come first.
+        Number of cells that this rank owns; they come first.
+    comm
+        The ranks that share the cells.
     """
 
     element: Element
@@ -77,10 +78,17 @@ class CellGeometry:
     def evaluate(
         self, X: Array, cells: Numbers | slice = slice(None)
     ) -> tuple[Array, Array, Array]:
-        """Places and normals (cells, n, 3), and length or area over that of the reference cell
-        (cells, n).
+        """Return places and normals (cells, n, 3), and the ratio of sizes (cells, n).
 
-        At reference points (n, dimension), or at points (cells, n, dimension) of each cell.
+        The ratio is the length or area over that of the reference cell; on a meridian it is rho
+        times the length, so that integrals are per radian.
+
+        Parameters
+        ----------
+        X
+            Reference points (n, dimension), or (cells, n, dimension) in each cell.
+        cells
+            Numbers of the cells; by default all.
         """
         nodal, d = self.nodal[cells], self.dimension
         table = self.element.tabulate(1, X.reshape(-1, d))[..., 0]
@@ -98,7 +106,7 @@ class CellGeometry:
         return x, m / size[..., None], size
 
     def sum_over_ranks(self, of_cells: Array) -> Array:
-        """Return the sum over the cells of all ranks; collective."""
+        """Return the sum of values (cells, ...) over the owned cells of all ranks; collective."""
         return np.asarray(self.comm.allreduce(of_cells[: self.owned].sum(axis=0)))
 
 
@@ -109,7 +117,7 @@ class ProjectedFormula:
     Attributes
     ----------
     nodal
-        (cells, nodes, components) values; those that were given where the formula is smooth.
+        (cells, nodes, components) values; the interpolated ones where the formula is smooth.
     smooth
         Whether the formula is smooth everywhere, on all ranks.
     size
@@ -119,7 +127,7 @@ class ProjectedFormula:
     rest
         Root of the integral of |f - p|^2 over that of |f|^2, of all cells.
     widest
-        Largest side of the cells that have a visible part of that.
+        Largest side of the cells that contribute a visible part to `rest`.
     open
         Part of the integral of |f| that samples may have missed, if it is more than allowed.
     """
@@ -143,34 +151,43 @@ def project_formula(
     bounded: bool = False,
     formulas: FormulaGroup | None = None,
 ) -> ProjectedFormula:
-    """Return a formula on cells, from its values and those at the nodes of each cell; collective.
+    """Return a formula on cells: its interpolant, or polynomials with the same moments; collective.
 
     Parameters
     ----------
+    values
+        Function of places and normals (cells, n, 3) -> values (cells, n, components).
+    cells
+        The cells of this rank.
     nodal, element
-        (cells, nodes, components) at the points of the element.
+        Values (cells, nodes, components) at the nodes of the element.
     degree
         Degree of the polynomials with the same moments, at most that of the element.
     bounded
-        Whether they stay between the least and the largest value in a cell; of their moments the
-        first is kept.
+        Whether the polynomials stay between the least and the largest value in a cell; of their
+        moments only the first is then kept.
     formulas
-        Formulas that vary, whose ranges show what is between the places.
+        Formulas that vary, whose ranges show what happens between the places; None without.
+
+    Notes
+    -----
+    Only cells in which the interpolant is off, or which hide detail, get new polynomials.
     """
-    X, w = (v.reshape(-1, *v.shape[2:]) for v in sampling_points(cells))
+    X, weights = (v.reshape(-1, *v.shape[2:]) for v in sampling_points(cells))
     x, normals, area_ratio = cells.evaluate(X)
     f = values(x, normals)
     interpolated = np.matmul(element.tabulate(0, X)[0, :, :, 0], nodal)
     interpolation_error = np.linalg.norm(interpolated - f, axis=-1)
-    magnitude, area = np.linalg.norm(f, axis=-1), area_ratio * w
+    magnitude, area = np.linalg.norm(f, axis=-1), area_ratio * weights
     sizes = (area * magnitude).sum(axis=1)
     errors = (area * interpolation_error).sum(axis=1)
     squares = (area * magnitude**2).sum(axis=1)
     sums = cells.sum_over_ranks(np.stack([sizes, errors, squares], axis=-1))
     size, total_error, total_square = map(float, sums)
-    scale = area.sum(axis=1) / w.sum()
+    scale = area.sum(axis=1) / weights.sum()
     if formulas:
-        detail = _find_hidden_detail(values, formulas, cells, np.einsum("q,cqi->ci", w, f))
+        # integrals over the reference cell from samples, which the parts' integrals may contradict
+        detail = _find_hidden_detail(values, formulas, cells, np.einsum("q,cqi->ci", weights, f))
     else:
         detail = _HiddenDetail.without_detail(len(scale))
     hidden_by_cell = scale * detail.hidden
@@ -182,7 +199,7 @@ def project_formula(
         return ProjectedFormula(nodal, smooth=True, size=size, open=detail.open)
     largest = cells.comm.allreduce(float(magnitude.max(initial=0.0)), MPI.MAX)
     projected_cells = np.flatnonzero(
-        (interpolation_error @ w > SMOOTH_CELL_TOLERANCE * largest * w.sum())
+        (interpolation_error @ weights > SMOOTH_CELL_TOLERANCE * largest * weights.sum())
         | (hidden_by_cell > PART_TOLERANCE * size)
     )
     first_parts = detail.parts_of(projected_cells, _uniform_parts(cells))
@@ -201,19 +218,21 @@ def project_formula(
     )
     Y, v = basix.make_quadrature(element.cell_type, 2 * degree)
     phi = space.tabulate(0, Y)[0, :, :, 0]
-    p = np.linalg.solve(phi.T @ (v[:, None] * phi), moments)
+    # p with these moments: mass matrix of the reference cell (rule Y, v) times p = moments
+    coefficients = np.linalg.solve(phi.T @ (v[:, None] * phi), moments)
     residual_squares = np.zeros(len(scale))
-    lost_squares = reference_squares - np.einsum("q,cqi->c", v, np.matmul(phi, p) ** 2)
+    # integral of |f|² less that of |p|²: p is an orthogonal projection of f
+    lost_squares = reference_squares - np.einsum("q,cqi->c", v, np.matmul(phi, coefficients) ** 2)
     residual_squares[projected_cells] = scale[projected_cells] * np.maximum(lost_squares, 0.0)
     size = float(cells.sum_over_ranks(sizes))
     total_residual = float(cells.sum_over_ranks(residual_squares))
     side = np.sqrt(2.0) * scale ** (1 / min(cells.dimension, 2))
     visible_sides = side[residual_squares > VISIBLE_SHARE * total_residual]
     widest = cells.comm.allreduce(float(visible_sides.max(initial=0.0)), MPI.MAX)
-    at_nodes = np.matmul(space.tabulate(0, element.points)[0, :, :, 0], p)
+    at_nodes = np.matmul(space.tabulate(0, element.points)[0, :, :, 0], coefficients)
     if bounded:
-        mean = np.einsum("q,cqi->ci", v, np.matmul(phi, p))[:, None] / v.sum()
-        at_samples = np.matmul(space.tabulate(0, X)[0, :, :, 0], p)
+        mean = np.einsum("q,cqi->ci", v, np.matmul(phi, coefficients))[:, None] / v.sum()
+        at_samples = np.matmul(space.tabulate(0, X)[0, :, :, 0], coefficients)
         at_nodes = _bounded(at_nodes, mean, at_samples, f[projected_cells])
     new_nodal = nodal.copy()
     new_nodal[projected_cells] = at_nodes
@@ -232,7 +251,7 @@ def project_formula(
 
 
 def _uniform_parts(cells: CellGeometry) -> SubCells:
-    """Return the parts in which every cell is sampled at first."""
+    """Return the parts of one cell, number 0, in which every cell is sampled at first."""
     d = cells.dimension
     parts = SubCells(np.zeros(1, np.int64), np.zeros((1, d)), np.ones((1, d)))
     for _ in range(FIRST_DIVISIONS[d]):
@@ -241,9 +260,7 @@ def _uniform_parts(cells: CellGeometry) -> SubCells:
 
 
 def sampling_points(cells: CellGeometry) -> tuple[Array, Array]:
-    """Return the points (parts, q, d) in the reference cell at which formulas are sampled, and
-    weights (parts, q).
-    """
+    """Return points (parts, q, d) in the reference cell for samples, and weights (parts, q)."""
     return _uniform_parts(cells).rule(
         *basix.make_quadrature(cells.element.cell_type, RULE_DEGREE[cells.dimension])
     )
@@ -256,11 +273,11 @@ class _HiddenDetail:
     Attributes
     ----------
     hidden
-        (cells,) difference of integrals over the reference cell from those of the places.
+        (cells,) difference of integrals over the reference cell from those of the samples.
     variation
         The integral of |f - its mean|.
     parts, is_divided
-        Parts of divided cells, and whether each cell is one (cells,).
+        Parts of divided cells, and flags (cells,) of the cells that are divided.
     open
         See `ProjectedFormula`.
     """
@@ -275,12 +292,14 @@ class _HiddenDetail:
     def without_detail(
         cls, cells: int, variation: float = 0.0, open_: float = 0.0
     ) -> "_HiddenDetail":
+        """Return an object for a number of cells that hide nothing."""
         no_parts = SubCells(np.empty(0, np.int64), np.empty((0, 0)), np.empty((0, 0)))
         return cls(np.zeros(cells), variation, no_parts, np.zeros(cells, bool), open_)
 
     def parts_of(self, cells: Numbers, uniform_parts: SubCells) -> SubCells:
-        """Return the parts of some cells: uniform ones, but those that the search made of divided
-        cells; none is larger than the uniform.
+        """Return the parts of some cells: uniform ones, or those of the search in divided cells.
+
+        No part is larger than a uniform one.
         """
         is_divided = self.is_divided[cells]
         if not is_divided.any():
@@ -299,14 +318,17 @@ class _HiddenDetail:
 def _find_hidden_detail(
     values: Values, formulas: FormulaGroup, cells: CellGeometry, sampled_integrals: Array
 ) -> _HiddenDetail:
-    """Compare integrals (cells, components) from samples with those over the parts that
-    `adaptive_sampling.refine_where_hidden` makes; collective.
+    """Return what samples of whole cells miss, by an adaptive search for hidden parts; collective.
+
+    `sampled_integrals` (cells, components), over the reference cell, are compared with integrals
+    over the parts from `adaptive_sampling.refine_where_hidden`.
     """
     d, kind = cells.dimension, cells.element.cell_type
     lattice = Lattice.make(kind, LATTICE_DIVISIONS[d])
     points, weights = basix.make_quadrature(kind, RULE_DEGREE[d])
 
     def places_of(parts: SubCells) -> tuple[Array, Array]:
+        """Return the lattice's places (parts, n, 3) in each part, and the areas (parts,)."""
         place_count = len(lattice.places)
         X, w = parts.rule(lattice.places, np.full(place_count, weights.sum() / place_count))
         x, _, area = cells.evaluate(X, parts.cell)
@@ -325,6 +347,7 @@ def _find_hidden_detail(
     for batch in parts.batches():
         X, w = batch.rule(points, weights)
         x, normals, _ = cells.evaluate(X, batch.cell)
+        # integrals over divided cells are sums over their parts
         np.add.at(integrals, batch.cell, np.einsum("pq,pqi->pi", w, values(x, normals)))
     differences = np.linalg.norm(integrals - sampled_integrals, axis=1)
     if not cells.sum_over_ranks(differences) > 0:
@@ -346,13 +369,30 @@ def _moments(
 
     Collective.
 
+    Parameters
+    ----------
+    values, cells
+        See `project_formula`.
+    projected_cells
+        Numbers of the cells.
+    scale
+        (all cells,) size of each cell over that of the reference cell.
+    first_parts
+        Parts with which the division begins.
+    threshold
+        Largest difference of a part's integral, over the surface, from that of its own parts.
+    space
+        Element of the functions in the moments.
+    components
+        Number of components of f.
+
     Returns
     -------
     moments
-        (cells, functions, components): integrals of f times each function of the space, over the
-        reference cell.
+        (projected cells, functions, components): integrals of f times each function of the space,
+        over the reference cell.
     sizes, squares
-        (cells,): integral of |f| over the surface, and of |f|^2 over the reference cell.
+        (projected cells,): integral of |f| over the surface, and of |f|^2 over the reference cell.
     error
         Estimated error of the integrals over the surface, of all ranks.
     """
@@ -361,6 +401,7 @@ def _moments(
     number[projected_cells] = np.arange(len(projected_cells))
 
     def evaluated(batch: SubCells) -> tuple[Array, Array, Array, Array]:
+        """Return points, weights, weights times area ratios, and values in each part."""
         X, w = batch.rule(points, weights)
         x, normals, area = cells.evaluate(X, batch.cell)
         return X, w, area * w, values(x, normals)
@@ -368,25 +409,26 @@ def _moments(
     def integrals(w: Array, f: Array) -> Array:
         return np.asarray(np.einsum("pq,pqi->pi", w, f))
 
-    by_cell = np.zeros((len(projected_cells), space.dim, components))
+    moments = np.zeros((len(projected_cells), space.dim, components))
     sizes = np.zeros(len(projected_cells))
     squares = np.zeros(len(projected_cells))
     errors = 0.0
     children = len(CHILDREN[cells.dimension])
     coarse_integrals = [integrals(w, f) for _, w, _, f in map(evaluated, first_parts.batches())]
     for depth in range(MAX_DIVISIONS + 1):
-        last = depth == MAX_DIVISIONS or cells.comm.allreduce(len(first_parts.cell)) > MAX_PARTS
+        is_last = depth == MAX_DIVISIONS or cells.comm.allreduce(len(first_parts.cell)) > MAX_PARTS
         divided_parts, divided_integrals = list[SubCells](), list[Array]()
         for batch, batch_integrals in zip(first_parts.batches(), coarse_integrals, strict=True):
             smaller = batch.divided()
             X, w, area, f = evaluated(smaller)
             child_integrals = integrals(w, f)
+            # difference of a part's integral from the sum over its own parts
             error = scale[batch.cell] * np.linalg.norm(
                 child_integrals.reshape(len(batch_integrals), children, -1).sum(axis=1)
                 - batch_integrals,
                 axis=1,
             )
-            converged = (error <= threshold) | last
+            converged = (error <= threshold) | is_last
             errors += float((error[converged & (batch.cell < cells.owned)] ** 2).sum())
             is_added = np.repeat(converged, children)
             cell_numbers = number[smaller.cell[is_added]]
@@ -396,7 +438,7 @@ def _moments(
                     *size.shape, space.dim
                 )
                 np.add.at(
-                    by_cell,
+                    moments,
                     cell_numbers,
                     np.matmul(np.swapaxes(w[is_added][..., None] * phi, 1, 2), f[is_added]),
                 )
@@ -411,23 +453,33 @@ def _moments(
         coarse_integrals = [
             all_integrals[i : i + BATCH_SIZE] for i in range(0, len(all_integrals), BATCH_SIZE)
         ]
-    return by_cell, sizes, squares, float(np.sqrt(cells.comm.allreduce(errors)))
+    return moments, sizes, squares, float(np.sqrt(cells.comm.allreduce(errors)))
 
 
 def _bounded(at_nodes: Array, mean: Array, inner_values: Array, f: Array) -> Array:
-    """Return polynomials (cells, nodes, components) that are contracted towards their means until
-    they have no values that f has not.
+    """Contract polynomials towards their means until all values are within the range of f.
+
+    Parameters
+    ----------
+    at_nodes
+        (cells, nodes, components) the polynomials.
+    mean
+        (cells, 1, components) their means.
+    inner_values
+        (cells, n, components) the polynomials at samples.
+    f
+        (cells, n, components) the formula at samples.
     """
     low, high = f.min(axis=1, keepdims=True), f.max(axis=1, keepdims=True)
     all_values = np.concatenate([at_nodes, inner_values], axis=1)
-    share = np.ones_like(mean)
+    contraction = np.ones_like(mean)
     for limit, extreme in (
         (low, all_values.min(axis=1, keepdims=True)),
         (high, all_values.max(axis=1, keepdims=True)),
     ):
         excess = extreme - mean
-        share = np.minimum(
-            share,
+        contraction = np.minimum(
+            contraction,
             np.where(np.abs(excess) > 0, (limit - mean) / np.where(excess == 0, 1.0, excess), 1.0),
         )
-    return np.asarray(mean + np.clip(share, 0.0, 1.0) * (at_nodes - mean))
+    return np.asarray(mean + np.clip(contraction, 0.0, 1.0) * (at_nodes - mean))

@@ -51,15 +51,15 @@ class PointTerm(Protocol):
 class PointGradient:
     """Densities of some terms at points, and the gradient dW/du of their sum.
 
-    Of a virtual work the derivative by v takes the place of dW/du. Kernels are compiled at their
+    For a virtual work, the derivative by v takes the place of dW/du. Kernels are compiled at their
     first use, on all ranks.
 
     Parameters
     ----------
     terms
-        Terms that are all on cells, or all on edges with as many sides.
+        Terms that are all on cells, or all on edges with the same number of sides.
     parts
-        Parts of the jets that the points have.
+        Names of the jet parts that are known at the points.
     points_per_entity, count
         Number of points of an entity, and of all points; a chunk has whole entities.
     r0
@@ -68,7 +68,9 @@ class PointGradient:
         (points, 4): `cell_frames`; on edges (points, 6 sides + 1): the frame of each side, the
         covectors of the edge in the sides' own coordinates (see `kinematics.conormal`), the width.
     values
-        Function that gives the values (points, components) of a field that a density depends on.
+        Function from a field that a density depends on to its values (points, components).
+    log
+        Log of compiled kernels.
     """
 
     def __init__(
@@ -131,7 +133,7 @@ class PointGradient:
         return None
 
     def energy(self, name: str) -> PointKernel | None:
-        """Return the kernel of a term's energy; None if that is zero."""
+        """Return the kernel of the energy of the named term; None if the energy is zero."""
         if name not in self._energies:
             W = self._W[self._names.index(name)]
             is_zero = isinstance(W, Zero)
@@ -145,14 +147,15 @@ class PointGradient:
         return self._chunks
 
     def input_array(self, chunk: slice) -> Array:
-        """Array (points, sides * parts * 3) to be filled with the derivatives of u in reference
-        coordinates.
+        """Return an array (points of the chunk, sides * parts * 3) for the derivatives of u.
+
+        The caller fills in derivatives by reference coordinates before `evaluate`.
         """
         count = chunk.stop - chunk.start
         return np.asarray(self._u.x.array[: count * self._size].reshape(count, self._size))
 
     def evaluate(self, chunk: slice, kernel: PointKernel) -> Array:
-        """Return a kernel's values at the points of a chunk, from what was filled in.
+        """Return a kernel's values at the points of a chunk, from the inputs that were filled in.
 
         They are in the order of `input_array`; the next call reuses the array.
         """
@@ -168,11 +171,11 @@ class _KernelInput:
     Attributes
     ----------
     field
-        Field of the values at the points of a chunk.
+        Point field of the values in a chunk.
     values
         Values at all points.
     filled
-        Chunk whose values the field has, and their version; None before the first.
+        Chunk whose values are in the field, and their version; None before the first.
     """
 
     field: fem.Function
@@ -180,19 +183,22 @@ class _KernelInput:
     filled: tuple[slice, int] | None = None
 
     def fill(self, chunk: slice) -> None:
-        """Fill the latest values of a chunk into the field."""
+        """Copy the latest values of a chunk into the field, unless they are there already."""
         if self.filled != (chunk, self.values.version):
             fill(self.field, self.values.latest[chunk])
             self.filled = chunk, self.values.version
 
 
 def _field_values(field: fem.Function, values: Callable[[fem.Function], Array]) -> Memo[Array]:
+    """Return a memo of a field's values at all points."""
     return Memo(lambda: values(field), lambda: (memo_input(field),))
 
 
 def in_own_coordinates(jet: Jet, frame: Sequence[Expr | Array]) -> Jet:
-    """Jet in the cell's own coordinates from that in reference coordinates; of expressions, or of
-    arrays.
+    """Return a jet in the cell's own coordinates, from one in reference coordinates.
+
+    `frame` has p, q, s of `cell_frames`: d/dx = p d/dX and d/dy = q d/dX + s d/dY. Parts are UFL
+    expressions or arrays.
     """
     p, q, s = frame[:3]
     return Jet(
@@ -214,30 +220,43 @@ def _energy(
 ) -> Expr:
     """Return a density per area of the reference cell, or per parameter (from 0 to 1) of the edge.
 
-    `fields` are those of r0, u and perhaps v.
+    Parameters
+    ----------
+    density
+        The density.
+    fields
+        Point fields of r0, u and perhaps v; those of u and v are by reference coordinates.
+    point_geometry
+        The geometry as in `PointGradient`.
+    parts
+        Names of the jet parts in the fields.
+    parameters
+        The density's parameters at points.
     """
     sides = range(density.sides)
     frames = [[point_geometry[FRAME_SIZE * side + i] for i in range(FRAME_SIZE)] for side in sides]
     r0_jets = [_jet(fields[0], side, parts) for side in sides]
-    others = [
+    displacement_jets = [
         [in_own_coordinates(_jet(f, side, parts), frames[side]) for side in sides]
         for f in fields[1:]
     ]
+    # the determinant in the frame turns an area of the flat cell into one of the reference cell
     if not density.on_edges:
-        return frames[0][-1] * density.value_at([r0_jets, *others], None, parameters)
+        return frames[0][-1] * density.value_at([r0_jets, *displacement_jets], None, parameters)
     first = FRAME_SIZE * density.sides
     m = [
         ufl.as_vector([point_geometry[first + 2 * side], point_geometry[first + 2 * side + 1]])
         for side in sides
     ]
     return density.value_at(
-        [r0_jets, *others], (m, point_geometry[first + 2 * density.sides]), parameters
+        [r0_jets, *displacement_jets], (m, point_geometry[first + 2 * density.sides]), parameters
     )
 
 
 def _jet(field: fem.Function, side: int, parts: Sequence[str]) -> Jet:
-    """Return the jet of a field on a side; parts that the points do not have are zero, since no
-    density needs them.
+    """Return the jet on one side, from a point field of jet parts.
+
+    Parts that are not known at the points are zero, since no density needs them.
     """
     first = 3 * len(parts) * side
     vectors = {

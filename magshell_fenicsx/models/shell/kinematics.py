@@ -28,9 +28,7 @@ VALUE_AND_FIRST = ("r", *FIRST_DERIVATIVES)
 
 @dataclass(frozen=True)
 class Jet:
-    """Value, first and second derivatives of a vector field in coordinates of the cell; each
-    (3,).
-    """
+    """A vector field's value, first and second derivatives by cell coordinates, (3,) each."""
 
     r: Expr
     r1: Expr
@@ -50,12 +48,12 @@ class Jet:
         return Jet(*(a - b for a, b in zip(self.parts(), other.parts(), strict=True)))
 
     def side(self, sign: str) -> Jet:
-        """The jet on one side ('+' or '-') of an edge."""
+        """Return the jet on one side ('+' or '-') of an edge."""
         return Jet(*(a(sign) for a in self.parts()))
 
 
 def cell_frame(mesh: ufl.Mesh) -> tuple[Expr, Expr]:
-    """Orthonormal vectors t_1, t_2 of the flat cell, t_1 x t_2 along its normal."""
+    """Return orthonormal vectors t_1, t_2 of the flat cell, t_1 x t_2 along its normal."""
     J = ufl.Jacobian(mesh)
     first, second = J[:, 0], J[:, 1]
     t1 = first / ufl.sqrt(ufl.dot(first, first))
@@ -64,7 +62,7 @@ def cell_frame(mesh: ufl.Mesh) -> tuple[Expr, Expr]:
 
 
 def jet(v: Expr, mesh: ufl.Mesh) -> Jet:
-    """The jet of a vector field on the affine mesh."""
+    """Return the jet of a vector field on the affine mesh, in the frame of `cell_frame`."""
     t1, t2 = cell_frame(mesh)
     Dv = ufl.grad(v)
     DDv = ufl.grad(Dv)
@@ -84,6 +82,7 @@ def area_vector(j: Jet) -> Expr:
 
 
 def unit(v: Expr) -> Expr:
+    """Return a vector over its length."""
     return v / ufl.sqrt(ufl.dot(v, v))
 
 
@@ -110,7 +109,7 @@ def inverse_metric(j: Jet) -> Expr:
 
 
 def dual_basis(j: Jet) -> tuple[Expr, Expr]:
-    """a^1, a^2 with a^i . a_j = delta^i_j, tangent to the surface."""
+    """Return a^1, a^2 with a^i . a_j = delta^i_j, tangent to the surface."""
     up = inverse_metric(j)
     return up[0, 0] * j.r1 + up[0, 1] * j.r2, up[1, 0] * j.r1 + up[1, 1] * j.r2
 
@@ -118,10 +117,10 @@ def dual_basis(j: Jet) -> tuple[Expr, Expr]:
 def strain_components(
     r0: Vectors, u: Vectors, dot: Callable[[Any, Any], Any]
 ) -> tuple[Any, Any, Any]:
-    """E_11, E_12 and E_22 from the first derivatives of r0 and u, without subtracting two metrics
-    of order one.
+    """Return E_11, E_12 and E_22 from the first derivatives of r0 and u.
 
-    `dot` is that of expressions or of arrays.
+    No two metrics of order one are subtracted. `dot` is the scalar product of expressions or of
+    arrays.
     """
     (r1, r2), (u1, u2) = r0, u
     E12 = (dot(r1, u2) + dot(u1, r2) + dot(u1, u2)) / 2
@@ -131,8 +130,18 @@ def strain_components(
 def curvature_components(
     n: Any, normal_change: Any, r0: Vectors, u: Vectors, dot: Callable[[Any, Any], Any]
 ) -> list[Any]:
-    """K_11, K_12 and K_22 from second derivatives, the deformed normal n and `normal_change`, n -
-    n0; `dot` as above.
+    """Return K_11, K_12 and K_22, the changes of n . r,_ij.
+
+    Parameters
+    ----------
+    n
+        The deformed unit normal.
+    normal_change
+        n - n0.
+    r0, u
+        Second derivatives r,_11, r,_12, r,_22 of placement and displacement.
+    dot
+        Scalar product of expressions or of arrays.
     """
     return [dot(n, uij) + dot(normal_change, rij) for rij, uij in zip(r0, u, strict=True)]
 
@@ -164,13 +173,15 @@ def facet_covector(mesh: ufl.Mesh) -> Expr:
 
 
 def conormal(r0: Jet, m: Expr) -> tuple[Expr, Expr, Expr]:
-    """Undeformed outward unit conormal of a cell's edge and the edge's length ratio.
+    """Return the undeformed outward unit conormal of a cell's edge and the edge's length ratio.
 
     Parameters
     ----------
+    r0
+        Jet of the placement.
     m
-        (2,) covector that is zero along the edge, whatever the placement, and positive outward.
-        The edge's length is told per length of (-m_2, m_1), which is along the edge.
+        (2,) covector that is zero along the edge, whatever the placement, and positive outward. The
+        edge's parameter is the length of (-m_2, m_1), which is along the edge.
 
     Returns
     -------
@@ -207,7 +218,7 @@ class Edge:
 
     @classmethod
     def of(cls, r0: Jet, m: Expr) -> Edge:
-        """The edge with the covector m, see `conormal`."""
+        """Return the edge with the covector m, see `conormal`, on a surface with the jet r0."""
         nu1, nu2, stretch = conormal(r0, m)
         t1, t2 = -m[1] / stretch, m[0] / stretch
         return cls(
@@ -215,17 +226,18 @@ class Edge:
         )
 
     def by_outward(self, j: Jet) -> Expr:
-        """The derivative of a field by the length along the outward conormal."""
+        """Return the derivative of a field with jet j by the length along the outward conormal."""
         return j.r1 * self.normal_part[0] + j.r2 * self.normal_part[1]
 
     def by_length(self, j: Jet) -> Expr:
-        """The derivative of a field by the arc length of the edge."""
+        """Return the derivative of a field with jet j by the arc length of the edge."""
         return j.r1 * self.tangent_part[0] + j.r2 * self.tangent_part[1]
 
 
 def angle_from(sine: Expr, cosine: Expr, reference_turn: Expr) -> Expr:
-    """Angle with that sine and cosine, counted from the turn whose cosine and sine are
-    `reference_turn` (2,).
+    """Return the angle (rad) with a sine and a cosine, counted from a reference turn.
+
+    `reference_turn` (2,) has cosine and sine of that turn. Sine and cosine need not be normalised.
     """
     return ufl.atan2(
         sine * reference_turn[0] - cosine * reference_turn[1],
@@ -259,12 +271,13 @@ class Forms:
     thickness: Expr
 
     def kink(self, nu1: Expr, nu2: Expr) -> Expr:
-        """Natural over undeformed b_nunu where the curvature is across an edge with that
-        conormal.
+        """Return natural over undeformed b_nunu, where the curvature is across an edge.
+
+        nu1 and nu2 are the components of the edge's undeformed unit conormal.
         """
         return self.along(nu1, nu2) / self.thickness
 
     def along(self, nu1: Expr, nu2: Expr) -> Expr:
-        """The natural length, squared, of a vector with these components."""
+        """Return the natural length, squared, of the vector with components nu1 and nu2."""
         nu = ufl.as_vector([nu1, nu2])
         return ufl.dot(nu, ufl.dot(self.metric, nu))

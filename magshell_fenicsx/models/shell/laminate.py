@@ -1,10 +1,9 @@
-"""The law of a laminate: Koiter's energies with stiffnesses A, B and D in the directions of its
-plies.
+"""The law of a laminate: Koiter's energies with stiffnesses A, B and D of plies.
 
 With z along the normal the layer at z has the strain E - z K, so that the energy per area is (E : A
-: E - 2 E : B : K + K : D : K)/2, A, B, D the integrals of 1, z, z^2 times the stiffness of the
-plies (R. M. Jones, *Mechanics of Composite Materials*, 1999, chapter 4). E h, E h^2 and E h^3 are
-taken out.
+: E - 2 E : B : K + K : D : K)/2. A, B and D are the integrals of 1, z and z^2 times the stiffness
+of the plies (R. M. Jones, *Mechanics of Composite Materials*, 1999, chapter 4). E h, E h^2 and E
+h^3 are taken out.
 """
 
 from dataclasses import dataclass, field, replace
@@ -33,7 +32,7 @@ class Laminate:
     Attributes
     ----------
     matrices
-        A, B, D (3, 6).
+        (3, 6) A, B, D, each as 11, 12, 22, 16, 26, 66.
     direction
         Direction of the angle 0 in the shell's frame; None for the meridians of its e3.
     isotropic
@@ -49,13 +48,14 @@ class Laminate:
     origin: Array = field(default_factory=lambda: np.zeros(3), repr=False)
 
     def refuse_normal(self, normals: Array, comm: MPI.Comm) -> None:
-        """Refuse a direction that is normal to a whole cell; `normals` are (cells, nodes, 3).
-        Collective.
+        """Refuse a direction that is normal to a whole cell; collective.
+
+        `normals` are (cells, nodes, 3) in the frame of the model.
 
         Raises
         ------
         MeshError
-            On every rank, if it is normal to a whole cell.
+            On every rank, for such a direction.
         """
         if self.direction is None or self.isotropic:
             return
@@ -71,8 +71,9 @@ class Laminate:
             )
 
     def mirrored(self, plane: Mirror) -> bool:
-        """Whether a plane mirrors plies that do not twist: it is along or across their directions
-        everywhere.
+        """Return whether a plane, in the model's frame, mirrors plies that do not twist.
+
+        It must be along or across their directions everywhere.
         """
         plane_in_shell_frame = replace(
             plane,
@@ -84,15 +85,15 @@ class Laminate:
 
 @dataclass(frozen=True)
 class Laminated(Law):
-    """The law of a laminate; its parameter is Poisson's ratio of the units.
+    """The law of a laminate; its parameter is the Poisson's ratio of the units.
 
     Attributes
     ----------
     A, B, D
-        Over E h, E h^2 and E h^3.
+        Over E h, E h^2 and E h^3, each as 11, 12, 22, 16, 26, 66.
     axis
-        The vector (3,) along whose part in the surface the angle 0 is, or whose meridians it is
-        along.
+        Vector (3,): the angle 0 is along its part in the surface or, with `meridian`, along the
+        meridians about it.
     origin
         A place (3,) on the axis of meridians.
     meridian
@@ -111,7 +112,7 @@ class Laminated(Law):
 
     @classmethod
     def from_laminate(cls, laminate: Laminate, h: float, nu: float) -> Self:
-        """Return the law of plies."""
+        """Return the law of plies, for the thickness h over R and the Poisson's ratio of units."""
         A, B, D = (tuple(float(v) for v in S) for S in laminate.matrices)
         direction, meridian = laminate.direction, laminate.direction is None
         axis_in_model = laminate.axes @ (np.eye(3)[2] if direction is None else direction)
@@ -133,6 +134,8 @@ class Laminated(Law):
         return self.meridian
 
     def at_point(self, r: Any, a1: Any, a2: Any, n: Any) -> Self:
+        """Return the law with the direction of the angle 0 at a point, see `Law.at_point`."""
+
         def dot(v: Any, a: Any) -> Scalar:
             return v[0] * a[..., 0] + v[1] * a[..., 1] + v[2] * a[..., 2]
 
@@ -152,23 +155,26 @@ class Laminated(Law):
         ).bending_stiffness
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
+        """Return E : A : E/2, over E h per undeformed area."""
         strain = _Frame(self.direction, up).strain_components(E)
         return (
             self.modulus_factor * self.thickness_factor / 2 * _work(_stress(self.A, strain), strain)
         )
 
     def stress(self, E: Tensor, up: Tensor) -> Components:
+        """Return S with indices up: A times the strain in the frame of the plies."""
         frame = _Frame(self.direction, up)
         return frame.components_up(
             self.modulus_factor * self.thickness_factor, _stress(self.A, frame.strain_components(E))
         )
 
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
+        """Return K : D : K/2 - E : B : K, over E h per undeformed area."""
         frame = _Frame(self.direction, up)
         stretched, bent = frame.strain_components(E), frame.strain_components(K)
         bending_work = _work(_stress(self.D, bent), bent)
         coupling_work = _work(_stress(self.B, bent), stretched)
-        return self._of_D / 2 * bending_work - self._of_B * coupling_work
+        return self._bending_factor / 2 * bending_work - self._coupling_factor * coupling_work
 
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
         frame = _Frame(self.direction, up)
@@ -182,32 +188,51 @@ class Laminated(Law):
         covector_up: tuple[Scalar, Scalar],
         covector_square: Scalar,
     ) -> Scalar:
+        """Return the moment contracted twice with a covector, in the frame of the plies."""
         frame = _Frame(self.direction, up)
         return _work(self._moment(frame, E, K), frame.product(covector_up))
 
     def edge_stiffness(
         self, E: Tensor, up: Tensor, covector_up: tuple[Scalar, Scalar], covector_square: Scalar
     ) -> Scalar:
+        """Return D contracted with the covector four times."""
         bent = _Frame(self.direction, up).product(covector_up)
-        return self._of_D * _work(_stress(self.D, bent), bent)
+        return self._bending_factor * _work(_stress(self.D, bent), bent)
 
     @property
-    def _of_B(self) -> Scalar:
+    def _coupling_factor(self) -> Scalar:
         return self.modulus_factor * self.h * self.thickness_factor**2
 
     @property
-    def _of_D(self) -> Scalar:
+    def _bending_factor(self) -> Scalar:
         return self.modulus_factor * self.h**2 * self.thickness_factor**3
 
     def _moment(self, frame: "_Frame", E: Tensor, K: Tensor) -> Triple:
-        of_D = _stress(self.D, frame.strain_components(K))
-        of_B = _stress(self.B, frame.strain_components(E))
-        M1, M2, M6 = (self._of_D * d - self._of_B * b for d, b in zip(of_D, of_B, strict=True))
+        """Return M_11, M_22, M_12 in the frame: D times K less B times E."""
+        bending_part = _stress(self.D, frame.strain_components(K))
+        stretching_part = _stress(self.B, frame.strain_components(E))
+        M1, M2, M6 = (
+            self._bending_factor * d - self._coupling_factor * b
+            for d, b in zip(bending_part, stretching_part, strict=True)
+        )
         return M1, M2, M6
 
 
 class _Frame:
-    """t1 along a direction and t2 = n x t1: orthonormal in the metric whose inverse is `up`."""
+    """Orthonormal vectors t1 along a direction and t2 = n x t1 in a surface.
+
+    Parameters
+    ----------
+    direction
+        Components of the direction with index down, of any length.
+    up
+        Inverse metric, in which the vectors are orthonormal.
+
+    Attributes
+    ----------
+    t1, t2
+        Components with index up.
+    """
 
     def __init__(self, direction: tuple[Scalar, Scalar], up: Tensor) -> None:
         (c1, c2), (a11, a12, a22) = direction, (up[..., 0, 0], up[..., 0, 1], up[..., 1, 1])
@@ -219,7 +244,7 @@ class _Frame:
         self.t2 = -(det**0.5) * c2 * inverse_length, det**0.5 * c1 * inverse_length
 
     def strain_components(self, S: Tensor) -> Triple:
-        """S_11, S_22 and 2 S_12 of a tensor with indices down."""
+        """Return S_11, S_22 and 2 S_12 in the frame, of a tensor with indices down."""
 
         def component(a: tuple[Scalar, Scalar], b: tuple[Scalar, Scalar]) -> Scalar:
             mixed = a[0] * b[1] + a[1] * b[0]
@@ -232,15 +257,19 @@ class _Frame:
         )
 
     def product(self, covector_up: tuple[Scalar, Scalar]) -> Triple:
-        """Return the components 11, 22 and 2 * 12 of c c, where the covector c has these components
-        with index up.
+        """Return the components 11, 22 and 2 * 12 in the frame of c c, for a covector c.
+
+        `covector_up` are the components of c with index up.
         """
         c = lower_index(covector_up, self._up)
         c_1, c_2 = (t[0] * c[0] + t[1] * c[1] for t in (self.t1, self.t2))
         return c_1**2, c_2**2, 2 * c_1 * c_2
 
     def components_up(self, factor: Scalar, S: Triple) -> Components:
-        """Return a factor times a stress S_11, S_22, S_12 as components with indices up."""
+        """Return a factor times a stress as components with indices up.
+
+        The stress S_11, S_22, S_12 is in the frame.
+        """
         (a1, a2), (b1, b2), (S1, S2, S6) = self.t1, self.t2, S
         S11 = S1 * a1**2 + S2 * b1**2 + 2 * S6 * a1 * b1
         S12 = S1 * a1 * a2 + S2 * b1 * b2 + S6 * (a1 * b2 + a2 * b1)
@@ -249,7 +278,7 @@ class _Frame:
 
 
 def _stress(Q: Stiffness, e: Triple) -> Triple:
-    """S_11, S_22, S_12 of a strain e_11, e_22, 2 e_12."""
+    """Return S_11, S_22, S_12 of a strain e_11, e_22, 2 e_12, by a stiffness Q."""
     return (
         Q[0] * e[0] + Q[1] * e[1] + Q[3] * e[2],
         Q[1] * e[0] + Q[2] * e[1] + Q[4] * e[2],

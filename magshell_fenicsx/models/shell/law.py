@@ -33,7 +33,7 @@ class Law(ABC):
     Attributes
     ----------
     h
-        The thickness that energies are over.
+        The thickness over R by which energies are divided.
     parameter
         The law's own number.
     thickness_factor
@@ -43,7 +43,7 @@ class Law(ABC):
     thins
         1 where the thickness follows from the area, so that the volume stays; else 0.
     depends_on_place
-        Whether directions depend on the place itself.
+        Whether directions of the law depend on the place itself.
     """
 
     h: Scalar
@@ -62,13 +62,17 @@ class Law(ABC):
 
     @property
     def numbers(self) -> tuple[Any, ...]:
-        """Numbers of the law in their order, without `thickness_factor` and `modulus_factor`; some
-        laws have vectors among them.
+        """The law's numbers in order, without `thickness_factor` and `modulus_factor`.
+
+        Some laws have vectors among them.
         """
         return self.h, self.parameter
 
     def with_numbers(self, *numbers: Any) -> Self:
-        """Return the law with other numbers, and `thickness_factor` and `modulus_factor` of 1."""
+        """Return the law with other numbers, in the order of `numbers`.
+
+        Its `thickness_factor` and `modulus_factor` are 1.
+        """
         return type(self)(*numbers)
 
     @property
@@ -76,8 +80,9 @@ class Law(ABC):
         return False
 
     def at_point(self, r: Any, a1: Any, a2: Any, n: Any) -> Self:
-        """Return the law at an undeformed place (..., 3) with these tangents and a normal of any
-        length, on which directions of plies depend.
+        """Return the law at a point of the undeformed surface, where plies have their directions.
+
+        r (..., 3) is the place, a1 and a2 are the tangents, n is a normal of any length.
         """
         return self
 
@@ -88,8 +93,8 @@ class Law(ABC):
     def with_material(self, modulus_factor: Scalar, nu: Scalar, shell_number: Scalar = 0) -> Self:
         """Return the law with another material.
 
-        Young's modulus is multiplied by a factor; Poisson's ratio is another one, where the law has
-        one; of several laws `shell_number` chooses one.
+        Young's modulus is multiplied by a factor; nu replaces Poisson's ratio where the law has
+        one. Of several laws `shell_number` selects one.
         """
         return replace(self, modulus_factor=modulus_factor * self.modulus_factor)
 
@@ -105,18 +110,18 @@ class Law(ABC):
 
     @abstractmethod
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
-        """The energy of stretching."""
+        """Return the energy of stretching."""
 
     @abstractmethod
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
-        """The energy of bending, quadratic in K."""
+        """Return the energy of bending, quadratic in K."""
 
     @abstractmethod
     def stress(self, E: Tensor, up: Tensor) -> Components:
-        """The derivative of `membrane` by E."""
+        """Return the derivative of `membrane` by E."""
 
     def stress_change(self, E: Tensor, change: Tensor, up: Tensor) -> Components:
-        """Stress of E + change less that of E."""
+        """Return the stress of E + change less that of E."""
         if self.linear is self:
             return self.stress(change, up)
         stress, changed_stress = self.stress(E, up), self.stress(E + change, up)
@@ -125,7 +130,7 @@ class Law(ABC):
 
     @abstractmethod
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
-        """The derivative of `bending` by K."""
+        """Return the derivative of `bending` by K."""
 
     @abstractmethod
     def edge_moment(
@@ -136,10 +141,14 @@ class Law(ABC):
         covector_up: tuple[Scalar, Scalar],
         covector_square: Scalar,
     ) -> Scalar:
-        """Moment contracted twice with a covector c.
+        """Return the moment contracted twice with a covector c.
 
         Parameters
         ----------
+        E, K
+            Membrane strain and change of curvature.
+        up
+            Inverse metric of the shape without stress.
         covector_up, covector_square
             c with its index up, and c . c: the unit conormal of an edge and 1, but for a natural
             stretch.
@@ -149,14 +158,15 @@ class Law(ABC):
     def edge_stiffness(
         self, E: Tensor, up: Tensor, covector_up: tuple[Scalar, Scalar], covector_square: Scalar
     ) -> Scalar:
-        """Derivative of `edge_moment` by K, contracted twice with c; the penalty of edges is
-        proportional to it.
+        """Return the derivative of `edge_moment` by K, contracted twice with c.
+
+        The penalty of edges is proportional to it. Parameters are those of `edge_moment`.
         """
 
 
 @dataclass(frozen=True)
 class Koiter(Law):
-    """Stress is linear in strain; stretching and bending do not know of each other.
+    """Koiter's law: stress is linear in strain, stretching and bending are independent.
 
     Its number is Poisson's ratio.
     """
@@ -175,6 +185,7 @@ class Koiter(Law):
         return self.modulus_factor * self.thickness_factor**3 * self.h**2 / (12 * (1 - self.nu**2))
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
+        """Return S : E/2 = ((1 - nu) E : E + nu tr² E)/(2 (1 - nu²)), times factors."""
         return (
             self.modulus_factor
             * self.thickness_factor
@@ -199,6 +210,7 @@ class Koiter(Law):
         covector_up: tuple[Scalar, Scalar],
         covector_square: Scalar,
     ) -> Scalar:
+        """Return D ((1 - nu) K_cc + nu c² tr K), for the covector c; see `Law.edge_moment`."""
         curvature_across = (
             K[..., 0, 0] * covector_up[0] ** 2
             + 2 * K[..., 0, 1] * covector_up[0] * covector_up[1]
@@ -214,7 +226,7 @@ class Koiter(Law):
         return self.bending_stiffness * covector_square**2
 
     def _square(self, S: Tensor, up: Tensor) -> Scalar:
-        """(1 - nu) S:S + nu tr^2 S."""
+        """Return (1 - nu) S:S + nu tr^2 S."""
         T11, T12, T21, T22 = _mixed(S, up)
         return (1 - self.nu) * (T11**2 + 2 * T12 * T21 + T22**2) + self.nu * (T11 + T22) ** 2
 
@@ -232,14 +244,14 @@ class Koiter(Law):
 
 @dataclass(frozen=True)
 class LawByShell(Law):
-    """Several shells, each with its own law; the first one's is that of the units.
+    """The laws of several shells; the first one is that of the units.
 
     Attributes
     ----------
     laws
         At least two, with the same h.
     shell_number
-        The number of the law at a place.
+        The number of the law at a place: a number, an expression or an array.
     """
 
     laws: tuple[Law, ...] = field(default=(), kw_only=True)
@@ -250,6 +262,7 @@ class LawByShell(Law):
         return tuple(number for law in self.laws for number in law.numbers)
 
     def with_numbers(self, *numbers: Any) -> Self:
+        """Return the laws with other numbers: first those of the first law, and so on."""
         remaining_numbers, laws = list(numbers), list[Law]()
         for law in self.laws:
             count = len(law.numbers)
@@ -317,6 +330,7 @@ class LawByShell(Law):
         covector_up: tuple[Scalar, Scalar],
         covector_square: Scalar,
     ) -> Scalar:
+        """Return the `edge_moment` of the law at the place."""
         return self._value_at_place(
             [law.edge_moment(E, K, up, covector_up, covector_square) for law in self.laws]
         )
@@ -324,6 +338,7 @@ class LawByShell(Law):
     def edge_stiffness(
         self, E: Tensor, up: Tensor, covector_up: tuple[Scalar, Scalar], covector_square: Scalar
     ) -> Scalar:
+        """Return the `edge_stiffness` of the law at the place."""
         return self._value_at_place(
             [law.edge_stiffness(E, up, covector_up, covector_square) for law in self.laws]
         )
@@ -332,7 +347,7 @@ class LawByShell(Law):
         return replace(self, laws=tuple(change(law) for law in self.laws))
 
     def _value_at_place(self, values: Sequence[Scalar]) -> Scalar:
-        """Return the value of the law at a place, from the values of all laws."""
+        """Return the value of the law `shell_number`, from the values of all laws."""
         value_at_place = values[0]
         for i, value in enumerate(values[1:]):
             if isinstance(self.shell_number, Expr):
@@ -347,7 +362,7 @@ class LawByShell(Law):
 
 
 def _mixed(S: Tensor, up: Tensor) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """S^i_j as 11, 12, 21, 22."""
+    """Return S^i_j = a^ik S_kj as 11, 12, 21, 22."""
     S11, S12, S22 = S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]
     a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
     return (
@@ -359,7 +374,7 @@ def _mixed(S: Tensor, up: Tensor) -> tuple[Scalar, Scalar, Scalar, Scalar]:
 
 
 def trace(S: Tensor, up: Tensor) -> Scalar:
-    """S^i_i."""
+    """Return S^i_i."""
     return (
         up[..., 0, 0] * S[..., 0, 0]
         + 2 * up[..., 0, 1] * S[..., 0, 1]
@@ -368,8 +383,9 @@ def trace(S: Tensor, up: Tensor) -> Scalar:
 
 
 def lower_index(covector_up: tuple[Scalar, Scalar], up: Tensor) -> tuple[Scalar, Scalar]:
-    """Return the components with index down of a covector, from those with index up; `up` is the
-    inverse metric (2, 2).
+    """Return the components of a covector with index down, from those with index up.
+
+    `up` is the inverse metric (2, 2).
     """
     a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
     det = a11 * a22 - a12**2
@@ -379,7 +395,7 @@ def lower_index(covector_up: tuple[Scalar, Scalar], up: Tensor) -> tuple[Scalar,
 
 
 def work(S: Components, T: Tensor) -> Scalar:
-    """S:T of a stress or a moment on a strain."""
+    """Return S:T of a stress or a moment S, with indices up, on a strain T."""
     return S[0] * T[..., 0, 0] + 2 * S[1] * T[..., 0, 1] + S[2] * T[..., 1, 1]
 
 
@@ -389,16 +405,32 @@ def elastic_density(
     thickness: Parameter | None = None,
     cell_materials: Parameter | None = None,
 ) -> Density:
-    """Return the density of a material, from one that takes a `law`, on two sides a pair of laws.
+    """Return a density with parameters for a material, from one that takes a `law`.
 
-    The numbers of the law become parameters. `thickness` (1,) multiplies the thickness; None for 1.
-    `cell_materials` (4,) is `ShellMaterial.numbers`; None for one material.
+    On interior edges the density takes a pair of laws. The numbers of the law become parameters,
+    then the fields.
+
+    Parameters
+    ----------
+    density
+        The density, whose function has the keyword `law`.
+    law
+        The law.
+    thickness
+        Field (1,) that multiplies the thickness; None for 1.
+    cell_materials
+        Field (4,) of `ShellMaterial.numbers`; None for one material.
     """
 
     def by_side(value: Any) -> Sequence[Any]:
+        """Return the values of all sides in a sequence."""
         return value if density.sides == 2 else [value]
 
     def with_law(*arguments: Expr, **keywords: Any) -> Expr:
+        """Return the density's value at its own arguments, numbers, thickness and materials.
+
+        The arguments come in this order; the last two are absent without such fields.
+        """
         arguments_left, factors, materials = list(arguments), [1] * density.sides, None
         if cell_materials is not None:
             materials = by_side(arguments_left.pop())
@@ -408,8 +440,8 @@ def elastic_density(
         laws = [law.with_numbers(*arguments_left[count:]).thicker(factor) for factor in factors]
         if materials is not None:
             laws = [
-                of_side.with_material(numbers[0], numbers[1], numbers[3])
-                for of_side, numbers in zip(laws, materials, strict=True)
+                side_law.with_material(numbers[0], numbers[1], numbers[3])
+                for side_law, numbers in zip(laws, materials, strict=True)
             ]
         return density.function(
             *arguments_left[:count], law=tuple(laws) if density.sides == 2 else laws[0], **keywords

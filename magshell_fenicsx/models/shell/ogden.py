@@ -53,17 +53,19 @@ class Ogden(Incompressible):
 
     @property
     def terms(self) -> list[tuple[Scalar, float]]:
-        """mu and alpha of each."""
+        """mu and alpha of each term."""
         return [(self.mu[i], alpha) for i, alpha in enumerate(self.alpha)]
 
     @property
     def softening(self) -> float:
-        """How much of the stress is taken into the stiffness of bending, so that it is positive at
-        every stretch.
+        """Share of the stress that is taken into the stiffness of bending.
+
+        It makes this stiffness positive at every stretch.
         """
         return max(0.0, 2 - min(abs(alpha) for alpha in self.alpha))
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
+        """Return the energy of stretching, without differences of numbers of order one."""
         surface, total = Stretched(E, up), 0.0
         for mu, alpha in self.terms:
             z, (V, _, _) = surface.d ** (alpha / 4), _chebyshev(alpha / 2, _uneven(surface))
@@ -73,6 +75,7 @@ class Ogden(Incompressible):
         return self.modulus_factor * self.thickness_factor * total
 
     def _slopes(self, surface: Stretched) -> tuple[Scalar, Scalar]:
+        """Return the energy's derivatives by T and D, where t = 2 + T and d = 1 + T + D."""
         w, by_t, by_d = _uneven(surface), 0.0, 0.0
         for mu, alpha in self.terms:
             a = alpha / 2
@@ -84,47 +87,66 @@ class Ogden(Incompressible):
         return by_t + by_d, by_d
 
     def _stiffness(self, surface: Stretched) -> tuple[Scalar, Scalar, Scalar, Scalar]:
+        """Return factors of T², -T tr K, -det K and (tr K)², see `Incompressible._stiffness`.
+
+        They follow from the second derivatives of the energy by t and d, see docs/theory.md,
+        Rubber.
+        """
         w, softening = _uneven(surface), self.softening
-        y, square, mixed, of_trace, equibiaxial = 1 + w, 0.0, 0.0, 0.0, 0.0
+        y, square_factor, mixed_factor, trace_factor, equibiaxial = 1 + w, 0.0, 0.0, 0.0, 0.0
         for mu, alpha in self.terms:
             a = alpha / 2
             V, V1, V2 = _chebyshev(a, w)
             z, m = surface.d ** (a / 2), mu / alpha
             by_d, by_both = a * (1 + V) - y * V1, (a - 1) * V1 - y * V2
-            of_trace = of_trace + 2 * m * z * V2
-            mixed = mixed + m * z * (4 * by_both + 2 * softening * V1)
+            trace_factor = trace_factor + 2 * m * z * V2
+            mixed_factor = mixed_factor + m * z * (4 * by_both + 2 * softening * V1)
             in_surface = (2 * a - 4 + 2 * softening) * by_d - 2 * y * by_both
-            square = square + m * (z * in_surface + (4 * a * (a + 1) - 2 * a * softening) / z**2)
+            square_factor = square_factor + m * (
+                z * in_surface + (4 * a * (a + 1) - 2 * a * softening) / z**2
+            )
             equibiaxial = equibiaxial + 4 * a * m * (
                 (a - 1 + softening / 2) * z + (a + 1 - softening / 2) / z**2
             )
-        uniaxial = of_trace + y * mixed + square
-        of_det = 2 * uniaxial**2 / (uniaxial + equibiaxial)
+        uniaxial = trace_factor + y * mixed_factor + square_factor
+        det_factor = 2 * uniaxial**2 / (uniaxial + equibiaxial)
         factor = self.modulus_factor * self.thickness_factor**3 * self.h**2 / (12 * surface.d)
         s = root(surface.d)
         return (
-            factor * square,
-            -factor * mixed / s,
-            factor * of_det * surface.up / surface.d,
-            factor * of_trace / surface.d,
+            factor * square_factor,
+            -factor * mixed_factor / s,
+            factor * det_factor * surface.up / surface.d,
+            factor * trace_factor / surface.d,
         )
 
 
 def _uneven(surface: Stretched) -> Scalar:
-    """w = t/(2 sqrt(d)) - 1, in which no numbers of order one are subtracted: (t^2/4 - d)/(sqrt(d)
-    (t/2 + sqrt(d))).
+    """Return w = t/(2 sqrt(d)) - 1, without a difference of numbers of order one.
+
+    It is (t^2/4 - d)/(sqrt(d) (t/2 + sqrt(d))).
     """
     s = root(surface.d)
     return (surface.T**2 / 4 - surface.D) / (s * (1 + surface.T / 2 + s))
 
 
 def _chebyshev(a: float, w: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """V(w) of the order a, and two derivatives."""
-    c = [0.0, a**2]
+    """Return V(w) of the order a and its first two derivatives.
+
+    V is that of the module's docstring: a power series below `SERIES_LIMIT`, or a polynomial if a
+    is a small integer; else from p = exp(a u).
+    """
+    coefficients = [0.0, a**2]
     for k in range(1, SERIES_TERMS):
-        c.append(c[-1] * (a**2 - k**2) / ((2 * k + 1) * (k + 1)))
+        # the differential equation of V gives each coefficient from the one before
+        coefficients.append(coefficients[-1] * (a**2 - k**2) / ((2 * k + 1) * (k + 1)))
     series = [
-        _horner([float(coefficient) for coefficient in np.polynomial.polynomial.polyder(c, n)], w)
+        _horner(
+            [
+                float(coefficient)
+                for coefficient in np.polynomial.polynomial.polyder(coefficients, n)
+            ],
+            w,
+        )
         for n in range(3)
     ]
     if a == int(a) and abs(a) <= SERIES_TERMS:  # a polynomial
@@ -136,14 +158,15 @@ def _chebyshev(a: float, w: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     V = (p + 1 / p) / 2 - 1
     V1 = a * (p - 1 / p) / (2 * root(bounded_w * (2 + bounded_w)))
     V2 = (a**2 * (1 + V) - y * V1) / (bounded_w * (2 + bounded_w))
-    value, slope, bend = (
+    value, slope, second = (
         _conditional(in_series, series_value, f)
         for series_value, f in zip(series, (V, V1, V2), strict=True)
     )
-    return value, slope, bend
+    return value, slope, second
 
 
 def _horner(c: list[float], w: Scalar) -> Scalar:
+    """Return the polynomial with coefficients c, of ascending powers, at w."""
     total: Scalar = float(c[-1])
     for coefficient in reversed(c[:-1]):
         total = total * w + float(coefficient)

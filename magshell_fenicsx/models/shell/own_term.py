@@ -1,6 +1,4 @@
-"""An energy of the mid-surface or of an edge, a part's or one's own, from nothing but its
-density.
-"""
+"""An energy of the mid-surface or of an edge, of a part or of a user, from its density alone."""
 
 from __future__ import annotations
 
@@ -52,7 +50,7 @@ COORDINATE_SAMPLES, COORDINATE_TOLERANCE = (
 
 
 def symbolic_functions() -> dict[str, Callable[..., Any]]:
-    """UFL's functions of formulas."""
+    """Return UFL's functions by the names that formulas have."""
     functions = {name: getattr(ufl, name) for name in ("sin", "cos", "tan", "exp", "sqrt", "sign")}
     return functions | {"log": ufl.ln, "abs": abs, "arctan2": ufl.atan2}
 
@@ -61,8 +59,8 @@ def symbolic_functions() -> dict[str, Callable[..., Any]]:
 class Free:
     """A parameter of densities that is an amplitude of its own, and may enter them in any way.
 
-    A place, an angle or a natural curvature, for instance: what is conjugate to it is -dPi/dp, a
-    force on what it moves. `value` is that of the undeformed shell.
+    It is a place, an angle or a natural curvature, for instance. Its conjugate is -dPi/dp, a force
+    on what it moves. `value` is that of the undeformed shell.
     """
 
     name: str
@@ -71,11 +69,10 @@ class Free:
 
 @dataclass(frozen=True)
 class FormulaParameter:
-    """A parameter that is a formula of x, y, z over R at the undeformed place: a number that varies
-    over the surface.
+    """A parameter that is a formula of x, y, z over R at the undeformed place.
 
-    Each cell has the polynomial with the moments of the formula: what is narrower than a cell is
-    not missed.
+    It is a number that varies over the surface. Each cell has the polynomial with the moments of
+    the formula: what is narrower than a cell is not missed.
 
     Attributes
     ----------
@@ -84,7 +81,7 @@ class FormulaParameter:
     key
         Key of the case file, for messages.
     turn
-        The frame of the model is turned about e3 by it (rad), the formula's is not.
+        Angle (rad) by which the model's frame is turned about e3 from the formula's.
     """
 
     text: str
@@ -94,18 +91,20 @@ class FormulaParameter:
     @property
     def of_place(self) -> Callable[[Array, Array, Array], Array]:
         """Formula as a function of arrays of coordinates in the model's frame."""
-        of_case = formula_function(self.text)
+        case_formula = formula_function(self.text)
         if not self.turn:
-            return of_case
+            return case_formula
         Q = rotation(self.turn)
-        return lambda x, y, z: of_case(*(Q[0, i] * x + Q[1, i] * y + Q[2, i] * z for i in range(3)))
+        return lambda x, y, z: case_formula(
+            *(Q[0, i] * x + Q[1, i] * y + Q[2, i] * z for i in range(3))
+        )
 
     def turns(self, outline: Outline) -> bool:
-        """Whether it is the same all around e3."""
+        """Return whether the formula is axisymmetric about e3."""
         return outline.meridian is not None and scalar_is_axisymmetric(self.text, outline.meridian)
 
     def mirrored(self, mirror: Mirror, outline: Outline) -> bool:
-        """Whether a plane mirrors it."""
+        """Return whether a plane mirrors the formula."""
         return mirrors_formula(self.text, mirror, outline.sample())
 
 
@@ -165,6 +164,13 @@ class OwnTerm:
     key: str = ""
 
     def __post_init__(self) -> None:
+        """Check the name, the value and the densities.
+
+        Raises
+        ------
+        ValueError
+            With the name of the term and what is allowed.
+        """
         if not self.name.isidentifier():
             raise ValueError(f"{self.name!r}: a term's name is an identifier, such as foundation")
         if not isinstance(self.value, Real) or not isfinite(self.value):
@@ -223,8 +229,9 @@ class OwnTerm:
 
     @cached_property
     def placement_parts(self) -> tuple[str, ...]:
-        """Parts of the placement's jet that the density depends on; the area of the surface takes
-        the first derivatives anyway.
+        """Parts of the placement's jet that the density needs.
+
+        The first derivatives are always among them: the area of the surface takes them.
         """
         return tuple(
             name
@@ -252,8 +259,14 @@ class OwnTerm:
         formula_to_function: Callable[[FormulaParameter], Coefficient],
         field_to_function: Callable[[UserField], Coefficient] | None = None,
     ) -> OwnTerm:
-        """Return the term with functions on a model's mesh, of numbers (size,), in place of
-        formulas and of the user's fields.
+        """Return the term with functions on a model's mesh in place of formulas and user fields.
+
+        Parameters
+        ----------
+        formula_to_function
+            Makes the function (1,) of a formula.
+        field_to_function
+            Makes the function (size,) of a user's field; None to keep these.
         """
 
         def function_of(p: Any) -> Any:
@@ -264,16 +277,25 @@ class OwnTerm:
         return replace(self, parameters=tuple(map(function_of, self.parameters)))
 
     def turned(self, angle: float) -> OwnTerm:
-        """Return the term in a frame that is turned about e3 (rad)."""
+        """Return the term in a frame that is turned by `angle` about e3 (rad).
+
+        Jets are rotated into the density's own frame before it is evaluated; cosine and sine are a
+        further parameter.
+        """
         if not angle or (self.turns and not self.formula_parameters):
             return self
 
         def rotated(v: Expr, about: Expr) -> Expr:
+            """Return a vector rotated about e3; `about` (2,) holds cosine and sine of the angle."""
+            # cosine and sine, and the components of the vector
             (c, s), (x, y, z) = (about[0], about[1]), (v[0], v[1], v[2])
             return ufl.as_vector([c * x - s * y, s * x + c * y, z])
 
         def in_frame(density: Callable[..., Expr]) -> Callable[..., Expr]:
+            """Return a density of jets in the turned frame; its last parameter is the rotation."""
+
             def density_in_frame(r0: Jet, u: Jet, *arguments: Any) -> Expr:
+                """Evaluate the density at rotated jets, with rotated vectors of an edge."""
                 *arguments_left, rotation = arguments
                 jets = (Jet(*(rotated(part, rotation) for part in jet.parts())) for jet in (r0, u))
                 if self.on is not None:
@@ -302,7 +324,10 @@ class OwnTerm:
         )
 
     def at_point(self, density: Callable[..., Expr]) -> Callable[..., Expr]:
-        """Return a density that takes functions of one number as vectors of one."""
+        """Return a density whose parameters of one number may be given as vectors (1,).
+
+        Functions on a mesh are such vectors at a point.
+        """
         is_number = [
             isinstance(p, ufl.Coefficient) and p.ufl_shape == (1,) for p in self.parameters
         ]
@@ -310,9 +335,10 @@ class OwnTerm:
             return density
 
         def density_of_numbers(*arguments: Any) -> Expr:
-            others, parameters = arguments[: -len(is_number)], arguments[-len(is_number) :]
+            """Evaluate the density with vectors (1,) unpacked."""
+            jets_and_edge, parameters = arguments[: -len(is_number)], arguments[-len(is_number) :]
             return density(
-                *others,
+                *jets_and_edge,
                 *(p[0] if number else p for p, number in zip(parameters, is_number, strict=True)),
             )
 
@@ -320,8 +346,9 @@ class OwnTerm:
 
     @cached_property
     def linear(self) -> bool:
-        """Whether the density is linear in the displacement: its second derivatives vanish
-        identically.
+        """Whether the density is linear in the displacement.
+
+        Its second derivatives then vanish identically.
         """
         W, parts = self._symbolic.W, [getattr(self._symbolic.u, name) for name in self.parts]
         second = (
@@ -333,8 +360,9 @@ class OwnTerm:
 
     @cached_property
     def turns(self) -> bool:
-        """Whether it, and what it observes, stays if shell and displacement turn about e3; at
-        random jets.
+        """Whether the densities stay the same if shell and displacement turn about e3.
+
+        It is tested at random jets.
         """
 
         def rotated(jet: Array, angle: float) -> Array:
@@ -348,8 +376,9 @@ class OwnTerm:
         )
 
     def mirrored(self, mirror: Mirror) -> bool:
-        """Whether it, and what it observes, stays if shell and displacement are mirrored; at random
-        jets.
+        """Return whether the densities stay the same if shell and displacement are mirrored.
+
+        It is tested at random jets. A term with functions on a mesh counts as not mirrored.
         """
         # the first coordinate changes places with the second, so that the normal stays outward
         if self.varying:
@@ -360,6 +389,7 @@ class OwnTerm:
         S = mirror.reflection
 
         def image(r0: Array, u: Array, m: Array) -> Sample:
+            """Return the mirror image of a sample, with the two coordinates exchanged."""
             return np.vstack([mirror.image(r0[:1]), r0[order[1:]] @ S]), u[order] @ S, m[::-1]
 
         if self.on is not None and mirror.image_of_edge(self.on) != self.on:
@@ -367,7 +397,7 @@ class OwnTerm:
         return all(self._is_same(sample, image(*sample)) for sample in _random_samples())
 
     def symmetry_constraint(self, outline: Outline) -> SymmetryConstraint:
-        """Return the symmetry that the term preserves."""
+        """Return the symmetry that the term preserves of a shell with this outline."""
         turns = self.turns and all(p.turns(outline) for p in self.formula_parameters)
 
         def mirrors(mirror: Mirror) -> bool:
@@ -383,7 +413,7 @@ class OwnTerm:
 
     @property
     def digest(self) -> str:
-        """A hash of its name, its amplitude and its values at random jets."""
+        """A hash of the term: name, amplitude, parameters, and densities at random jets."""
         values = [
             self._value(sample, density)
             for density in self.densities
@@ -400,7 +430,13 @@ class OwnTerm:
 
     @cached_property
     def _symbolic(self) -> Symbolic:
-        """Density as an expression, with the variables that it is written with."""
+        """The first density as an expression, with the variables that it is written with.
+
+        Raises
+        ------
+        ValueError
+            If the user's function fails.
+        """
         import basix.ufl
 
         domain = ufl.Mesh(basix.ufl.element("Lagrange", "triangle", 1, shape=(2,)))
@@ -426,9 +462,7 @@ class OwnTerm:
             ) from e
 
     def _foreign_terminals(self) -> list[Expr]:
-        """Fields, constants and coordinates of some mesh that the density has besides its
-        arguments.
-        """
+        """Return fields, constants and coordinates in the density that are no arguments."""
         W, r0, u, m = self._symbolic
         arguments = [m, *(part.ufl_operands[0] for jet in (r0, u) for part in jet.parts())]
         return [
@@ -439,8 +473,9 @@ class OwnTerm:
         ]
 
     def _refuse_coordinates(self) -> None:
-        """Refuse a density that differs in other coordinates of the surface, since each cell has
-        its own.
+        """Refuse a density that depends on the coordinates of the surface.
+
+        Each cell has its own, so the value must be the same in others.
 
         Raises
         ------
@@ -465,6 +500,7 @@ class OwnTerm:
                     )
 
     def _parts_in(self, jet: Jet) -> tuple[str, ...]:
+        """Return the names of the parts of a jet of `_symbolic` that the density depends on."""
         coefficients = ufl.algorithms.extract_coefficients(self._symbolic.W)
         return tuple(
             name
@@ -473,16 +509,17 @@ class OwnTerm:
         )
 
     def _edge(self, r0: Jet, m: Expr) -> tuple[Edge, ...]:
-        """Arguments of the densities after the jets."""
+        """Return the arguments of the densities between jets and parameters: an edge, or none."""
         return () if self.on is None else (Edge.of(r0, m),)
 
     def _expression(self, r0: Jet, u: Jet, m: Expr, density: Callable[..., Expr]) -> Expr:
+        """Return a density at given jets as an expression of UFL."""
         return ufl.as_ufl(
             density(r0, u, *self._edge(r0, m), *(_as_expression(p) for p in self.parameters))
         )
 
     def _is_same(self, *samples: Sample) -> bool:
-        """Whether the density, and each that is observed, is the same at two samples."""
+        """Return whether every density has the same value at two samples, to rounding."""
         for density in self.densities:
             first, second = (self._value(sample, density) for sample in samples)
             if not abs(first - second) <= SYMMETRY_TOLERANCE * max(
@@ -492,9 +529,7 @@ class OwnTerm:
         return True
 
     def _value(self, sample: Sample, density: Callable[..., Expr]) -> float:
-        """Return a density's value at a sample; nan where it has none, as a root of less than
-        zero.
-        """
+        """Return a density's value at a sample; nan where it has none, as for a negative root."""
         r0, u, m = sample
         try:
             lowered = ufl.algorithms.apply_algebra_lowering.apply_algebra_lowering
@@ -515,7 +550,7 @@ class Symbolic(NamedTuple):
 
 
 def _random_samples() -> list[Sample]:
-    """Jets of r0 and u, and covectors, always the same."""
+    """Return jets of r0 and u, and covectors of an edge, always the same."""
     # within a box about as large as a shell
     rng = np.random.default_rng(2026)
     jets = rng.uniform(-1, 1, (SYMMETRY_SAMPLES, 2, 6, 3))
@@ -524,10 +559,11 @@ def _random_samples() -> list[Sample]:
 
 
 def _in_other_coordinates(sample: Sample) -> Sample:
-    """Return a sample in other coordinates of the surface."""
+    """Return a sample (jets of r0 and u, a covector) in other coordinates of the surface."""
     A = OTHER_COORDINATES
     (r0, u), m = (np.array(jet) for jet in sample[:2]), sample[2]
     for jet in (r0, u):
+        # second derivatives as a symmetric matrix of vectors
         second = jet[[3, 4, 4, 5]].reshape(2, 2, 3)
         jet[1:3] = A @ jet[1:3]
         jet[3:] = np.einsum("ai,bj,ijc->abc", A, A, second).reshape(4, 3)[[0, 1, 3]]
@@ -541,6 +577,10 @@ def _as_jet(parts: Array) -> Jet:
 def _as_expression(
     value: float | Array | Free | UserField | FormulaParameter | Coefficient,
 ) -> Expr:
+    """Return a parameter's value as an expression, for tests of a density.
+
+    Formulas and functions get a value other than zero, so that no term vanishes.
+    """
     if isinstance(value, FormulaParameter):  # of any value
         value = 1.0
     if isinstance(value, UserField):

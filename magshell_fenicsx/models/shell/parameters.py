@@ -19,7 +19,7 @@ from magshell_fenicsx.models.shell.spatial_fields import Pattern
 
 @dataclass(frozen=True)
 class HeldComponents:
-    """Support at which some components of the displacement are zero and rotations are free."""
+    """Support that holds some components (0 to 2) of the displacement; rotations are free."""
 
     components: tuple[int, ...]
 
@@ -51,11 +51,25 @@ class ShellMaterial:
 
 @dataclass(frozen=True)
 class Material:
-    """nu, and h over R; of rubber its numbers, and nu is 1/2; of plies their laminate, and nu is
-    that of units.
+    """The material of a shell, dimensionless.
 
-    Several shells: `shells` is name -> material, and nu is that of the first; None if all have the
-    same. `laws` has the law of each in their order, and `laminates` is name -> plies.
+    Attributes
+    ----------
+    nu
+        Poisson's ratio: 1/2 for rubber, that of the units for plies, that of the first of several
+        shells.
+    h
+        Thickness over R.
+    rubber
+        Numbers of a law of rubber; None without.
+    laminate
+        Plies; None without.
+    shells
+        Name of each of several shells -> its material; None if all have the same.
+    laws
+        The law of each of several shells, in their order.
+    laminates
+        Name of a shell -> its plies.
     """
 
     nu: float
@@ -68,7 +82,7 @@ class Material:
 
     @property
     def law(self) -> Law:
-        """How a shell of it resists strains."""
+        """The law of the material: energies, stresses and moments as functions of strains."""
         if self.laws:
             if len(self.laws) > 1:
                 return LawByShell(self.h, self.nu, laws=self.laws)
@@ -82,17 +96,19 @@ class Material:
 
     @property
     def laminate_by_shell(self) -> dict[str, Laminate]:
-        """Name of a shell -> its plies; the name is empty where there is one."""
+        """Name of a shell -> its plies; the name is empty if there is one shell."""
         return {**({"": self.laminate} if self.laminate else {}), **self.laminates}
 
     def law_in(self, cells: NDArray[np.float64] | None) -> Law:
-        """Return the law in cells with these `ShellMaterial.numbers` (cells, 4), for arrays (cells,
-        n); None where all shells have one material.
+        """Return the law in cells, for arrays (cells, n) of values at points.
+
+        `cells` (cells, 4) are the `ShellMaterial.numbers` of cells; None if all shells have one
+        material.
         """
         if cells is None:
             return self.law
-        e, nu, _, which = np.moveaxis(cells[:, None], -1, 0)
-        return self.law.with_material(e, nu, which)
+        modulus_factor, nu, _, law_number = np.moveaxis(cells[:, None], -1, 0)
+        return self.law.with_material(modulus_factor, nu, law_number)
 
     @property
     def bending_stiffness(self) -> float:
@@ -101,7 +117,7 @@ class Material:
 
     @property
     def classical_pressure(self) -> float:
-        """p_c/E = 2/sqrt(3 (1 - nu^2)) (h/R)^2, of the perfect sphere."""
+        """p_c/E = 2/sqrt(3 (1 - nu^2)) (h/R)^2, the buckling pressure of the perfect sphere."""
         return float(2 / np.sqrt(3 * (1 - self.nu**2)) * self.h**2)
 
 
@@ -131,8 +147,9 @@ class PointForce:
 
 @dataclass(frozen=True)
 class EdgeForce:
-    """A dead force (3,), or a pattern, on a named edge: per length over E h or, if `total`, in all
-    over E h R.
+    """A dead force (3,), or a pattern, on a named edge.
+
+    It is per length over E h; if `total`, it is the whole force over E h R.
     """
 
     edge: str
@@ -150,10 +167,10 @@ class EdgeMoment:
 
 @dataclass(frozen=True)
 class AreaForce:
-    """A dead force (3,), or a pattern, per undeformed area over E h/R, on a patch, or on all.
+    """A dead force (3,), or a pattern, per undeformed area over E h/R.
 
-    A number in place of the vector is a pressure along the undeformed normal, positive from
-    outside.
+    It acts on a named patch, or with None on the whole shell. A number in place of the vector is a
+    pressure along the undeformed normal, positive from outside.
     """
 
     patch: str | None
@@ -162,8 +179,9 @@ class AreaForce:
 
 @dataclass(frozen=True)
 class Potential:
-    """An energy per undeformed area that depends on the deformed place, with the amplitude
-    "load".
+    """An energy per undeformed area that depends on the deformed place.
+
+    Its amplitude is "load".
     """
 
     term: OwnTerm
@@ -174,15 +192,15 @@ DeadLoad = PointForce | EdgeForce | EdgeMoment | AreaForce | Potential
 
 @dataclass(frozen=True)
 class Move:
-    """A motion of supports: edges, points or patches that are held."""
+    """A motion of supports: of the named edges, points or patches that are held."""
 
     names: tuple[str, ...]
     motion: RigidMotion
 
 
 def default_penalty(degree: int) -> float:
-    """sigma of the C0 interior penalty (over half the height of the triangles).
+    """Return sigma of the C0 interior penalty, over half the height of the triangles.
 
-    It grows with degree squared, as the inverse inequality asks.
+    It grows with degree squared, as the inverse inequality requires.
     """
     return 5.0 * degree**2

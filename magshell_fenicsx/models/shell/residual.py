@@ -1,5 +1,6 @@
-"""Energies and residuals from the terms' densities and their gradients at points, without compiled
-forms, and the derivatives of both by free parameters.
+"""Energies and residuals from densities and their gradients at points, without forms.
+
+The derivatives of both by free parameters are computed in the same way.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -45,16 +46,24 @@ Array = NDArray[np.float64]
 
 
 class _ResidualPart(Protocol):
+    """Terms on cells, or on edges, that are evaluated together."""
+
     names: list[str]
 
     def energy(self, nodal: Array, name: str) -> float:
-        """Return the energy of a term on this rank's part."""
+        """Return the energy of the named term on this rank's part.
+
+        `nodal` (cells, functions * 3) are the displacements of all local cells.
+        """
 
     def begin(self, *, energies: bool) -> None:
-        """Begin the kernels of `add`, and those of `energy` if they will be asked for."""
+        """Begin to compile the kernels of `add`; with `energies`, those of `energy` too."""
 
     def add(self, nodal: Array, factors: Mapping[str, float], elements: Array) -> None:
-        """Add the element vectors (cells, functions * 3) of the terms with these factors."""
+        """Add the element vectors (cells, functions * 3) of terms to `elements`.
+
+        `factors` are by name; a term without one is left out. `nodal` is as in `energy`.
+        """
 
 
 class FastResidual:
@@ -70,6 +79,8 @@ class FastResidual:
         Degree of the elements.
     terms
         Terms with a density.
+    log
+        Log of compiled kernels.
     one_by_one
         Whether each term has a kernel of its own, so that it can be added alone.
 
@@ -89,41 +100,42 @@ class FastResidual:
         *,
         one_by_one: bool = False,
     ) -> None:
-        on_cells = [term for term in terms if not term.density.on_edges]
-        on_edges = [term for term in terms if term.density.on_edges]
+        cell_terms = [term for term in terms if not term.density.on_edges]
+        edge_terms = [term for term in terms if term.density.on_edges]
 
         def kind(term: PointTerm) -> tuple[int | None, str | None, str]:
+            """Return a key of terms on cells that share a kernel."""
             return term.density.quadrature, term.amplitude, term.name if one_by_one else ""
 
-        parts: list[_ResidualPart] = []
-        for kind_of_terms in dict.fromkeys(map(kind, on_cells)):
-            terms_of_kind = [term for term in on_cells if kind(term) == kind_of_terms]
-            parts.append(
+        residual_parts: list[_ResidualPart] = []
+        for kind_of_terms in dict.fromkeys(map(kind, cell_terms)):
+            terms_of_kind = [term for term in cell_terms if kind(term) == kind_of_terms]
+            residual_parts.append(
                 _CellTerms(r0, kind_of_terms[0] or cell_quadrature(degree), terms_of_kind, log)
             )
-        if on_edges:
-            parts.append(_EdgeTerms(r0, edge_quadrature(degree), on_edges, log))
-        self._parts = parts
+        if edge_terms:
+            residual_parts.append(_EdgeTerms(r0, edge_quadrature(degree), edge_terms, log))
+        self._parts = residual_parts
         self.names = frozenset(term.name for term in terms)
         self._u, self._nodes = u, u.function_space.dofmap.list
         self._dofs = (3 * self._nodes[:, :, None] + np.arange(3)).ravel()
 
     def begin(self, *, energies: bool = False) -> None:
-        """Begin the kernels of the residual, and those of the energies if they will be asked
-        for.
-        """
+        """Begin to compile the kernels of the residual; with `energies`, those of energies too."""
         for part in self._parts:
             part.begin(energies=energies)
 
     def energy(self, name: str) -> float:
-        """Return the energy of a term on this rank's part, at the present u; collective at
-        first.
+        """Return the energy of the named term on this rank's part, at the present u.
+
+        The first call is collective: kernels are compiled.
         """
         return next(part for part in self._parts if name in part.names).energy(self._nodal(), name)
 
     def add(self, b: Array, factors: Mapping[str, float]) -> None:
-        """Add the residual to the local vector (ghosts included), at the present u; collective at
-        first.
+        """Add the residual at the present u to the local vector b (ghosts included).
+
+        `factors` are those of terms, by name. The first call is collective: kernels are compiled.
         """
         nodal = self._nodal()
         elements = np.zeros_like(nodal)
@@ -132,51 +144,72 @@ class FastResidual:
         b += np.bincount(self._dofs, elements.ravel(), len(b))
 
     def _nodal(self) -> Array:
-        """u as (cells, functions * 3)."""
+        """Return u as (cells, functions * 3)."""
         nodal = np.take(self._u.x.array.reshape(-1, 3), self._nodes, axis=0)
         return np.asarray(nodal.reshape(-1, 3 * self._nodes.shape[1]))
 
 
 class _CellTerms:
-    """Terms with one amplitude on the owned cells."""
+    """Terms with one amplitude and one quadrature on the owned cells.
+
+    Parameters
+    ----------
+    r0
+        The placement.
+    degree
+        Degree of the quadrature.
+    terms
+        The terms; their densities are on cells.
+    log
+        Log of compiled kernels.
+    """
 
     def __init__(
         self, r0: fem.Function, degree: int, terms: Sequence[PointTerm], log: KernelLog
     ) -> None:
         V = r0.function_space
         self.names = [term.name for term in terms]
-        X, self._weights = cell_rule(degree)
-        table, points_per_cell = ShapeTable.tabulate(V.element.basix_element, X), len(X)
-        parts = [
+        reference_points, self._weights = cell_rule(degree)
+        table, points_per_cell = (
+            ShapeTable.tabulate(V.element.basix_element, reference_points),
+            len(reference_points),
+        )
+        jet_parts = [
             name
             for name in JET_NAMES
             if name in FIRST_DERIVATIVES or any(name in term.density.jet_parts for term in terms)
         ]
-        self._sheet = PointSampling(table, self._weights, [JET_NAMES.index(part) for part in parts])
+        self._sampling = PointSampling(
+            table, self._weights, [JET_NAMES.index(part) for part in jet_parts]
+        )
         cells = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)
         frames = cell_frames(V.mesh)
         geometry = np.repeat(frames[cells], points_per_cell, axis=0)
         count = len(cells) * points_per_cell
 
         def placement() -> Array:
-            return _placement(r0, table, frames, parts)[cells].reshape(count, 3 * len(parts))
+            return _placement(r0, table, frames, jet_parts)[cells].reshape(
+                count, 3 * len(jet_parts)
+            )
 
         placements = Memo(placement, lambda: (r0.x.array,))
         self._points = PointGradient(
             terms,
-            parts,
+            jet_parts,
             points_per_cell,
             count,
             placements,
             geometry,
-            lambda field: at_points(field, X, cells),
+            lambda field: at_points(field, reference_points, cells),
             log,
         )
 
     def begin(self, *, energies: bool) -> None:
+        """Begin to compile the gradient's kernel; with `energies`, those of energies too."""
         _ = self._points.gradient, [self._points.energy(name) for name in self.names if energies]
 
     def energy(self, nodal: Array, name: str) -> float:
+        """Return the energy of the named term on the owned cells."""
         if (kernel := self._points.energy(name)) is None:
             return 0.0
         total = 0.0
@@ -190,24 +223,39 @@ class _CellTerms:
         return total
 
     def add(self, nodal: Array, factors: Mapping[str, float], elements: Array) -> None:
+        """Add the element vectors of all terms; they share the factor of the first."""
         factor = factors.get(self.names[0], 0.0)
         if not factor or (kernel := self._points.gradient) is None:
             return
         for chunk, cells in self._filled(nodal):
-            elements[cells] += factor * self._sheet.at_nodes(self._points.evaluate(chunk, kernel))
+            elements[cells] += factor * self._sampling.at_nodes(
+                self._points.evaluate(chunk, kernel)
+            )
 
     def _filled(self, nodal: Array) -> Iterator[tuple[slice, slice]]:
-        """Yield each chunk, with the derivatives of u filled in, and its cells."""
+        """Yield each chunk of points and its cells, with derivatives of u filled in as inputs."""
         points_per_cell = len(self._weights)
         for chunk in self._points.chunks():
             cells = slice(chunk.start // points_per_cell, chunk.stop // points_per_cell)
-            self._sheet.at_points(nodal[cells], self._points.input_array(chunk))
+            self._sampling.at_points(nodal[cells], self._points.input_array(chunk))
             yield chunk, cells
 
 
 class _EdgeTerms:
-    """Terms on edges, interior and boundary: the jets on the edges of all cells are found
-    together.
+    """Terms on edges, interior and boundary.
+
+    The jets on the edges of all cells are computed together, three edges for each cell.
+
+    Parameters
+    ----------
+    r0
+        The placement.
+    degree
+        Degree of the quadrature along edges.
+    terms
+        The terms; their densities are on edges.
+    log
+        Log of compiled kernels.
     """
 
     def __init__(
@@ -218,27 +266,35 @@ class _EdgeTerms:
         rules = [edge_rule(degree, edge, is_reversed=False) for edge in range(3)]
         self._weights = rules[0][1]
         points_per_edge = len(self._weights)
-        X, w = np.concatenate([points for points, _ in rules]), np.tile(self._weights, 3)
-        table = ShapeTable.tabulate(V.element.basix_element, X)
-        parts = [
+        reference_points, all_weights = (
+            np.concatenate([points for points, _ in rules]),
+            np.tile(self._weights, 3),
+        )
+        table = ShapeTable.tabulate(V.element.basix_element, reference_points)
+        jet_parts = [
             name
             for name in JET_NAMES
             if name in ALL_DERIVATIVES or any(name in term.density.jet_parts for term in terms)
         ]
-        self._width = 3 * len(parts)
-        self._sheet = PointSampling(table, w, [JET_NAMES.index(part) for part in parts])
+        self._width = 3 * len(jet_parts)
+        self._sampling = PointSampling(
+            table, all_weights, [JET_NAMES.index(part) for part in jet_parts]
+        )
         frames, cells = cell_frames(V.mesh), np.arange(len(V.dofmap.list), dtype=np.int32)
-        self._there, self._back = (np.empty((len(cells) * len(X), self._width)) for _ in range(2))
-        self._on = dict[str, tuple[NDArray[np.intp], PointGradient]]()
+        self._displacement_jets, self._back = (
+            np.empty((len(cells) * len(reference_points), self._width)) for _ in range(2)
+        )
+        self._points_of_terms = dict[str, tuple[NDArray[np.intp], PointGradient]]()
 
         def placements() -> dict[str, Array]:
-            all_cells = _placement(r0, table, frames, parts).reshape(-1, self._width)
+            """Return the placement's jets (points, sides * parts * 3) of each term, by name."""
+            all_cells = _placement(r0, table, frames, jet_parts).reshape(-1, self._width)
             return {
                 name: all_cells[rows].reshape(len(rows), rows.shape[1] * self._width)
-                for name, (rows, _) in on_terms.items()
+                for name, (rows, _) in points_of_terms.items()
             }
 
-        on_terms = {
+        points_of_terms = {
             term.name: _points_on_edges(V, term.density, frames, points_per_edge) for term in terms
         }
         all_placements = Memo(placements, lambda: (r0.x.array,))
@@ -247,54 +303,62 @@ class _EdgeTerms:
             return all_placements.renew()[name]
 
         for term in terms:
-            rows, geometry = on_terms[term.name]
+            rows, geometry = points_of_terms[term.name]
 
             def values(field: fem.Function, rows: NDArray[np.intp] = rows) -> Array:
-                return at_points(field, X, cells)[rows].reshape(
+                """Return a field's values (points, sides * components) at the points of a term."""
+                return at_points(field, reference_points, cells)[rows].reshape(
                     len(rows), rows.shape[1] * field.ufl_shape[0]
                 )
 
             at_cells = Memo(partial(placements_on, term.name), lambda: (r0.x.array,))
             points = PointGradient(
-                [term], parts, points_per_edge, len(rows), at_cells, geometry, values, log
+                [term], jet_parts, points_per_edge, len(rows), at_cells, geometry, values, log
             )
-            self._on[term.name] = rows, points
+            self._points_of_terms[term.name] = rows, points
 
     def begin(self, *, energies: bool) -> None:
-        for name, (_, points) in self._on.items():
+        for name, (_, points) in self._points_of_terms.items():
             _ = points.gradient, points.energy(name) if energies else None
 
     def energy(self, nodal: Array, name: str) -> float:
-        self._sheet.at_points(nodal, self._there)
-        kernel, total = self._on[name][1].energy(name), 0.0
+        """Return the energy of the named term on its edges."""
+        self._sampling.at_points(nodal, self._displacement_jets)
+        kernel, total = self._points_of_terms[name][1].energy(name), 0.0
         for _, values in self._evaluated(name, kernel):
             total += float(np.sum(values.reshape(-1, len(self._weights)) @ self._weights))
         return total
 
     def add(self, nodal: Array, factors: Mapping[str, float], elements: Array) -> None:
+        """Add the element vectors of the terms with factors.
+
+        Gradients at points of edges are collected by cell and then integrated back to nodes.
+        """
         active = [name for name in self.names if factors.get(name)]
         if not active:
             return
-        self._sheet.at_points(nodal, self._there)
+        self._sampling.at_points(nodal, self._displacement_jets)
         self._back[:] = 0
         for name in active:
-            for numbers, values in self._evaluated(name, self._on[name][1].gradient):
+            for numbers, values in self._evaluated(name, self._points_of_terms[name][1].gradient):
                 self._back[numbers] += factors[name] * values.reshape(-1, self._width)
-        elements += self._sheet.at_nodes(self._back)
+        elements += self._sampling.at_nodes(self._back)
 
     def _evaluated(
         self, name: str, kernel: PointKernel | None
     ) -> Iterator[tuple[NDArray[np.intp], Array]]:
-        """Yield, for each chunk, the numbers of its points among those of all cells' edges, and a
-        kernel's values there.
+        """Yield a kernel's values at the points of a term's edges, chunk by chunk.
+
+        Before the values come the numbers of their points, on all sides, among the points of all
+        cells' edges.
         """
         if kernel is None:
             return
-        rows, points = self._on[name]
+        rows, points = self._points_of_terms[name]
         for chunk in points.chunks():
             numbers = rows[chunk].ravel()
             np.take(
-                self._there,
+                self._displacement_jets,
                 numbers,
                 axis=0,
                 out=points.input_array(chunk).reshape(len(numbers), -1),
@@ -304,8 +368,9 @@ class _EdgeTerms:
 
 
 def _placement(r0: fem.Function, table: ShapeTable, frames: Array, parts: Sequence[str]) -> Array:
-    """Return the parts (local cells, points, parts, 3) of the placement's jet in the cells' own
-    coordinates.
+    """Return the parts (local cells, points, parts, 3) of the placement's jet.
+
+    They are in the cells' own coordinates, given by `cell_frames`; `parts` are names.
     """
     nodes = r0.x.array.reshape(-1, 3)[r0.function_space.dofmap.list]
     jet = in_own_coordinates(
@@ -317,10 +382,27 @@ def _placement(r0: fem.Function, table: ShapeTable, frames: Array, parts: Sequen
 def _points_on_edges(
     V: fem.FunctionSpace, density: Density, frames: Array, points_per_edge: int
 ) -> tuple[NDArray[np.intp], Array]:
-    """Return the numbers (points, sides) of a density's points among those of all cells' edges, and
-    their geometry for `PointGradient`.
+    """Return where a density's points are among those of all cells' edges, and their geometry.
 
     A rule on an edge is symmetric: run backwards, its points come in the opposite order.
+
+    Parameters
+    ----------
+    V
+        Space of the displacement.
+    density
+        Density on interior edges, or on its boundary edges.
+    frames
+        (cells, 4) `cell_frames`.
+    points_per_edge
+        Number of points of the rule.
+
+    Returns
+    -------
+    rows
+        (points, sides) numbers of the points, counted cell by cell and edge by edge.
+    geometry
+        (points, 6 sides + 1) as in `PointGradient`.
     """
     if density.facets is None:
         cells, edges, backwards = interior_edges(V)
@@ -338,13 +420,13 @@ def _points_on_edges(
     first, second = np.array([edge_covector(edge) for edge in range(3)])[edges].transpose(2, 0, 1)
     m = np.stack([area * p * first, area * (q * first + s * second)], axis=2)  # as long as the edge
     width = edge_width(V, tuple(cells.T), edges[:, 0])
-    sides = [
+    columns = [
         frames[cells].reshape(-1, FRAME_SIZE * density.sides),
         m.reshape(-1, 2 * density.sides),
         width[:, None],
     ]
     return rows.reshape(-1, density.sides), np.repeat(
-        np.concatenate(sides, axis=1), points_per_edge, axis=0
+        np.concatenate(columns, axis=1), points_per_edge, axis=0
     )
 
 
@@ -353,7 +435,17 @@ Serve = Callable[[Sequence[PointTerm]], FastResidual]
 
 @dataclass
 class ParameterDerivative:
-    """A term's derivative by parameters, with the amplitude of the term."""
+    """A term's derivative by a parameter, or by two, with the amplitude of the term.
+
+    Attributes
+    ----------
+    name, amplitude
+        Name, and amplitude of the term; None without one.
+    density
+        Derivative of the density.
+    points
+        Computes its integral and residual.
+    """
 
     name: str
     amplitude: str | None
@@ -365,7 +457,7 @@ class ParameterDerivative:
         return self.points.energy(self.name)
 
     def add_residual(self, b: NDArray[np.float64], factor: float) -> None:
-        """Add factor times its derivative by u to the local vector (ghosts included)."""
+        """Add factor times its derivative by u to the local vector b (ghosts included)."""
         self.points.add(b, {self.name: factor})
 
 
@@ -377,17 +469,19 @@ def point_parameters(
     Parameters
     ----------
     constants
-        The parameters as they stand in the densities of the terms.
+        Name -> the parameter as it stands in the densities.
+    terms
+        All terms.
     serve
-        Makes what serves terms each apart.
+        Function from terms to a `FastResidual` that can add each of them alone.
     """
     parameters = {}
     for name, p in constants.items():
-        of_terms = slopes(p, terms, f"by {name}", serve)
-        for served in {id(slope.points): slope.points for slope in of_terms}.values():
-            served.begin()
+        term_slopes = slopes(p, terms, f"by {name}", serve)
+        for residual in {id(slope.points): slope.points for slope in term_slopes}.values():
+            residual.begin()
         parameters[name] = FreeParameter(
-            p, of_terms, partial(slopes, terms=of_terms, words="twice", serve=serve)
+            p, term_slopes, partial(slopes, terms=term_slopes, words="twice", serve=serve)
         )
     return parameters
 
@@ -395,7 +489,10 @@ def point_parameters(
 def slopes(
     p: fem.Constant, terms: Sequence[PointTerm], words: str, serve: Serve
 ) -> list[ParameterDerivative]:
-    """Return the derivatives, by a parameter, of those terms that it enters."""
+    """Return the derivatives by a parameter of those terms whose densities depend on it.
+
+    `words` complete the names of the derivatives; `serve` is as in `point_parameters`.
+    """
     entered = [term for term in terms if any(q is p for q in term.density.parameters)]
     derivatives = [
         ParameterDerivative(f"{term.name} {words}", term.amplitude, derivative_by(term.density, p))
@@ -409,9 +506,10 @@ def slopes(
 
 
 def derivative_by(density: Density, p: fem.Constant) -> Density:
-    """Return the density's derivative by a parameter of it."""
+    """Return the density's derivative by one of its parameters p, without virtual work."""
 
     def derivative(*arguments: Any) -> Expr:
+        """Return the derivative of the density at its arguments, by all places of the parameter."""
         first = len(arguments) - len(density.parameters)
         positions = [first + i for i, q in enumerate(density.parameters) if q is p]
         variable = ufl.variable(arguments[positions[0]])

@@ -32,8 +32,10 @@ from magshell_fenicsx.models.shell.law import (
 
 
 class Incompressible(Law):
-    """A law of rubber, from its energy, the derivatives of that by the strain, and a stiffness of
-    bending.
+    """A law of rubber, from its energy, its slopes and a stiffness of bending.
+
+    A subclass gives the energy (`membrane`), the derivatives by the strain and the factors in the
+    energy of bending.
     """
 
     @property
@@ -45,6 +47,7 @@ class Incompressible(Law):
         return Koiter(self.h, 0.5, self.thickness_factor, self.modulus_factor)
 
     def stress(self, E: Tensor, up: Tensor) -> Components:
+        """Return S with indices up, by the energy's slopes in T = tr C - 2 and D = det(C - 1)."""
         surface = Stretched(E, up)
         by_T, by_D = (
             self.modulus_factor * self.thickness_factor * slope for slope in self._slopes(surface)
@@ -58,19 +61,30 @@ class Incompressible(Law):
         return S11, S12, S22
 
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
-        of_square, of_mixed, of_det, of_drawn = self._stiffness(surface := Stretched(E, up))
+        """Return the energy of bending, a quadratic form in T = a^ij K_ij, tr K and det K."""
+        square_factor, mixed_factor, det_factor, trace_factor = self._stiffness(
+            surface := Stretched(E, up)
+        )
         det = K[..., 0, 0] * K[..., 1, 1] - K[..., 0, 1] ** 2
         T, tau = surface.deformed_trace(K), trace(K, up)
-        return (of_square * T**2 - of_mixed * T * tau - of_det * det + of_drawn * tau**2) / 2
+        return (
+            square_factor * T**2 - mixed_factor * T * tau - det_factor * det + trace_factor * tau**2
+        ) / 2
 
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
-        of_square, of_mixed, of_det, of_drawn = self._stiffness(surface := Stretched(E, up))
+        """Return M with indices up, the derivative of `bending` by K."""
+        square_factor, mixed_factor, det_factor, trace_factor = self._stiffness(
+            surface := Stretched(E, up)
+        )
         T, tau = surface.deformed_trace(K), trace(K, up)
         a = (up[..., 0, 0], up[..., 0, 1], up[..., 1, 1])
         adjugate = (K[..., 1, 1], -K[..., 0, 1], K[..., 0, 0])
-        by_T, by_tau = of_square * T - of_mixed / 2 * tau, of_drawn * tau - of_mixed / 2 * T
+        by_T, by_tau = (
+            square_factor * T - mixed_factor / 2 * tau,
+            trace_factor * tau - mixed_factor / 2 * T,
+        )
         M11, M12, M22 = (
-            by_T * deformed_up + by_tau * metric_up - of_det / 2 * curvature_cofactor
+            by_T * deformed_up + by_tau * metric_up - det_factor / 2 * curvature_cofactor
             for deformed_up, metric_up, curvature_cofactor in zip(
                 surface.inverse, a, adjugate, strict=True
             )
@@ -85,27 +99,37 @@ class Incompressible(Law):
         covector_up: tuple[Scalar, Scalar],
         covector_square: Scalar,
     ) -> Scalar:
+        """Return the moment contracted twice with a covector, see `Law.edge_moment`."""
         M, (c1, c2) = self.moment(E, K, up), lower_index(covector_up, up)
         return M[0] * c1**2 + 2 * M[1] * c1 * c2 + M[2] * c2**2
 
     def edge_stiffness(
         self, E: Tensor, up: Tensor, covector_up: tuple[Scalar, Scalar], covector_square: Scalar
     ) -> Scalar:
-        of_square, of_mixed, _, of_drawn = self._stiffness(
+        """Return the second derivative of `bending` along c c, see `Law.edge_stiffness`.
+
+        The determinant of c c is zero, so that its factor does not matter.
+        """
+        square_factor, mixed_factor, _, trace_factor = self._stiffness(
             surface := Stretched(E, up)
         )  # c c has no determinant
         (c1, c2), (a11, a12, a22) = lower_index(covector_up, up), surface.inverse
         T = a11 * c1**2 + 2 * a12 * c1 * c2 + a22 * c2**2
-        return of_square * T**2 - of_mixed * T * covector_square + of_drawn * covector_square**2
+        return (
+            square_factor * T**2
+            - mixed_factor * T * covector_square
+            + trace_factor * covector_square**2
+        )
 
     @abstractmethod
     def _slopes(self, surface: "Stretched") -> tuple[Scalar, Scalar]:
-        """Derivatives by T and D of the energy of stretching, per volume over E."""
+        """Return the derivatives by T and D of the energy of stretching, per volume over E."""
 
     @abstractmethod
     def _stiffness(self, surface: "Stretched") -> tuple[Scalar, Scalar, Scalar, Scalar]:
-        """Factors of T^2, -T tr K, -det K and (tr K)^2 in twice the energy of bending, T = a^ij
-        K_ij with the deformed a.
+        """Return factors of T^2, -T tr K, -det K and (tr K)^2 in twice the energy of bending.
+
+        Here T = a^ij K_ij with the deformed inverse metric a^ij.
         """
 
 
@@ -114,6 +138,7 @@ class Rubber(Incompressible):
     """The law of Mooney and Rivlin; its parameter is C01/(C10 + C01), 0 for neo-Hooke."""
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
+        """Return ((1 - s)(I1 - 3) + s (I2 - 3))/6 times factors, with s = C01/(C10 + C01)."""
         surface = Stretched(E, up)
         return (
             self.modulus_factor
@@ -123,35 +148,37 @@ class Rubber(Incompressible):
         )
 
     def _slopes(self, surface: "Stretched") -> tuple[Scalar, Scalar]:
+        """Return the derivatives by T and D of ((1 - s)(I1 - 3) + s (I2 - 3))/6."""
         first_slopes = 2 * surface.T + surface.D - surface.first, surface.T - 1 - surface.first
         second_slopes = (
             2 * (surface.d - 1) - surface.second,
             2 * (surface.d - 1) - 1 - surface.second,
         )
         by_T, by_D = (
-            ((1 - self.parameter) * of_first + self.parameter * of_second) / (6 * surface.d)
-            for of_first, of_second in zip(first_slopes, second_slopes, strict=True)
+            ((1 - self.parameter) * first_slope + self.parameter * second_slope) / (6 * surface.d)
+            for first_slope, second_slope in zip(first_slopes, second_slopes, strict=True)
         )
         return by_T, by_D
 
     def _stiffness(self, surface: "Stretched") -> tuple[Scalar, Scalar, Scalar, Scalar]:
+        """Return factors of T², -T tr K, -det K and (tr K)², see `Incompressible._stiffness`."""
         factor = (
             self.modulus_factor * self.thickness_factor**3 * self.h**2 / 18 / surface.d**2
         )  # h^2/(12 d) times 4/6 and 1/d
-        first_share, second_share, t = 1 - self.parameter, self.parameter, 2 + surface.T
-        of_det = first_share + second_share * (
-            t - root(surface.d)
+        first_share, second_share, trace_of_C = 1 - self.parameter, self.parameter, 2 + surface.T
+        det_factor = first_share + second_share * (
+            trace_of_C - root(surface.d)
         )  # W'' has d^2 in place of the root
         return (
-            factor * 2 * (first_share + second_share * t),
+            factor * 2 * (first_share + second_share * trace_of_C),
             factor * 2 * second_share,
-            factor * 2 * of_det * surface.up / surface.d,
+            factor * 2 * det_factor * surface.up / surface.d,
             0,
         )
 
 
 class Stretched:
-    """A surface with a strain.
+    """A surface with a membrane strain E, and the invariants of C = up a.
 
     Attributes
     ----------
@@ -180,10 +207,11 @@ class Stretched:
         )
 
     def deformed_trace(self, K: Tensor) -> Scalar:
+        """Return a^ij K_ij with the inverse of the deformed metric."""
         a11, a12, a22 = self.inverse
         return a11 * K[..., 0, 0] + 2 * a12 * K[..., 0, 1] + a22 * K[..., 1, 1]
 
 
 def root(x: Scalar) -> Scalar:
-    """The square root."""
+    """Return the square root of an expression, a number or an array."""
     return ufl.sqrt(x) if isinstance(x, Expr) else x**0.5

@@ -39,8 +39,9 @@ InsideRim = Callable[[Array], NDArray[np.bool_]]  # places (n, 3) -> whether the
 
 
 class PlacementField(fem.Function):  # type: ignore[misc]  # dolfinx has no types
-    """A field that follows from the placement; `rebuild` makes it from another one, which may jump
-    from cell to cell.
+    """A field, perhaps discontinuous, that follows from the placement.
+
+    `rebuild` is a function from another placement to the field on it.
     """
 
     def __init__(
@@ -51,7 +52,7 @@ class PlacementField(fem.Function):  # type: ignore[misc]  # dolfinx has no type
 
 
 def radial(r0: Array, n0: Array) -> Array:
-    """Pattern along the normal."""
+    """Pattern along the normal: n0 at places r0, (cells, nodes, 3) each."""
     return n0
 
 
@@ -74,8 +75,14 @@ class Uniform:
 
 @dataclass(frozen=True)
 class Components:
-    """Three functions of x, y, z, perhaps of a frame whose axes (3, 3), told in this one, are
-    columns of `frame`.
+    """Pattern of three functions of x, y, z.
+
+    Attributes
+    ----------
+    of_position
+        Functions of arrays x, y, z over R, one for each component.
+    frame
+        (3, 3) axes of the functions' frame as columns, in the model's frame; None for that frame.
     """
 
     by_formula: ClassVar[bool] = True
@@ -94,8 +101,9 @@ class Components:
 
 @dataclass(frozen=True)
 class WithinRims:
-    """A vector within each rim, another in the rest; rims separate cells, and the first of two that
-    overlap counts.
+    """Pattern of a vector within each rim, and another one elsewhere.
+
+    Rims separate cells; where two overlap, the first counts.
     """
 
     inner_vectors: tuple[tuple[InsideRim, Array], ...]
@@ -116,13 +124,13 @@ class ByPatch:
     vectors: Array
 
     def __call__(self, r0: Array, n0: Array) -> Array:
-        of_cells = self.vectors[: len(r0), None]  # owned cells come first
-        return np.broadcast_to(of_cells, (*r0.shape[:-1], of_cells.shape[-1]))
+        cell_vectors = self.vectors[: len(r0), None]  # owned cells come first
+        return np.broadcast_to(cell_vectors, (*r0.shape[:-1], cell_vectors.shape[-1]))
 
 
 @dataclass(frozen=True)
 class PosedPattern:
-    """The pattern of one shell of several in its own frame, times a factor."""
+    """The pattern of one shell of several in its own frame, turned and times a factor."""
 
     pattern: Pattern
     place: ShellPose
@@ -135,7 +143,15 @@ class PosedPattern:
 
 @dataclass(frozen=True, eq=False)
 class PatternsByPatch:
-    """A pattern on each of some cells of this rank, ghosts included; vectors elsewhere."""
+    """Patterns on some cells of this rank, and vectors elsewhere.
+
+    Attributes
+    ----------
+    patterns
+        Flags (cells,) of cells, ghosts included, with the pattern there.
+    others
+        The vectors.
+    """
 
     patterns: tuple[tuple[NDArray[np.bool_], Pattern], ...]
     others: ByPatch
@@ -151,13 +167,16 @@ class PatternsByPatch:
 
 @dataclass(frozen=True, eq=False)
 class CellPolynomials:
-    """A field that is a polynomial of its own in each cell; it is known at the same places of all
-    cells.
+    """A field that is a polynomial of its own in each cell.
+
+    It can be evaluated at places that are the same in the reference cell for all cells.
 
     Attributes
     ----------
     values
         (cells, nodes, size) at the nodes of the element `element`.
+    element
+        Lagrange element of the polynomials.
     cells
         The cells with their geometry.
     """
@@ -167,14 +186,19 @@ class CellPolynomials:
     cells: CellGeometry
 
     def __call__(self, r0: Array, n0: Array | None = None) -> Array:
+        """Return the values (cells, n, size) at places r0 (cells, n, 3) in the first cells.
+
+        Owned cells come first. The reference points are found from the places in the first cell.
+        """
         table = self.element.tabulate(
             0, self._reference(r0[0]) if len(r0) else self.element.points
         )[0, :, :, 0]
         return np.asarray(np.matmul(table, self.values[: len(r0)]))  # owned cells come first
 
     def values_between_nodes(self) -> tuple[Array, Array]:
-        """Return values (cells, n, size) and places (cells, n, 3) in own cells, at the nodes and
-        between them.
+        """Return values and places in owned cells, at the nodes and between them.
+
+        Both are (cells, n, size or 3), on a lattice of twice the degree.
         """
         X = basix.create_lattice(
             self.element.cell_type,
@@ -191,8 +215,9 @@ class CellPolynomials:
         )
 
     def _reference(self, places: Array) -> Array:
-        """Return the reference points (n, 2) of places (n, 3) of the first cell, by Newton's
-        method.
+        """Return the reference points (n, 2) of places (n, 3) of the first cell.
+
+        Newton's method starts from the middle.
         """
         element, nodal = self.cells.element, self.cells.nodal[0]
         X = np.full((len(places), 2), 1 / 3)
@@ -235,18 +260,17 @@ def by_patch(
     cells: int,
     key: str = "magnetic.remanent.patches",
 ) -> ByPatch | PatternsByPatch:
-    """Return a vector for each named patch of a mesh, and one for the "rest", zero by default; all
-    have the same size.
-
-    A patch may have a pattern of vectors (3,) in place of one; patches that come later take the
-    place of others.
+    """Return a pattern with a vector, or a pattern, on each named patch of a mesh.
 
     Parameters
     ----------
+    vectors
+        Name -> vector or pattern. The vector of "rest" is that of all other cells, zero by default.
+        All vectors have the same size; patches that come later take the place of others.
     patches
-        Name -> whether each cell of this rank belongs to it.
+        Name -> flags (cells,) of this rank's cells in the patch.
     cells
-        How many there are.
+        Number of this rank's cells.
     key
         Key of the case file, for the message.
 
@@ -283,13 +307,16 @@ def pattern_field(
     key: str = "magnetic.remanent",
     size: int = 3,
 ) -> tuple[PlacementField, float | None]:
-    """Return the field of a pattern in every cell, free to jump from cell to cell, see
-    `project_pattern`; collective.
+    """Return a pattern as a discontinuous field on all cells, see `project_pattern`; collective.
 
     Parameters
     ----------
+    pattern
+        Function of undeformed places and normals.
+    r0
+        The placement.
     finer
-        Degree of the field less that of r0.
+        Degree of the field less that of r0; positive for loads.
     name, size
         Name of the field, and how many numbers it has.
     key
@@ -297,7 +324,10 @@ def pattern_field(
 
     Returns
     -------
-    The field, and the integral of its size; None where the field itself has it.
+    field
+        The field; its `rebuild` makes it on another placement.
+    size
+        Integral of its size; None if the field itself has that integral.
 
     Raises
     ------
@@ -320,7 +350,7 @@ def pattern_field(
 
 
 def formula_field(r0: fem.Function, parameter: FormulaParameter) -> fem.Function:
-    """Return a formula's field in every cell, of shape (1,), see `pattern_field`; collective."""
+    """Return a formula's field (1,) on all cells, see `pattern_field`; collective."""
     return pattern_field(
         Components([parameter.of_place]), r0, name="factor", key=parameter.key, size=1
     )[0]
@@ -329,9 +359,25 @@ def formula_field(r0: fem.Function, parameter: FormulaParameter) -> fem.Function
 def pattern_on_edge(
     pattern: Pattern, r0: fem.Function, facets: NDArray[np.int32], finer: int
 ) -> tuple[fem.Function, float | None]:
-    """Return the field of a pattern on some facets of the boundary, and the integral of its size.
+    """Return a pattern as a field on some facets of the boundary; collective.
 
-    It is right there alone: its moments are those along the facets. See `pattern_field`.
+    Its values are valid on the facets alone: its moments are those along them.
+
+    Parameters
+    ----------
+    pattern
+        Function of undeformed places and normals.
+    r0
+        The placement.
+    facets
+        Local numbers of the facets.
+    finer
+        Degree of the field less that of r0.
+
+    Returns
+    -------
+    field, size
+        As those of `pattern_field`.
     """
     V = r0.function_space
     field, _ = pattern_field(InterpolatedPattern(pattern), r0, finer)
@@ -346,6 +392,7 @@ def pattern_on_edge(
     ]
     place_tables = [placement_element.tabulate(0, X)[0, :, :, 0] for X in points_by_side]
     cell_places = r0.x.array.reshape(-1, 3)[V.dofmap.list[cells]]
+    # places on the facets, as cells of dimension one
     nodal = np.matmul(np.array(place_tables)[local_sides], cell_places).reshape(len(cells), -1, 3)
     owned = int(np.sum(facets < topology.index_map(1).size_local))
     edge = CellGeometry(edge_placement_element, nodal, owned, V.mesh.comm)
@@ -358,6 +405,7 @@ def pattern_on_edge(
         for side in range(3)
     ]
     values = field.x.array.reshape(-1, 3)
+    # the field keeps its nodes inside the cells and takes the projection at those on facets
     for cell, side, vectors in zip(cells, local_sides, projection.nodal, strict=True):
         values[Q.dofmap.list[cell][nodes_by_side[side]]] = vectors
     return field, projection.size
@@ -366,7 +414,7 @@ def pattern_on_edge(
 def _cells_at_facets(
     topology: mesh.Topology, facets: NDArray[np.int32]
 ) -> tuple[NDArray[np.int64], list[int]]:
-    """Return the cells with some boundary facets, and the number of the facet in each."""
+    """Return the cells (facets,) with boundary facets, and each facet's number in its cell."""
     topology.create_connectivity(1, 2)
     topology.create_connectivity(2, 1)
     to_cell, to_facet = topology.connectivity(1, 2), topology.connectivity(2, 1)
@@ -379,7 +427,7 @@ def _cells_at_facets(
 
 
 def _interval_element(degree: int) -> Element:
-    """Return the Lagrange element of an edge."""
+    """Return the Lagrange element of a degree on an interval."""
     return basix.create_element(
         basix.ElementFamily.P, basix.CellType.interval, degree, basix.LagrangeVariant.gll_warped
     )
@@ -398,7 +446,7 @@ def _nearest_nodes(element: Element, points: Array) -> list[int]:
 
 @dataclass(frozen=True)
 class InterpolatedPattern:
-    """A pattern that is interpolated, whatever it is."""
+    """A pattern that is interpolated, even if it is a formula."""
 
     pattern: Pattern
 
@@ -407,7 +455,7 @@ class InterpolatedPattern:
 
 
 def cell_geometry(r0: fem.Function) -> CellGeometry:
-    """Return the cells of a placement, or of a meridian's, with their geometry."""
+    """Return the cells of a placement, on a surface or a meridian, with their geometry."""
     V = r0.function_space
     owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
     return CellGeometry(
@@ -421,8 +469,10 @@ def cell_geometry(r0: fem.Function) -> CellGeometry:
 def project_pattern(
     pattern: Pattern, cells: CellGeometry, nodal: Array, element: Element
 ) -> ProjectedFormula:
-    """Return a pattern in every cell from its values at the nodes; a formula has the same moments,
-    see `project_formula`. Collective.
+    """Return a pattern in every cell; collective.
+
+    A formula has the same moments, see `project_formula`; other patterns are interpolated. `nodal`
+    are the values (cells, nodes, components) at the nodes of `element`.
     """
     if not getattr(pattern, "by_formula", False):
         return ProjectedFormula(nodal, smooth=True, size=0.0)
@@ -431,18 +481,19 @@ def project_pattern(
 
 
 def inside_cells(nodes: Array) -> Array:
-    """Return places (cells, nodes, 3) just inside their cells: a formula that jumps between two
-    cells has both its values.
+    """Return the nodes (cells, nodes, 3) moved slightly into their cells.
+
+    So a formula that jumps between two cells has both its values.
     """
     return np.asarray(nodes + INWARD_SHARE * (nodes.mean(axis=1, keepdims=True) - nodes))
 
 
 def positions_and_normals(r0: fem.Function, points: Array | None = None) -> tuple[Array, Array]:
-    """Return the nodes of every cell, or other reference points (n, 2), and the cell's normals
-    there: (cells, n, 3) each.
+    """Return the places and unit normals at the nodes of every cell: (cells, n, 3) each.
 
-    On a meridian, whose placement has components along e_rho and e_z, they are along (e_rho,
-    e_theta, e_z).
+    With `points` (n, 2), or (n, 1) on a meridian, they are those at these reference points. On a
+    meridian, whose placement has components along e_rho and e_z, results are along (e_rho, e_theta,
+    e_z).
     """
     V = r0.function_space
     element, size = V.element.basix_element, V.dofmap.index_map_bs
@@ -458,7 +509,7 @@ def positions_and_normals(r0: fem.Function, points: Array | None = None) -> tupl
 
 
 def body_cell_geometry(V: fem.FunctionSpace) -> CellGeometry:
-    """Return the cells of a body with their geometry."""
+    """Return the cells of a body with their geometry; V is its Lagrange space."""
     owned = V.mesh.topology.index_map(3).size_local
     return CellGeometry(
         V.element.basix_element, V.tabulate_dof_coordinates()[V.dofmap.list], owned, V.mesh.comm
@@ -466,8 +517,9 @@ def body_cell_geometry(V: fem.FunctionSpace) -> CellGeometry:
 
 
 def body_positions_and_normals(V: fem.FunctionSpace) -> tuple[Array, Array]:
-    """Return the nodes of every cell of a body, and the normals of the surface at their height,
-    (cells, nodes, 3) each.
+    """Return the nodes of every cell of a body, and the normals of the surface at their height.
+
+    Both are (cells, nodes, 3). That surface is where the third reference coordinate is constant.
     """
     element = V.element.basix_element
     table = element.tabulate(1, element.points)[:, :, :, 0]
@@ -485,13 +537,16 @@ def field_in_body(
     key: str = "magnetic.remanent",
     size: int = 3,
 ) -> fem.Function:
-    """Return a pattern's field at the nodes of every cell, free to jump from cell to cell; `size`
-    numbers each. Collective.
+    """Return a pattern as a discontinuous field on the cells of a body; collective.
 
     Parameters
     ----------
-    name
-        Name of the field.
+    pattern
+        Function of undeformed places and normals.
+    V
+        Lagrange space of the body.
+    name, size
+        Name of the field, and how many numbers it has.
     key
         Key of the case, for the message.
 
@@ -517,12 +572,14 @@ def field_in_body(
 def refuse_unbounded(
     vectors: Array, nodes: Array, comm: MPI.Comm, key: str = "magnetic.remanent"
 ) -> None:
-    """Refuse vectors, at places (cells, nodes, 3), that are not finite or too large; collective.
+    """Refuse vectors that are not finite or above `MAX_COMPONENT`; collective.
+
+    `vectors` and the places `nodes` are (cells, nodes, 3).
 
     Raises
     ------
     MeshError
-        On every rank, if a vector is not finite.
+        On every rank, with the first such place; it begins with `key`.
     """
     refuse_places(
         nodes[~(np.abs(vectors) <= MAX_COMPONENT).all(axis=-1)],

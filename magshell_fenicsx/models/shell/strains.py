@@ -1,9 +1,9 @@
 """Membrane strains, changes of curvature and bending moments at points, in NumPy, for output.
 
 The tensors are those of the energy (`kinematics`, `law`), on the undeformed surface: E_ij = (a_ij -
-a0_ij)/2, K_ij = b_ij - b0_ij and M_ij, what the energy gives for a change of K. The normal is
-outward and b = n . r,_ij, so a sphere has b = -a/R, and a positive moment flattens it: it stretches
-the inner face.
+a0_ij)/2, K_ij = b_ij - b0_ij, and M_ij, the derivative of the energy by K. The normal is outward
+and b = n . r,_ij, so a sphere has b = -a/R, and a positive moment flattens it: it stretches the
+inner face.
 """
 
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class TangentFrame:
-    """Undeformed points in an orthonormal frame each.
+    """Undeformed points, each with an orthonormal frame.
 
     Attributes
     ----------
@@ -49,7 +49,7 @@ class TangentFrame:
 
     @classmethod
     def from_jet(cls, jet: Array) -> "TangentFrame":
-        """Return the frame whose first vector is along r0,_1."""
+        """Return the frame at points with a jet (6, ..., 3); its first vector is along r0,_1."""
         m, area = _area_vector(jet)
         n0 = m / area[..., None]
         t1 = jet[1] / np.linalg.norm(jet[1], axis=-1, keepdims=True)
@@ -67,28 +67,29 @@ class TangentFrame:
         )
 
     def membrane_strain(self, u: Array) -> Array:
-        """E_11, E_12, E_22 (..., 3) of a displacement's jet (6, ..., 3) over R; not as a difference
-        of two metrics.
+        """Return E_11, E_12, E_22 (..., 3) in the frame, of a displacement.
+
+        The displacement's jet u is (6, ..., 3), over R. E is no difference of two metrics.
         """
         components = strain_components(self.jet[1:3], u[1:3], _dot)
         return _times(self.in_frame, np.stack(components, axis=-1))
 
     def curvature_change(self, u: Array) -> Array:
-        """K_11, K_12, K_22 (..., 3) times R of a displacement's jet (6, ..., 3) over R."""
+        """Return R times K_11, K_12, K_22 (..., 3) in the frame, of a displacement's jet."""
         n = self.normal(u)
         components = curvature_components(n, n - self.n0, self.jet[3:], u[3:], _dot)
         return _times(self.in_frame, np.stack(components, axis=-1))
 
     def normal(self, u: Array) -> Array:
-        """The deformed unit normal (..., 3)."""
+        """Return the deformed unit normal (..., 3), from a displacement's jet."""
         m, area = _area_vector(self.jet[:3] + u[:3])
         return np.asarray(m / area[..., None])
 
     def convected(self, v: Array, u: Array, *, thins: Array | float = 0) -> Array:
-        """F v with F = a_i (x) a0^i + s n (x) n0, of vectors (..., 3): how a remanence moves with
-        the shell.
+        """Return F v (..., 3) of vectors v, with F = a_i (x) a0^i + s n (x) n0.
 
-        The stretch s of the thickness is that of a volume that stays where `thins` is 1, else 1.
+        So a remanence moves with the shell. Where `thins` is 1, the stretch s of the thickness
+        keeps the volume; else s = 1. `u` is the displacement's jet.
         """
         convected = self._moved_with(self._deformed(u), v, u)
         if not np.any(thins):
@@ -98,36 +99,40 @@ class TangentFrame:
         return np.asarray(convected + (thinned * _dot(self.n0, v) / area)[..., None] * m)
 
     def rotated(self, v: Array, u: Array) -> Array:
-        """R v with the rotation R of F, of vectors (..., 3); see `magnetism.laws`."""
+        """Return R v (..., 3) of vectors v, with the rotation R of F; see `magnetism.laws`."""
         f, n = self._deformed(u), self.normal(u)
+        # J F C^-1 on t_1 and t_2; R = (F + J F C^-1)/T, T² = tr C + 2 J
         cofactor = np.stack([np.cross(f[..., 1, :], n), np.cross(n, f[..., 0, :])], axis=-2)
         T = np.sqrt(np.sum(f * (f + cofactor), axis=(-2, -1)))
         return self._moved_with((f + cofactor) / T[..., None, None], v, u)
 
     def _deformed(self, u: Array) -> Array:
-        """F t_1, F t_2 (..., 2, 3)."""
+        """Return F t_1 and F t_2 (..., 2, 3), from a displacement's jet."""
         return np.asarray(np.einsum("...ia,a...j->...ij", self.dual, self.jet[1:3] + u[1:3]))
 
     def _moved_with(self, t: Array, v: Array, u: Array) -> Array:
-        """Return the vector that has the components of v in t and along the deformed normal."""
+        """Return vectors (..., 3) whose components in t (..., 2, 3) are those of v in the frame.
+
+        Their components along the deformed normal are those of v along n0.
+        """
         in_surface = np.einsum("...ik,...k,...ij->...j", self.t, v, t)
         return np.asarray(in_surface + _dot(self.n0, v)[..., None] * self.normal(u))
 
     def tensor(self, S: Array) -> Array:
-        """S_11, S_12, S_22 (..., 3) in the frame as a tensor in space, (..., 3, 3)."""
+        """Return the tensor in space (..., 3, 3) of S_11, S_12, S_22 (..., 3) in the frame."""
         return np.asarray(np.einsum("...ija,...a->...ij", self.in_space, S))
 
 
 @dataclass(frozen=True)
 class NaturalFrame:
-    """Natural forms at points in their frames, at given amplitudes; see `natural.Forms`.
+    """Natural forms at points in their frames, at given amplitudes; see `kinematics.Forms`.
 
     Attributes
     ----------
     strain, bend
         (..., 3) (a_n - a0)/2 and b_n - b0, the latter times R.
     inverse
-        (..., 2, 2) of the stretch tensor U.
+        (..., 2, 2) inverse of the stretch tensor U.
     thickness
         (...) h_n over h.
     """
@@ -141,8 +146,19 @@ class NaturalFrame:
     def from_tensors(
         cls, frame: TangentFrame, T: Array, kappa: Array, t: Array, bent: float, stretched: float
     ) -> "NaturalFrame":
-        """Return the natural forms from the tensors of `parts.natural.shape.Natural.at`, times R,
-        and the amplitudes.
+        """Return the natural forms at points, from tensors of the natural shape and amplitudes.
+
+        Parameters
+        ----------
+        frame
+            The points with their frames.
+        T, kappa
+            (..., 3, 3) in space: natural stretch in the surface less one, and natural curvature
+            times R.
+        t
+            (...) natural stretch of the thickness less one.
+        bent, stretched
+            Amplitudes of kappa, and of T and t.
         """
         t0 = frame.t
         tensors_in_frame = [
@@ -151,46 +167,52 @@ class NaturalFrame:
         b = np.einsum("d...i,...i->...d", frame.jet[3:], frame.n0)
         b0, s = _matrix(_times(frame.in_frame, b)), (1 + stretched * t)[..., None, None]
         U = np.eye(2) + tensors_in_frame[0]
+        # b_n - b0: b0 stretched by U and thickened by s, plus the natural curvature in the metric
+        # of U
         bend = (b0 @ U @ U + U @ U @ b0) / (2 * s) - b0 + U @ tensors_in_frame[1] @ U
         strain = tensors_in_frame[0] + tensors_in_frame[0] @ tensors_in_frame[0] / 2
         return cls(_components(strain), _components(bend), np.linalg.inv(U), s[..., 0, 0])
 
     def elastic(self, E: Array) -> Array:
-        """U^-1 (E - E_n) U^-1, (..., 3): the strain of the natural shell."""
+        """Return U^-1 (E - E_n) U^-1, (..., 3): the strain of the natural shell."""
         return _components(self.inverse @ _matrix(E - self.strain) @ self.inverse)
 
     def moment(self, E: Array, K: Array, law: Law) -> Array:
-        """M (..., 3) over E h R, what works on K."""
+        """Return M (..., 3) over E h R, the derivative of the energy by K, at E and K."""
         up, area = self.inverse @ self.inverse, 1 / np.linalg.det(self.inverse)
         M = law.thicker(self.thickness).moment(_matrix(E - self.strain), _matrix(K - self.bend), up)
         return np.asarray(area[..., None] * np.stack(M, axis=-1))
 
 
 def _matrix(S: Array) -> Array:
+    """Return S_11, S_12, S_22 (..., 3) as matrices (..., 2, 2)."""
     return np.stack([S[..., :2], S[..., 1:]], axis=-2)
 
 
 def _components(S: Array) -> Array:
+    """Return the components S_11, S_12, S_22 (..., 3) of symmetric matrices (..., 2, 2)."""
     return np.stack([S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]], axis=-1)
 
 
 def bending_moment(E: Array, K: Array, law: Law) -> Array:
-    """M (..., 3) over E h R of E_11, E_12, E_22 and K_11, K_12, K_22 (..., 3) in an orthonormal
-    frame.
+    """Return M_11, M_12, M_22 (..., 3) over E h R, in an orthonormal frame.
+
+    E and K (..., 3) are the components 11, 12, 22 of strain and change of curvature.
     """
     return np.stack(law.moment(_matrix(E), _matrix(K), np.eye(2)), axis=-1)
 
 
 def principal(S: Array) -> tuple[Array, Array]:
-    """The larger and the smaller eigenvalue (...) of S_11, S_12, S_22 (..., 3) in an orthonormal
-    frame.
+    """Return the larger and the smaller eigenvalue (...) of symmetric tensors.
+
+    S (..., 3) are the components 11, 12, 22 in an orthonormal frame.
     """
     mean, radius = (S[..., 0] + S[..., 2]) / 2, np.hypot((S[..., 0] - S[..., 2]) / 2, S[..., 1])
     return mean + radius, mean - radius
 
 
 def _of_symmetric(A: Array) -> Array:
-    """B (..., n, n, 3) with A S A^T = B (S_11, S_12, S_22), of A (..., n, 2)."""
+    """Return B (..., n, n, 3) with A S A^T = B (S_11, S_12, S_22), for A (..., n, 2)."""
     first, second = A[..., 0], A[..., 1]
     mixed = first[..., :, None] * second[..., None, :]
     first_square, second_square = (v[..., :, None] * v[..., None, :] for v in (first, second))
@@ -206,6 +228,6 @@ def _dot(a: Array, b: Array) -> Array:
 
 
 def _area_vector(jet: Array) -> tuple[Array, Array]:
-    """a_1 x a_2 (..., 3) and its length (...)."""
+    """Return a_1 x a_2 (..., 3) and its length (...), from a jet."""
     m = np.cross(jet[1], jet[2])
     return m, np.linalg.norm(m, axis=-1)

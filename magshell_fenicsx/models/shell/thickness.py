@@ -28,20 +28,20 @@ MIN_THICKNESS_FACTOR, MAX_THICKNESS_FACTOR = 1e-3, 1e3
 
 @dataclass(frozen=True)
 class Thickness:
-    """h(x)/h, which multiplies the thickness.
+    """The factor h(x)/h, which multiplies the thickness.
 
     Attributes
     ----------
     of_position
         Function of arrays of x, y, z over R; None for 1.
     patches
-        Patch of a mesh -> a number or the thickness of a shell; the rest has 1.
+        Patch of a mesh -> a number, or the factor of a shell that has a place; the rest has 1.
     formulas
         Formulas that vary in the function.
     user_field
         A field on the triangles of a mesh in place of the function.
     polynomials
-        The same in the cells of a model.
+        The user's field in the cells of a model.
     """
 
     of_position: Callable[[Array, Array, Array], Array] | None = None
@@ -51,8 +51,9 @@ class Thickness:
     polynomials: CellPolynomials | None = None
 
     def values_at(self, x: Array) -> Array:
-        """Return the values at places (..., 3), without patches; for a user's field at places
-        (cells, n, 3) in cells.
+        """Return the factor (...) at places x (..., 3) over R, without patches.
+
+        A user's field needs places (cells, n, 3) in cells.
         """
         if self.polynomials:
             return np.array(self.polynomials(x)[..., 0])
@@ -61,7 +62,10 @@ class Thickness:
         return np.ones(x.shape[:-1])
 
     def values_in_cells(self, cells: CellGeometry, nodal: Array) -> Array:
-        """Return the values (cells, nodes), of a formula by `project_formula`; collective."""
+        """Return the factor (cells, nodes), for a formula by `project_formula`; collective.
+
+        `nodal` are its values at the nodes.
+        """
         if self.of_position is None:
             return nodal
         element = cells.element
@@ -79,15 +83,17 @@ class Thickness:
 
 @dataclass(frozen=True)
 class PlacedFactor:
-    """The thickness of a shell that has a place, times a number."""
+    """The thickness factor of a shell that has a place, times a number."""
 
     thickness: Thickness
     place: ShellPose
     factor: float
 
     def in_cells(self, cells: CellGeometry) -> Array:
-        """Return the values (cells, nodes) in cells in space, or on a meridian around its axis;
-        collective.
+        """Return the factor (cells, nodes); collective.
+
+        The cells are those of a surface in space, or of a meridian around its axis. Places are
+        moved into the shell's own frame.
         """
         if cells.nodal.shape[-1] == 3:
             nodal = x = self.place.to_shell_frame(cells.nodal)
@@ -100,12 +106,14 @@ class PlacedFactor:
 
 
 def refuse_unfit(factors: Array, x: Array, comm: MPI.Comm) -> None:
-    """Refuse factors of the thickness at places (..., 3) that are too small or large; collective.
+    """Refuse factors (...) of the thickness that are too small or too large; collective.
+
+    `x` (..., 3) are their places over R.
 
     Raises
     ------
     MeshError
-        On every rank, if it is not positive somewhere.
+        On every rank, with the first such place.
     """
     refuse_places(
         x[~((factors >= MIN_THICKNESS_FACTOR) & (factors <= MAX_THICKNESS_FACTOR))],
@@ -118,12 +126,21 @@ def refuse_unfit(factors: Array, x: Array, comm: MPI.Comm) -> None:
 def thickness_field(
     thickness: Thickness, r0: fem.Function, patches: Mapping[str, NDArray[np.bool_]] | None = None
 ) -> fem.Function:
-    """Return h(x)/h at the nodes of every cell, free to jump from cell to cell; shape (1,).
+    """Return h(x)/h as a discontinuous field (1,) of the placement's degree; collective.
+
+    Parameters
+    ----------
+    thickness
+        The factor.
+    r0
+        The placement.
+    patches
+        Patch -> flags (cells,) of this rank's cells in it; None without patches.
 
     Raises
     ------
     MeshError
-        On every rank, if it is not positive somewhere, or a patch is unknown.
+        On every rank, if the factor is too small or too large somewhere, or a patch is unknown.
     """
     V = r0.function_space
     nodes, _ = positions_and_normals(r0)
@@ -149,9 +166,14 @@ def thickness_field(
 def material_field(
     shells: Mapping[str, ShellMaterial], domain: mesh.Mesh, patches: Mapping[str, NDArray[np.bool_]]
 ) -> fem.Function:
-    """`ShellMaterial.numbers` of each cell; shape (4,).
+    """Return `ShellMaterial.numbers` of each cell as a field (4,), constant in cells.
 
-    `patches` tell for each cell of this rank, ghosts too, whether it belongs to a shell.
+    `patches` maps each shell's name to flags (cells,) of this rank's cells in it, ghosts included.
+
+    Raises
+    ------
+    MeshError
+        If a shell has no patch.
     """
     Q = fem.functionspace(domain, ("DG", 0, (4,)))
     field = fem.Function(Q, name="material")
@@ -162,14 +184,14 @@ def material_field(
 
 
 def select_cells(cells: CellGeometry, selection: NDArray[np.bool_]) -> CellGeometry:
-    """Return some of this rank's cells."""
+    """Return the selected cells of this rank, by flags (cells,), with their geometry."""
     return replace(cells, nodal=cells.nodal[selection], owned=int(selection[: cells.owned].sum()))
 
 
 def patch_of(
     patches: Mapping[str, NDArray[np.bool_]], name: str, key: str = "loading.loads"
 ) -> NDArray[np.bool_]:
-    """Whether each cell belongs to a patch; `key` is the one of the case that names it.
+    """Return flags (cells,) of the cells in a named patch; `key` is the key of the case.
 
     Raises
     ------
@@ -183,8 +205,9 @@ def patch_of(
 
 
 def thickness_weighted(density: Density, t: fem.Function, component: int = 0) -> Density:
-    """Return a density per E h times a component of the field t, by default the first, which is the
-    thickness over h.
+    """Return a density times a component of the field t, which becomes a parameter.
+
+    By default it is the first component, the thickness over h.
     """
 
     def weighted(*arguments: Expr) -> Expr:

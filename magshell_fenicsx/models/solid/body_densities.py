@@ -1,5 +1,4 @@
-"""The compressible rubber that E and nu stand for as a solid: its energies as plain functions of
-point quantities.
+"""Energies of the solid of compressible rubber for which E and nu stand, at points.
 
 Energies are over E, with lengths in R; divided by h/R they are in the shell's unit E h R^2. X is
 the undeformed place, u the displacement and H its gradient by X; F = 1 + H. At an end, the face
@@ -17,8 +16,9 @@ from magshell_fenicsx.models.shell.densities import field_at_displacement
 
 
 def distortion(X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr, growth: Expr | None = None) -> Expr:
-    """mu/2 (J^(-2/3) F:F - 3): what does not depend on a change of volume; of F G^(-1) after a
-    growth G.
+    """mu/2 (J^(-2/3) F:F - 3)/h: the energy of distortion, without that of a change of volume.
+
+    After a `growth` G it is that of F G^(-1), times det G. `shear` is mu over E.
     """
     F = ufl.Identity(3) + H
     if growth is not None:
@@ -31,7 +31,7 @@ def distortion(X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr, growth: Expr | N
 def areal_distortion(
     X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr, growth: Expr | None = None
 ) -> Expr:
-    """mu/2 (J^(-4/3) I2 - 3), I2 the second invariant of F^T F, as `distortion`."""
+    """mu/2 (J^(-4/3) I2 - 3)/h, I2 the second invariant of F^T F; arguments as in `distortion`."""
     F = ufl.Identity(3) + H
     if growth is not None:
         return ufl.det(growth) * areal_distortion(
@@ -42,7 +42,10 @@ def areal_distortion(
 
 
 def compression(X: Expr, u: Expr, H: Expr, bulk: Expr, h: Expr, growth: Expr | None = None) -> Expr:
-    """kappa/2 (J - 1)^2; J/det G takes the place of J after a growth G."""
+    """kappa/2 (J - 1)^2/h, with kappa = `bulk` over E.
+
+    After a `growth` G, J/det G takes the place of J, and the energy is times det G.
+    """
     J = ufl.det(ufl.Identity(3) + H)
     if growth is not None:
         return ufl.det(growth) * bulk / (2 * h) * (J / ufl.det(growth) - 1) ** 2
@@ -50,29 +53,32 @@ def compression(X: Expr, u: Expr, H: Expr, bulk: Expr, h: Expr, growth: Expr | N
 
 
 def magnetic(X: Expr, u: Expr, H: Expr, Br: Expr, Ba: Expr, h: Expr) -> Expr:
-    """-Ba . (F - 1) Br, paper Eq. (eq:mage) without its constant: a dead load."""
+    """-Ba . (F - 1) Br/h, paper Eq. (eq:mage) without its constant: a dead load."""
     return -ufl.dot(Ba, ufl.dot(H, Br)) / h
 
 
 def magnetic_gradient(X: Expr, u: Expr, H: Expr, Br: Expr, G: Expr, h: Expr) -> Expr:
-    """The part of Ba = G x: -(G x) . F Br at the deformed place x = X + u, without its value at u =
-    0.
+    """Magnetic density in the part Ba = G x of the field, at the deformed place x = X + u.
+
+    It is -(G x) . F Br/h without its value at u = 0.
     """
     F = ufl.Identity(3) + H
     return -(ufl.dot(ufl.dot(G, X + u), ufl.dot(F, Br)) - ufl.dot(ufl.dot(G, X), Br)) / h
 
 
 def magnetic_in_space(X: Expr, u: Expr, H: Expr, Br: Expr, P: Expr, h: Expr) -> Expr:
-    """Magnetic density in a field known by values, without its value at u = 0; P as in
-    `field_at_displacement`.
+    """Magnetic density in a field known by values, without its value at u = 0.
+
+    P is the field's polynomial as in `field_at_displacement`.
     """
     B, change = field_at_displacement(P, u)
     return magnetic(X, u, H, Br, B, h) - ufl.dot(change, Br) / h
 
 
 def enclosed(x: Expr, x1: Expr, x2: Expr) -> Expr:
-    """x . n da/3 under a face, per area of its coordinates: with flat ends through the origin the
-    volume.
+    """x . n da/3 under a face, per area of its coordinates, from its place and tangents x1, x2.
+
+    With flat ends through the origin the integral is the volume.
     """
     return ufl.dot(x, ufl.cross(x1, x2)) / 3
 
@@ -80,8 +86,10 @@ def enclosed(x: Expr, x1: Expr, x2: Expr) -> Expr:
 def pressure(
     X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, unit: Expr, origin: Expr | None = None
 ) -> Expr:
-    """Pi/p of a live pressure in that unit: the change of the volume between the outer face and an
-    origin.
+    """Pi/p of a live pressure, times `unit`: the change of volume between a face and an origin.
+
+    X1, X2, u1, u2 are derivatives by the face's coordinates; it is per area of these. `origin` is
+    that of X by default.
     """
     X = X if origin is None else X - origin
     return unit * (enclosed(X + u, X1 + u1, X2 + u2) - enclosed(X, X1, X2))
@@ -90,8 +98,10 @@ def pressure(
 def swept_volume(
     X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, unit: Expr | float = 1.0
 ) -> Expr:
-    """Volume that a face sweeps, per area of its coordinates; as
-    `models.shell.densities.swept_volume`.
+    """Volume that a face sweeps, times `unit`, per area of its coordinates.
+
+    It is that of `models.shell.densities.swept_volume`: u times the mean of the area vector on the
+    way.
     """
     mean = ufl.cross(X1, X2) + (ufl.cross(X1, u2) + ufl.cross(u1, X2)) / 2 + ufl.cross(u1, u2) / 3
     return unit * ufl.dot(u, mean)
@@ -100,14 +110,14 @@ def swept_volume(
 def follower_pressure_work(
     X: Expr, X1: Expr, X2: Expr, u: Expr, u1: Expr, u2: Expr, v: Expr, unit: Expr
 ) -> Expr:
-    """v . n da: the virtual work of p = 1 in that unit, per area of the face's coordinates."""
+    """v . n da: the virtual work of p = 1 along v, times `unit`, per area of the coordinates."""
     return unit * ufl.dot(v, ufl.cross(X1 + u1, X2 + u2))
 
 
 def sealing(
     X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, unit: Expr, origin: Expr | None = None
 ) -> Expr:
-    """`pressure` on a part of an end, per undeformed area."""
+    """`pressure` on a part of an end, per undeformed area, with the tangents t and n."""
     return pressure(X, t, n, u, ufl.dot(H, t), ufl.dot(H, n), unit, origin)
 
 
@@ -126,8 +136,7 @@ def follower_pressure_work_on_end(
 def turning(
     X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, weight: Expr, intensity: Expr, reference_turn: Expr
 ) -> Expr:
-    """-Pi of a moment per length about t: intensity times the mean angle that lines along n have
-    turned.
+    """-Pi of a moment per length about t: intensity times the mean angle of lines along n.
 
     With the `weight` (1,) 3/2 (1 - 4 z^2/h^2)/h over the thickness, its forces are at first a
     traction linear in z. `reference_turn` is that of `models.shell.edges.turning`.
@@ -164,8 +173,9 @@ class MooneyRivlin:
     ) -> "MooneyRivlin":
         """Return the law with Young's modulus 1 at small strains.
 
-        For nu = 0.5 the shear modulus of the incompressible solid, 1/3, and `bulk_to_shear` times
-        that: both Young's modulus and nu then fall short of their limits, by 1/(3 bulk_to_shear).
+        For nu = 0.5 the shear modulus is that of the incompressible solid, 1/3, and the bulk
+        modulus is `bulk_to_shear` times as large. Young's modulus is then less than 1 by about 1/(3
+        bulk_to_shear), and nu less than 1/2 by about 1/(2 bulk_to_shear).
         """
         shear = 1 / (2 * (1 + nu))
         return cls(shear, bulk_to_shear * shear if nu == 0.5 else 1 / (3 * (1 - 2 * nu)), share)

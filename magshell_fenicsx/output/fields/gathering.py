@@ -1,4 +1,4 @@
-"""The gatherer of each model collects nodal fields on rank 0, for pictures and for ParaView.
+"""Gatherers: they collect the nodal fields of a model on rank 0, for pictures and for ParaView.
 
 Input: the displacement and the amplitudes of a state. Output: a `surface.Surface`. The gatherer of
 a meridian returns the surface of revolution that the meridian sweeps, in flat triangles.
@@ -45,23 +45,29 @@ Array = NDArray[np.float64]
 
 
 class RevolvedGatherer:
-    """Gather displacement and fields of a meridian on its surface of revolution.
+    """Gather displacement and fields of a meridian on the surface of revolution that it sweeps.
 
-    Strains and moments are recovered from samples in the cells of the meridian.
+    Every rank has the whole meridian; rank 0 of `comm` makes the surface. Strains and moments are
+    recovered from samples in the cells of the meridian.
     """
 
     def __init__(self, model: "MeridianModel", comm: MPI.Comm) -> None:
+        """Prepare the gathering for all states of a model of a meridian."""
         self.comm, self._model = comm, model
         self._inner, rule = basix.make_quadrature(basix.CellType.interval, 2 * model.degree - 3)
         self._swept = Revolution(model)
         self._set_placement({})
+        # fields may jump at kinks: circles of nodes there are double
         if len(kinks := self._kinks()):
             self._swept = Revolution(model, kinks=kinks)
             self._set_placement({})
         self._recovered = RecoveredMeridian(self._swept, self._model, self._inner, rule)
 
     def _set_placement(self, mu: Mapping[str, float]) -> None:
-        """Set what depends on the placement, at the amplitudes of growing imperfections."""
+        """Set all that depends on the undeformed placement: fields, stresses, constant parts.
+
+        `mu` has the amplitudes of growing imperfections.
+        """
         model, swept, loads = self._model, self._swept, self._model.loads
         r, r_at_samples = swept.jets(model.r0), swept.inner_jets(model.r0, self._inner)
         thickness_at_ends, thickness_at_samples = (
@@ -93,15 +99,13 @@ class RevolvedGatherer:
             imperfect = replace(embedding, deviations=deviations)
             w0 = imperfect.w0(np.column_stack([s, 0 * s])) / model.material.h
             self._fields.constant[W0] = np.asarray(w0.reshape(-1, 2))
-        if in_shells := [*model.meridian.patches.values()]:
-            shell_number = np.argmax(in_shells, axis=0)[swept.order, None].astype(np.float64)
+        if cells_in_shells := [*model.meridian.patches.values()]:
+            shell_number = np.argmax(cells_in_shells, axis=0)[swept.order, None].astype(np.float64)
             self._fields.constant[SHELL] = np.asarray(np.repeat(shell_number, 2, axis=1))
         self._constant = self._swept_fields(self._fields.constant)
 
     def _kinks(self) -> list[int]:
-        """Return the numbers of the meridian's vertices where the normal or a prescribed field
-        jumps.
-        """
+        """Return the numbers of the cells before which the normal or a prescribed field jumps."""
         model, fields = self._model, self._fields
         prescribed_fields = [values for values in (fields.Br, fields.susceptibility) if values.size]
         if model.loads.natural:
@@ -109,11 +113,13 @@ class RevolvedGatherer:
             prescribed_fields += model.loads.natural.tensors_at(places, fields.n0)
         if model.thickness is not None:
             prescribed_fields.append(self._swept.scalars(model.thickness))
-        parts = smooth_parts(self._swept.ends, np.array([[0], [1]]), prescribed_fields, fields.n0)
-        return [int(i) + 1 for i in np.flatnonzero(np.diff(parts))]
+        part_numbers = smooth_parts(
+            self._swept.ends, np.array([[0], [1]]), prescribed_fields, fields.n0
+        )
+        return [int(i) + 1 for i in np.flatnonzero(np.diff(part_numbers))]
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
-        """Return the displaced surface with its fields at the amplitudes mu.
+        """Return the displaced surface with its fields at the amplitudes `mu`.
 
         On rank 0; None on other ranks.
         """
@@ -123,7 +129,7 @@ class RevolvedGatherer:
         return self._model.system.at_state(state).evaluate(lambda: self._surface_at(state))
 
     def _surface_at(self, state: State) -> Surface:
-        """Return the surface at the displacement and the placement that are set."""
+        """Return the surface at the state that the model has been set to."""
         if self._model.growing:
             self._set_placement(state.mu)
         swept = self._swept
@@ -150,7 +156,7 @@ class RevolvedGatherer:
         )
 
     def _swept_fields(self, fields: Mapping[str, Array]) -> dict[str, Array]:
-        """Return fields (cells, 2, ...) of the meridian at the nodes of the swept surface."""
+        """Return fields at the nodes of the swept surface, from cell ends (cells, 2, ...)."""
         return {
             name: self._swept.on_parallels(values, self._fields.weight)
             for name, values in fields.items()
@@ -158,16 +164,25 @@ class RevolvedGatherer:
 
 
 class RecoveredMeridian:
-    """Recover tensor components along and across the meridian at cell ends from samples in the
-    cells.
+    """Recover tensor components at the cell ends of a meridian from samples in its cells.
 
-    At a pole both components are even functions of the arc length: the cell there is fitted
-    together with its mirror image.
+    Components are along and across the meridian. At a pole they are even functions of the arc
+    length: the cell there is fitted together with its mirror image.
+
+    Parameters
+    ----------
+    swept
+        Surface of revolution, with the order of the cells.
+    model
+        Model of the meridian.
+    inner, rule
+        (q, 1) samples in the reference cell, and their weights (q,).
     """
 
     def __init__(
         self, swept: Revolution, model: "MeridianModel", inner: Array, rule: Array
     ) -> None:
+        """Set the recovery, and the matrices from its coefficients to cell ends and to samples."""
         s, ends, poles = model.meridian.cells, swept.ends, model.meridian.poles
         length, cells = np.diff(s), np.arange(len(s))
         samples = s[:, :1] + length * inner[:, 0]
@@ -179,6 +194,7 @@ class RecoveredMeridian:
             s[pole_cells, pole_end],
             s[pole_cells, 1 - pole_end],
         )
+        # each cell at a pole gets a mirror image, with one new vertex beyond the pole
         images = len(vertices) + np.arange(len(pole_cells))
         vertices = np.concatenate([vertices, 2 * pole - other_end])
         self._recovery = Recovery(
@@ -191,6 +207,7 @@ class RecoveredMeridian:
         )
         self._weight = length * rule
         count = len(inner)
+        # barycentric coordinates of the samples
         hats = np.column_stack([1 - inner[:, 0], inner[:, 0]])
         self._to_samples = self._recovery.evaluation_matrix(
             np.repeat(cells, count), samples.reshape(-1, 1), np.tile(hats, (len(cells), 1))
@@ -204,7 +221,7 @@ class RecoveredMeridian:
     def components(
         self, stresses: Mapping[str, Array]
     ) -> tuple[dict[str, Array], dict[str, float]]:
-        """Return stress components at the ends of cells, and the jumps of the samples.
+        """Return components at the ends of cells recovered from samples, and the samples' jumps.
 
         Parameters
         ----------
@@ -223,15 +240,16 @@ class RecoveredMeridian:
             coefficients = self._recovery.coefficients(np.concatenate([S, S[self._pole_cells]]))
             at_ends[name] = (self._to_ends @ coefficients).reshape(-1, 2, 3)
             if name in ROUNDING:
-                smooth = (self._to_samples @ coefficients).reshape(S.shape)
-                jumps[name] = relative_jump(S, smooth, self._weight, ROUNDING[name])
+                smooth_at_samples = (self._to_samples @ coefficients).reshape(S.shape)
+                jumps[name] = relative_jump(S, smooth_at_samples, self._weight, ROUNDING[name])
         return at_ends, jumps
 
 
 class BodyGatherer:
-    """Gather the displacement of a solid; n0 is the direction of the thickness."""
+    """Gather the displacement of a solid; its field n0 is the direction of the thickness."""
 
     def __init__(self, model: "SolidModel") -> None:
+        """Gather all that the displacement does not change: cells, nodes; collective."""
         self._model, self.comm = model, model.V.mesh.comm
         V = model.V
         cells = V.dofmap.list[: V.mesh.topology.index_map(3).size_local]
@@ -246,7 +264,10 @@ class BodyGatherer:
         self._r0, self._n0 = self._nodes(model.r0), self._nodes(_thickness_directions(model.r0))
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
-        """Return the displaced body on rank 0; None on other ranks."""
+        """Return the displaced body with its imperfections; collective.
+
+        On rank 0; None on other ranks. `mu` changes nothing.
+        """
         system = self._model.system
         displacement = self._gather_nodes(system.with_ghosts(u)[: system.size].reshape(-1, 3))
         if self.comm.rank:
@@ -254,17 +275,26 @@ class BodyGatherer:
         return Surface(self._r0, displacement, self._n0, self._cells, self._fields)
 
     def _nodes(self, f: fem.Function) -> Array:
-        """Return the values (n, 3) at the owned nodes of all ranks, in global order, on rank 0."""
+        """Return the values (n, 3) of f at the owned nodes of all ranks on rank 0; collective.
+
+        Nodes are in global order. Other ranks get their own values.
+        """
         return self._gather_nodes(f.x.array[: self._model.system.size].reshape(-1, 3))
 
     def _gather_nodes(self, part: NDArray[Any]) -> NDArray[Any]:
-        """Return the parts of all ranks on rank 0, the own part on other ranks."""
-        parts = self.comm.gather(part.copy())
-        return np.concatenate(parts) if self.comm.rank == 0 else part
+        """Return the values of all ranks, one after the other, on rank 0; collective.
+
+        Other ranks get their own values back.
+        """
+        values_of_ranks = self.comm.gather(part.copy())
+        return np.concatenate(values_of_ranks) if self.comm.rank == 0 else part
 
 
 def _thickness_directions(r0: fem.Function) -> fem.Function:
-    """Return the unit vector in the direction of the thickness, at the nodes."""
+    """Return the unit vectors along the thickness of a solid at its nodes, as a function.
+
+    They are tangents of the third reference direction of its hexahedra.
+    """
     V = r0.function_space
     element = V.element.basix_element
     slopes = element.tabulate(1, element.points)[3, :, :, 0]
@@ -277,19 +307,19 @@ def _thickness_directions(r0: fem.Function) -> fem.Function:
 
 
 class Gatherer(Protocol):
-    """Gather the displacement and fields of one model; collective."""
+    """What collects displacement and fields of one model on rank 0; collective."""
 
     comm: MPI.Comm
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
-        """Return the displaced nodes with their fields at the amplitudes mu.
+        """Return the displaced nodes with their fields at the amplitudes `mu`.
 
-        On rank 0; None on other ranks.
+        On rank 0; None on other ranks. `u` is this rank's part of the displacement.
         """
 
 
 def gatherer(model: "ShellModel | MeridianModel | SolidModel", comm: MPI.Comm) -> Gatherer:
-    """Return the gatherer of a model."""
+    """Return the gatherer for a model of a meridian, a shell or a solid."""
     if model.axisymmetric:
         return RevolvedGatherer(model, comm)
     return SurfaceGatherer(model) if model.thin else BodyGatherer(model)

@@ -19,9 +19,9 @@ TEXT_FIELDS = ("name", "unit", "words")
 
 
 def grid_content(grid: MapGrid, R: float) -> bytes:
-    """Return the content of a .vtu file with the flux density B at the points of a grid.
+    """Return a grid with the flux density B at its points as the content of a .vtu file.
 
-    The points are over R, which is in metres; nan without units.
+    Places are over R. `R` is in metres; nan for a case without units.
     """
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonCore import vtkPoints
@@ -30,37 +30,43 @@ def grid_content(grid: MapGrid, R: float) -> bytes:
     points, cells, vtk_grid = vtkPoints(), vtkCellArray(), vtkUnstructuredGrid()
     points.SetData(numpy_to_vtk(np.ascontiguousarray(grid.places), deep=True))
     corners = _cells(grid.points)
-    starts = np.arange(0, corners.size + 1, corners.shape[1])
+    cell_starts = np.arange(0, corners.size + 1, corners.shape[1])
     cells.SetData(
-        *(numpy_to_vtk(array.astype(np.int64), deep=True) for array in (starts, corners.ravel()))
+        *(
+            numpy_to_vtk(array.astype(np.int64), deep=True)
+            for array in (cell_starts, corners.ravel())
+        )
     )
     vtk_grid.SetPoints(points)
     vtk_grid.SetCells(QUAD if len(grid.points) == 2 else HEXAHEDRON, cells)
     add_array(vtk_grid.GetPointData(), "B", grid.values)
-    data = vtk_grid.GetFieldData()
-    numbers = {
+    file_data = vtk_grid.GetFieldData()
+    file_arrays = {
         "corner": grid.corner[None],
         "sides": grid.sides,
         "points_along": np.array(grid.points, dtype=float),
     }
-    for name, values in (numbers | ({} if isnan(R) else {"R_in_m": np.array([R])})).items():
-        add_array(data, name, values)
+    for name, values in (file_arrays | ({} if isnan(R) else {"R_in_m": np.array([R])})).items():
+        add_array(file_data, name, values)
     for name in TEXT_FIELDS:
-        add_texts(data, name, [str(getattr(grid, name))])
-    add_texts(data, "units", ["points: R", f"B: {grid.unit}"])
+        add_texts(file_data, name, [str(getattr(grid, name))])
+    add_texts(file_data, "units", ["points: R", f"B: {grid.unit}"])
     return content_of(vtk_grid)
 
 
 def read_map(file: Path) -> tuple[MapGrid, float]:
-    """Return the grid in a file, and R in metres.
+    """Return the grid in a .vtu file of `grid_content`, and R in metres.
+
+    R is nan for a case without units.
 
     Raises
     ------
     Damaged
-        If it cannot be read.
+        If the file cannot be read.
     """
 
     def map_grid(vtk_grid: "vtkUnstructuredGrid") -> tuple[MapGrid, float]:
+        """Return the grid and R from VTK's grid."""
         numbers = arrays(vtk_grid.GetFieldData())
         texts = {name: _text(vtk_grid.GetFieldData(), name) for name in TEXT_FIELDS}
         points_per_side = tuple(int(n) for n in numbers["points_along"].ravel())
@@ -75,11 +81,15 @@ def read_map(file: Path) -> tuple[MapGrid, float]:
 
 
 def _text(data: Any, name: str) -> str:
+    """Return the text of a name in VTK's data of a file."""
     return str(data.GetAbstractArray(name).GetValue(0))
 
 
 def _cells(points: tuple[int, ...]) -> NDArray[np.int64]:
-    """Return the corners (cells, 4 or 8) of a grid's cells, in VTK's order."""
+    """Return the corners (cells, 4 or 8) of a grid's cells, in VTK's order.
+
+    `points` are the numbers of points along two or three sides.
+    """
     number = np.arange(np.prod(points)).reshape(points[::-1])
     low, high = slice(None, -1), slice(1, None)
     # along the second and the first side

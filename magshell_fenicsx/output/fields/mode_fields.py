@@ -1,8 +1,8 @@
 """Modes and null vectors on the whole deformed shell: fields for ParaView, tables, captions.
 
-A half shell is completed by the symmetric or antisymmetric mirror image of the mode. The
-coefficients of waves are evaluated around the axis. Files of gradients and of frequencies are here
-too.
+A half shell is completed by the symmetric or antisymmetric mirror image of the mode. Waves are
+given by coefficients along the meridian, which are evaluated around the axis. Files of gradients
+and of frequencies are here too.
 """
 
 from collections.abc import Mapping, Sequence
@@ -58,19 +58,23 @@ def mode_surface(
 
     Parameters
     ----------
-    label, vector
-        "m = 7", "torsion": the vector has the coefficients (U + V, V, W) of waves; "antisymmetric":
-        the other half is the mirror image with the opposite sign; any other label: the mode has the
-        model's own symmetry.
+    u
+        This rank's part of the displacement.
+    label
+        "m = 7" or "torsion" of a meridian: `vector` has the coefficients (U + V, V, W) of a wave.
+        "antisymmetric": the other half of the mode is the opposite of its mirror image. Any other
+        label: the mode has the symmetry of the model.
+    vector
+        This rank's part of the mode.
     azimuth
-        Azimuth of the model's frame, rad.
+        Azimuth of the model's frame (rad).
     mu
-        The amplitudes, where imperfections grow.
+        Amplitude -> value; needed where imperfections grow.
 
     Returns
     -------
     On rank 0 the surface with the fields "mode" (n, 3), scaled to a largest length of one, and
-    "mode_w" (n,), its component along -n0; None on other ranks.
+    "mode_w" (n,), the component of the mode along -n0; None on other ranks.
     """
     if (label.startswith(WAVES) or label == TORSION) and model.axisymmetric:
         if gatherer.comm.rank:
@@ -91,10 +95,12 @@ def mode_surface(
 
 
 def mode_file(folder: Path, point: int, name: str, label: str) -> Path:
-    """Return the file of a mode.
+    """Return the path of the file of a mode in a run's folder.
 
     Parameters
     ----------
+    folder
+        Folder of the run.
     point
         Number of the point on the path.
     name
@@ -112,7 +118,9 @@ def mode_file(folder: Path, point: int, name: str, label: str) -> Path:
 
 
 def write_mode(file: Path, surface: Surface, shell_data: ShellData) -> None:
-    """Write the surface of `mode_surface`; in ParaView, `Warp By Vector` with "mode" shows it.
+    """Write the surface of `mode_surface` as a .vtu file; rank 0 calls it alone.
+
+    In ParaView, `Warp By Vector` with "mode" shows the mode.
 
     Raises
     ------
@@ -123,7 +131,10 @@ def write_mode(file: Path, surface: Surface, shell_data: ShellData) -> None:
 
 
 def mode_table(by_point: Mapping[int, Sequence[LabelledEigenvalue]]) -> bytes:
-    """Return stability.csv: the modes of each point, ascending in eigenvalues over E h/R^2."""
+    """Return the content of stability.csv, with eigenvalues over E h/R².
+
+    `by_point` maps the number of a point to its modes, ascending in eigenvalues.
+    """
     lines = list[tuple[int, int, str, float]]()
     for point, modes in by_point.items():
         for number, mode in enumerate(modes, 1):
@@ -132,7 +143,7 @@ def mode_table(by_point: Mapping[int, Sequence[LabelledEigenvalue]]) -> bytes:
 
 
 def mode_caption(number: int, mode: LabelledEigenvalue) -> str:
-    r"""Return the caption of a panel: number, label and eigenvalue, in matplotlib's mathematics.
+    r"""Return the caption of a mode: number, label and eigenvalue, in matplotlib's mathematics.
 
     Examples
     --------
@@ -147,14 +158,14 @@ def mode_caption(number: int, mode: LabelledEigenvalue) -> str:
 
 
 def _with_mode(base: Surface, v: Array) -> Surface:
-    """Return the surface with a mode as its fields, scaled to a largest length of one.
+    """Return the surface with a mode v (n, 3) as its fields, scaled to a largest length of one.
 
     The mode points inward at the first node where its normal component is largest.
     """
     inward = -np.einsum("ij,ij->i", v, base.n0)
-    size = np.abs(inward)
+    normal_size = np.abs(inward)
     # the crests and troughs of a wave differ only by rounding
-    first_crest = np.argmax(size > (1 - CREST_TOLERANCE) * size.max())
+    first_crest = np.argmax(normal_size > (1 - CREST_TOLERANCE) * normal_size.max())
     scale = np.copysign(np.linalg.norm(v, axis=1).max(), inward[first_crest])
     return replace(base, fields={"mode": v / scale, "mode_w": inward / scale})
 
@@ -162,10 +173,19 @@ def _with_mode(base: Surface, v: Array) -> Surface:
 def _revolved_wave(
     model: "MeridianModel", u: Vector, m: int, vector: Vector
 ) -> tuple[Surface, Array]:
-    """Return the surface with at least twelve sectors per wave, and the wave (n, 3) at its nodes.
+    """Return the surface of revolution of a displaced meridian, and a wave (n, 3) at its nodes.
 
-    v = U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z; torsion, m = 0, is V
-    e_theta.
+    The surface has at least twelve sectors for each wave. The wave is v = U cos(m theta) e_rho + V
+    sin(m theta) e_theta + W cos(m theta) e_z; torsion, m = 0, is V e_theta.
+
+    Parameters
+    ----------
+    u
+        Displacement of the meridian.
+    m
+        Number of waves.
+    vector
+        Coefficients (U + V, V, W) at the nodes of the meridian.
     """
     sectors = max(96, 12 * m)
     swept = Revolution(model, sectors)
@@ -181,9 +201,9 @@ def _revolved_wave(
 
 
 def wave_number(surface: Surface) -> int | None:
-    """Return the number m >= 2 of waves of a mode around e3, see `ring.waves_around`.
+    """Return the number m >= 2 of a mode's waves around e3, see `ring.waves_around`.
 
-    None also if the mesh does not resolve them.
+    None if no single number fits, or the mesh does not resolve so many waves.
     """
     waves = waves_around(surface)
     return waves.number if waves and waves.resolved else None
@@ -194,12 +214,15 @@ CURVATURES = ("curvature_11", "curvature_22", "curvature_12")
 
 
 def columns_of(field_name: str) -> tuple[str, ...]:
-    """Return the names in the file of a field's gradient; the remanence is one vector."""
+    """Return the names of the arrays in the file of a field's gradient.
+
+    The remanence is one vector; the curvature has three components.
+    """
     return CURVATURES if field_name == "curvature" else (field_name,)
 
 
 def gradient_file(folder: Path, result: str) -> Path:
-    """Return the file of a result's gradients.
+    """Return the path of the file of a result's gradients in a run's folder.
 
     Examples
     --------
@@ -210,7 +233,7 @@ def gradient_file(folder: Path, result: str) -> Path:
 
 
 def gradient_files(folder: Path) -> dict[str, Path]:
-    """Return the files of gradients in a run's folder, by result."""
+    """Return result -> file of its gradients, for all such files in a run's folder."""
     return {
         file.stem.removeprefix(GRADIENT_PREFIX): file
         for file in sorted((folder / "fields").glob(f"{GRADIENT_PREFIX}*.vtu"))
@@ -225,7 +248,7 @@ CONTACT_CHANGE = "contact_change"
 
 @dataclass(frozen=True)
 class Frequency:
-    """A row of frequencies.csv.
+    """A natural frequency: one row of frequencies.csv.
 
     Attributes
     ----------
@@ -234,9 +257,9 @@ class Frequency:
     wave
         Circumferential wave number or symmetry of the mode, see `wave_of`.
     omega2
-        ω² ρ R²/E.
+        Square of the angular frequency, ω² ρ R²/E; negative for an unstable mode.
     hertz
-        nan without a density, and of an unstable mode, which does not vibrate.
+        Frequency in Hz; nan without a density, and for an unstable mode, which does not vibrate.
     """
 
     point: int
@@ -246,9 +269,9 @@ class Frequency:
 
 
 def wave_of(label: str, symmetric_wave: str) -> str:
-    """Return the circumferential wave number or the symmetry of a mode.
+    """Return the circumferential wave number or the symmetry of a mode, from its label.
 
-    `symmetric_wave` is the result for modes with the model's own symmetry.
+    `symmetric_wave` is the result for modes with the model's own symmetry, whose label is empty.
 
     Examples
     --------
@@ -259,9 +282,9 @@ def wave_of(label: str, symmetric_wave: str) -> str:
 
 
 def hertz(omega2: float, time_unit: float | None) -> float | None:
-    """Return a frequency in Hz, with `time_unit` R √(ρ/E) in s.
+    """Return a frequency in Hz from omega2 = ω² ρ R²/E.
 
-    None without the unit, and for an unstable mode.
+    `time_unit` is R √(ρ/E) in s. None without that unit, and for an unstable mode.
     """
     return sqrt(omega2) / (2 * pi * time_unit) if time_unit and omega2 >= 0 else None
 
@@ -272,7 +295,7 @@ def frequency_table(
     time_unit: float | None,
     contact_changes: Mapping[int, Sequence[float]],
 ) -> bytes:
-    """Return frequencies.csv: modes of each point, ascending.
+    """Return the content of frequencies.csv: the modes of each point, in their order.
 
     Parameters
     ----------
@@ -299,7 +322,7 @@ def frequency_table(
 
 
 def read_frequencies(folder: Path) -> list[Frequency]:
-    """Return the rows of frequencies.csv in a run's folder; none without the file."""
+    """Return the rows of frequencies.csv in a run's folder; empty without that file."""
 
     def frequency_of(line: Mapping[str, str]) -> Frequency:
         return Frequency(

@@ -1,6 +1,6 @@
 """Bodies and field sources beside a shell, as .vtp files: their outlines and faces.
 
-They are where the amplitudes have driven them.
+They are drawn where the amplitudes have driven them.
 """
 
 import re
@@ -25,7 +25,7 @@ DIGITS = 7  # decimals of the corners of faces, over R
 
 
 def outlines(loads: Loads, mu: Mapping[str, float], h: float) -> tuple[Array, ...]:
-    """Return places (n, 3) over R along lines of bodies and sources, in the model's frame.
+    """Return places (n, 3) over R along the lines of bodies and sources, in the model's frame.
 
     Parameters
     ----------
@@ -43,7 +43,7 @@ def outlines(loads: Loads, mu: Mapping[str, float], h: float) -> tuple[Array, ..
 
 
 def solids(loads: Loads, mu: Mapping[str, float], h: float) -> tuple[Solid, ...]:
-    """Return the faces of bodies and sources, see `outlines`."""
+    """Return the faces of bodies and sources, in the model's frame; arguments as of `outlines`."""
     solids_in_space = list[Solid]()
     for drawn_object, Q, t, name in _placed_objects(loads, mu, h):
         if solid := getattr(drawn_object, "solid", None):
@@ -54,33 +54,43 @@ def solids(loads: Loads, mu: Mapping[str, float], h: float) -> tuple[Solid, ...]
 def _placed_objects(
     loads: Loads, mu: Mapping[str, float], h: float
 ) -> Iterator[tuple[Any, Array, Array, str]]:
-    """Yield bodies and sources with their rigid motion x -> Q x + t and their names.
+    """Yield (object, Q, t, name) of bodies and sources, with their rigid motion x -> Q x + t.
 
-    The motion is from the place where all amplitudes are zero. Sources have no name.
+    The motion begins at the place where all amplitudes are zero. Sources have no name. Arguments
+    are as of `outlines`.
     """
     for contact in loads.contacts:
         translation = mu.get(contact.amplitude, 0.0) * h * contact.direction
         yield contact.distance, np.eye(3), translation, contact.body
     if loads.magnetic is None:
         return
-    for part in getattr(loads.magnetic.in_space, "parts", ()):
-        yield part, np.eye(3), np.zeros(3), ""
+    for part_of_field in getattr(loads.magnetic.in_space, "parts", ()):
+        yield part_of_field, np.eye(3), np.zeros(3), ""
     for moving_source in loads.magnetic.driven:
         yield moving_source.at_rest, *combined_motion(moving_source.motions, mu), ""
 
 
 def vtp_content(lines: tuple[Array, ...], faces: Sequence[Solid] = ()) -> bytes:
-    """Return the content of a .vtp file; VTK's own writer takes as long as a step of a path.
+    """Return outlines and faces as the content of a .vtp file.
 
-    The array `pole` is positive on the half of a magnet with its north pole; `names` are those of
-    the bodies and magnets.
+    VTK's own writer takes as long as a step of a path. The array `pole` is positive on the north
+    half of a magnet. The arrays `names` and `sizes` have the name, the number of corners and the
+    number of triangles of each body or magnet.
+
+    Parameters
+    ----------
+    lines
+        Places (n, 3) along each line.
+    faces
+        Faces of bodies and magnets.
     """
-    sizes = [len(line) for line in lines]
-    starts = np.cumsum([sum(sizes), *(len(solid.points) for solid in faces)])
+    line_sizes = [len(line) for line in lines]
+    # number of each solid's first corner, after the points of lines
+    starts = np.cumsum([sum(line_sizes), *(len(solid.points) for solid in faces)])
     corners = [np.round(solid.points, DIGITS) for solid in faces]
     triangles = [solid.triangles + start for solid, start in zip(faces, starts, strict=False)]
     poles = [
-        np.zeros(sum(sizes)),
+        np.zeros(sum(line_sizes)),
         *(_poles_of(solid) for solid in faces),
     ]
     counts = [[len(solid.points), len(solid.triangles)] for solid in faces]
@@ -103,24 +113,32 @@ def vtp_content(lines: tuple[Array, ...], faces: Sequence[Solid] = ()) -> bytes:
         f'NumberOfPolys="{count}">\n'
         f"<PointData>{pole}</PointData>\n"
         f"<Points>{points}</Points>\n"
-        f"<Lines>{_cells(np.arange(sum(sizes)), np.cumsum(sizes))}</Lines>\n"
+        f"<Lines>{_cells(np.arange(sum(line_sizes)), np.cumsum(line_sizes))}</Lines>\n"
         f"<Polys>{polys}</Polys>\n"
         "</Piece></PolyData></VTKFile>\n"
     ).encode()
 
 
 def _poles_of(solid: Solid) -> Array:
-    """Return the signs of the magnetic poles at the corners of a solid; zero without a magnet."""
+    """Return the pole strengths at the corners of a solid; zero for a body that is no magnet."""
     return np.zeros(len(solid.points)) if solid.poles is None else solid.poles
 
 
 def _cells(numbers: NDArray[np.int64], ends: NDArray[np.int64]) -> str:
-    """Return the XML of cells with node numbers, which end at `ends`."""
+    """Return the XML of cells from all their node numbers; `ends` is where each cell ends."""
     return _array("connectivity", "Int64", numbers.ravel()) + _array("offsets", "Int64", ends)
 
 
 def _array(name: str, kind: str, values: NDArray[Any], attributes: str = "") -> str:
-    """Return the XML of an array of a VTK type, with further attributes."""
+    """Return the XML of an array in text form.
+
+    Parameters
+    ----------
+    kind
+        VTK's name of the type.
+    attributes
+        Further attributes of the element.
+    """
     width = values.shape[1] if values.ndim > 1 else 1
     text = " ".join(map(repr, values.ravel().tolist()))
     space = " " if attributes else ""
@@ -131,9 +149,9 @@ def _array(name: str, kind: str, values: NDArray[Any], attributes: str = "") -> 
 
 
 def read_outlines(folder: Path, number: int) -> tuple[tuple[Array, ...], tuple[Solid, ...]]:
-    """Return the lines and faces of bodies and sources at a point of a path.
+    """Return lines and faces of bodies and sources at point `number`, from a folder of fields.
 
-    Empty without a file; no faces in the file of an earlier version.
+    Both are empty without a file. The file of an earlier version has no faces.
 
     Raises
     ------
@@ -151,7 +169,10 @@ def read_outlines(folder: Path, number: int) -> tuple[tuple[Array, ...], tuple[S
 
 
 def _read(text: str) -> tuple[tuple[Array, ...], tuple[Solid, ...]]:
-    """Return lines and faces from the content of a .vtp file of `vtp_content`."""
+    """Return the lines and the faces in the text of a .vtp file that `vtp_content` made.
+
+    Raises KeyError, ValueError or IndexError for other texts.
+    """
     before_faces, _, polys = text.partition("<Polys>")
     arrays = {name: text_of_array.split() for name, text_of_array in ARRAY.findall(before_faces)}
     ends = np.array(arrays["offsets"], dtype=int)
@@ -160,24 +181,24 @@ def _read(text: str) -> tuple[tuple[Array, ...], tuple[Solid, ...]]:
     lines = tuple(np.split(points[:on_lines], ends[:-1])) if len(ends) else ()
     if "sizes" not in arrays:
         return lines, ()
-    sizes = np.array(arrays["sizes"], dtype=int).reshape(-1, 2)
+    solid_counts = np.array(arrays["sizes"], dtype=int).reshape(-1, 2)
     names = bytes(int(code) for code in arrays["names"]).decode().split("\0")
     connectivity = dict(ARRAY.findall(polys))["connectivity"].split()
     triangles = np.array(connectivity, dtype=int).reshape(-1, 3)
     poles, solids = np.array(arrays["pole"], dtype=float), list[Solid]()
-    start, first_triangle = on_lines, 0
-    for name, (point_count, triangle_count) in zip(names, sizes, strict=False):
-        pole_values = poles[start : start + point_count]
-        numbers = triangles[first_triangle : first_triangle + triangle_count] - start
+    first_corner, first_triangle = on_lines, 0
+    for name, (point_count, triangle_count) in zip(names, solid_counts, strict=False):
+        pole_values = poles[first_corner : first_corner + point_count]
+        numbers = triangles[first_triangle : first_triangle + triangle_count] - first_corner
         if numbers.size and not 0 <= numbers.min() <= numbers.max() < point_count:
             raise IndexError(name)
         solids.append(
             Solid(
-                points[start : start + point_count],
+                points[first_corner : first_corner + point_count],
                 numbers,
                 name,
                 pole_values if pole_values.any() else None,
             )
         )
-        start, first_triangle = start + point_count, first_triangle + triangle_count
+        first_corner, first_triangle = first_corner + point_count, first_triangle + triangle_count
     return lines, tuple(solids)

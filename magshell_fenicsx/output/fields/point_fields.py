@@ -29,20 +29,29 @@ Array = NDArray[np.float64]
 def magnetic_loads(
     g: "SurfaceGeometry", field: Magnetisation, r0: Array, h: float | Array
 ) -> tuple[dict[str, Array], "Torque"]:
-    """Return the magnetic loads p_mag and k, and the torque as a function of the displacement.
+    """Return the magnetic loads p_mag, k and f_mag, and the torque of the displacement.
 
-    f_mag is added if the remanence and the thickness are uniform.
+    Br and Ba are of unit length: p_mag and f_mag are over E lambda_m, k and the torque over h E
+    lambda_m. f_mag is there only if the remanence and the thickness are uniform. The formulas are
+    in docs/theory.md.
 
     Parameters
     ----------
     g
-        Bases and curvature at the points.
+        Bases, normal and curvature at the points.
     field
         The magnetisation and the applied field.
     r0
         (..., 3) places of the points.
     h
         Thickness over R; an array (...) if it varies.
+
+    Returns
+    -------
+    loads
+        Name -> (...) p_mag and k, and (..., 3) f_mag.
+    torque
+        Function of the displacement's derivatives, see `Torque`.
     """
     pattern = field.remanent
     Br = pattern(r0, g.n0) if callable(pattern) else np.broadcast_to(pattern, r0.shape)
@@ -61,7 +70,17 @@ def magnetic_loads(
 
 @dataclass(frozen=True)
 class SurfaceGeometry:
-    """Bases a1, a2 (..., 2, 3), normal n0 (..., 3), curvature b0_ij (..., 2, 2); undeformed."""
+    """Undeformed geometry of a surface at points.
+
+    Attributes
+    ----------
+    a
+        (..., 2, 3) tangent basis a1, a2.
+    n0
+        (..., 3) unit normal.
+    b0
+        (..., 2, 2) curvature b0_ij = r0,_ij . n0.
+    """
 
     a: Array
     n0: Array
@@ -75,13 +94,16 @@ class SurfaceGeometry:
 
 
 def magnetic_pressure(g: SurfaceGeometry, Br: Array, Ba: Array, h: float | Array) -> Array:
-    """Return p_mag = h b0:B0 with B0 = -Br (x) Ba, (...)."""
+    """Return the magnetic pressure p_mag = h b0:B0 (...), with B0 = -Br (x) Ba.
+
+    Br (..., 3) and Ba (3,) are remanence and applied field; h is the thickness over R.
+    """
     b = np.einsum("...ab,...ai,...bj->...ij", g.b0, g.dual, g.dual)
     return np.asarray(-h * np.einsum("...ij,...i,j->...", b, Br, Ba))
 
 
 def in_plane_force(g: SurfaceGeometry, Br: Array, Ba: Array, h: float) -> Array:
-    """Return f_mag (..., 3) for uniform Br and Ba.
+    """Return the in-plane force f_mag (..., 3) of uniform Br and Ba, as a vector.
 
     f_c is -h times the surface divergence of -(a_c . Ba)(a^a . Br). For constant vectors this
     equals h [b_ca (n . Ba)(a^a . Br) + tr b (n . Br)(a_c . Ba)].
@@ -100,7 +122,7 @@ def in_plane_force(g: SurfaceGeometry, Br: Array, Ba: Array, h: float) -> Array:
 
 
 def spring_stiffness(g: SurfaceGeometry, Br: Array, Ba: Array) -> Array:
-    """Return k = (n0 (x) n0):B0, (...)."""
+    """Return the stiffness of rotational springs k = (n0 (x) n0):B0 (...), with B0 = -Br (x) Ba."""
     return np.asarray(-np.einsum("...i,...i->...", g.n0, Br) * np.einsum("...i,i->...", g.n0, Ba))
 
 
@@ -138,7 +160,7 @@ class Torque:
 
 
 def torque(g: SurfaceGeometry, Br: Array, Ba: Array, *, rotates: bool = False) -> Torque:
-    """Return the torque as a function of the displacement's derivatives.
+    """Return the magnetic torque tau as a function of the displacement's derivatives.
 
     The remanence rotates with the surface if `rotates`; otherwise it is convected.
     """
@@ -154,18 +176,21 @@ def torque(g: SurfaceGeometry, Br: Array, Ba: Array, *, rotates: bool = False) -
 
 
 class Stresses:
-    """Membrane strains and bending moments at points (cells, points per cell).
+    """Membrane strains and bending moments at points (cells, points per cell) of a shell.
 
     Parameters
     ----------
     r0
-        (6, cells, points, 3) jet of the placement; see `strains.TangentFrame`.
+        (6, cells, points, 3) jet of the placement: r0 and its derivatives, see
+        `strains.TangentFrame`.
+    material
+        Material of the shell.
     thickness
-        (cells, points) factor of h; None for 1.
+        (cells, points) factor of the thickness h; None for 1.
     natural
-        The natural shape; None for the drawn one.
+        The natural shape; None if the drawn shape is without stress.
     made_of
-        (cells, 4) `parameters.OwnMaterial` of each cell; None for that of `material`.
+        (cells, 4) `parameters.OwnMaterial` of each cell; None if all cells have `material`.
     """
 
     def __init__(
@@ -176,6 +201,7 @@ class Stresses:
         natural: Natural | None = None,
         made_of: Array | None = None,
     ) -> None:
+        """Set frames, law and natural shape at the points."""
         self.frame = frame = TangentFrame.from_jet(r0)
         self._thickness = thickness
         self._law = material.law_in(made_of).at_point(
@@ -185,7 +211,7 @@ class Stresses:
         self._unit = material.bending_stiffness
 
     def values_of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
-        """Return strains and moments of a displacement.
+        """Return strains and moments of a displacement at the points.
 
         Parameters
         ----------
@@ -217,7 +243,10 @@ class Stresses:
 
 
 def principal_fields(components: Mapping[str, Array]) -> dict[str, Array]:
-    """Return E_1, E_2, M_1, M_2 (...): the principal values of E and M (..., 3), descending."""
+    """Return E_1, E_2, M_1, M_2 (...): the principal values of E and M, the larger first.
+
+    `components` maps "E" and "M" to components 11, 12 and 22 (..., 3) in an orthonormal frame.
+    """
     return {
         f"{name}_{number}": values
         for name in ("E", "M")
@@ -226,7 +255,7 @@ def principal_fields(components: Mapping[str, Array]) -> dict[str, Array]:
 
 
 def rubber_fields(fields: Mapping[str, Array], law: Law) -> dict[str, Array]:
-    """Return stretches and true stresses over E of a material whose thickness follows its area.
+    """Return stretches and true stresses over E of a rubber, whose thickness follows its area.
 
     Parameters
     ----------
@@ -261,34 +290,43 @@ def rubber_fields(fields: Mapping[str, Array], law: Law) -> dict[str, Array]:
 
 
 def in_space(S: Array, t: Array) -> Array:
-    """Return tensors (..., 3, 3) from components (..., 3) in frames t (..., 2, 3)."""
+    """Return symmetric tensors in space (..., 3, 3) with components 11, 12, 22 (..., 3).
+
+    The frames `t` (..., 2, 3) are orthonormal and tangent to the surface.
+    """
     return np.asarray(np.swapaxes(t, -1, -2) @ S[..., [[0, 1], [1, 2]]] @ t)
 
 
 def in_frame(S: Array, t: Array) -> Array:
-    """Return components (..., 3) in frames t (..., 2, 3) of symmetric tensors (..., 3, 3)."""
+    """Return components 11, 12, 22 (..., 3) of symmetric tensors in space (..., 3, 3).
+
+    The frames `t` (..., 2, 3) are orthonormal and tangent to the surface.
+    """
     return np.asarray((t @ S @ np.swapaxes(t, -1, -2))[..., [0, 0, 1], [0, 1, 1]])
 
 
 class PointFields:
-    """Fields of a shell at points (cells, points per cell).
+    """Magnetic fields and gaps of a shell at points (cells, points per cell).
 
     Parameters
     ----------
     r0
-        (6, cells, points, 3) jet of the placement; see `strains.TangentFrame`.
+        (6, cells, points, 3) jet of the placement: r0 and its derivatives, see
+        `strains.TangentFrame`.
+    material
+        Material of the shell.
     field
-        The magnetisation, or None.
+        The magnetisation with its applied field; None without a field.
     thickness
-        (cells, points) factor of h; None for 1.
+        (cells, points) factor of the thickness h; None for 1.
     contacts
         Rigid bodies in contact with the shell.
     remanence
-        The magnetisation of a shell without an applied field.
+        The magnetisation of a shell without an applied field; None if it has none.
     natural
-        The natural shape; its volume is the deformed one of a material that thins.
+        The natural shape. A material that thins has its thickness from the volume of this shape.
     made_of
-        (cells, 4) `parameters.OwnMaterial` of each cell; None for that of `material`.
+        (cells, 4) `parameters.OwnMaterial` of each cell; None if all cells have `material`.
 
     Attributes
     ----------
@@ -296,12 +334,14 @@ class PointFields:
         Name -> values (cells, points, ...) of the fields that do not depend on the displacement:
         p_mag, k and f_mag of a uniform applied field.
     n0
-        (cells, points, 3) undeformed normals.
+        (cells, points, 3) undeformed unit normals.
     weight
         (cells, points) area: the weight of a cell in the mean over the cells that share a point.
-    Br, susceptibility
-        (cells, points, 3) the undeformed remanence, (cells, points, 1) the susceptibility; (cells,
-        points, 0) without.
+    Br
+        (cells, points, 3) undeformed remanence over its largest magnitude; (cells, points, 0)
+        without one.
+    susceptibility
+        (cells, points, 1) magnetic susceptibility; (cells, points, 0) without soft material.
     """
 
     def __init__(
@@ -315,6 +355,7 @@ class PointFields:
         natural: Natural | None = None,
         made_of: Array | None = None,
     ) -> None:
+        """Set the constant fields, and what fields of a displacement need."""
         self._contacts, self._h, self._thins = contacts, material.h, material.law_in(made_of).thins
         self._frame, self._field, self._thickness = TangentFrame.from_jet(r0), field, thickness
         self._natural = (
@@ -352,7 +393,7 @@ class PointFields:
         return self._frame.jet
 
     def values_of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
-        """Return the fields of a displacement.
+        """Return the fields of a displacement at the points.
 
         Parameters
         ----------
@@ -399,7 +440,10 @@ class PointFields:
         return fields
 
     def _thinned(self, u: Array, mu: Mapping[str, float]) -> Array:
-        """Return the deformed thickness over the undeformed one; see `parts.gap`."""
+        """Return the deformed thickness over the undeformed one (cells, points); see `parts.gap`.
+
+        It is 1 where the thickness is constant. `u` and `mu` are as in `values_of`.
+        """
         area = np.linalg.norm(np.cross(*(self._frame.jet[1:3] + u[1:3])), axis=-1)
         stretch = self._frame.area / area
         if self._natural is not None:
@@ -410,7 +454,10 @@ class PointFields:
         return np.asarray(1 + self._thins * (stretch - 1))
 
     def _gap(self, u: Array, mu: Mapping[str, float]) -> Array:
-        """Return the least gap (cells, points) to a body over h; u as of `values_of`."""
+        """Return the least gap to a body over h (cells, points); negative where they overlap.
+
+        `u` and `mu` are as in `values_of`.
+        """
         h, r = self._h, self._frame.jet[0] + u[0]
         thickness = 1.0 if self._thickness is None else self._thickness
         thickness = thickness * (self._thinned(u, mu) if np.any(self._thins) else 1.0)
@@ -422,7 +469,7 @@ class PointFields:
         return np.asarray(np.min(gaps, axis=0) / h).reshape(r.shape[:-1])
 
     def _geometry(self) -> SurfaceGeometry:
-        """Return bases, normals and curvature of the placement."""
+        """Return tangent bases, normals and curvature of the undeformed surface at the points."""
         r0 = self._frame.jet
         b11, b12, b22 = np.einsum("d...i,...i->d...", r0[3:], self.n0)
         b0 = np.stack([np.stack([b11, b12], -1), np.stack([b12, b22], -1)], -2)

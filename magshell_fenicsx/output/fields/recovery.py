@@ -1,8 +1,8 @@
 """Recovery of strains, moments and stresses at nodes, in the smooth parts of a surface.
 
 A polynomial is fitted to samples in the patch of cells around each vertex, as in the
-superconvergent patch recovery of Zienkiewicz and Zhu. The parts of a surface within which
-prescribed fields and the normal are continuous are recovered apart.
+superconvergent patch recovery of Zienkiewicz and Zhu. A surface is split into smooth parts, within
+which prescribed fields and the normal are continuous. Each part is recovered on its own.
 """
 
 from collections.abc import Mapping
@@ -19,9 +19,9 @@ ROUNDING = {"E": 1e-13, "M": 1e-8}  # strains, moments over D/R: smaller ones ar
 
 
 def relative_jump(values: Array, continuous: Array, weight: Array, zero: float = 0.0) -> float:
-    """Return the jump of values between cells: weighted rms of the difference to continuous values.
+    """Return the jump of values between cells, as an error relative to a continuous field.
 
-    The difference is over the rms of the values.
+    It is the weighted rms of `values - continuous` over the weighted rms of `values`.
 
     Parameters
     ----------
@@ -43,8 +43,8 @@ def relative_jump(values: Array, continuous: Array, weight: Array, zero: float =
         squared = (f**2).reshape(*weight.shape, -1).sum(axis=-1)
         return float((weight * squared).sum() / weight.sum())
 
-    size = np.sqrt(mean_square(values))
-    return float(np.sqrt(mean_square(values - continuous)) / size) if size > zero else 0.0
+    rms = np.sqrt(mean_square(values))
+    return float(np.sqrt(mean_square(values - continuous)) / rms) if rms > zero else 0.0
 
 
 Numbers = NDArray[np.int64]
@@ -55,19 +55,18 @@ RIDGE = 1e-10  # regularises fits whose samples lie on few lines
 
 
 class Recovery:
-    """Piecewise polynomial through samples: one polynomial around each vertex, blended in the
-    cells.
+    """Piecewise polynomial fitted to samples: one around each vertex, blended in the cells.
 
-    The blend weights are the barycentric coordinates of a cell. So the result is continuous where
+    The blend weights are the barycentric coordinates in a cell. So the result is continuous where
     cells share vertices, and polynomials are reproduced. Around a vertex at an edge the second ring
-    of cells has a small weight.
+    of cells also counts, with a small weight.
 
     Parameters
     ----------
     cells
         (m, d + 1) numbers of vertices, all of 0, 1, ...; cells of two smooth parts share none.
     samples, weight
-        (m, q, k) places in each cell, and (m, q) their weights.
+        (m, q, k) places of the samples in each cell, and (m, q) their weights.
     vertices
         (v, k) places.
     frames
@@ -85,6 +84,7 @@ class Recovery:
         frames: Array,
         degree: int,
     ) -> None:
+        """Set the sparse matrix from samples to the coefficients of all polynomials."""
         self._cells, self._vertices, self._frames, self._degree = cells, vertices, frames, degree
         self._coefficient_count = len(_powers(cells.shape[1] - 1, degree))
         self._size = np.ones(len(vertices))
@@ -95,18 +95,21 @@ class Recovery:
         row_lengths = np.repeat(cells_per_vertex * samples_per_cell, self._coefficient_count)
         starts = np.concatenate([[0], np.cumsum(row_lengths)])
         columns, values = np.zeros(starts[-1], np.int32), np.zeros(starts[-1])
-        for number in np.unique(cells_per_vertex):
-            vertices_alike = np.flatnonzero(cells_per_vertex == number)
-            in_patch = patches.indptr[vertices_alike][:, None] + np.arange(number)
-            cells_around = patches.indices[in_patch]
-            sample_weights = weight[cells_around] * cell_weights[in_patch][..., None]
+        # vertices with equally many cells are fitted together, in one array
+        for cell_count in np.unique(cells_per_vertex):
+            vertices_alike = np.flatnonzero(cells_per_vertex == cell_count)
+            patch_entries = patches.indptr[vertices_alike][:, None] + np.arange(cell_count)
+            cells_around = patches.indices[patch_entries]
+            sample_weights = weight[cells_around] * cell_weights[patch_entries][..., None]
             fit_matrices = self._fit_matrices(vertices_alike, samples[cells_around], sample_weights)
             sample_numbers = cells_around[..., None] * samples_per_cell
             sample_numbers = sample_numbers + np.arange(samples_per_cell)
             count = self._coefficient_count
+            # places of these vertices' rows in the arrays of the sparse matrix
             entries = starts[vertices_alike * count][:, None]
             entries = entries + np.arange(count * sample_numbers[0].size)
             columns[entries] = np.tile(sample_numbers.reshape(len(vertices_alike), -1), count)
+            # a polynomial of lower degree fills the first rows alone
             values[entries[:, : fit_matrices[0].size]] = fit_matrices.reshape(
                 len(vertices_alike), -1
             )
@@ -114,13 +117,23 @@ class Recovery:
         self._coefficients = scipy.sparse.csr_matrix((values, columns, starts), shape)
 
     def coefficients(self, values: Array) -> Array:
-        """Return the coefficients of all polynomials from values (m, q, ...) at the samples."""
+        """Return the coefficients of all polynomials, from values at the samples.
+
+        Parameters
+        ----------
+        values
+            (m, q, ...) values in each cell.
+
+        Returns
+        -------
+        (v c, ...) with c coefficients for each of the v vertices; further axes are made one.
+        """
         return np.asarray(self._coefficients @ values.reshape(self._coefficients.shape[1], -1))
 
     def evaluation_matrix(
         self, cell: Numbers, places: Array, barycentric: Array
     ) -> "scipy.sparse.csr_matrix":
-        """Return the sparse matrix from coefficients to values at places.
+        """Return the sparse matrix from coefficients to values at places in the cells.
 
         Parameters
         ----------
@@ -131,14 +144,20 @@ class Recovery:
         barycentric
             (n, d + 1) their barycentric coordinates.
         """
-        vertex = self._cells[cell]
-        local = np.einsum(
-            "nvdk,nvk->nvd", self._frames[vertex], places[:, None] - self._vertices[vertex]
+        vertices_of_cells = self._cells[cell]
+        local_coordinates = np.einsum(
+            "nvdk,nvk->nvd",
+            self._frames[vertices_of_cells],
+            places[:, None] - self._vertices[vertices_of_cells],
         )
+        # monomials at the place, times the blend weight of the vertex
         values = (
-            _monomials(local / self._size[vertex][..., None], self._degree) * barycentric[..., None]
+            _monomials(local_coordinates / self._size[vertices_of_cells][..., None], self._degree)
+            * barycentric[..., None]
         )
-        columns = vertex[..., None] * self._coefficient_count + np.arange(self._coefficient_count)
+        columns = vertices_of_cells[..., None] * self._coefficient_count + np.arange(
+            self._coefficient_count
+        )
         starts = np.arange(len(cell) + 1) * columns[0].size
         return scipy.sparse.csr_matrix(
             (values.ravel(), columns.ravel(), starts),
@@ -147,6 +166,9 @@ class Recovery:
 
     def _fit_matrices(self, vertex: Numbers, samples: Array, weight: Array) -> Array:
         """Return the least-squares fits around vertices, and set the sizes of their patches.
+
+        The degree is lowered until there are enough samples. A small ridge makes fits regular whose
+        samples lie on few lines.
 
         Parameters
         ----------
@@ -160,30 +182,49 @@ class Recovery:
         Matrices (n, coefficients, samples) from values to coefficients.
         """
         n = len(vertex)
-        relative = samples.reshape(n, -1, samples.shape[-1]) - self._vertices[vertex][:, None]
-        local = relative @ np.swapaxes(self._frames[vertex], 1, 2)
-        self._size[vertex] = np.abs(local).max(axis=(1, 2))
+        offsets = samples.reshape(n, -1, samples.shape[-1]) - self._vertices[vertex][:, None]
+        local_coordinates = offsets @ np.swapaxes(self._frames[vertex], 1, 2)
+        self._size[vertex] = np.abs(local_coordinates).max(axis=(1, 2))
         degree = self._degree
         while (
             degree
-            and MIN_SAMPLES_PER_COEFFICIENT * len(_powers(local.shape[-1], degree)) > local.shape[1]
+            and MIN_SAMPLES_PER_COEFFICIENT * len(_powers(local_coordinates.shape[-1], degree))
+            > local_coordinates.shape[1]
         ):
             degree -= 1
-        monomials = _monomials(local / self._size[vertex][:, None, None], degree)
+        monomials = _monomials(local_coordinates / self._size[vertex][:, None, None], degree)
         weight = weight.reshape(n, -1)
-        root = np.sqrt(weight / weight.sum(axis=1, keepdims=True))[..., None]
+        weight_roots = np.sqrt(weight / weight.sum(axis=1, keepdims=True))[..., None]
         ridge = np.broadcast_to(
             RIDGE * np.eye(monomials.shape[-1]), (n, monomials.shape[-1], monomials.shape[-1])
         )
         # a factorisation by reflections keeps the condition small
-        Q, triangle = np.linalg.qr(np.concatenate([root * monomials, ridge], axis=1))
+        Q, upper_triangle = np.linalg.qr(np.concatenate([weight_roots * monomials, ridge], axis=1))
         return np.asarray(
-            np.linalg.solve(triangle, np.swapaxes(Q[:, : monomials.shape[1]] * root, 1, 2))
+            np.linalg.solve(
+                upper_triangle, np.swapaxes(Q[:, : monomials.shape[1]] * weight_roots, 1, 2)
+            )
         )
 
 
 def _patches(cells: Numbers, count: int) -> tuple["scipy.sparse.csr_matrix", Array]:
-    """Return the cells around each vertex as a sparse pattern, and their weights in its order."""
+    """Return the cells around each vertex, and their weights.
+
+    Parameters
+    ----------
+    cells
+        (m, d + 1) numbers of vertices.
+    count
+        Number v of vertices.
+
+    Returns
+    -------
+    patches
+        Sparse pattern (v, m) of the first ring of cells around each vertex. For a vertex at an edge
+        it also has the second ring.
+    weights
+        (entries,) weight of each entry, in the order of `patches.indices`.
+    """
     m, corners = cells.shape
     first_ring = scipy.sparse.csr_matrix(
         (np.ones(cells.size), (cells.ravel(), np.repeat(np.arange(m), corners))), (count, m)
@@ -192,6 +233,7 @@ def _patches(cells: Numbers, count: int) -> tuple["scipy.sparse.csr_matrix", Arr
     sides, cells_per_side = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
     is_at_edge = np.zeros(count)
     is_at_edge[sides[cells_per_side == 1]] = 1.0
+    # cells that share a vertex with the first ring
     second_ring = scipy.sparse.diags(is_at_edge) @ (first_ring @ (first_ring.T @ first_ring))
     second_ring.data[:] = SECOND_RING_WEIGHT
     patches = (first_ring + second_ring).tocsr()
@@ -199,14 +241,14 @@ def _patches(cells: Numbers, count: int) -> tuple["scipy.sparse.csr_matrix", Arr
 
 
 def _powers(dimensions: int, degree: int) -> list[tuple[int, ...]]:
-    """Return the exponents of all monomials, ascending in degree."""
+    """Return the exponents of all monomials up to `degree` in one or two variables."""
     if dimensions == 1:
         return [(n,) for n in range(degree + 1)]
     return [(i, n - i) for n in range(degree + 1) for i in range(n + 1)]
 
 
 def _monomials(y: Array, degree: int) -> Array:
-    """Return the values (..., coefficients) of all monomials at y (..., d)."""
+    """Return the values (..., coefficients) of all monomials up to `degree` at y (..., d)."""
     exponents = range(degree + 1)
     powers = [np.stack([x**n for n in exponents], axis=-1) for x in np.moveaxis(y, -1, 0)]
     monomials = []
@@ -222,18 +264,18 @@ COMPONENT_WEIGHTS = np.sqrt([1.0, 2, 2, 1, 2, 1])  # the sum of six squares is t
 
 
 class RecoveredShell:
-    """Recover tensors at nodes from samples in the cells of a shell.
+    """Recover tensors at the nodes of a shell from samples in its cells.
 
     Parameters
     ----------
     numbers
-        (m, s) nodes of all cells, corners first; smooth parts share none.
+        (m, s) nodes of all cells, corners first; cells of two smooth parts share none.
     reference
-        (s, 2) their places in the reference cell.
+        (s, 2) places of a cell's nodes in the reference triangle.
     nodes, normals
-        (m, s, 3) places and undeformed normals there.
+        (m, s, 3) places and undeformed normals at the nodes.
     samples, weight
-        (m, q, 3) places and (m, q) weights.
+        (m, q, 3) places of the samples, and (m, q) their weights.
     table
         (q, s) values of the nodes' shape functions at the samples.
     degree
@@ -251,12 +293,16 @@ class RecoveredShell:
         table: Array,
         degree: int,
     ) -> None:
+        """Set the recovery around the vertices, and its evaluation at all nodes."""
         vertices, corners = np.unique(numbers[:, :3], return_inverse=True)
         corners = corners.reshape(-1, 3)
-        place, normal = np.zeros((2, len(vertices), 3))
-        place[corners] = nodes[:, :3]
-        np.add.at(normal, corners, normals[:, :3])
-        self._recovery = Recovery(corners, samples, weight, place, frames_across(normal), degree)
+        vertex_places, vertex_normals = np.zeros((2, len(vertices), 3))
+        vertex_places[corners] = nodes[:, :3]
+        np.add.at(vertex_normals, corners, normals[:, :3])
+        self._recovery = Recovery(
+            corners, samples, weight, vertex_places, frames_across(vertex_normals), degree
+        )
+        # each node is evaluated once, in the first cell that has it
         _, first_entry = np.unique(numbers, return_index=True)
         cell, node = np.divmod(first_entry, numbers.shape[1])
         barycentric = np.column_stack([1 - reference.sum(axis=1), reference])[node]
@@ -304,17 +350,18 @@ class RecoveredShell:
 
 
 def components_in_space(frame: TangentFrame) -> Array:
-    """Return the map from S_11, S_12, S_22 in a frame to six weighted components in space.
+    """Return the linear map from S_11, S_12, S_22 in a tangent frame to components in space.
 
     Returns
     -------
-    (..., 6, 3); the components are `SYMMETRIC_COMPONENTS` times `COMPONENT_WEIGHTS`.
+    (..., 6, 3) matrices; the six components are those at `SYMMETRIC_COMPONENTS`, times
+    `COMPONENT_WEIGHTS`.
     """
     return np.asarray(frame.in_space[..., *SYMMETRIC_COMPONENTS, :] * COMPONENT_WEIGHTS[:, None])
 
 
 def frames_across(normals: Array) -> Array:
-    """Return two orthogonal unit vectors (n, 2, 3) across each of the vectors (n, 3)."""
+    """Return two orthogonal unit vectors (n, 2, 3) across each of n vectors (n, 3)."""
     n = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
     t1 = np.cross(n, np.where(np.abs(n[:, :1]) < 0.8, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
     t1 /= np.linalg.norm(t1, axis=-1, keepdims=True)
@@ -328,9 +375,10 @@ KINK = 0.5  # jump of the unit normal that splits the surface, some 30 degrees: 
 def smooth_parts(
     corners: Numbers, sides: Numbers, prescribed_fields: list[Array], normals: Array
 ) -> Numbers:
-    """Return the number of the smooth part to which each cell belongs.
+    """Return (m,) the number of the smooth part to which each cell belongs.
 
-    Parts are connected over sides where neither a prescribed field nor the normal jumps.
+    Cells are in one part if they are connected across sides where neither a prescribed field nor
+    the normal jumps.
 
     Parameters
     ----------
@@ -345,12 +393,14 @@ def smooth_parts(
     """
     count = len(corners)
     nodes_of_sides = corners[:, sides].reshape(-1, sides.shape[1])  # cell after cell
+    # sorted node numbers identify a side from both of its cells
     order = np.argsort(nodes_of_sides, axis=1)
     key = np.take_along_axis(nodes_of_sides, order, axis=1)
     _, first_with_key, key_numbers, sides_with_key = np.unique(
         key, axis=0, return_index=True, return_inverse=True, return_counts=True
     )
     key_numbers = key_numbers.ravel()
+    # sides of two cells, at their second occurrence
     second_sides = np.flatnonzero(
         (sides_with_key[key_numbers] == 2)
         & (first_with_key[key_numbers] != np.arange(len(nodes_of_sides)))
@@ -383,7 +433,7 @@ def smooth_parts(
 
 
 def split(numbers: Numbers, parts: Numbers) -> Numbers:
-    """Return the nodes (m, s) of cells, renumbered so that parts share none.
+    """Return the nodes (m, s) of cells, renumbered so that cells of different parts share none.
 
     Examples
     --------

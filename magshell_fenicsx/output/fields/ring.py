@@ -26,7 +26,7 @@ MAX_TRIANGLES = 1_000_000
 
 @dataclass(frozen=True)
 class WaveCount:
-    """Number of waves of a mode around e3, at least two.
+    """Number of a mode's waves around e3, at least two, and how many the mesh resolves.
 
     Attributes
     ----------
@@ -47,14 +47,14 @@ class WaveCount:
 
 @dataclass(frozen=True)
 class Ring:
-    """Points of a closed ring around e3, ascending in azimuth.
+    """Points of a closed ring around e3, ascending in azimuth, with the mode there.
 
     Attributes
     ----------
     theta, w
-        (n,) azimuth in rad, and the mode's normal component.
+        (n,) azimuth (rad), and normal component of the mode.
     spacing
-        Largest distance of nodes around the ring, rad.
+        Largest angle (rad) around e3 between neighbouring nodes of the mesh.
     """
 
     theta: Array
@@ -62,7 +62,10 @@ class Ring:
     spacing: float
 
     def waves(self) -> WaveCount | None:
-        """Return the wave count; None if no single number of at least two waves fits the mode."""
+        """Return the wave count; None if no single number of at least two waves fits the mode.
+
+        Each number is fitted by least squares; the one that leaves the least of the mode counts.
+        """
         angle_to_next = np.diff(self.theta, append=self.theta[0] + 2 * np.pi)
         # weights by the length of arc: small elements have many points
         arc_weights = np.sqrt((angle_to_next + np.roll(angle_to_next, 1)) / 2)
@@ -80,7 +83,9 @@ class Ring:
 
 
 def waves_around(surface: Surface) -> WaveCount | None:
-    """Return the wave count of a mode around e3, on the ring where the mode is largest.
+    """Count a mode's waves around e3, on the ring where the mode is largest.
+
+    A ring is the surface at one height z.
 
     Parameters
     ----------
@@ -89,23 +94,30 @@ def waves_around(surface: Surface) -> WaveCount | None:
 
     Returns
     -------
-    None if no single number of at least two waves dominates, if the surface is flat, or if the ring
-    is not closed around e3.
+    The number of waves and how many the mesh resolves. None if no single number of at least two
+    waves dominates, if the surface is flat, or if the ring is not closed around e3.
     """
     height = surface.r0[:, 2]
     if np.ptp(height) < MIN_HEIGHT:
         return None
     crest = surface.r0[np.argmax(np.abs(surface.fields["mode_w"]))]
-    inwards = np.sign((height.max() + height.min()) / 2 - crest[2]) or 1.0
+    sign_inwards = np.sign((height.max() + height.min()) / 2 - crest[2]) or 1.0
     tessellation = tessellate(surface, MAX_TRIANGLES)
+    # just inside the crest, and farther from it where rims are uneven
     for offset in OFFSETS_OF_RING:
-        if ring := _ring(surface, tessellation, crest, float(crest[2] + offset * inwards)):
+        if ring := _ring(surface, tessellation, crest, float(crest[2] + offset * sign_inwards)):
             return ring.waves()
     return None
 
 
 def _ring(surface: Surface, tessellation: Tessellation, crest: Array, height: float) -> Ring | None:
-    """Return the ring at a height that passes a place (3,); None if it is not closed around e3."""
+    """Return the ring at a height z over R that passes a place; None if it is not closed around e3.
+
+    Parameters
+    ----------
+    crest
+        (3,) place of the largest mode; of several rings at that height it chooses the nearest.
+    """
     r, mode_w = tessellation.at_points(surface.r0), tessellation.at_points(surface.fields["mode_w"])
     is_above = r[tessellation.triangles, 2] > height
     cut_triangles = np.flatnonzero(is_above.any(axis=1) & ~is_above.all(axis=1))
@@ -130,10 +142,23 @@ def _ring(surface: Surface, tessellation: Tessellation, crest: Array, height: fl
 def _cuts(
     triangles: NDArray[np.int32], is_above: NDArray[np.bool_], values: Array, height: float
 ) -> tuple[Array, Array]:
-    """Return the lines in which a plane cuts triangles: x and y (t, 2, 2) of both ends, and w (t,
-    2).
+    """Return the lines in which the plane z = height cuts triangles.
 
-    `values` (n, 4) are x, y, z, w at points.
+    Parameters
+    ----------
+    triangles
+        (t, 3) numbers of points, of triangles that the plane cuts.
+    is_above
+        (t, 3) whether each corner is above the plane.
+    values
+        (n, 4) x, y, z and the mode's w at points.
+
+    Returns
+    -------
+    ends
+        (t, 2, 2) x and y of both ends of each line.
+    w
+        (t, 2) w at these ends.
     """
     # the corner that is alone on its side of the plane
     single_corner = np.argmax(is_above == (is_above.sum(axis=1) == 1)[:, None], axis=1)
@@ -146,12 +171,13 @@ def _cuts(
 
 
 def _connected(ends: Array, place: Array) -> Numbers:
-    """Return the numbers of the lines that are connected with the line nearest to a place.
+    """Return the numbers of the lines that are connected with the line nearest to a place (3,).
 
-    `ends` (t, 2, 2) are the ends of the lines.
+    `ends` (t, 2, 2) are x and y of the ends of t lines.
     """
     points = ends.reshape(-1, 2)
     pairs = scipy.spatial.cKDTree(points).query_pairs(ENDPOINT_TOLERANCE, output_type="ndarray")
+    # ends at one place, and the two ends of each line
     links = np.concatenate([pairs, np.arange(len(points)).reshape(-1, 2)])
     graph = scipy.sparse.coo_array(
         (np.ones(len(links)), tuple(links.T)), shape=(len(points), len(points))
@@ -162,6 +188,14 @@ def _connected(ends: Array, place: Array) -> Numbers:
 
 
 def _extent(nodes: Array, theta: Array) -> float:
-    """Return the largest angle about e3 that cells span; nodes (t, k, 3), each near theta (t,)."""
+    """Return the largest angle (rad) about e3 that a cell spans.
+
+    Parameters
+    ----------
+    nodes
+        (t, k, 3) nodes of the cells.
+    theta
+        (t,) azimuth of a point in each cell, so that angles do not jump by 2 pi.
+    """
     azimuth = np.arctan2(nodes[..., 1], nodes[..., 0]) - theta[:, None]
     return float(np.ptp((azimuth + np.pi) % (2 * np.pi) - np.pi, axis=1).max())

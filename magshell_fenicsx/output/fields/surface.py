@@ -1,7 +1,7 @@
 """The deformed mid-surface gathered on rank 0, for pictures and for ParaView.
 
-A `Surface` has the nodes of the whole shell or body and fields at them. `SurfaceGatherer` makes it
-from a state of a shell; half shells and sectors are completed by symmetry.
+A `Surface` has the nodes of the whole shell or body, and fields at the nodes. A `SurfaceGatherer`
+makes it from a state of a shell model. Half shells and sectors are completed by symmetry.
 """
 
 from collections.abc import Callable, Mapping
@@ -62,26 +62,28 @@ class Surface:
     Attributes
     ----------
     r0, u, n0
-        (n, 3) undeformed placement, displacement, undeformed normal.
+        (n, 3) undeformed placement, displacement and undeformed unit normal of each node.
     cells
-        (m, k) node numbers of triangles of the displacement's degree or of hexahedra, in VTK's
+        (m, k) node numbers of triangles of the displacement's degree, or of hexahedra, in VTK's
         order.
     fields
-        Name -> (n,), (n, 3) or (n, 3, 3): E, M as tensors in space, tangent to the undeformed
-        surface, and E_total where there is a natural shape (see `point_fields.Stresses`); E_1, E_2,
-        M_1, M_2, their principal values, the larger first; those of `point_fields.PointFields`;
-        w0_over_h where there are imperfections, of a solid that alone.
+        Name -> (n,), (n, 3) or (n, 3, 3) values at the nodes. E, M: strain and bending moment,
+        tensors in space that are tangent to the undeformed surface. E_total: the strain from the
+        drawn shape, where there is a natural shape. E_1, E_2, M_1, M_2: principal values of E and
+        M, the larger first. w0_over_h: the imperfections, where there are some; a solid has no
+        other field. Further names are those of `point_fields.PointFields` and
+        `point_fields.rubber_fields`.
     outlines
-        Places (n, 3) along lines: the sources of the applied field, and bodies.
+        Places (n, 3) along lines that outline the sources of the applied field, and bodies.
     jump
-        Jump of the bending moments M between cells, see `recovery.relative_jump`. None of a solid.
+        Jump of the bending moments M between cells, see `recovery.relative_jump`. None for a solid.
     strain_jump
-        Jump of the strains E.
+        The same measure for the strains E.
     solids
         The faces of sources and bodies.
     shells
-        The names of several shells, in the order of their numbers in the field `shell`; nodes of
-        two are double.
+        Names of several shells, in the order of their numbers in the field `shell`. Nodes that two
+        shells share are double.
     """
 
     r0: Array
@@ -107,13 +109,15 @@ class Surface:
 
 
 class SurfaceGatherer:
-    """Gather displacements and fields of one shell; constant fields are computed and gathered once.
+    """Gather the displacement and the fields of one shell from all ranks, at any of its states.
 
-    Strains and moments are recovered from samples inside the cells, in each smooth part of the
-    surface; all else is the mean of the cells that share a node.
+    Fields that do not depend on the displacement are computed and gathered once. Strains and
+    moments are recovered from samples inside the cells, in each smooth part of the surface. All
+    other fields are means of the cells that share a node.
     """
 
     def __init__(self, model: "ShellModel") -> None:
+        """Prepare the gathering for all states of a model; collective."""
         self._model = model
         domain, degree = model.V.mesh, model.degree
         self.comm = domain.comm
@@ -143,9 +147,15 @@ class SurfaceGatherer:
     def _set_placement(
         self, mu: Mapping[str, float], numbers: NDArray[np.int64] | None = None
     ) -> None:
-        """Set what depends on the placement, at the amplitudes of growing imperfections.
+        """Set all that depends on the undeformed placement: fields, recovery, averages; collective.
 
-        The first call has the node `numbers` (cells, nodes of a cell) of all cells.
+        Parameters
+        ----------
+        mu
+            Amplitudes, those of growing imperfections among them.
+        numbers
+            Global node numbers (cells, nodes of a cell) of all cells; given at the first call
+            alone.
         """
         model, loads = self._model, self._model.loads
         r = self._jet(model.r0, self._reference_nodes)
@@ -186,38 +196,40 @@ class SurfaceGatherer:
         }
 
     def _split_nodes(self, numbers: NDArray[np.int64], r: Array, inner: Array) -> None:
-        """Set the nodes of all cells, split between smooth parts, and the recovery on them;
-        collective.
+        """Split the nodes of all cells between smooth parts, and set the recovery; collective.
+
+        A smooth part ends where a prescribed field or the normal jumps. Nodes there get several
+        numbers.
 
         Parameters
         ----------
         numbers
-            (cells, nodes of a cell) node numbers.
+            (cells, nodes of a cell) global node numbers of all cells.
         r, inner
-            Placement (cells, points, 3) at the nodes, and at the samples.
+            Placement (cells, points, 3) of this rank's cells, at the nodes and at the samples.
         """
         loads, fields = self._model.loads, self._fields
-        prescribed = [fields.Br, fields.susceptibility]
+        prescribed_fields = [fields.Br, fields.susceptibility]
         if loads.natural:
-            prescribed += loads.natural.tensors_at(inside_cells(r), fields.n0)
+            prescribed_fields += loads.natural.tensors_at(inside_cells(r), fields.n0)
         thickness = self._thickness(self._reference_nodes)
         if self._model.midsurface.shells:
-            prescribed.append(self._shell_numbers())
+            prescribed_fields.append(self._shell_numbers())
         materials = self._cell_materials()
         if isinstance(self._model.material.law, LawByShell) and materials is not None:
-            prescribed.append(np.repeat(materials[:, None, 3], r.shape[1], axis=1))
+            prescribed_fields.append(np.repeat(materials[:, None, 3], r.shape[1], axis=1))
         if thickness is not None:
-            prescribed.append(thickness)
-        prescribed = [self._gather_cells(field) for field in prescribed if field.size]
+            prescribed_fields.append(thickness)
+        prescribed_fields = [self._gather_cells(field) for field in prescribed_fields if field.size]
         sample_area = self._stresses.frame.area * self._sample_weights
         r, n0, inner, weight = (
             self._gather_cells(values) for values in (r, fields.n0, inner, sample_area)
         )
         self._numbers = numbers
-        if self.comm.rank:
+        if self.comm.rank:  # rank 0 alone recovers fields
             return
         sides = np.array(self._element.entity_closure_dofs[1])
-        self._numbers = split(numbers, smooth_parts(numbers, sides, prescribed, n0))
+        self._numbers = split(numbers, smooth_parts(numbers, sides, prescribed_fields, n0))
         to_vtk = np.argsort(perm_vtk(mesh.CellType.triangle, numbers.shape[1]))
         self._cells = self._numbers[:, to_vtk]
         table = self._element.tabulate(0, self._reference_samples)[0, :, :, 0]
@@ -226,15 +238,27 @@ class SurfaceGatherer:
         )
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
-        """Return the displaced surface with its fields at the amplitudes mu; collective.
+        """Return the displaced surface with its fields at the amplitudes `mu`; collective.
 
-        On rank 0; None on other ranks.
+        Parameters
+        ----------
+        u
+            This rank's part of the displacement.
+        mu
+            Amplitude -> value; contact fields are left out if there is none.
+
+        Returns
+        -------
+        The surface on rank 0; None on other ranks.
         """
         state = State(u, dict(mu or {}))
         return self._model.system.at_state(state).evaluate(lambda: self._surface_at(state))
 
     def _surface_at(self, state: State) -> Surface | None:
-        """Return the surface at the displacement and the placement that are set, on rank 0."""
+        """Return the surface at the state that the model has been set to; collective.
+
+        On rank 0; None on other ranks.
+        """
         if self._model.growing:
             self._set_placement(state.mu)
         jet = self._jet(self._model.u, self._reference_nodes, 1)
@@ -271,21 +295,25 @@ class SurfaceGatherer:
         )
 
     def _shell_numbers(self) -> Array:
-        """Return the number of its shell at the nodes of each owned cell (cells, nodes)."""
+        """Return (cells, nodes) the number of the shell to which each owned cell belongs."""
         midsurface = self._model.midsurface
         in_shells = [midsurface.patches[name][: self._owned_cells] for name in midsurface.shells]
         numbers = np.argmax(in_shells, axis=0)[:, None].astype(np.float64)
         return np.repeat(numbers, len(self._reference_nodes), axis=1)
 
     def _gather_cells(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return the values of all ranks' cells on rank 0, those of its own on other ranks."""
-        parts = self.comm.gather(values)
-        return values if self.comm.rank else np.concatenate(parts)
+        """Return the values of all ranks' cells on rank 0; other ranks get their own values back.
+
+        Collective. The first axis of the values counts the owned cells of a rank.
+        """
+        values_of_ranks = self.comm.gather(values)
+        return values if self.comm.rank else np.concatenate(values_of_ranks)
 
     def _jet(self, f: fem.Function, points: Array, order: int = 2) -> Array:
-        """Return f, f,_1, f,_2, f,_11, f,_12, f,_22 at reference points of each owned cell.
+        """Return f and its derivatives f,_1, f,_2, f,_11, f,_12, f,_22 in each owned cell.
 
-        Derivatives are in reference coordinates, up to an order; shape (6, cells, points, 3).
+        Derivatives are in reference coordinates, at the reference `points`. Shape: (6, cells,
+        points, 3) for `order` 2, (3, ...) for `order` 1.
         """
         table = self._model.V.element.basix_element.tabulate(order, points)[:, :, :, 0]
         coefficients = f.x.array.reshape(-1, 3)[self._model.V.dofmap.list[: self._owned_cells]]
@@ -301,7 +329,7 @@ class SurfaceGatherer:
         return np.asarray(factor.x.array[V.dofmap.list[: self._owned_cells]] @ values.T)
 
     def _cell_materials(self) -> Array | None:
-        """Return the material (cells, 4) of each owned cell, where shells have their own."""
+        """Return the material (cells, 4) of each owned cell; None if the shell has one material."""
         materials = self._model.cell_materials
         if materials is None:
             return None
@@ -309,30 +337,40 @@ class SurfaceGatherer:
         return np.asarray(materials.x.array.reshape(-1, 4)[cell_dofs])
 
     def _law_at_nodes(self) -> Law:
-        """Return the law of elasticity, on rank 0 with arrays (nodes,); collective."""
+        """Return the law of elasticity at the nodes; collective.
+
+        Where shells have materials of their own, it holds arrays (nodes,), which are right on rank
+        0 only.
+        """
         materials, law = self._cell_materials(), self._model.material.law
         if materials is None:
             return law
         count = len(self._reference_nodes)
-        e, nu, _, law_number = (
+        modulus, nu, _, law_number = (
             self._averaged(np.repeat(values[:, None], count, axis=1)) for values in materials.T
         )
-        return law.with_material(e, nu, law_number)
+        return law.with_material(modulus, nu, law_number)
 
     def _weighted_mean(self) -> "scipy.sparse.csr_matrix | None":
         """Return the sparse matrix of the area-weighted mean over the cells that share a node.
 
-        Its columns are the nodes of all cells. On rank 0; None on other ranks.
+        Its rows are nodes and its columns the nodes of all cells, cell after cell. On rank 0; None
+        on other ranks. Collective.
         """
         weights = self._gather_cells(self._fields.weight).ravel()
         if self.comm.rank:
             return None
         node_numbers = self._numbers.ravel()
+        # area of each cell at a node over the area of all cells there
         share = weights / np.bincount(node_numbers, weights)[node_numbers]
         return scipy.sparse.csr_matrix((share, (node_numbers, np.arange(len(node_numbers)))))
 
     def _averaged(self, values: Array) -> Array:
-        """Return the weighted mean over the cells that share a node, on rank 0."""
+        """Return the area-weighted mean over the cells that share a node; collective.
+
+        `values` (cells, nodes of a cell, ...) are those of owned cells. Rank 0 gets (nodes, ...);
+        other ranks get `values` back.
+        """
         values_of_all, matrix = self._gather_cells(values), self._averaging_matrix
         if matrix is None:
             return values
@@ -346,8 +384,7 @@ def add_contact(
     state: State,
     at_nodes: Callable[[Array], Array],
 ) -> None:
-    """Add the contact pressure and the gap between shells to fields at the nodes of cells;
-    collective.
+    """Add contact pressure and gap between shells to fields at the nodes of cells; collective.
 
     Besides the pressure it adds what `resolved_pressure` takes out again: `RESOLVED`, one in a cell
     that is in contact all over; `RESOLVED_PRESSURE`, the pressure of such a cell; `GAP_OPEN`, one
@@ -375,18 +412,20 @@ def add_contact(
 
 
 def resolved_pressure(cells: NDArray[np.int64], fields: dict[str, Array]) -> dict[str, Array]:
-    """Return the fields with the contact pressure where the mesh resolves it, and nan where not.
+    """Return the fields with the contact pressure only where the mesh resolves it.
 
-    In a cell that is pressed in part its mean is no pressure. Beside one that is pressed all over
-    it is the edge of that zone, which ends where the gap is open; by itself it may be any part of
-    what presses there.
+    The mean pressure of a cell that is pressed only in part is no pressure at a point. Next to an
+    evenly pressed cell, such a cell is the edge of the contact zone. At its nodes the pressure is
+    zero where the gap is open, and the mean of the cells elsewhere. Away from evenly pressed cells
+    a positive pressure becomes nan.
 
     Parameters
     ----------
     cells
         (m, k) node numbers.
     fields
-        At nodes, the means of the cells that meet there, as `add_contact` makes them.
+        Name -> values (n,) at nodes, the means of the cells that meet there. The auxiliary fields
+        that `add_contact` adds are read here and left out of the result.
     """
     if PRESSURE not in fields:
         return fields
@@ -394,6 +433,7 @@ def resolved_pressure(cells: NDArray[np.int64], fields: dict[str, Array]) -> dic
     shown_fields = {name: values for name, values in fields.items() if name not in auxiliary}
     in_zone = fields[RESOLVED] > 0
     in_zone_or_edge = in_zone.copy()
+    # the edge of the zone: all nodes of cells that touch it
     in_zone_or_edge[cells[in_zone[cells].any(axis=1)]] = True
     pressure_in_zone = fields[RESOLVED_PRESSURE] / np.where(in_zone, fields[RESOLVED], 1.0)
     edge_is_open = in_zone_or_edge & (fields[GAP_OPEN] > 0)
@@ -406,7 +446,15 @@ def resolved_pressure(cells: NDArray[np.int64], fields: dict[str, Array]) -> dic
 def deviations_at(
     imperfections: Mapping[str, tuple[Deviation, ...]], mu: Mapping[str, float]
 ) -> list[Deviation]:
-    """Return the growing imperfections at their amplitudes."""
+    """Return each growing imperfection times its amplitude.
+
+    Parameters
+    ----------
+    imperfections
+        Amplitude -> deviations w0 over R, functions of places (n, 3).
+    mu
+        Amplitude -> value; a missing one is zero.
+    """
 
     def times(deviation: Deviation, factor: float) -> Deviation:
         return lambda places: factor * deviation(places)
@@ -419,10 +467,7 @@ def deviations_at(
 
 
 def rotated_surface(surface: Surface, azimuth: float) -> Surface:
-    """Return the surface rotated about e3 by an angle in rad.
-
-    So it is in the user's frame in place of the model's.
-    """
+    """Return the surface rotated about e3 by `azimuth` (rad), into the user's frame."""
     return _transformed(surface, rotation(azimuth))
 
 
@@ -458,35 +503,36 @@ def completed(surface: Surface, mirror: Array) -> Surface:
 
 
 def completed_by_symmetry(surface: Surface, mirror: Mirror) -> Surface:
-    """Return all of the shell from the half, or the sector, that is modelled."""
-    two_sectors = completed(surface, mirror.plane)
+    """Return the surface of the whole shell from that of its modelled half or sector."""
+    surface_and_image = completed(surface, mirror.plane)
     if not isinstance(mirror, Sector):
-        return two_sectors
+        return surface_and_image
+    # images of positive sign are rotations about e3, the identity among them
     turns = [image.Q.T for image in mirror.images if image.sign > 0]
-    copies = [_transformed(two_sectors, Q) for Q in turns]
-    count = len(two_sectors.r0)
+    copies = [_transformed(surface_and_image, Q) for Q in turns]
+    count = len(surface_and_image.r0)
 
     def of_all_copies(values_of: Callable[[Surface], Array]) -> Array:
         return np.concatenate([values_of(copy) for copy in copies])
 
     return replace(
-        two_sectors,
+        surface_and_image,
         r0=of_all_copies(lambda s: s.r0),
         u=of_all_copies(lambda s: s.u),
         n0=of_all_copies(lambda s: s.n0),
-        cells=np.concatenate([two_sectors.cells + k * count for k in range(len(copies))]),
+        cells=np.concatenate([surface_and_image.cells + k * count for k in range(len(copies))]),
         fields={
             name: np.concatenate([copy.fields[name] for copy in copies])
-            for name in two_sectors.fields
+            for name in surface_and_image.fields
         },
     )
 
 
 def on_nodes_of(surface: Surface, target: Surface) -> Surface:
-    """Return displacements and fields at the nodes of another mesh of the same shell.
+    """Return the surface with displacement and fields at the nodes of another mesh of the shell.
 
-    They are linear functions through the nearest nodes: exact to the second order of their
-    distance. On the same mesh the result is the surface itself.
+    Values are linear functions fitted to the nearest nodes of `surface`, so that errors are of
+    second order in their distance. On the same mesh `surface` itself is returned.
     """
     if (
         surface.r0.shape == target.r0.shape
@@ -495,9 +541,10 @@ def on_nodes_of(surface: Surface, target: Surface) -> Surface:
         return surface
     distance, nearest_nodes = scipy.spatial.cKDTree(surface.r0).query(target.r0, NODES_OF_FIT)
     offsets = surface.r0[nearest_nodes] - target.r0[:, None]
-    size = np.maximum(distance.max(axis=1), SAME_PLACE_TOLERANCE)[:, None]
-    weight = np.exp(-((2 * distance / size) ** 2))[..., None]
-    basis = np.concatenate([np.ones((*nearest_nodes.shape, 1)), offsets / size[..., None]], axis=2)
+    reach = np.maximum(distance.max(axis=1), SAME_PLACE_TOLERANCE)[:, None]
+    weight = np.exp(-((2 * distance / reach) ** 2))[..., None]
+    # row 0 of the pseudo-inverse is the fit's constant, its value at the target node
+    basis = np.concatenate([np.ones((*nearest_nodes.shape, 1)), offsets / reach[..., None]], axis=2)
     interpolation = np.linalg.pinv(weight * basis, rcond=EXTENT_TOLERANCE)[:, 0] * weight[..., 0]
 
     def interpolated(f: Array) -> Array:
@@ -515,25 +562,36 @@ def on_nodes_of(surface: Surface, target: Surface) -> Surface:
 
 
 def _parity(surface: Surface, normal: Array, offset: float) -> float:
-    """Return 1 if mirror images of remanence and applied field continue them, -1 if the opposites
-    do.
+    """Return the sign of a mirror image of Br and Ba: 1 if it continues them, else -1.
 
-    Both fields have the same sign. It is that of the applied field at the plane, which is
-    continuous there; without one, that of the remanence, if it does not jump at the plane.
+    Both fields have the same sign. It follows from the applied field Ba at the plane, which is
+    continuous there. Without Ba it follows from the remanence Br, and is 1 if Br jumps at the
+    plane.
+
+    Parameters
+    ----------
+    surface
+        The modelled half.
+    normal, offset
+        The plane is normal . x = offset, over R.
     """
     on_plane = np.abs(surface.r0 @ normal - offset) < SAME_PLACE_TOLERANCE
     for name in ("Ba", "Br"):
         vectors = surface.fields.get(name, np.zeros((len(on_plane), 3)))[on_plane]
-        size = np.nan_to_num(np.linalg.norm(vectors, axis=1))
-        if size.max(initial=0.0) > 0:
-            jumps = size.min() < size.max() / 2
-            is_tangential = 2 * np.nansum((vectors @ normal) ** 2) <= np.sum(size**2)
+        magnitude = np.nan_to_num(np.linalg.norm(vectors, axis=1))
+        if magnitude.max(initial=0.0) > 0:
+            jumps = magnitude.min() < magnitude.max() / 2
+            # a tangential vector equals its image, a normal one is the opposite of its image
+            is_tangential = 2 * np.nansum((vectors @ normal) ** 2) <= np.sum(magnitude**2)
             return 1.0 if jumps or is_tangential else -1.0
     return 1.0
 
 
 def _transformed(surface: Surface, Q: Array) -> Surface:
-    """Return a surface with points and vectors v -> v Q, and tensors T -> Q^T T Q."""
+    """Return a surface with vectors v -> v Q, row by row, and tensors T -> Q^T T Q.
+
+    Places, displacements, normals, fields, outlines and solids are transformed.
+    """
 
     def transformed(f: Array) -> Array:
         if f.ndim == 1:

@@ -1,4 +1,4 @@
-"""Tessellation: the flat triangles of a surface, as fine as its cells are curved."""
+"""Tessellation: flat triangles of a surface, as fine as its cells are curved."""
 
 from dataclasses import dataclass
 
@@ -18,20 +18,23 @@ TINY = 1e-300  # least divisor
 
 @dataclass(frozen=True)
 class Tessellation:
-    """Flat triangles in the cells of a surface; its points are the same for every displacement.
+    """Flat triangles in the cells of a surface.
+
+    Each cell has the same q points in its reference cell, whatever the displacement. Points are
+    numbered cell after cell.
 
     Attributes
     ----------
     nodes
         (m, k) nodes of each cell, or of each outer face of a solid.
     table
-        (q, k) values of the cells' shape functions at their q points.
+        (q, k) values of the cells' shape functions at the points.
     slopes
-        (2, q, k) their derivatives at the points.
+        (2, q, k) derivatives of the shape functions at the points, by the reference coordinates.
     triangles
-        (t, 3) numbers of points, of all cells.
+        (t, 3) numbers of the points of all cells.
     flat
-        Whether the cells are flat triangles, whose normals are averaged at nodes.
+        Whether the cells are flat triangles; their normals are then averaged at nodes.
     degree
         Degree of the shape functions.
     """
@@ -44,13 +47,14 @@ class Tessellation:
     degree: int = 1
 
     def at_points(self, values: Array) -> Array:
-        """Return the values of nodes (n, ...) at the points (m q, ...)."""
+        """Return values at nodes (n, ...), interpolated at the points of all cells (m q, ...)."""
         values_of_cells = values[self.nodes].reshape(*self.nodes.shape, -1)
         return np.asarray(np.matmul(self.table, values_of_cells).reshape(-1, *values.shape[1:]))
 
     def normals(self, r: Array) -> Array:
-        """Return unit normals (m q, 3) of the surface with nodes at r (n, 3), one sign for each
-        cell.
+        """Return unit normals (m q, 3) at the points, of the surface with nodes at r (n, 3).
+
+        Within a cell they have one orientation.
         """
         tangents = np.matmul(self.slopes[:, None], r[self.nodes])
         vectors = np.cross(*tangents).reshape(-1, 3)
@@ -63,9 +67,9 @@ class Tessellation:
 
 
 def tessellate(surface: Surface, max_triangles: int = 40_000) -> Tessellation:
-    """Return the flat triangles of a surface, about `max_triangles` of them at most.
+    """Return the flat triangles of a surface, about `max_triangles` at most.
 
-    They are never fewer than the cells of the surface give.
+    There are never fewer than one triangle for each cell, or two for each outer face of a solid.
     """
     if surface.is_body:
         faces = _outer_faces(surface.cells)
@@ -75,6 +79,7 @@ def tessellate(surface: Surface, max_triangles: int = 40_000) -> Tessellation:
         )
         return _divided(faces, element, np.arange(9), _squares(division))
     count = surface.cells.shape[1]
+    # a triangle of degree d has (d + 1)(d + 2)/2 nodes
     degree = round((np.sqrt(8 * count + 1) - 3) / 2)
     element = basix.create_element(
         basix.ElementFamily.P, basix.CellType.triangle, degree, EQUISPACED
@@ -85,7 +90,10 @@ def tessellate(surface: Surface, max_triangles: int = 40_000) -> Tessellation:
 
 
 def _division(triangles: int, finest: int, max_triangles: int) -> int:
-    """Return into how many parts the sides of triangles are divided, from 1 to `finest`."""
+    """Return the number of equal parts of each side of a triangle, from 1 to `finest`.
+
+    `triangles` is the number of triangles that are to be divided.
+    """
     return int(np.clip(np.sqrt(max_triangles / max(triangles, 1)), 1, finest))
 
 
@@ -95,7 +103,19 @@ def _divided(
     order: Numbers,
     triangulation: tuple[Array, Numbers],
 ) -> Tessellation:
-    """Return cells divided alike; `triangulation` is that of the reference cell."""
+    """Return the tessellation of cells that are all divided alike.
+
+    Parameters
+    ----------
+    nodes
+        (m, k) nodes of the cells.
+    element
+        Element with the cells' shape functions.
+    order
+        Number in `element` of each node of a cell.
+    triangulation
+        Points (q, 2) in the reference cell, and triangles (t, 3) between them.
+    """
     points, triangles = triangulation
     table, *slopes = element.tabulate(1, points)[:, :, :, 0][:, :, order]
     numbers = np.arange(len(nodes))[:, None, None] * len(points) + triangles
@@ -106,7 +126,7 @@ def _divided(
 
 
 def _triangle(n: int) -> tuple[Array, Numbers]:
-    """Return points (q, 2) of the reference triangle in a grid, and its n² triangles."""
+    """Return points (q, 2) in the reference triangle, and n² triangles (n², 3) between them."""
     places = [(i, j) for j in range(n + 1) for i in range(n + 1 - j)]
     number = {place: k for k, place in enumerate(places)}
     up = [(number[i, j], number[i + 1, j], number[i, j + 1]) for i, j in places if i + j < n]
@@ -119,7 +139,7 @@ def _triangle(n: int) -> tuple[Array, Numbers]:
 
 
 def _squares(n: int) -> tuple[Array, Numbers]:
-    """Return points (q, 2) of the reference square in a grid, and its 2 n² triangles."""
+    """Return points (q, 2) in the reference square, and 2 n² triangles between them."""
     x, y = np.meshgrid(np.arange(n + 1), np.arange(n + 1))
     low = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
     right, upper = low + 1, low + n + 1
@@ -130,7 +150,10 @@ def _squares(n: int) -> tuple[Array, Numbers]:
 
 
 def _outer_faces(cells: Numbers) -> Numbers:
-    """Return the nodes (m, 9) of faces of one hexahedron only, in Basix's order of a square."""
+    """Return the nodes (m, 9) of the faces that belong to one hexahedron only.
+
+    They are in Basix's order of a square. `cells` (m, 27) are in VTK's order.
+    """
     body = basix.create_element(basix.ElementFamily.P, basix.CellType.hexahedron, 2, EQUISPACED)
     square = basix.create_element(
         basix.ElementFamily.P, basix.CellType.quadrilateral, 2, EQUISPACED
@@ -139,7 +162,7 @@ def _outer_faces(cells: Numbers) -> Numbers:
     cells_in_basix_order = cells[:, to_basix]
 
     def half_steps(point: Array) -> tuple[int, ...]:
-        """Return coordinates of a node of degree two as multiples of a half."""
+        """Return the coordinates of a node of degree two as multiples of a half."""
         return tuple(np.round(2 * point).astype(int))
 
     faces = []
@@ -151,6 +174,7 @@ def _outer_faces(cells: Numbers) -> Numbers:
             nodes_of_face = [node_at[half_steps(point)] for point in square.points]
             faces.append(cells_in_basix_order[:, nodes_of_face])
     all_faces = np.concatenate(faces)
+    # the same face of two cells has the same four corners
     corners = np.sort(all_faces[:, :4], axis=1)
     _, first_face, count = np.unique(corners, axis=0, return_index=True, return_counts=True)
     return np.asarray(all_faces[np.sort(first_face[count == 1])])

@@ -1,4 +1,4 @@
-"""Fields for ParaView: a .vtu file with curved cells per point, and a .pvd list of the points.
+"""Fields for ParaView: a .vtu file with curved cells for each point, and a .pvd list of the points.
 
 Pictures read these files back.
 """
@@ -55,7 +55,7 @@ TIME_INCREMENT = 1e-9  # between points of one time, in units of the time
 
 @dataclass(frozen=True)
 class ShellData:
-    """Data of a shell that pictures need besides the nodes; every file has them.
+    """Data of a shell that pictures need besides the nodes; every .vtu file has them.
 
     Attributes
     ----------
@@ -64,10 +64,10 @@ class ShellData:
     nu
         Poisson's ratio.
     mirror
-        Unit normal (3,) of the mirror plane of a half shell, then its offset if that is not zero;
-        None for a whole one.
+        Mirror plane of a half shell: its unit normal (3,), followed by its offset over R unless
+        that is zero. None for a whole shell.
     R
-        In metres; nan of a case without units.
+        In metres; nan for a case without units.
     """
 
     h: float
@@ -79,12 +79,18 @@ class ShellData:
 def unstructured_grid(
     surface: Surface, h: float, *, deformed: bool = False
 ) -> "vtkUnstructuredGrid":
-    """Return the surface or body with u, u/h, w/h, r0, n0 and its fields at the nodes, as VTK's
-    grid.
+    """Return a surface or body as VTK's grid, with u, u/h, w/h, r0, n0 and fields at the nodes.
 
-    Its points are undeformed, so that warping by the vector `u` deforms it to scale, or deformed.
-    Lengths are over R. It is built without pyvista, which takes longer to import than all fields of
-    a path to write.
+    Lengths are over R. The grid is built without pyvista, which takes longer to import than all
+    fields of a path take to write.
+
+    Parameters
+    ----------
+    h
+        Thickness over R.
+    deformed
+        Whether the points of the grid are the deformed ones. Undeformed points are deformed to
+        scale by warping with the vector `u`.
     """
     from vtkmodules.util.numpy_support import numpy_to_vtk
     from vtkmodules.vtkCommonCore import vtkPoints
@@ -92,12 +98,17 @@ def unstructured_grid(
 
     points, cells, grid = vtkPoints(), vtkCellArray(), vtkUnstructuredGrid()
     points.SetData(numpy_to_vtk(surface.r0 + surface.u if deformed else surface.r0, deep=True))
-    number, count = surface.cells.shape
-    starts, nodes = np.arange(0, (number + 1) * count, count), surface.cells.ravel()
-    cells.SetData(*(numpy_to_vtk(array.astype(np.int64), deep=True) for array in (starts, nodes)))
+    cell_count, nodes_per_cell = surface.cells.shape
+    cell_starts, nodes = (
+        np.arange(0, (cell_count + 1) * nodes_per_cell, nodes_per_cell),
+        surface.cells.ravel(),
+    )
+    cells.SetData(
+        *(numpy_to_vtk(array.astype(np.int64), deep=True) for array in (cell_starts, nodes))
+    )
     grid.SetPoints(points)
     cell_type = LAGRANGE_HEXAHEDRON if surface.is_body else LAGRANGE_TRIANGLE
-    grid.SetCells(TRIANGLE if count == 3 else cell_type, cells)
+    grid.SetCells(TRIANGLE if nodes_per_cell == 3 else cell_type, cells)
     data_of_surface = (surface.u, surface.u / h, surface.w / h, surface.r0, surface.n0)
     fields = {
         name: values if values.ndim < 3 else values[:, *VTK_TENSOR_INDICES]
@@ -112,7 +123,7 @@ def unstructured_grid(
 
 
 def add_array(vtk_data: Any, name: str, values: NDArray[Any]) -> None:
-    """Add an array to VTK's data of points, or of a file."""
+    """Add a named array (n,) or (n, k) to VTK's data of points, or to its data of a whole file."""
     from vtkmodules.util.numpy_support import numpy_to_vtk
 
     array = numpy_to_vtk(np.ascontiguousarray(values), deep=True)
@@ -121,34 +132,35 @@ def add_array(vtk_data: Any, name: str, values: NDArray[Any]) -> None:
 
 
 def add_texts(vtk_data: Any, name: str, lines: Sequence[str]) -> None:
-    """Add texts to VTK's data of a file."""
+    """Add a named list of texts to VTK's data of a whole file."""
     from vtkmodules.vtkCommonCore import vtkStringArray
 
-    array = vtkStringArray()
-    array.SetName(name)
+    text_array = vtkStringArray()
+    text_array.SetName(name)
     for line in lines:
-        array.InsertNextValue(line)
-    vtk_data.AddArray(array)
+        text_array.InsertNextValue(line)
+    vtk_data.AddArray(text_array)
 
 
 def read_vtu(file: Path) -> tuple[Surface, ShellData]:
-    """Return the surface and the shell's data in a file of `FieldSeries` or `write_mode`.
+    """Return the surface and the shell's data from a .vtu file that this module wrote.
 
     Raises
     ------
     CaseError
-        If an earlier version wrote it, without the data of `ShellData`, or it is damaged.
+        If the file is damaged, or an earlier version wrote it without the data of `ShellData`.
     """
     return read_grid(file, lambda grid: _surface(grid, file))
 
 
 def read_grid(file: Path, convert: "Callable[[vtkUnstructuredGrid], Read]") -> "Read":
-    """Return what a function makes of the grid in a .vtu file.
+    """Read a .vtu file and return what `convert` makes of its grid.
 
     Raises
     ------
     Damaged
-        If the file is damaged; whatever `convert` raises of data that are missing says so.
+        If the file is damaged. A KeyError, ValueError, IndexError, TypeError or AttributeError of
+        `convert` counts as damage.
     """
     from vtkmodules.vtkCommonCore import vtkObject
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridReader
@@ -174,7 +186,7 @@ def read_grid(file: Path, convert: "Callable[[vtkUnstructuredGrid], Read]") -> "
 
 
 def is_whole(file: Path) -> bool:
-    """Whether a file is XML of VTK with its beginning and its end."""
+    """Whether a file is VTK's XML with its beginning and its end, and so not cut off."""
     if not file.is_file():
         return False
     with file.open("rb") as stream:
@@ -184,7 +196,7 @@ def is_whole(file: Path) -> bool:
 
 
 def arrays(vtk_data: Any) -> dict[str, Array]:
-    """Return the numerical arrays of VTK's data of points, or of a file, by name."""
+    """Return name -> values of the numerical arrays in VTK's data of points, or of a whole file."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     named_arrays = (
@@ -197,27 +209,30 @@ def arrays(vtk_data: Any) -> dict[str, Array]:
 
 
 def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, ShellData]:
-    """Return the surface and the shell's data in a grid of `unstructured_grid`.
+    """Return the surface and the shell's data in a grid that `unstructured_grid` made.
 
-    Whatever exception is raised, the grid has none.
+    Any exception says that the grid is not of that kind; `file` is named in messages.
     """
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     node_numbers = vtk_to_numpy(grid.GetCells().GetConnectivityArray())
     cells = node_numbers.reshape(grid.GetNumberOfCells(), -1)
-    data, numbers = arrays(grid.GetPointData()), arrays(grid.GetFieldData())
+    point_arrays, file_arrays = arrays(grid.GetPointData()), arrays(grid.GetFieldData())
     fields = {
         name: f[:, VTK_TENSOR_POSITIONS] if f.shape[1:] == (6,) else f
-        for name, f in data.items()
+        for name, f in point_arrays.items()
         if name not in DATA_OF_SURFACE
     }
-    if "h_over_R" not in numbers:
+    if "h_over_R" not in file_arrays:
         raise CaseError(f"{file} is of an earlier version: run the case again")
-    R = float(numbers["R_in_m"][0]) if "R_in_m" in numbers else nan
+    R = float(file_arrays["R_in_m"][0]) if "R_in_m" in file_arrays else nan
     shell_data = ShellData(
-        float(numbers["h_over_R"][0]), float(numbers["poisson_ratio"][0]), numbers.get("mirror"), R
+        float(file_arrays["h_over_R"][0]),
+        float(file_arrays["poisson_ratio"][0]),
+        file_arrays.get("mirror"),
+        R,
     )
-    r0, u, n0 = (data[name] for name in ("r0", "u_over_h", "n0"))
+    r0, u, n0 = (point_arrays[name] for name in ("r0", "u_over_h", "n0"))
     if (
         {r0.shape, u.shape, n0.shape} != {(len(r0), 3)}
         or not cells.size
@@ -227,7 +242,7 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, ShellDat
     if not all(np.isfinite(values).all() for values in (r0, u, n0)):
         raise ValueError("a node is nowhere")
     moment_jump, strain_jump = (
-        float(numbers[name][0]) if name in numbers else None for name in JUMPS
+        float(file_arrays[name][0]) if name in file_arrays else None for name in JUMPS
     )
     shell_names = grid.GetFieldData().GetAbstractArray(SHELLS)
     shells = (
@@ -248,15 +263,17 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, ShellDat
 
 
 class FieldSeries:
-    """Writer of `point_NNNN.vtu` files, which updates `path.pvd` after each.
+    """Writer of `point_NNNN.vtu` files, which updates the list `path.pvd` after each.
 
     It continues after an interrupted run.
 
     Parameters
     ----------
+    folder
+        Folder of the files; made if it is not there.
     outlines
-        Format of the name of a point's file with the outlines of sources and bodies, of the point's
-        number; empty without.
+        Name of a point's file with the outlines of sources and bodies, as a format of the point's
+        number; empty if there are none.
     rows
         Rows of path.csv of the points that an interrupted run has written.
     grids
@@ -265,7 +282,7 @@ class FieldSeries:
     Attributes
     ----------
     complete_points
-        Number of leading points whose files are complete.
+        Number of leading points all of whose files are complete.
     """
 
     def __init__(
@@ -276,6 +293,7 @@ class FieldSeries:
         rows: Sequence[Mapping[str, Any]] = (),
         grids: Sequence[str] = (),
     ) -> None:
+        """Count the complete points in the folder, and list them in path.pvd."""
         self._folder, self._shell_data, self._outlines, self._grids = (
             folder,
             shell_data,
@@ -302,14 +320,16 @@ class FieldSeries:
         row: Mapping[str, Any] | None = None,
         grid_contents: Mapping[str, bytes] = MappingProxyType({}),
     ) -> None:
-        """Write the files of a point.
+        """Write the files of a point and update the lists.
 
         Parameters
         ----------
+        number
+            Number of the point.
         row
-            The point's row of path.csv.
+            The point's row of path.csv; None if only its number is known.
         grid_contents
-            Name of a grid -> content of its file.
+            Name of a grid outside the shell -> content of its file.
 
         Raises
         ------
@@ -331,18 +351,18 @@ class FieldSeries:
         self._write_list()
 
     def _files(self, number: int) -> list[Path]:
-        """Return the files of a point."""
+        """Return the paths of all files of point `number`, grids outside the shell included."""
         names = self._files_of_shell(number)
         names += [grid_file(grid, number) for grid in self._grids]
         return [self._folder / name for name in names]
 
     def _files_of_shell(self, number: int) -> list[str]:
-        """Return the names of a point's files of the shell and of what is beside it."""
+        """Return the names of a point's files of the shell and of the outlines beside it."""
         outlines = [self._outlines.format(number)] if self._outlines else []
         return [point_file(number), *outlines]
 
     def _write_list(self) -> None:
-        """Write the lists of all points, path.pvd and one of each grid."""
+        """Write the lists of all points for ParaView: path.pvd, and map_NAME.pvd for each grid."""
         numbers = [int(row["point"]) for row in self._rows]
         times = abscissae(self._rows)
         files = [self._files_of_shell(number) for number in numbers]
@@ -353,7 +373,7 @@ class FieldSeries:
 
 
 def pvd_content(times: Sequence[float], files: Sequence[Sequence[str]]) -> bytes:
-    """Return the content of a .pvd file.
+    """Return the content of a .pvd file: which files ParaView shows at which time.
 
     Parameters
     ----------
@@ -363,9 +383,9 @@ def pvd_content(times: Sequence[float], files: Sequence[Sequence[str]]) -> bytes
         The files of each point, first that of the shell.
     """
     rows = "\n".join(
-        f'    <DataSet timestep="{t!r}" part="{part}" file="{file}"/>'
+        f'    <DataSet timestep="{t!r}" part="{part_number}" file="{file}"/>'
         for t, files_of_point in zip(times, files, strict=True)
-        for part, file in enumerate(files_of_point)
+        for part_number, file in enumerate(files_of_point)
     )
     return (
         '<?xml version="1.0"?>\n<VTKFile type="Collection" version="0.1">\n  <Collection>\n'
@@ -376,9 +396,9 @@ def pvd_content(times: Sequence[float], files: Sequence[Sequence[str]]) -> bytes
 def abscissae(rows: Sequence[Mapping[str, Any]]) -> list[float]:
     """Return the places of the points of a path on ParaView's time axis, ascending.
 
-    They are the time of a run with motions, in s if it has units; points at rest follow it closely.
-    Else they are the amplitude that varied, in the case's unit, if it is one and rises all the way;
-    else the numbers of the points.
+    A run with motions has its time, in s if it has units. Points at rest follow one another
+    closely. Otherwise the axis is the amplitude that varied, in the case's unit, if only one did
+    and it rises all the way. Failing that, it is the number of each point.
 
     Examples
     --------
@@ -406,37 +426,41 @@ def abscissae(rows: Sequence[Mapping[str, Any]]) -> list[float]:
 
 
 def point_file(number: int) -> str:
-    """Return the name of a point's file."""
+    """Return the name of the file with the surface of point `number`."""
     return f"point_{number:04d}.vtu"
 
 
 def grid_file(name: str, number: int) -> str:
-    """Return the name of a point's file of a grid outside the shell."""
+    """Return the name of the file with grid `name` outside the shell, at point `number`."""
     return f"map_{name}_{number:04d}.vtu"
 
 
 def vtu_content(surface: Surface, shell_data: ShellData) -> bytes:
-    """Return the content of a .vtu file; VTK's own writer would ignore a full disk.
+    """Return the content of the .vtu file of a surface; VTK's own writer would ignore a full disk.
 
-    LZ4 compression costs almost no time; zlib takes ten times as long and saves only a tenth more
-    on curved surfaces.
+    Names of units, of shells, and the data of `ShellData` are in the file's field data. Its LZ4
+    compression costs almost no time. zlib takes ten times as long and saves only a tenth more on
+    curved surfaces.
     """
     grid = unstructured_grid(surface, shell_data.h)
-    numbers = {
+    file_arrays = {
         "h_over_R": np.array([shell_data.h]),
         "poisson_ratio": np.array([shell_data.nu]),
         "mirror": shell_data.mirror,
     }
     jumps = zip(JUMPS, (surface.jump, surface.strain_jump), strict=True)
-    numbers |= {name: None if jump is None else np.array([jump]) for name, jump in jumps}
-    numbers |= {"R_in_m": None if isnan(shell_data.R) else np.array([shell_data.R])}
-    for name, values in numbers.items():
+    file_arrays |= {name: None if jump is None else np.array([jump]) for name, jump in jumps}
+    file_arrays |= {"R_in_m": None if isnan(shell_data.R) else np.array([shell_data.R])}
+    for name, values in file_arrays.items():
         if values is not None:
             add_array(grid.GetFieldData(), name, values)
-    data = grid.GetPointData()
-    names = ["points", *(data.GetArrayName(i) for i in range(data.GetNumberOfArrays()))]
+    point_data = grid.GetPointData()
+    array_names = [
+        "points",
+        *(point_data.GetArrayName(i) for i in range(point_data.GetNumberOfArrays())),
+    ]
     texts = {
-        "units": [f"{name}: {UNITS[name]}" for name in names if name in UNITS],
+        "units": [f"{name}: {UNITS[name]}" for name in array_names if name in UNITS],
         SHELLS: surface.shells,
     }
     for name, lines in texts.items():
@@ -446,7 +470,7 @@ def vtu_content(surface: Surface, shell_data: ShellData) -> bytes:
 
 
 def content_of(grid: "vtkUnstructuredGrid") -> bytes:
-    """Return the content of a .vtu file of a grid."""
+    """Return a grid as the bytes of a .vtu file."""
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
     writer = vtkXMLUnstructuredGridWriter()
@@ -461,9 +485,9 @@ def content_of(grid: "vtkUnstructuredGrid") -> bytes:
 
 
 def read_point(folder: Path, number: int) -> tuple[Surface, ShellData]:
-    """Return the surface of a point in a folder of fields, with the outlines beside it.
+    """Return the surface of a point with its outlines, and the shell's data, from its files.
 
-    A half shell is completed.
+    A half shell is completed by its mirror image. `ShellData.mirror` still has its plane.
     """
     surface, shell_data = read_vtu(folder / point_file(number))
     lines, solids = read_outlines(folder, number)
@@ -474,11 +498,16 @@ def read_point(folder: Path, number: int) -> tuple[Surface, ShellData]:
 
 
 def write_whole_shells(folder: Path) -> list[str]:
-    """Write `whole_NNNN.vtu` and `whole.pvd` beside the points of a half shell.
+    """Write `whole_NNNN.vtu` and `whole.pvd` with both halves of a half shell, beside its points.
+
+    Parameters
+    ----------
+    folder
+        Folder of a run.
 
     Returns
     -------
-    The names of the files; none if the shell is whole.
+    The names of the files; an empty list if the shell is whole.
 
     Raises
     ------

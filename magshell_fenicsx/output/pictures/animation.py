@@ -40,9 +40,9 @@ Array = NDArray[np.float64]
 
 
 def magnification(surfaces: Sequence[Surface]) -> float:
-    """Return the factor of the drawn displacements: 1, 2, 5, 10, ...
+    """Return the factor by which drawn displacements are magnified: 1, 2, 5, 10, ...
 
-    It is the least one with which the largest displacement is visible.
+    It is the least factor with which the largest displacement is visible.
 
     Examples
     --------
@@ -71,7 +71,7 @@ def animated(
     camera: Camera,
     pole: str = POLE,
 ) -> bytes:
-    """Return the content of a GIF file.
+    """Return the animation of a path as the content of a GIF file.
 
     Parameters
     ----------
@@ -93,18 +93,18 @@ def animated(
     dither = Pillow.Dither.FLOYDSTEINBERG  # without it 256 colours are contours that are not there
     samples = [frames[i] for i in sorted({0, len(frames) // 2, len(frames) - 1})]
     palette = _palette(samples)  # the same for all frames
-    first_image, *further = (
+    first_image, *further_images = (
         _with_white(frame, Pillow.fromarray(frame).quantize(palette=palette, dither=dither))
         for frame in frames
     )
     duration = round(max(1000 * DURATION / len(frames), MIN_FRAME_DURATION), -1)
-    durations = [*[duration] * len(further), DURATION_OF_LAST]
+    durations = [*[duration] * len(further_images), DURATION_OF_LAST]
     content = io.BytesIO()
     first_image.save(
         content,
         "GIF",
         save_all=True,
-        append_images=further,
+        append_images=further_images,
         duration=durations,
         loop=0,
         optimize=False,
@@ -113,9 +113,16 @@ def animated(
 
 
 def _with_white(frame: Image, reduced: "Pillow.Image") -> "Pillow.Image":
-    """Return a frame in the colours of a palette, white where it is white.
+    """Return a frame reduced to a palette, with white kept white.
 
-    Pillow alone takes a neighbour of white there.
+    Pillow alone takes a colour next to white there.
+
+    Parameters
+    ----------
+    frame
+        (height, width, 3) colours.
+    reduced
+        The frame as Pillow reduces it to the palette, whose first colour is white.
     """
     from PIL import Image as Pillow
 
@@ -127,9 +134,9 @@ def _with_white(frame: Image, reduced: "Pillow.Image") -> "Pillow.Image":
 
 
 def _palette(frames: Sequence[Image]) -> "Pillow.Image":
-    """Return a palette of 2 `COLOURS` entries.
+    """Return a palette of 2 `COLOURS` entries for all frames; the first entry is white.
 
-    Half of them cover all colours, half resolve the frequent ones.
+    Half of the entries cover all colours, half resolve the frequent ones.
     """
     from PIL import Image as Pillow
 
@@ -144,7 +151,15 @@ def _palette(frames: Sequence[Image]) -> "Pillow.Image":
 
 
 def _views(surfaces: Sequence[Surface], h: float, factor: float, camera: Camera) -> list[Panel]:
-    """Return the panels of all frames, with the same window and colours."""
+    """Return the panels of all frames, with one window and one scale of colours.
+
+    Parameters
+    ----------
+    h
+        Thickness over R.
+    factor
+        Magnification of the displacements; colours show the true ones.
+    """
     lowest = min(float(surface.w.min()) for surface in surfaces)
     highest = max(float(surface.w.max()) for surface in surfaces)
     limits = from_zero(lowest / h, highest / h)
@@ -170,9 +185,20 @@ def _composed(
     frame_rows: Sequence[Row],
     pole: str,
 ) -> list[NDArray[np.uint8]]:
-    """Return the frames (height, width, 3).
+    """Return the frames (height, width, 3) of an animation.
 
-    The fixed parts are drawn once, then the title, the shell and the marker on copies.
+    The fixed parts are drawn once; title, shell and marker are drawn on copies.
+
+    Parameters
+    ----------
+    views, titles, frame_rows
+        For each frame: the shell, the title and the row of path.csv.
+    factor
+        Magnification of the displacements.
+    rows
+        All rows of the path, for the curves.
+    pole
+        Name of the point of w_pole_over_h in a case without named points.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -184,6 +210,7 @@ def _composed(
     boxes = FigureBoxes(figure)
 
     def box(left: float, low: float, box_width: float, box_height: float) -> "Axes":
+        """Return axes in a box of pixels from the lower left of the figure."""
         return boxes.axes(*(length / STYLE.dpi for length in (left, low, box_width, box_height)))
 
     canvas = FigureCanvasAgg(figure)
@@ -220,7 +247,7 @@ def _composed(
 
 
 def _overlay(image: Image, frame: NDArray[np.uint8]) -> None:
-    """Put an image with transparency on a part of a frame."""
+    """Draw an image (n, m, 4) with transparency over a part of a frame (n, m, 3), in place."""
     opacity = image[..., 3:] / 255
     overlaid = opacity * image[..., :3] + (1 - opacity) * frame
     edge = EDGE_OPACITY * edge_of(opacity)
@@ -228,9 +255,9 @@ def _overlay(image: Image, frame: NDArray[np.uint8]) -> None:
 
 
 def edge_of(coverage: Array) -> Array:
-    """Return the edge of what is drawn: one in the pixels at its rim.
+    """Return the edge (n, m, 1) of what is drawn: 1 in pixels at its rim, 0 elsewhere.
 
-    `coverage` (n, m, 1) is how much of each pixel it covers.
+    `coverage` (n, m, 1) is the drawn fraction of each pixel.
     """
     smallest = coverage.copy()
     for axis, shift in ((0, 1), (0, -1), (1, 1), (1, -1)):

@@ -43,19 +43,20 @@ class SolidImage:
     Attributes
     ----------
     image
-        (height, width, 4) its colours.
+        (height, width, 4) colours.
     opacity
-        (height, width) how much of them each pixel has.
+        (height, width) opacity of the solid in each pixel, from 0 to 1.
     """
 
     image: Image
     opacity: Array
 
     def over(self, background: Image) -> Image:
-        """Return an image with the solid in front."""
+        """Return the image `background` with the solid drawn in front of it."""
         composed, covered = background.copy(), self.opacity > 0
         opacity, behind = self.opacity[covered], background[covered]
         opacity_behind = behind[:, 3] / 255 * (1 - opacity)
+        # opacity of both together
         alpha = opacity + opacity_behind
         colours = opacity[:, None] * self.image[covered, :3]
         colours = colours + opacity_behind[:, None] * behind[:, :3]
@@ -65,7 +66,13 @@ class SolidImage:
 
 
 class BodiesInView:
-    """The solids near a shell in its window, and where the shell hides them."""
+    """The solids near a shell in a window, and where the shell hides them.
+
+    Parameters
+    ----------
+    shell
+        The shell rendered in the same window.
+    """
 
     def __init__(
         self, surface: Surface, camera: Camera, window: Window, shell: RenderedSurface
@@ -75,7 +82,7 @@ class BodiesInView:
 
     @cached_property
     def _views(self) -> list[RenderedSurface]:
-        """The solids as they are seen, one by one."""
+        """Each solid rendered alone in the window."""
         return [
             RenderedSurface(_face_tessellation(solid), solid.points, self._camera, self._window)
             for solid in self._solids
@@ -83,18 +90,23 @@ class BodiesInView:
 
     @cached_property
     def _visible(self) -> list[NDArray[np.bool_]]:
-        """Drawn pixels where each solid is in front of the others and of the shell."""
+        """For each solid the drawn pixels where it is in front of other solids and of the shell."""
         depths = [view.depth for view in self._views]
         in_front = []
         for i, depth in enumerate(depths):
-            others = [self._shell.depth, *(other for k, other in enumerate(depths) if k != i)]
-            in_front_of_others = np.logical_and.reduce([depth >= other for other in others])
+            other_depths = [
+                self._shell.depth,
+                *(depth_of_other for k, depth_of_other in enumerate(depths) if k != i),
+            ]
+            in_front_of_others = np.logical_and.reduce(
+                [depth >= depth_of_other for depth_of_other in other_depths]
+            )
             in_front.append((depth > -np.inf) & in_front_of_others)
         return in_front
 
     @cached_property
     def images(self) -> list[SolidImage]:
-        """Images of all solids, to be put over an image of the shell."""
+        """Images of all solids, to be drawn over an image of the shell."""
         behind, images = self._shell.depth > -np.inf, []
         for solid, view, visible in zip(self._solids, self._views, self._visible, strict=True):
             opacity_alone, opacity_over_shell = (
@@ -145,7 +157,7 @@ class BodiesInView:
 
     @property
     def poles(self) -> list[tuple[float, float, str]]:
-        """Place and letter of the visible poles N and S of magnets, in the projection."""
+        """(x, y, letter) of the visible poles N and S of magnets, in the projection."""
         letters = []
         for solid, view in zip(self._solids, self._views, strict=True):
             if solid.poles is None:
@@ -153,21 +165,27 @@ class BodiesInView:
             centres = _centres(solid)
             visible = view.shows(centres, 2 * DEPTH_TOLERANCE / self._window.scale)
             for sign, letter in ((1, "N"), (-1, "S")):
-                faces = centres[(_poles(solid) * sign > 0) & visible]
-                if len(faces) and self._shell.shows(faces.mean(axis=0)[None], 0.0)[0]:
-                    x, y = self._camera(faces.mean(axis=0))[:2]
+                centres_of_pole = centres[(_poles(solid) * sign > 0) & visible]
+                if (
+                    len(centres_of_pole)
+                    and self._shell.shows(centres_of_pole.mean(axis=0)[None], 0.0)[0]
+                ):
+                    x, y = self._camera(centres_of_pole.mean(axis=0))[:2]
                     letters.append((float(x), float(y), letter))
         return letters
 
 
 def _face_tessellation(solid: Solid) -> Tessellation:
-    """Return the faces of a solid as flat triangles, smooth where they share corners."""
+    """Return the faces of a solid as flat triangles, with normals averaged at corners."""
     numbers = np.arange(3 * len(solid.triangles), dtype=np.int32).reshape(-1, 3)
     return Tessellation(solid.triangles, np.eye(3), SLOPES, numbers, flat=True)
 
 
 def _divided(line: Array) -> Array:
-    """Return a line with points between its ends, the last one twice."""
+    """Return a line from its first to its last place with points between, the last one twice.
+
+    The last point is made nan by the caller, so that lines are not joined.
+    """
     is_long = len(line) == 2 and np.ptp(line, axis=0).max() > LONG_LINE
     count = DIVISIONS_OF_LONG_LINES if is_long else DIVISIONS
     t = np.linspace(0.0, 1.0, count)[:, None]
@@ -180,18 +198,21 @@ def _centres(solid: Solid) -> Array:
 
 
 def _poles(solid: Solid) -> Array:
-    """Return the strength of the poles (m,) at the triangles of a magnet."""
+    """Return the pole strength (m,) at the triangles of a magnet: positive on its north half."""
     assert solid.poles is not None
     return np.asarray(solid.poles[solid.triangles].mean(axis=1))
 
 
 def near_places(surface: Surface) -> Sequence[Array]:
-    """Return places (n, 3) of all that is drawn beside the shell."""
+    """Return places (n, 3) of all that is drawn beside the shell, to fit a window around it."""
     return (*near_outlines(surface), *(solid.points for solid in near_solids(surface)))
 
 
 def bare_outlines(surface: Surface) -> tuple[Array, ...]:
-    """Return the lines of what has no faces, such as coils."""
+    """Return the lines (n, 3) of sources that have no faces, such as coils.
+
+    Such a line lies in no box around a solid.
+    """
     corners = [solid.points for solid in surface.solids]
     boxes = [(np.min(points, axis=0), np.max(points, axis=0)) for points in corners]
 
@@ -205,11 +226,11 @@ def bare_outlines(surface: Surface) -> tuple[Array, ...]:
 
 
 def far_bodies_note(surface: Surface) -> str:
-    """Return a note on the bodies and sources that are too far away to be drawn."""
+    """Return a note on bodies and sources that are too far away to be drawn; empty without such."""
     near = near_solids(surface)
-    far = [solid for solid in surface.solids if not any(solid is other for other in near)]
+    far_solids = [solid for solid in surface.solids if not any(solid is other for other in near)]
     middle = (surface.r0 + surface.u).mean(axis=0)
-    words = [f"{solid.name} ({_distance(solid, middle):.2g} R away)" for solid in far]
+    words = [f"{solid.name} ({_distance(solid, middle):.2g} R away)" for solid in far_solids]
     if words:
         return f"Outside the picture: {', '.join(words)}."
     left_out = len(surface.outlines) - len(near_outlines(surface))

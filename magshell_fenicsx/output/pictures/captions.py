@@ -28,9 +28,9 @@ HALF_MARK = 3.0  # half the size of a mark, in points
 def write_numbers(
     axes: "Axes", marks: Sequence[tuple[tuple[float, float], str]], curves: Sequence[Array]
 ) -> None:
-    """Write texts beside marks at places of the data.
+    """Write texts beside marks at places of the data, such as the numbers of instabilities.
 
-    Texts that would cover others, or other marks, are left out.
+    Texts that would cover other texts or marks are left out.
 
     Parameters
     ----------
@@ -46,12 +46,13 @@ def write_numbers(
     box, figure = axes.get_position(), axes.get_figure(root=True)
     assert figure
     figure_width, figure_height = 72 * figure.get_size_inches()
-    size, (left, right), (low, high) = rcParams["font.size"], axes.get_xlim(), axes.get_ylim()
+    font_size, (left, right), (low, high) = rcParams["font.size"], axes.get_xlim(), axes.get_ylim()
     extent = np.array(
         [box.width * figure_width, box.height * figure_height]
     )  # of the axes, in points
 
     def in_points(places: Array) -> Array:
+        """Return places (n, 2) of the data in points from the lower left of the axes."""
         return np.asarray((places - [left, low]) / [right - left, high - low] * extent)
 
     places_of_marks = in_points(np.array([place for place, _ in marks], float))
@@ -61,24 +62,25 @@ def write_numbers(
     occupied = [(place, np.full(2, HALF_MARK)) for place in places_of_marks]
     for i, (_, text) in enumerate(marks):
         place: Array = places_of_marks[i]
-        half = np.array([DIGIT_WIDTH * len(text), DIGIT_HEIGHT]) * size / 2
+        half_size = np.array([DIGIT_WIDTH * len(text), DIGIT_HEIGHT]) * font_size / 2
         middles = [
-            place + np.array(direction) * (half + MARK_DISTANCE) for direction in TEXT_DIRECTIONS
+            place + np.array(direction) * (half_size + MARK_DISTANCE)
+            for direction in TEXT_DIRECTIONS
         ]
         free_middles = [
             middle
             for middle in middles
-            if _is_inside(middle, half, extent) and _is_free(middle, half, occupied)
+            if _is_inside(middle, half_size, extent) and _is_free(middle, half_size, occupied)
         ]
         if not free_middles:
             continue
-        best = min(
-            free_middles, key=partial(_fault, place, half, places_of_marks, points_of_curves)
+        best_middle = min(
+            free_middles, key=partial(_fault, place, half_size, places_of_marks, points_of_curves)
         )
-        occupied.append((best, half))
+        occupied.append((best_middle, half_size))
         axes.text(
-            best[0] / extent[0],
-            best[1] / extent[1],
+            best_middle[0] / extent[0],
+            best_middle[1] / extent[1],
             text,
             transform=axes.transAxes,
             ha="center",
@@ -87,26 +89,45 @@ def write_numbers(
 
 
 def _fault(place: Array, half: Array, marks: Array, line: Array, middle: Array) -> tuple[int, int]:
-    """Return how many other marks are nearer than its own, and how many curve points it covers."""
+    """Return the faults of a place for a mark's number: (nearer marks, covered points of curves).
+
+    Parameters
+    ----------
+    place, half
+        (2,) the mark, and half the size of the text.
+    marks, line
+        (n, 2) all marks, and points of all curves.
+    middle
+        (2,) middle of the text; all in points.
+    """
     nearer = np.linalg.norm(marks - middle, axis=1) < np.linalg.norm(place - middle) - ROUNDING
     return int(nearer.sum()), int((np.abs(line - middle) < half).all(axis=1).sum())
 
 
 def _is_inside(middle: Array, half: Array, extent: Array) -> bool:
-    """Whether a box with a middle and half its size is within the axes, all (2,) in points."""
+    """Whether a text lies within the axes.
+
+    Its middle, half its size, and the extent of the axes are (2,) in points.
+    """
     return bool(((middle - half > 0) & (middle + half < extent)).all())
 
 
 def _is_free(middle: Array, half: Array, occupied: Sequence[tuple[Array, Array]]) -> bool:
-    """Whether a box with a middle and half its size meets none of the occupied ones."""
+    """Whether a text covers none of the occupied boxes.
+
+    A box is its middle and half its size, (2,) in points.
+    """
     return not any(
-        bool((np.abs(middle - other) < half + half_of_other).all())
-        for other, half_of_other in occupied
+        bool((np.abs(middle - occupied_middle) < half + occupied_half).all())
+        for occupied_middle, occupied_half in occupied
     )
 
 
 def shell_caption(h: float, nu: float, row: Row) -> str:
-    """Return R/h, Poisson's ratio and the field, from the thickness h over R and nu."""
+    """Return R/h, Poisson's ratio and the field at a row of path.csv, for a caption.
+
+    `h` is the thickness over R, and `nu` Poisson's ratio.
+    """
     text = rf"$R/h$ = {1 / h:.6g}, $\nu$ = {nu:g}"
     return text + (f", {named_value('lambda_m', row)}" if row["lambda_m"] else "")
 
@@ -129,36 +150,36 @@ def caption(h: float, nu: float, row: Row, amplitudes: Iterable[str] = ()) -> st
     >>> caption(0.01, 0.5, row | {"my_springs": 0.02}, amplitudes=["pressure", "my_springs"])
     '$R/h$ = 100, $\\nu$ = 0.5, $p/p_\\mathrm{c}$ = 0.25, my springs = 0.02'
     """
-    parts = [shell_caption(h, nu, row)]
+    items = [shell_caption(h, nu, row)]
     if row["field_angle"]:
-        parts.append(rf"turned by ${row['field_angle']:.4g}\degree$")
+        items.append(rf"turned by ${row['field_angle']:.4g}\degree$")
     if row["p_over_pc"]:
-        parts.append(named_value("p_over_pc", row, 5))
+        items.append(named_value("p_over_pc", row, 5))
     if row.get("force"):
         displacement = f"{named_value('w_over_h', row)} {amplitude('force').place}"
-        parts.append(f"{named_value('force', row)}, {displacement}")
+        items.append(f"{named_value('force', row)}, {displacement}")
     if "load_factor" in row:
-        parts.append(f"{named_value('load_factor', row)}, {named_value('w_over_h', row)}")
+        items.append(f"{named_value('load_factor', row)}, {named_value('w_over_h', row)}")
     if row["amplitude"] == "time":
-        parts.append(named_value("time", row))
-    others = (amplitude(name).column for name in amplitudes)
-    parts += [
+        items.append(named_value("time", row))
+    further_columns = (amplitude(name).column for name in amplitudes)
+    items += [
         named_value(column, row)
-        for column in others
+        for column in further_columns
         if column not in CAPTION_COLUMNS and row.get(column)
     ]
-    return ", ".join(parts)
+    return ", ".join(items)
 
 
 def named_value(name: str, row: Row, digits: int = 4) -> str:
-    """Return symbol and value of a column of a row, in the case's units if it has any."""
+    """Return "symbol = value" of a column of a row, in the case's units if the row has them."""
     q = shown_quantity(name, row)
     unit = q.si.replace("%", r"\%") if q.name != name else ""
     return f"{q.latex} = {in_mathematics(float(row[q.name]), digits)}{f' {unit}' if unit else ''}"
 
 
 def in_mathematics(value: float, digits: int) -> str:
-    r"""Return a number with so many digits, with a power of ten where Python has an exponent.
+    r"""Return a number with `digits` digits, and a power of ten in place of an exponent.
 
     Examples
     --------

@@ -114,7 +114,10 @@ def shell(surface: Surface, h: float) -> list[ColouredField]:
 
 
 def strains(surface: Surface, h: float) -> tuple[list[ColouredField], str]:
-    """Return the principal strains and a note; none where they are noise of the mesh."""
+    """Return the principal strains as coloured fields, and a note.
+
+    Both are empty where the strains are noise of the mesh. `h` is the thickness over R.
+    """
     if unresolved_strains_note(surface, h):
         return [], ""
     fields, notes = _principal(surface, STRAINS, surface.strain_jump)
@@ -124,7 +127,10 @@ def strains(surface: Surface, h: float) -> tuple[list[ColouredField], str]:
 
 
 def moments(surface: Surface, h: float) -> tuple[list[ColouredField], str]:
-    """Return the principal moments and a note, also on strains that are left out."""
+    """Return the principal moments as coloured fields, and a note, also on strains not drawn.
+
+    `h` is the thickness over R.
+    """
     fields, notes = _principal(surface, MOMENTS, surface.jump)
     if not fields:
         return [], ""
@@ -133,9 +139,9 @@ def moments(surface: Surface, h: float) -> tuple[list[ColouredField], str]:
 
 
 def unresolved_strains_note(surface: Surface, h: float) -> str:
-    """Return a note that strains are not drawn; empty where they are.
+    """Return a note that strains are not drawn, and why; empty where they are drawn.
 
-    They are left out where they are small beside those of bending and differ from cell to cell.
+    They are not drawn where they are small beside strains of bending and differ from cell to cell.
     """
     jump = surface.strain_jump or 0.0
     if not {*STRAINS, *MOMENTS} <= surface.fields.keys() or jump < UNRESOLVED_JUMP:
@@ -153,9 +159,9 @@ def unresolved_strains_note(surface: Surface, h: float) -> str:
 
 
 def stretches(surface: Surface) -> list[ColouredField]:
-    """Return stretches and true stresses of rubber; stresses are white at zero.
+    """Return stretches and true stresses of rubber as coloured fields; stresses are white at zero.
 
-    Shells of another law beside it have none.
+    Nodes of shells of another law are nan.
     """
     fields = []
     for name, caption in STRETCHES.items():
@@ -171,7 +177,15 @@ def stretches(surface: Surface) -> list[ColouredField]:
 
 
 def jump_note(jump: float | None, quantities: str) -> str:
-    """Return how far strains or moments of the cells are from the smooth field that is drawn."""
+    """Return a note on how far the cells' own values are from the smooth field that is drawn.
+
+    Parameters
+    ----------
+    jump
+        Their relative difference, see `recovery.relative_jump`; None gives an empty note.
+    quantities
+        "strains" or "moments".
+    """
     if jump is None:
         return ""
     rms = 100 * jump
@@ -183,29 +197,35 @@ def jump_note(jump: float | None, quantities: str) -> str:
 
 
 def _largest(surface: Surface, names: Iterable[str]) -> float:
-    """Return the largest magnitude of some fields."""
+    """Return the largest magnitude of the scalar fields `names` at any node."""
     return max(float(np.abs(surface.fields[name]).max()) for name in names)
 
 
 def _principal(
     surface: Surface, captions: dict[str, str], jump: float | None
 ) -> tuple[list[ColouredField], list[str]]:
-    """Return two principal fields with the same colours, white at zero, and notes on those left
-    out.
+    """Return two principal fields with the same colours, white at zero, and notes.
 
     The common limit makes rounding of a constant field invisible. A field that is zero beside the
-    other, or no larger than the noise of the mesh, is named and not drawn.
+    other, or no larger than the noise of the mesh, is named in a note and not drawn.
+
+    Parameters
+    ----------
+    captions
+        Name of each field -> caption, the larger principal value first.
+    jump
+        Difference of the cells' own values from the smooth field, relative; None for 0.
     """
     if not captions.keys() <= surface.fields.keys():
         return [], []
-    first, second = captions
-    noise = _noise(surface, first, second, jump or 0.0)
-    limit = max(_limit(surface, first, second), noise)
+    first_name, second_name = captions
+    noise = _noise(surface, first_name, second_name, jump or 0.0)
+    limit = max(_limit(surface, first_name, second_name), noise)
     fields, notes = list[ColouredField](), list[str]()
-    sizes = {name: float(np.abs(surface.fields[name]).max()) for name in captions}
+    magnitudes = {name: float(np.abs(surface.fields[name]).max()) for name in captions}
     for name, caption in captions.items():
         values = surface.fields[name]
-        if sizes[name] < ZERO_FRACTION * max(sizes.values()):
+        if magnitudes[name] < ZERO_FRACTION * max(magnitudes.values()):
             notes.append(f"The {caption.partition(' $')[0]} is zero everywhere.")
             continue
         if float(np.sqrt((values**2).mean())) < noise / LIMIT_OVER_NOISE:
@@ -213,42 +233,44 @@ def _principal(
             continue
         lowest, highest = from_zero(float(values.min()), float(values.max()), ZERO_FRACTION)
         limits = (-limit if lowest < 0 else 0.0, limit if highest > 0 else 0.0)
-        if max(sizes.values()) < ZERO_STRESS[first]:
+        if max(magnitudes.values()) < ZERO_STRESS[first_name]:
             limits = -limit, limit
         fields.append(ColouredField(name, values, limits, SIGNED, caption))
     return fields, notes
 
 
 def _noise(surface: Surface, first: str, second: str, jump: float) -> float:
-    """Return a colour limit far above the difference of the fields of cells from smooth ones.
+    """Return a colour limit far above the noise of the mesh in two principal fields.
 
-    With it a field that is zero but for the mesh is pale.
+    With it a field that is zero but for the mesh is pale. `jump` is the relative difference of the
+    cells' own values from the smooth fields.
     """
-    sizes = surface.fields[first] ** 2 + surface.fields[second] ** 2
-    return LIMIT_OVER_NOISE * jump * float(np.sqrt(sizes.mean()))
+    squares = surface.fields[first] ** 2 + surface.fields[second] ** 2
+    return LIMIT_OVER_NOISE * jump * float(np.sqrt(squares.mean()))
 
 
 def _limit(surface: Surface, first: str, second: str) -> float:
-    """Return the colour limit of two fields: their largest magnitude.
+    """Return the colour limit of two fields: their largest magnitude, without peaks of small area.
 
-    Peaks of small area, such as at a point load, are cut off.
+    Such a peak is at a point load, for instance.
     """
-    size = np.maximum(np.abs(surface.fields[first]), np.abs(surface.fields[second]))
-    if (largest := float(size.max())) < ZERO_STRESS[first]:
+    magnitude = np.maximum(np.abs(surface.fields[first]), np.abs(surface.fields[second]))
+    if (largest := float(magnitude.max())) < ZERO_STRESS[first]:
         return 1.0
-    in_cells = size[surface.cells].mean(axis=1)
+    in_cells = magnitude[surface.cells].mean(axis=1)
     a, b, c = np.moveaxis(surface.r0[surface.cells[:, :3]], 1, 0)
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     order = np.argsort(in_cells)
+    # magnitude that all but a small part of the area does not exceed
     quantile = in_cells[order][np.searchsorted(np.cumsum(area[order]), AREA_QUANTILE * area.sum())]
     return float(min(largest, max(PEAK * quantile, ZERO_STRESS[first])))
 
 
 def couple(surface: Surface) -> Array | None:
-    """Return the moment (n, 3) of the field on the carried remanence per area, over h E λ_m.
+    """Return the couple (n, 3) of the field on the carried remanence per area, over h E λ_m.
 
-    None without a field. λ_m is the largest length of the applied field, so that for a uniform
-    field the result is the product of unit vectors.
+    None without a field. λ_m is the largest magnitude of the applied field; in a uniform field the
+    result is the product of unit vectors.
     """
     fields = surface.fields
     if not {"Br", "Ba"} <= fields.keys():
@@ -260,7 +282,7 @@ def couple(surface: Surface) -> Array | None:
 
 
 def loads(surface: Surface, h: float) -> tuple[list[ColouredField], str]:
-    """Return the magnetic loads that are not zero everywhere, and a note on those left out."""
+    """Return the magnetic loads that are not zero everywhere, and a note on the others."""
     fields = surface.fields
     magnetic_couple = couple(surface)
     if magnetic_couple is None:
@@ -289,7 +311,7 @@ def loads(surface: Surface, h: float) -> tuple[list[ColouredField], str]:
 
 
 def contact(surface: Surface) -> list[ColouredField]:
-    """Return the gap and the contact pressure.
+    """Return gap and contact pressure as coloured fields.
 
     Empty without contact; the gap alone where the mesh resolves no pressure.
     """
@@ -324,9 +346,10 @@ def pressure_note(surface: Surface) -> str:
 
 
 def contact_region(surface: Surface) -> Array | None:
-    """Return places (8, 3) around the contact.
+    """Return eight places (8, 3) around the contact, the corners of a box.
 
-    None without contact, or if it is large enough to be seen in a picture of the whole shell.
+    None without contact, or if the contact is large enough to be seen in a picture of the whole
+    shell.
     """
     r = surface.r0 + surface.u
     in_contact = r[(surface.fields["contact_pressure"] > 0) | (surface.fields["gap_over_h"] < 1)]

@@ -52,12 +52,12 @@ MAX_COVERED = 0.02  # of the points of all curves, that an inset may cover
 def curve_figure(
     rows: Sequence[Row], amplitude: str, style: OutputSection, pole: str = POLE
 ) -> "Figure":
-    """Return the figure of the part of the path in which `amplitude` varied, and its branches.
+    """Return the figure of the part of a path in which `amplitude` varied, with its branches.
 
-    Instabilities are marked and numbered. For a programme each step is drawn, the last one largest,
-    without steps of a single straight line. Stable parts are solid, unstable parts dashed; an
-    unstable part that its marks would hide is drawn again in an inset. A user-defined amplitude is
-    drawn over the displacement of the pole.
+    Instabilities are marked and numbered. Of a programme each step is drawn, the last one largest;
+    earlier steps that are a single straight line are left out. Stable parts are solid, unstable
+    parts dashed. An unstable part that its marks would hide is drawn again in an inset. A
+    user-defined amplitude is drawn over the displacement of the pole.
 
     Parameters
     ----------
@@ -74,24 +74,30 @@ def curve_figure(
     width = (style.width or (ONE_COLUMN if len(steps) == 1 else TWO_COLUMNS)) / INCH
     if last_is_wide and last_number:
         columns = min(last_number, 3)
-        small_rows = -(-last_number // columns)
+        small_row_count = -(-last_number // columns)
         last_height = 0.45 * width
     else:
-        columns, small_rows = len(steps), 0
+        columns, small_row_count = len(steps), 0
         last_height = width * (0.75 / columns)
     small_height = 0.75 * width / max(columns, 2)
     with drawing(style):
         figure = Figure(
-            figsize=(width, last_height + small_rows * small_height),
+            figsize=(width, last_height + small_row_count * small_height),
             dpi=style.dpi,
             layout="constrained",
         )
-        grid = figure.add_gridspec(
-            small_rows + 1, columns, height_ratios=[small_height] * small_rows + [last_height]
+        grid_of_axes = figure.add_gridspec(
+            small_row_count + 1,
+            columns,
+            height_ratios=[small_height] * small_row_count + [last_height],
         )
         for i, step in enumerate(steps):
             spans_row = last_is_wide and i == last_number
-            cell = grid[small_rows, :] if spans_row else grid[i // columns, i % columns]
+            cell = (
+                grid_of_axes[small_row_count, :]
+                if spans_row
+                else grid_of_axes[i // columns, i % columns]
+            )
             axes = figure.add_subplot(cell)
             plot_curve(axes, step, pole)
             axes.set_title(step.title)
@@ -103,39 +109,46 @@ def curve_figure(
 
 
 def worth_drawing(parts: Sequence[CurveStep]) -> list[CurveStep]:
-    """Return the steps of a curve without those of a single straight line; the last one always."""
+    """Return the steps whose curve is not a single straight line, and always the last step."""
     widths: dict[str, float] = defaultdict(float)  # of the curves over each quantity
-    names = [axes_for(part)[0].name for part in parts]
-    for name, part in zip(names, parts, strict=True):
-        widths[name] = max(widths[name], float(np.ptp(_points(part)[0])))
-    bent = (
-        part
-        for name, part in zip(names[:-1], parts[:-1], strict=True)
-        if _bends(part, WIDTH_TOLERANCE * widths[name])
+    names = [axes_for(step)[0].name for step in parts]
+    for name, step in zip(names, parts, strict=True):
+        widths[name] = max(widths[name], float(np.ptp(_points(step)[0])))
+    bent_steps = (
+        step
+        for name, step in zip(names[:-1], parts[:-1], strict=True)
+        if _bends(step, WIDTH_TOLERANCE * widths[name])
     )
-    return [*bent, parts[-1]]
+    return [*bent_steps, parts[-1]]
 
 
 def _points(step: CurveStep) -> Array:
-    """Return the points of a curve (2, rows)."""
+    """Return the coordinates (2, rows) of a step's rows in the axes of its curve."""
     return np.array([curve_coordinates(row, step.amplitude) for row in step.rows]).T
 
 
 def _bends(step: CurveStep, min_width: float) -> bool:
-    """Whether a curve is no straight line; one narrower than `min_width` is an upright line."""
+    """Whether the curve of a step is no straight line.
+
+    A curve narrower than `min_width`, in the unit of its x axis, counts as an upright line.
+    """
     x, y = _points(step)
     if np.ptp(x) <= min_width:
         return False
     width, height = (float(np.ptp(values)) or 1.0 for values in (x, y))
     x, y = (x - x[0]) / width, (y - y[0]) / height
     chord_x, chord_y = x[-1], y[-1]
-    chord = float(np.hypot(chord_x, chord_y)) or 1.0
+    chord_length = float(np.hypot(chord_x, chord_y)) or 1.0
+    # distance from the chord times its length, in axes scaled to one
     distance = np.abs(x * chord_y - y * chord_x).max()
-    return bool(len(x) > 2 and distance > STRAIGHTNESS_TOLERANCE * chord)
+    return bool(len(x) > 2 and distance > STRAIGHTNESS_TOLERANCE * chord_length)
 
 
 def legend(figure: "Figure", max_columns: int) -> None:
-    """Draw one legend above all axes, where it covers no curve."""
+    """Draw one legend above all axes of a figure, where it covers no curve.
+
+    Equal names are one entry; `max_columns` is the largest number of entries in a row.
+    """
     entries = dict[str, Any]()
     for axes in figure.axes:
         handles, names = axes.get_legend_handles_labels()
@@ -153,7 +166,10 @@ def legend(figure: "Figure", max_columns: int) -> None:
 
 
 def plot_curve(axes: "Axes", step: CurveStep, pole: str = POLE) -> None:
-    """Draw a step of a path in given axes."""
+    """Draw a step of a path in given axes: curve, instabilities, solutions, numbers and labels.
+
+    `pole` names the point of w_pole_over_h in a case without named points.
+    """
     x_label, y_label = (
         with_point_name(axis_quantity, step.rows[0], pole, r"\$").label
         for axis_quantity in axes_for(step)
@@ -192,14 +208,18 @@ def plot_curve(axes: "Axes", step: CurveStep, pole: str = POLE) -> None:
 def draw_lines(
     axes: "Axes", step: CurveStep, colour: str = "C0", place_of: PlaceOf | None = None
 ) -> list[Array]:
-    """Draw the lines, points and marks of a step, and return its smooth curves (2, n).
+    """Draw the lines, points and marks of a step, and return its smooth curves.
 
     Parameters
     ----------
     colour
-        Of the lines and points.
+        Colour of lines and points.
     place_of
-        The coordinates of a row; by default those of the curve of the amplitude.
+        Coordinates of a row; by default those of the curve of the amplitude.
+
+    Returns
+    -------
+    Coordinates (2, n) of each line.
     """
     curves = list[Array]()
     coordinates = place_of or (lambda row: curve_coordinates(row, step.amplitude))
@@ -213,8 +233,8 @@ def draw_lines(
         segments = _segments(line, curve, crossings, coordinates)
         for unstable, group in groupby(segments, key=lambda segment: segment[2]):
             ends = [(first, last) for first, last, _ in group]
-            part = curve[:, ends[0][0] : ends[-1][1] + 1]
-            axes.plot(*part, color=colour, lw=1.2, linestyle=DASHED if unstable else "-")
+            part_of_curve = curve[:, ends[0][0] : ends[-1][1] + 1]
+            axes.plot(*part_of_curve, color=colour, lw=1.2, linestyle=DASHED if unstable else "-")
         dots = [
             coordinates(row) for row in line.rows if row["label"] in ("target", "step", "field")
         ]
@@ -237,10 +257,21 @@ def draw_lines(
 def _segments(
     line: Line, curve: Array, crossings: Sequence[Row], place_of: PlaceOf
 ) -> Iterator[tuple[int, int, bool]]:
-    """Yield the first and last point of each segment of a smooth curve, and whether it is unstable.
+    """Yield (first point, last point, is unstable) of each segment of a smooth curve.
 
-    Between two rows a symmetry-breaking mode crosses zero at the first or the last of the
-    `crossings` there.
+    If a symmetry-breaking mode becomes neutral between two rows, the segment is divided there.
+
+    Parameters
+    ----------
+    line
+        Rows along the curve.
+    curve
+        (2, n) points of the smooth curve, SEGMENTS_PER_INTERVAL for each interval between rows.
+    crossings
+        Rows at which such a mode is neutral; the first or the last of those between two rows
+        divides.
+    place_of
+        Coordinates of a row.
     """
     extent = np.ptp(curve, axis=1)[:, None]
     for i, unstable in enumerate(line.unstable):
@@ -262,33 +293,45 @@ def _segments(
 
 
 def hidden_box(axes: "Axes", step: CurveStep) -> Array | None:
-    """Return the corners (2, 2) around the first unstable part of a curve that its marks hide.
+    """Return the box around the first unstable part of a curve that its marks hide.
 
-    None if all unstable parts can be seen.
+    Returns
+    -------
+    Lower left and upper right corner (2, 2) in data coordinates; None if no unstable part is
+    hidden.
     """
     for line in line_coordinates(step):
         places = [curve_coordinates(row, step.amplitude) for row in line.rows]
         load_coordinate = load_axis(step.amplitude)
         curve = line.smooth_curve(*zip(*places, strict=True), load_axis=load_coordinate)
         for first, last, unstable in line.segments:
-            part = curve[:, first * SEGMENTS_PER_INTERVAL : last * SEGMENTS_PER_INTERVAL + 1]
-            size = np.ptp(axes.transData.transform(part.T), axis=0) * 72 / axes.figure.dpi
-            if unstable and line.rows[last]["label"] in LOCATED and max(size) < HIDDEN_SIZE:
-                low, high = part.min(axis=1), part.max(axis=1)
+            part_of_curve = curve[
+                :, first * SEGMENTS_PER_INTERVAL : last * SEGMENTS_PER_INTERVAL + 1
+            ]
+            size_in_points = (
+                np.ptp(axes.transData.transform(part_of_curve.T), axis=0) * 72 / axes.figure.dpi
+            )
+            if (
+                unstable
+                and line.rows[last]["label"] in LOCATED
+                and max(size_in_points) < HIDDEN_SIZE
+            ):
+                low, high = part_of_curve.min(axis=1), part_of_curve.max(axis=1)
                 margin = INSET_MARGIN * (high - low)
                 return np.array([low - margin, high + margin])
     return None
 
 
 def draw_hidden(axes: "Axes", step: CurveStep) -> None:
-    """Draw an unstable part that its marks hide once more in an inset.
+    """Draw in an inset the unstable part that its marks hide; do nothing if none is hidden.
 
-    The inset is in the corner with the fewest points of the curves; there is none where all corners
-    are covered.
+    The inset is in the corner with the fewest points of the curves. It is left out where all
+    corners are covered.
     """
     if (box := hidden_box(axes, step)) is None:
         return
     points = drawn_points(axes)
+    # in units of the axes, from 0 to 1
     places = axes.transAxes.inverted().transform(axes.transData.transform(points))
     far_side = 0.97 - INSET_SIZE
     corners = [(x, y) for y in (INSET_GAP, far_side) for x in (far_side, INSET_GAP)]
@@ -315,7 +358,10 @@ def drawn_points(axes: "Axes") -> Array:
 
 
 def _once(axes: "Axes", name: str) -> str:
-    """Return a label of the legend, "_" if it is there already: matplotlib leaves that out."""
+    """Return `name` as a label of the legend, or "_" if the axes have that label already.
+
+    Matplotlib leaves out labels that begin with "_".
+    """
     return "_" if name in axes.get_legend_handles_labels()[1] else name
 
 
@@ -325,11 +371,18 @@ MAX_NAMED_WAVES = 12  # waves in the legend
 def frequencies_figure(
     frequencies: Sequence[Frequency], rows: Sequence[Row], style: OutputSection
 ) -> "Figure":
-    """Return the figure of frequencies over the amplitude that varied last.
+    """Return the figure of natural frequencies over the amplitude that varied last.
 
     The n-th lowest frequency of each wave is one line. Frequencies of one point alone are drawn
-    over the number of waves, where all have one, else over the number of the mode. They are in Hz
-    with a density, those of unstable modes below zero; else ω² ρ R²/E.
+    over their number of waves if all have one, else over the number of the mode. With a density
+    they are in Hz, those of unstable modes below zero; without one the figure shows ω² ρ R²/E.
+
+    Parameters
+    ----------
+    frequencies
+        Frequencies of all points, ascending at each.
+    rows
+        Rows of path.csv with fields; frequencies of other points are left out.
     """
     from matplotlib.figure import Figure
     from matplotlib.ticker import MaxNLocator
@@ -388,7 +441,10 @@ def frequencies_figure(
 
 
 def _hertz_per_root(frequencies: Sequence[Frequency]) -> float:
-    """Return the frequency in Hz of omega2 = 1; 0 without a density."""
+    """Return the frequency in Hz of omega2 = 1; 0 without a density.
+
+    A frequency in Hz is this factor times the root of its omega2 = ω² ρ R²/E.
+    """
     return max(
         (
             frequency.hertz / np.sqrt(frequency.omega2)

@@ -46,7 +46,7 @@ OPAQUE = 127  # of 255: pixels with a larger opacity belong to a shell
 
 
 def runs_figure(runs: Mapping[Path, Sequence[Row]], style: OutputSection) -> "Figure":
-    """Return the last curve of each run in one picture; labels say in what their cases differ.
+    """Return the last curve of each run in one picture, with labels that say how the cases differ.
 
     Parameters
     ----------
@@ -104,7 +104,9 @@ def _last_step(folder: Path, rows: Sequence[Row]) -> CurveStep:
 
 
 def labels(cases: Mapping[Path, Mapping[str, Any]]) -> list[str]:
-    """Return for each run the values of the keys in which the cases differ, or its folder's name.
+    """Return a label for each run: the values of the keys in which the cases differ.
+
+    If too many keys differ, or none, the labels are the names of the folders.
 
     Examples
     --------
@@ -114,18 +116,23 @@ def labels(cases: Mapping[Path, Mapping[str, Any]]) -> list[str]:
     """
     flat_cases = [dict(_flat(case)) for case in cases.values()]
     all_keys = dict.fromkeys(key for case in flat_cases for key in case)
-    differing = [key for key in all_keys if len({str(case.get(key)) for case in flat_cases}) > 1]
-    if not 0 < len(differing) <= MAX_KEYS:
+    differing_keys = [
+        key for key in all_keys if len({str(case.get(key)) for case in flat_cases}) > 1
+    ]
+    if not 0 < len(differing_keys) <= MAX_KEYS:
         return [folder.name.replace("$", r"\$") for folder in cases]
     names = []
     for case in flat_cases:
-        values = [f"{_key_words(key)} = {_value_words(case.get(key))}" for key in differing]
+        values = [f"{_key_words(key)} = {_value_words(case.get(key))}" for key in differing_keys]
         names.append(", ".join(values))
     return names
 
 
 def _flat(section: Any, path: str = "") -> Iterator[tuple[str, Any]]:
-    """Yield key with its path and value, of all values of a case but those of its pictures."""
+    """Yield (key path, value) of all single values of a case, except those of the section `output`.
+
+    `path` is the key path of `section`; empty for the whole case.
+    """
     items = section.items() if isinstance(section, Mapping) else enumerate(section)
     for key, value in items:
         name = f"{path}.{key}" if path else str(key)
@@ -138,13 +145,13 @@ def _flat(section: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _key_words(key: str) -> str:
-    """Return the symbol or the words of a key."""
+    """Return the symbol of the quantity with the name of a key, else the name in words."""
     name = key.rpartition(".")[2]
     return QUANTITIES[name].latex if name in QUANTITIES else name.replace("_", " ")
 
 
 def _value_words(value: Any) -> str:
-    """Return a value of a case as text."""
+    """Return a value of a case as text for matplotlib."""
     if isinstance(value, float | int):
         return f"{value:.6g}".replace("-", "−")
     return str(value).replace("$", r"\$")
@@ -157,26 +164,33 @@ def add_shapes(
     style: OutputSection,
     camera: Camera,
 ) -> None:
-    """Put the shell at some points on the curves of a figure, with a line from each to its point.
+    """Draw the shell at some points on the curves of a figure, with a line from each to its point.
 
-    Each shell is where it covers least. All have one scale; displacements that would not be seen
-    are drawn larger, which the title says.
+    Each shell is where it covers least. All are of one scale. Displacements too small to be seen
+    are magnified, and the title says so.
+
+    Parameters
+    ----------
+    figure, steps
+        Figure with one curve for each step, in this order.
+    shapes
+        Row of path.csv of each point, and the deformed shell there.
     """
-    numbers = [
+    curve_numbers = [
         next((i for i in range(len(steps) - 1, -1, -1) if row in steps[i].rows), None)
         for row, _ in shapes
     ]
     factor = magnification([surface for _, surface in shapes])
     magnified = [replace(surface, u=factor * surface.u) for _, surface in shapes]
     if factor > 1:
-        for curve_number in dict.fromkeys(i for i in numbers if i is not None):
+        for curve_number in dict.fromkeys(i for i in curve_numbers if i is not None):
             axes = figure.axes[curve_number]
             title = f"{axes.get_title()}; " if axes.get_title() else ""
             axes.set_title(rf"{title}displacements of shapes $\times$ {factor:g}")
     figure.draw_without_rendering()
     places = camera(np.concatenate([surface.r0 + surface.u for surface in magnified]))
     occupied = dict[int, list[Array]]()
-    for number, (row, _), surface in zip(numbers, shapes, magnified, strict=True):
+    for number, (row, _), surface in zip(curve_numbers, shapes, magnified, strict=True):
         if number is None:
             continue
         axes = figure.axes[number]
@@ -186,20 +200,28 @@ def add_shapes(
         width = max(int(room), 8)
         window = Window.around(places, width)
         image = _cropped(Background(surface, camera, width, window).grey_image(GREY))
-        size = np.array([image.shape[1] / box.width, image.shape[0] / box.height])
+        size_over_axes = np.array([image.shape[1] / box.width, image.shape[0] / box.height])
         point = np.array(curve_coordinates(row, steps[number].amplitude))
-        corner = _free_corner(axes, point, size, occupied.setdefault(number, []))
-        occupied[number].append(np.array([corner, corner + size]))
-        _add_shape(axes, image, point, corner, size)
+        corner = _free_corner(axes, point, size_over_axes, occupied.setdefault(number, []))
+        occupied[number].append(np.array([corner, corner + size_over_axes]))
+        _add_shape(axes, image, point, corner, size_over_axes)
         if row["label"] not in LOCATED:  # those have marks
             axes.plot(*point, "o", color="k", markersize=MARK_SIZE, zorder=5)
 
 
 def _add_shape(axes: "Axes", image: Image, point: Array, corner: Array, size: Array) -> None:
-    """Put an image at a corner of the axes, with a line to a point of the data."""
+    """Draw an image at a corner of the axes, with a line to a point of the data.
+
+    Parameters
+    ----------
+    point
+        (2,) in data coordinates.
+    corner, size
+        (2,) lower left corner and size of the image, over the axes.
+    """
     from matplotlib.offsetbox import AnnotationBbox, OffsetImage
 
-    line = {
+    line_style = {
         "arrowstyle": "-",
         "color": "0.5",
         "linewidth": 0.6,
@@ -208,14 +230,17 @@ def _add_shape(axes: "Axes", image: Image, point: Array, corner: Array, size: Ar
     }
     end = _nearest(axes, image, point, corner, size)
     begin, (x, y) = (float(point[0]), float(point[1])), corner + size / 2
-    axes.annotate("", begin, end, textcoords="axes fraction", arrowprops=line, zorder=3)
+    axes.annotate("", begin, end, textcoords="axes fraction", arrowprops=line_style, zorder=3)
     offset_image = OffsetImage(image, zoom=72 / axes.figure.dpi, resample=True)
     options: dict[str, Any] = {"xycoords": "axes fraction", "frameon": False, "pad": 0, "zorder": 3}
     axes.add_artist(AnnotationBbox(offset_image, (float(x), float(y)), **options))
 
 
 def _cropped(image: Image) -> Image:
-    """Return the drawn part of an image, with a line around what is drawn."""
+    """Return the drawn part of an image, with a line around the shell.
+
+    The image (height, width, 4) is transparent where nothing is drawn.
+    """
     opacity = image[..., 3:] / 255
     edge = EDGE_OPACITY * edge_of(opacity)
     lined = image.copy()
@@ -227,7 +252,10 @@ def _cropped(image: Image) -> Image:
 def _nearest(
     axes: "Axes", image: Image, point: Array, corner: Array, size: Array
 ) -> tuple[float, float]:
-    """Return where in the axes an image at a corner is nearest to a point of the data."""
+    """Return (x, y), over the axes, of the image's drawn pixel nearest to a point of the data.
+
+    `corner` and `size` are those of the image, over the axes.
+    """
     down, right = np.nonzero(image[..., 3] > OPAQUE)
     pixels = corner + size * np.column_stack(
         [(right + 0.5) / image.shape[1], 1 - (down + 0.5) / image.shape[0]]
@@ -239,7 +267,7 @@ def _nearest(
 
 
 def _free_corner(axes: "Axes", point: Array, size: Array, occupied: Sequence[Array]) -> Array:
-    """Return the lower left corner (2,) of a box that covers little and is near its point.
+    """Return the lower left corner (2,), over the axes, of a box that covers little near its point.
 
     Parameters
     ----------
@@ -255,6 +283,7 @@ def _free_corner(axes: "Axes", point: Array, size: Array, occupied: Sequence[Arr
     target = in_axes(axes.transData.transform(point))
 
     def cost(low: Array) -> float:
+        """Return the cost of a box at `low`: what it covers, and its distance from its point."""
         high = low + size
         covered = ((points > low) & (points < high)).all(axis=1).mean()
         overlap = sum(

@@ -43,9 +43,9 @@ def field_maps_figure(
     case: Mapping[str, Any],
     style: OutputSection,
 ) -> "Figure":
-    """Return the figure of |B| in colours and the field lines of the part in the plane.
+    """Return the figure of magnetic fields on planes: |B| in colours, and field lines in the plane.
 
-    Of a box it shows the plane nearest to its middle.
+    A box is shown by its plane nearest to the middle.
 
     Parameters
     ----------
@@ -80,7 +80,7 @@ def field_maps_figure(
 
 
 def plane_of(grid: MapGrid) -> MapGrid:
-    """Return the grid itself, or the layer of a box nearest to the middle of its third side."""
+    """Return the grid itself if it is a plane; of a box the layer nearest to its middle."""
     if len(grid.points) == 2:
         return grid
     nx, ny, nz = grid.points
@@ -93,7 +93,8 @@ def plane_of(grid: MapGrid) -> MapGrid:
 def section(surface: Surface, grid: MapGrid) -> Array:
     """Return the lines (n, 2, 3) over R in which a deformed surface meets the plane of a grid.
 
-    The surface is the mid-surface, or the surface of a solid.
+    Each line lies in one triangle. The surface is the mid-surface of a shell, or the surface of a
+    solid.
     """
     tessellation = tessellate(surface)
     places = tessellation.at_points(surface.r0 + surface.u)
@@ -104,41 +105,59 @@ def section(surface: Surface, grid: MapGrid) -> Array:
     corners, heights = places[tessellation.triangles], height[tessellation.triangles]
     crossed = np.abs(np.sign(heights).sum(axis=1)) < 3
     corners, heights = corners[crossed], heights[crossed]
+    # the corner that is alone on its side of the plane
     single_corner = np.where(
         np.sign(heights).sum(axis=1) > 0, heights.argmin(axis=1), heights.argmax(axis=1)
     )
     rows, ends = np.arange(len(corners)), list[Array]()
     for shift in (1, 2):
-        other = (single_corner + shift) % 3
-        height_of_corner, height_of_other = heights[rows, single_corner], heights[rows, other]
-        fraction = (height_of_corner / (height_of_corner - height_of_other))[:, None]
-        ends.append((1 - fraction) * corners[rows, single_corner] + fraction * corners[rows, other])
+        other_corner = (single_corner + shift) % 3
+        height_of_corner, height_of_other_corner = (
+            heights[rows, single_corner],
+            heights[rows, other_corner],
+        )
+        fraction = (height_of_corner / (height_of_corner - height_of_other_corner))[:, None]
+        ends.append(
+            (1 - fraction) * corners[rows, single_corner] + fraction * corners[rows, other_corner]
+        )
     return np.stack(ends, axis=1)
 
 
 def _draw(
     axes: "Axes", grid: MapGrid, R: float, surface: Surface, h: float, case: Mapping[str, Any]
 ) -> None:
-    """Draw a plane grid in axes; R is in metres, nan without units, h over R."""
+    """Draw the field on a plane grid in axes, with the section of the shell.
+
+    Parameters
+    ----------
+    R
+        In metres; nan for a case without units.
+    h
+        Thickness over R.
+    case
+        The case of summary.json.
+    """
     from matplotlib.collections import PolyCollection
     from matplotlib.patches import PathPatch
 
     size_of_unit, unit = unit_of(case)
-    length = 1.0 if isnan(R) else 1e3 * R
+    length_of_R = 1.0 if isnan(R) else 1e3 * R
     directions = grid.sides / np.linalg.norm(grid.sides, axis=1)[:, None]
     nx, ny = grid.points
     x, y = (
-        length * (e @ grid.corner + np.linspace(0, np.linalg.norm(side), n))
+        length_of_R * (e @ grid.corner + np.linspace(0, np.linalg.norm(side), n))
         for e, side, n in zip(directions, grid.sides, grid.points, strict=True)
     )
     B = size_of_unit * grid.values.reshape(ny, nx, 3)
-    size = np.linalg.norm(B, axis=-1)
-    norm, largest, is_logarithmic = _colour_norm(size)
-    image = axes.pcolormesh(x, y, masked(size), norm=norm, cmap="viridis", shading="nearest")
+    magnitude = np.linalg.norm(B, axis=-1)
+    norm, largest, is_logarithmic = _colour_norm(magnitude)
+    image = axes.pcolormesh(x, y, masked(magnitude), norm=norm, cmap="viridis", shading="nearest")
     in_plane = [B @ e for e in directions]
-    largest_in_plane = max(float(np.nanmax(np.abs(part), initial=0.0)) for part in in_plane)
+    largest_in_plane = max(
+        float(np.nanmax(np.abs(component), initial=0.0)) for component in in_plane
+    )
     if largest_in_plane > MIN_IN_PLANE_PART * largest:
-        along_x, along_y = (masked(part) for part in in_plane)
+        along_x, along_y = (masked(component) for component in in_plane)
         axes.streamplot(
             x,
             y,
@@ -152,25 +171,28 @@ def _draw(
     lines = section(surface, grid)
     axes.set(xlim=(x[0], x[-1]), ylim=(y[0], y[-1]), aspect="equal")
     axes.set(xlabel=_direction(directions[0], R), ylabel=_direction(directions[1], R))
-    place = _place(grid, directions, length, R)
+    place = _place(grid, directions, length_of_R, R)
     axes.set_title(f"{grid.name.replace('_', ' ')}\n{grid.words} field{place}")
     bar = axes.figure.colorbar(
         image, ax=axes, label=f"$|B|$  {unit}", location="bottom", fraction=0.05
     )
     if not is_logarithmic:
         bar.ax.xaxis.set_major_formatter(number_format())
-    plane_lines = length * np.stack([lines @ e for e in directions], axis=-1)
+    plane_lines = length_of_R * np.stack([lines @ e for e in directions], axis=-1)
     if surface.is_body:
         area = with_holes(outlines(plane_lines))
         axes.add_patch(PathPatch(area, color="0.15", linewidth=LINE_WIDTH))
     else:
-        rectangles = list(_thickened(plane_lines, length * h))
+        rectangles = list(_thickened(plane_lines, length_of_R * h))
         collection = PolyCollection(rectangles, color="0.15", linewidth=LINE_WIDTH)
         axes.add_collection(collection, autolim=False)
 
 
 def _colour_norm(size: Array) -> tuple["Normalize", float, bool]:
-    """Return the norm of colours of |B|, the largest |B|, and whether the norm is logarithmic."""
+    """Return the norm of colours for |B|, the largest |B|, and whether the norm is logarithmic.
+
+    `size` is |B| (ny, nx), with nan where there is no value.
+    """
     from matplotlib.colors import LogNorm, Normalize
 
     low = float(np.nanmin(size, initial=np.inf))
@@ -183,7 +205,7 @@ def _colour_norm(size: Array) -> tuple["Normalize", float, bool]:
 
 
 def _thickened(lines: Array, h: float) -> Array:
-    """Return lines (n, 2, 2) as rectangles (n, 4, 2) of a width h."""
+    """Return lines (n, 2, 2) as rectangles (n, 4, 2) of width h around them."""
     vectors = lines[:, 1] - lines[:, 0]
     offsets = np.stack([-vectors[:, 1], vectors[:, 0]], axis=-1)
     offsets *= h / 2 / np.maximum(np.linalg.norm(offsets, axis=1), TINY)[:, None]
@@ -199,7 +221,7 @@ def _thickened(lines: Array, h: float) -> Array:
 
 
 def outlines(lines: Array) -> list[Array]:
-    """Return the polygons that lines (n, 2, 2) with common ends make, in any order."""
+    """Return the closed polygons (k, 2) that lines (n, 2, 2) form, given in any order."""
     from scipy.spatial import cKDTree  # takes long to import
 
     lengths = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
@@ -208,6 +230,7 @@ def outlines(lines: Array) -> list[Array]:
         return []
     ends = lines.reshape(-1, 2)
     nearest, numbers = cKDTree(ends).query(ends, k=2)[1], np.arange(len(ends))
+    # the same point as an end of another line; ends 2 i and 2 i + 1 belong to line i
     twin = np.where(nearest[:, 0] == numbers, nearest[:, 1], nearest[:, 0])
     remaining, polygons = set(range(len(lines))), list[Array]()
     while remaining:
@@ -225,7 +248,10 @@ def outlines(lines: Array) -> list[Array]:
 
 
 def with_holes(polygons: Sequence[Array]) -> "MatplotlibPath":
-    """Return the area between polygons (n, 2): those within an odd number of others are holes."""
+    """Return the area between polygons (n, 2) as a path of matplotlib.
+
+    A polygon within an odd number of others is a hole.
+    """
     from matplotlib.path import Path as MatplotlibPath
 
     paths = [
@@ -235,8 +261,10 @@ def with_holes(polygons: Sequence[Array]) -> "MatplotlibPath":
     for path, polygon in zip(paths, polygons, strict=True):
         x, y = polygon.T
         corner = x[0], y[0]
-        enclosing = sum(other is not path and other.contains_point(corner) for other in paths)
-        is_hole = enclosing % 2
+        enclosing_count = sum(
+            other_path is not path and other_path.contains_point(corner) for other_path in paths
+        )
+        is_hole = enclosing_count % 2
         is_clockwise = np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) < 0
         if is_clockwise != is_hole:
             path = MatplotlibPath(np.asarray(path.vertices)[::-1], path.codes)
@@ -245,12 +273,24 @@ def with_holes(polygons: Sequence[Array]) -> "MatplotlibPath":
 
 
 def masked(values: Array) -> Any:
-    """Return values with nan masked."""
+    """Return values as a masked array without its nan."""
     return np.ma.masked_array(values, np.isnan(values))  # type: ignore[no-untyped-call]
 
 
 def _place(grid: MapGrid, directions: Array, length: float, R: float) -> str:
-    """Return words for the place of a plane, if it is one of x, y or z; else none."""
+    """Return words for the place of a plane of constant x, y or z, such as ", $z$ = 5 mm".
+
+    Empty for other planes.
+
+    Parameters
+    ----------
+    directions
+        (2, 3) unit vectors along the sides.
+    length
+        R in the unit of the picture.
+    R
+        In metres; nan without units.
+    """
     normal = np.abs(np.cross(*directions))
     number = int(normal.argmax())
     if normal[number] < PARALLEL:
@@ -260,7 +300,7 @@ def _place(grid: MapGrid, directions: Array, length: float, R: float) -> str:
 
 
 def _direction(e: Array, R: float) -> str:
-    """Return the label of an axis of the picture along a direction e (3,)."""
+    """Return the label of the picture's axis along a unit vector e (3,); R is nan without units."""
     unit = "/ $R$" if isnan(R) else "(mm)"
     for number, name in enumerate("xyz"):
         if abs(e[number]) > PARALLEL:

@@ -42,9 +42,9 @@ class Arrow:
     Attributes
     ----------
     feet, vectors
-        (n, 3) as the camera projects them.
+        (n, 3) places and vectors as the camera projects them: right, up, towards the eye.
     colour, name
-        Of all of them.
+        Colour of all arrows, and the name of the field.
     """
 
     feet: Array
@@ -55,16 +55,26 @@ class Arrow:
 
 @dataclass(frozen=True)
 class Panel:
-    """One view of a shell.
+    """One view of a shell in a figure.
 
     Attributes
     ----------
+    image
+        (height, width, 4) colours.
+    window
+        Part of the projection that the image shows.
+    camera
+        Projection.
+    scale
+        What the colours mean.
     lines
         Lines (n, 2) in the projection, with their pens: a grey, and matplotlib's name of dashes.
+    arrows
+        Arrows of fields.
     texts
-        Places in the projection, and letters there.
+        (x, y, letter) in the projection, of the poles of magnets.
     names
-        Places in the projection, and names of shells there.
+        (x, y, name) in the projection, of shells.
     """
 
     image: Image
@@ -78,7 +88,7 @@ class Panel:
 
     @property
     def frame(self) -> tuple[float, float, float, float]:
-        """Box (left, right, low, high) of the window, and of arrows that leave it."""
+        """Box (left, right, low, high) over R around the window and arrows that leave it."""
         left, right, low, high = self.window.box
         if not any(len(arrows.feet) for arrows in self.arrows):
             return self.window.box
@@ -103,22 +113,22 @@ class Panel:
 
 
 def drawing(style: OutputSection) -> AbstractContextManager[None]:
-    """Return a context with matplotlib's settings while a figure is made and written.
+    """Return a context with matplotlib's settings for making and writing a figure.
 
     Text stays text in svg and pdf.
     """
     import matplotlib
 
-    size = style.font_size
+    font_size = style.font_size
     settings: dict[str, Any] = {
-        "font.size": size,
-        "axes.labelsize": size,
-        "axes.titlesize": size,
-        "legend.fontsize": size,
+        "font.size": font_size,
+        "axes.labelsize": font_size,
+        "axes.titlesize": font_size,
+        "legend.fontsize": font_size,
     }
     settings |= {
-        "xtick.labelsize": 0.9 * size,
-        "ytick.labelsize": 0.9 * size,
+        "xtick.labelsize": 0.9 * font_size,
+        "ytick.labelsize": 0.9 * font_size,
         "axes.linewidth": 0.6,
     }
     settings |= {"svg.fonttype": "none", "pdf.fonttype": 42, "svg.hashsalt": "magshell"}
@@ -126,72 +136,94 @@ def drawing(style: OutputSection) -> AbstractContextManager[None]:
 
 
 def columns(panels: int) -> int:
-    """Return how many of so many panels are in a row."""
+    """Return the number of panels in a row, of `panels` in all."""
     if panels == 4:
         return 2
     return min(panels, 3)
 
 
 def panel_width(style: OutputSection, panels_per_row: int) -> int:
-    """Return the width of a panel's image in pixels, of so many panels in a row."""
+    """Return the width of a panel's image in pixels, with `panels_per_row` panels in a row."""
     width = style.width or (ONE_COLUMN if panels_per_row == 1 else TWO_COLUMNS)
     return max(int((width / panels_per_row - GAP) / INCH * style.dpi), 50)
 
 
 def panels_figure(panels: Sequence[Panel], style: OutputSection, note: str = "") -> "Figure":
-    """Return panels in rows, each above its colour bar; the directions once; a note at the foot."""
+    """Return a figure with panels in rows, each above its colour bar.
+
+    The directions of e1, e2, e3 are drawn once. `note` is at the foot. Lengths and places in the
+    code are in inches from the lower left of the figure.
+    """
     from matplotlib.figure import Figure
 
-    per_row, line = columns(len(panels)), LINE_HEIGHT * style.font_size
-    rows = -(-len(panels) // per_row)
+    per_row, line_height = columns(len(panels)), LINE_HEIGHT * style.font_size
+    row_count = -(-len(panels) // per_row)
     gap, dpi = GAP / INCH, style.dpi
     heights, widths = zip(*(panel.size for panel in panels), strict=True)
     image_height, cell_width = max(heights) / dpi, max(widths) / dpi + gap
     has_bar = any(panel.scale.colours for panel in panels)
-    below = (4.2 if has_bar else 0.4) * line
-    legend = max((sum(bool(arrows.name) for arrows in panel.arrows) for panel in panels), default=0)
-    above = gap / 2 + legend * line
-    cell_height = image_height + below + above
+    height_below = (4.2 if has_bar else 0.4) * line_height
+    legend_lines = max(
+        (sum(bool(arrows.name) for arrows in panel.arrows) for panel in panels), default=0
+    )
+    height_above = gap / 2 + legend_lines * line_height
+    cell_height = image_height + height_below + height_above
 
     # the directions are beside the first bar, else in a free panel or at the foot
     beside_bar = has_bar and per_row < 3
     free_panels = 0 if beside_bar else len(panels) % per_row
     at_foot = not beside_bar and not free_panels
-    indent = gap / 2 + (4.0 * line if at_foot else 0.0)
-    notes = _wrapped(note, cell_width * per_row - indent - gap / 2, style.font_size)
-    foot = max(len(notes) * line, 3.2 * line if at_foot else 0.0)
-    height = rows * cell_height + foot
+    indent = gap / 2 + (4.0 * line_height if at_foot else 0.0)
+    note_lines = _wrapped(note, cell_width * per_row - indent - gap / 2, style.font_size)
+    foot_height = max(len(note_lines) * line_height, 3.2 * line_height if at_foot else 0.0)
+    height = row_count * cell_height + foot_height
     figure = Figure(figsize=(cell_width * per_row, height), dpi=dpi)
     boxes = FigureBoxes(figure)
     for i, panel in enumerate(panels):
-        left, low = i % per_row * cell_width, height - (i // per_row + 1) * cell_height
+        left, lower = i % per_row * cell_width, height - (i // per_row + 1) * cell_height
         panel_height, width = (pixels / dpi for pixels in panel.size)
-        start = left + (cell_width - width) / 2
-        panel_low = low + below + (image_height - panel_height) / 2
-        draw_panel(boxes.axes(start, panel_low, width, panel_height), panel, style)
+        panel_left = left + (cell_width - width) / 2
+        panel_low = lower + height_below + (image_height - panel_height) / 2
+        draw_panel(boxes.axes(panel_left, panel_low, width, panel_height), panel, style)
         for k, arrows in enumerate(panel.arrows):
-            y = low + below + image_height + above - gap / 2 - (k + 0.5) * line
-            place = boxes.place(left + gap / 2, y)
-            figure.text(*place, arrows.name, color=arrows.colour, va="center")
+            y = (
+                lower
+                + height_below
+                + image_height
+                + height_above
+                - gap / 2
+                - (k + 0.5) * line_height
+            )
+            text_place = boxes.place(left + gap / 2, y)
+            figure.text(*text_place, arrows.name, color=arrows.colour, va="center")
         if panel.scale.colours:
-            spare = (4.4 if beside_bar else 2.2) * line  # a power of ten needs the other side
-            length = max(cell_width - gap - spare - 3.2 * line, 3 * line)
-            bar = boxes.axes(left + gap / 2 + spare, low + 1.7 * line, length, 0.65 * line)
-            room = length + (0.8 if beside_bar else 2 * 2.2) * line
-            colour_bar(figure, bar, panel.scale, room=room)
-    size, low = 3.4 * line, height - cell_height if beside_bar else foot
-    low += -3.3 * line if at_foot else 0.4 * line
-    box = boxes.axes(free_panels * cell_width + gap / 2, low, size, size)
-    directions(box, panels[0].camera, style)
-    for k, text in enumerate(reversed(notes)):
-        place = boxes.place(indent, (k + 0.5) * line)
-        figure.text(*place, text, va="center", fontsize=0.9 * style.font_size)
+            room_at_left = (
+                4.4 if beside_bar else 2.2
+            ) * line_height  # a power of ten needs the other side
+            bar_length = max(cell_width - gap - room_at_left - 3.2 * line_height, 3 * line_height)
+            bar_axes = boxes.axes(
+                left + gap / 2 + room_at_left,
+                lower + 1.7 * line_height,
+                bar_length,
+                0.65 * line_height,
+            )
+            caption_room = bar_length + (0.8 if beside_bar else 2 * 2.2) * line_height
+            colour_bar(figure, bar_axes, panel.scale, room=caption_room)
+    directions_size, lower = 3.4 * line_height, height - cell_height if beside_bar else foot_height
+    lower += -3.3 * line_height if at_foot else 0.4 * line_height
+    directions_axes = boxes.axes(
+        free_panels * cell_width + gap / 2, lower, directions_size, directions_size
+    )
+    directions(directions_axes, panels[0].camera, style)
+    for k, text in enumerate(reversed(note_lines)):
+        text_place = boxes.place(indent, (k + 0.5) * line_height)
+        figure.text(*text_place, text, va="center", fontsize=0.9 * style.font_size)
     return figure
 
 
 @dataclass(frozen=True)
 class FigureBoxes:
-    """Boxes in inches from the lower left of a figure."""
+    """Boxes of a figure, given in inches from its lower left."""
 
     figure: "Figure"
 
@@ -201,7 +233,7 @@ class FigureBoxes:
         return x / width, y / height
 
     def axes(self, left: float, low: float, width: float, height: float) -> "Axes":
-        """Return new axes in a box."""
+        """Return new axes in the box with lower left corner (left, low)."""
         return self.figure.add_axes((*self.place(left, low), *self.place(width, height)))
 
 
@@ -249,9 +281,10 @@ def draw_panel(axes: "Axes", panel: Panel, style: OutputSection) -> None:
 
 
 def _draw_arrows(axes: "Axes", arrows: Arrow, extent: float, style: OutputSection) -> None:
-    """Draw arrows in the plane of the picture.
+    """Draw the arrows of one field in the plane of the picture.
 
-    An arrow that points to the eye is a dot in a circle, one that points away a cross in it.
+    An arrow towards the eye is a dot in a circle, an arrow away from it a cross in a circle.
+    `extent` is the width of the panel over R.
     """
     in_picture, lengths = arrows.vectors[:, :2], np.linalg.norm(arrows.vectors, axis=1)
     is_point = np.linalg.norm(in_picture, axis=1) < MAX_SLOPE_TO_EYE * lengths
@@ -272,11 +305,11 @@ def _draw_arrows(axes: "Axes", arrows: Arrow, extent: float, style: OutputSectio
         headlength=5,
         headaxislength=4.5,
     )
-    size = (0.9 * style.font_size) ** 2
+    marker_area = (0.9 * style.font_size) ** 2
     axes.scatter(
         x[~is_point],
         y[~is_point],
-        s=size / 9 * thinness**2,
+        s=marker_area / 9 * thinness**2,
         color=arrows.colour,
         zorder=4,
         linewidths=0,
@@ -287,7 +320,7 @@ def _draw_arrows(axes: "Axes", arrows: Arrow, extent: float, style: OutputSectio
             axes.scatter(
                 x[points],
                 y[points],
-                s=size,
+                s=marker_area,
                 facecolors="white",
                 edgecolors=arrows.colour,
                 linewidths=0.8,
@@ -296,7 +329,7 @@ def _draw_arrows(axes: "Axes", arrows: Arrow, extent: float, style: OutputSectio
             axes.scatter(
                 x[points],
                 y[points],
-                s=size / 3,
+                s=marker_area / 3,
                 color=arrows.colour,
                 marker=marker,
                 linewidths=0.8,
@@ -305,7 +338,7 @@ def _draw_arrows(axes: "Axes", arrows: Arrow, extent: float, style: OutputSectio
 
 
 def directions(axes: "Axes", camera: Camera, style: OutputSection) -> None:
-    """Draw the directions of e1, e2, e3."""
+    """Draw arrows along e1, e2, e3 with their letters, as the camera sees them."""
     axes.set(xlim=(-1.5, 1.5), ylim=(-1.5, 1.5))
     axes.set_axis_off()
     on_screen = axes_on_screen(camera.direction)
@@ -318,40 +351,47 @@ def directions(axes: "Axes", camera: Camera, style: OutputSection) -> None:
     }
     letters = list[Array]()
     for number, (x, y) in enumerate(zip(*(0.9 * on_screen).T, strict=True), 1):
-        size = float(np.hypot(x, y))
-        if size < MIN_DIRECTION:  # it points to the eye, or away
+        length = float(np.hypot(x, y))
+        if length < MIN_DIRECTION:  # it points to the eye, or away
             axes.plot(0, 0, "k.", ms=0.4 * style.font_size)
-            x, y, size = -0.35, -0.35, 0.5
+            x, y, length = -0.35, -0.35, 0.5
         else:
             axes.annotate("", (x, y), (0, 0), arrowprops=arrow)
-        letters.append(_letter_place(np.array([x, y]), size, letters))
+        letters.append(_letter_place(np.array([x, y]), length, letters))
         axes.text(
             float(letters[-1][0]), float(letters[-1][1]), f"$e_{number}$", ha="center", va="center"
         )
 
 
 def _letter_place(end: Array, size: float, others: Sequence[Array]) -> Array:
-    """Return the place (2,) of the letter of an arrow.
+    """Return the place (2,) of the letter of an arrow from the origin.
 
-    It is ahead of the arrow's end, or beside it if another letter is there.
+    Parameters
+    ----------
+    end
+        (2,) end of the arrow.
+    size
+        Length of the arrow.
+    others
+        Places of earlier letters; the letter is beside the arrow if one of them is ahead of it.
     """
     forward, sideways = 0.4 * end / size, LETTER_DISTANCE * np.array([-end[1], end[0]]) / size
     places = [end + forward, end + sideways, end - sideways]
     for place in places:
-        if all(np.linalg.norm(place - other) > LETTER_DISTANCE for other in others):
+        if all(np.linalg.norm(place - other_letter) > LETTER_DISTANCE for other_letter in others):
             return np.asarray(place)
     return np.asarray(places[0])
 
 
 def _wrapped(text: str, inches: float, size: float) -> list[str]:
-    """Return a text in lines that fit a width, with letters of a size in points."""
+    """Return a text in lines that fit into a width in inches; `size` is the font's in points."""
     import textwrap
 
     return textwrap.wrap(text, max(int(inches * 72 / (LETTER_WIDTH * size)), 20)) if text else []
 
 
 def figure_files(figure: "Figure", style: OutputSection, name: str) -> Iterator[tuple[str, bytes]]:
-    """Yield names and contents of a figure's files: PNG and the further formats."""
+    """Yield names and contents of a figure's files: `name`.png, and one in each further format."""
     with drawing(style):
         yield f"{name}.png", png(figure)
     for kind in dict.fromkeys(kind for kind in style.formats if kind != "png"):
@@ -365,7 +405,7 @@ DATE_KEYS = {"svg": "Date", "pdf": "CreationDate"}  # of metadata
 
 
 def png(figure: "Figure") -> bytes:
-    """Return the content of a PNG file, without the fourth channel that Matplotlib writes."""
+    """Return a figure as a PNG file, without the channel of opacity that Matplotlib writes."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from PIL import Image as Pillow
 

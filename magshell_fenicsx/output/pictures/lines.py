@@ -1,6 +1,4 @@
-"""Curves of a run as data, for pictures and the report alike: steps, lines of points, smooth
-curves.
-"""
+"""Curves of a run as data, for pictures and the report: steps, lines, smooth curves."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -28,13 +26,13 @@ class CurveStep:
     Attributes
     ----------
     amplitude
-        The amplitude that varied.
+        Name of the amplitude that varied.
     rows
-        Its rows of path.csv, after the row before the step.
+        Rows of path.csv of the step, after the last row before it.
     title
         Title of the curve.
     numbers
-        Number of a point -> number of its instability.
+        Number of a point -> number of the instability there.
     """
 
     amplitude: str
@@ -44,38 +42,51 @@ class CurveStep:
 
 
 def instability_numbers(rows: Sequence[Row]) -> dict[int, int]:
-    """Return point -> number of its instability, from 1 along path.csv.
+    """Return number of a point -> number of its instability, from 1 along path.csv.
 
-    So instabilities are numbered in all pictures and tables.
+    All pictures and tables number instabilities in this way.
     """
     located = [row for row in rows if row["label"] in LOCATED]
     return {int(row["point"]): number for number, row in enumerate(located, 1)}
 
 
 def curve_steps(rows: Sequence[Row], amplitude: str) -> list[CurveStep]:
-    """Return the steps of a programme, or the last part in which the amplitude varied."""
+    """Return the steps of a programme as curves, or the part in which `amplitude` varied.
+
+    Parameters
+    ----------
+    rows
+        Rows of path.csv.
+    amplitude
+        The amplitude that varied last.
+    """
     steps = sorted({int(row.get("step", 0)) for row in rows if row["label"] != "field"} - {0})
     numbers = instability_numbers(rows)
     if len(steps) < 2:
         return [CurveStep(amplitude, last_varied_rows(rows, amplitude), "", numbers)]
     curves = []
     for step in steps:
-        first = next(i for i, row in enumerate(rows) if row["step"] == step)
-        previous = max((i for i in range(first) if rows[i]["branch"] == 0), default=0)
-        rows_of_step = [row for row in rows[first:] if row["step"] == step]
+        first_row = next(i for i, row in enumerate(rows) if row["step"] == step)
+        row_before = max((i for i in range(first_row) if rows[i]["branch"] == 0), default=0)
+        rows_of_step = [row for row in rows[first_row:] if row["step"] == step]
         name = str(rows_of_step[0]["amplitude"])
         words = quantity(registered(name).column).words
         title = f"step {step}: {words}"
-        curves.append(CurveStep(name, [rows[previous], *rows_of_step], title, numbers))
+        curves.append(CurveStep(name, [rows[row_before], *rows_of_step], title, numbers))
     return curves
 
 
 def last_varied_rows(rows: Sequence[Row], amplitude: str) -> Sequence[Row]:
-    """Return the last part of a path in which an amplitude varied."""
+    """Return the last rows of a path, in which an amplitude varied, after the row before them.
+
+    For the field's amplitude lambda_m they are all rows.
+    """
     if amplitude == "lambda_m":
         return rows
-    first = max(i for i, row in enumerate(rows) if row["amplitude"] != amplitude or row is rows[0])
-    return rows[first:]
+    first_row = max(
+        i for i, row in enumerate(rows) if row["amplitude"] != amplitude or row is rows[0]
+    )
+    return rows[first_row:]
 
 
 def axes_for(step: CurveStep) -> tuple[Quantity, Quantity]:
@@ -90,7 +101,7 @@ def axes_for(step: CurveStep) -> tuple[Quantity, Quantity]:
 
 
 def curve_coordinates(row: Row, amplitude: str) -> tuple[float, float]:
-    """Return the coordinates of a point in the axes of its curve."""
+    """Return x and y of a row of path.csv in the axes of the curve of `amplitude`."""
     x, y = axes_of(amplitude, row)
     return x.on_axis(row), y.on_axis(row)
 
@@ -98,7 +109,16 @@ def curve_coordinates(row: Row, amplitude: str) -> tuple[float, float]:
 def with_point_name(of_point: Quantity, row: Row, pole: str = POLE, dollar: str = "$") -> Quantity:
     """Return a quantity whose words name the point of `w_pole_over_h`.
 
-    `dollar` replaces that sign in the name.
+    Parameters
+    ----------
+    of_point
+        The quantity, whose words may contain `POLE`.
+    row
+        A row of path.csv, which names the case's points.
+    pole
+        Name of the point in a case without named points.
+    dollar
+        Text for a dollar sign in a name, which would begin mathematics in matplotlib.
     """
     name = pole_name(row, pole).replace("$", dollar)
     return replace(
@@ -107,9 +127,9 @@ def with_point_name(of_point: Quantity, row: Row, pole: str = POLE, dollar: str 
 
 
 def is_unstable(row: Row) -> bool:
-    """Whether the model, or a mode that it excludes, is unstable.
+    """Whether the model at a row of path.csv, or a mode that it excludes, is unstable.
 
-    A path.csv of an earlier version has no excluded_pivots.
+    A path.csv of an earlier version has no column `excluded_pivots`.
     """
     return _unstable_count(row) > 0
 
@@ -125,6 +145,8 @@ class Line:
 
     Attributes
     ----------
+    rows
+        Rows of path.csv in their order along the line.
     in_time
         Whether the points are those of a motion, joined by a spline over the time.
     amplitude
@@ -137,18 +159,19 @@ class Line:
 
     @property
     def unstable(self) -> list[bool]:
-        """Whether each segment between two rows is unstable.
+        """Whether each segment between two rows is unstable, (rows - 1).
 
-        A segment is as its end, or if that is located as its beginning. Between two located rows
-        the number of unstable directions is that of a row, or one more, at both.
+        A segment is as its last row, or as its first row if the last one is a fold or bifurcation.
+        If both are, the number of unstable directions changes by one at each of them.
         """
         are_unstable: list[bool] = []
-        for first, last in pairwise(self.rows):
-            not_located = [row for row in (last, first) if row["label"] not in LOCATED]
+        for first_row, last_row in pairwise(self.rows):
+            not_located = [row for row in (last_row, first_row) if row["label"] not in LOCATED]
             if not_located:
                 are_unstable.append(is_unstable(not_located[0]))
                 continue
-            first_count, last_count = _unstable_count(first), _unstable_count(last)
+            first_count, last_count = _unstable_count(first_row), _unstable_count(last_row)
+            # between the two rows: as many as at each of them, or one more
             possible_counts = {first_count, first_count + 1} & {last_count, last_count + 1}
             alternates = not (are_unstable and are_unstable[-1])
             are_unstable.append(min(possible_counts, default=0) > 0 or alternates)
@@ -156,16 +179,16 @@ class Line:
 
     @property
     def segments(self) -> list[tuple[int, int, bool]]:
-        """First and last row of each stable or unstable part, and whether it is unstable."""
-        parts = []
+        """(first row, last row, is unstable) of each stable or unstable part of the line."""
+        segments_of_line = []
         for unstable, group in groupby(enumerate(self.unstable), key=lambda item: item[1]):
             numbers = [i for i, _ in group]
-            parts.append((numbers[0], numbers[-1] + 1, unstable))
-        return parts
+            segments_of_line.append((numbers[0], numbers[-1] + 1, unstable))
+        return segments_of_line
 
     @property
     def level(self) -> list[int]:
-        """Ends of the line, 0 and -1, at which its amplitude has an extreme: a fold in it."""
+        """Ends of the line, 0 or -1, at which its amplitude has an extreme, a fold."""
         fold = "fold", self.amplitude
         return [
             end for end in (0, -1) if (self.rows[end]["label"], self.rows[end]["amplitude"]) == fold
@@ -174,8 +197,7 @@ class Line:
     def smooth_curve(
         self, x: Sequence[float], y: Sequence[float], *, load_axis: int | None = None
     ) -> Array:
-        """Return a smooth curve (2, SEGMENTS_PER_INTERVAL (n - 1) + 1) through coordinates of its n
-        rows.
+        """Return a smooth curve (2, SEGMENTS_PER_INTERVAL (n - 1) + 1) through the line's n rows.
 
         Parameters
         ----------
@@ -191,7 +213,7 @@ class Line:
 
 
 def line_coordinates(step: CurveStep) -> list[Line]:
-    """Return the lines of a step: its branches, in their order."""
+    """Return the lines of a step's curve, one for each branch, in the order of the branches."""
     path = [row for row in step.rows if row["label"] != SOLUTION]
     in_time = step.amplitude == "time"
     branches = sorted({int(row["branch"]) for row in path})
@@ -205,19 +227,20 @@ def line_coordinates(step: CurveStep) -> list[Line]:
 def _line(rows: Sequence[Row], amplitude: str) -> list[Row]:
     """Return the rows of a branch along its curve.
 
-    They are those of the model, and a symmetry-breaking instability at its end.
+    They are the points of the model, and a symmetry-breaking instability after the last one.
     """
     rows_of_model = [row for row in rows if row["mode"] in OWN_MODES]
-    last = curve_coordinates(rows_of_model[-1], amplitude)
-    previous = curve_coordinates(rows_of_model[max(len(rows_of_model) - 2, 0)], amplitude)
+    last_place = curve_coordinates(rows_of_model[-1], amplitude)
+    previous_place = curve_coordinates(rows_of_model[max(len(rows_of_model) - 2, 0)], amplitude)
     at_end = [row for row in rows[-1:] if row not in rows_of_model and row["label"] in LOCATED]
-    direction = np.subtract(last, previous)
-    line = list(rows_of_model)
+    direction = np.subtract(last_place, previous_place)
+    rows_on_line = list(rows_of_model)
     for row in at_end:
-        step = np.subtract(curve_coordinates(row, amplitude), last)
-        if np.dot(step, direction) > 0:
-            line.append(row)
-    return line
+        direction_to_row = np.subtract(curve_coordinates(row, amplitude), last_place)
+        # it lies ahead of the last point, not behind it
+        if np.dot(direction_to_row, direction) > 0:
+            rows_on_line.append(row)
+    return rows_on_line
 
 
 def load_axis(amplitude: str) -> int:
@@ -233,10 +256,10 @@ def smooth(
 ) -> Array:
     """Return a smooth curve (2, SEGMENTS_PER_INTERVAL (n - 1) + 1) through n points.
 
-    The parameter is the root of the scaled chord. The curve consists of cubics with the slopes of
-    parabolas through three points, limited so that what rises from point to point rises (Fritsch
-    and Carlson, SIAM J. Numer. Anal. 17, 1980). What turns between two points turns smoothly there,
-    what turns at a located point turns at it.
+    The parameter is the root of the scaled chord. The curve consists of cubics. Their slopes at the
+    points are those of parabolas through three points, limited so that the curve rises wherever the
+    points rise (Fritsch and Carlson, SIAM J. Numer. Anal. 17, 1980). A coordinate that turns
+    between two points turns smoothly there. One that turns at a located point turns exactly at it.
 
     Parameters
     ----------
@@ -260,14 +283,17 @@ def smooth(
         slopes[coordinate, end] = 0.0
     t = np.arange(SEGMENTS_PER_INTERVAL) / SEGMENTS_PER_INTERVAL
     h, rise = np.diff(chord)[:, None], np.diff(xy, axis=1)[..., None]
-    first, last = h * slopes[:, :-1, None], h * slopes[:, 1:, None]
-    quadratic, cubic = 3 * rise - 2 * first - last, first + last - 2 * rise
-    curve = xy[:, :-1, None] + t * (first + t * (quadratic + t * cubic))
+    first_term, last_term = h * slopes[:, :-1, None], h * slopes[:, 1:, None]
+    quadratic, cubic = 3 * rise - 2 * first_term - last_term, first_term + last_term - 2 * rise
+    curve = xy[:, :-1, None] + t * (first_term + t * (quadratic + t * cubic))
     return np.concatenate([curve.reshape(2, -1), xy[:, -1:]], axis=1)
 
 
 def _slopes(t: Array, values: Array, located: NDArray[np.bool_]) -> Array:
-    """Return the derivatives (n,) of values over a parameter at n points."""
+    """Return the derivatives (n,) of values at n points by a parameter t; see `smooth`.
+
+    `located` tells which points are folds or bifurcations.
+    """
     h, chords = np.diff(t), np.diff(values) / np.diff(t)
     if len(chords) == 1:
         return np.full(2, chords[0])
@@ -275,20 +301,23 @@ def _slopes(t: Array, values: Array, located: NDArray[np.bool_]) -> Array:
     limits = MAX_SLOPE_RATIO * np.abs(chords)
     limits[1:-1][chords[:-2] * chords[2:] < 0] = np.inf  # it turns between these two points
     max_slopes = np.minimum(limits[:-1], limits[1:])
-    inner = np.clip((h2 * chords_before + h1 * chords_after) / (h1 + h2), -max_slopes, max_slopes)
-    inner[located[1:-1] & (chords_before * chords_after < 0)] = 0.0
+    # slope of the parabola through three points, within the limits
+    inner_slopes = np.clip(
+        (h2 * chords_before + h1 * chords_after) / (h1 + h2), -max_slopes, max_slopes
+    )
+    inner_slopes[located[1:-1] & (chords_before * chords_after < 0)] = 0.0
     ends = [
         _end_slope(h[0], h[1], chords[0], chords[1]),
         _end_slope(h[-1], h[-2], chords[-1], chords[-2]),
     ]
-    return np.concatenate([ends[:1], inner, ends[1:]])
+    return np.concatenate([ends[:1], inner_slopes, ends[1:]])
 
 
 def _end_slope(h1: float, h2: float, first: float, second: float) -> float:
-    """Return the slope at an end: that of a parabola through three points, limited.
+    """Return the slope at an end of a curve: that of a parabola through three points, limited.
 
-    It is zero if its sign is not that of the first chord, and at most MAX_SLOPE_RATIO times its
-    slope.
+    It is zero if its sign is not that of the first chord. It is at most MAX_SLOPE_RATIO times the
+    slope of that chord.
 
     Parameters
     ----------
@@ -304,10 +333,11 @@ def _end_slope(h1: float, h2: float, first: float, second: float) -> float:
 
 
 def spline_curve(x: Sequence[float], y: Sequence[float], point_times: Sequence[float]) -> Array:
-    """Return a smooth curve by cubic splines over the time, see `smooth`.
+    """Return a smooth curve by cubic splines over the time, an array as that of `smooth`.
 
-    With four points a period a vibration keeps its form. Equal times, such as those of the point
-    before a motion and of its first, are joined straight.
+    With four points a period, a vibration keeps its form. The point before a motion and its first
+    point have the same time and are joined by a straight line. `smooth` takes the place of splines
+    where points are too few, or where further times are equal.
     """
     xy, times = np.array([x, y], float), np.array(point_times, float)
     is_later = np.concatenate([[True], np.diff(times) > 0])
@@ -323,7 +353,7 @@ def spline_curve(x: Sequence[float], y: Sequence[float], point_times: Sequence[f
 
 
 def _refined(values: Array) -> Array:
-    """Return values with SEGMENTS_PER_INTERVAL equal steps between every two of them."""
+    """Return values (n,) with SEGMENTS_PER_INTERVAL equal steps between every two of them."""
     count = SEGMENTS_PER_INTERVAL * (len(values) - 1) + 1
     positions = np.arange(count) / SEGMENTS_PER_INTERVAL
     return np.interp(positions, np.arange(len(values)), values)

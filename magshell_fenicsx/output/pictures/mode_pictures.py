@@ -1,4 +1,4 @@
-"""Pictures of modes and of further solutions as small panels, and of gradients.
+"""Pictures of modes and further solutions as small panels, and pictures of gradients.
 
 gradients.png shows where a result would change most with more of a field.
 """
@@ -74,14 +74,22 @@ def small_panels(
     camera: Camera,
     note: str = "",
 ) -> "Figure":
-    """Return small panels in one window, with captions above them and a note at the foot.
+    """Return a figure of small panels in one window, with captions and one colour bar.
 
-    The layers have the same limits, and one colour bar.
+    The layers must have the same limits.
+
+    Parameters
+    ----------
+    surfaces, layers, captions
+        For each panel: the deformed shell, its coloured field, and the text above it.
+    note
+        Text at the foot of the figure; empty for none.
     """
     from matplotlib.figure import Figure
 
-    count, line, gap = len(surfaces), LINE_HEIGHT * style.font_size, GAP / INCH
+    count, line_height, gap = len(surfaces), LINE_HEIGHT * style.font_size, GAP / INCH
     per_row = columns(count) if count < 10 else 4
+    # lengths are in inches
     width = (style.width or (ONE_COLUMN if count == 1 else TWO_COLUMNS)) / INCH
     cell_width = width / per_row
     places = [camera(np.concatenate([surface.r0, surface.r0 + surface.u])) for surface in surfaces]
@@ -89,36 +97,54 @@ def small_panels(
     window = Window.around(np.concatenate(places), pixels)
     image_height = window.shape[0] / style.dpi
     caption_lines = max(caption.count("\n") + 1 for caption in captions)
-    cell_height, below = image_height + caption_lines * line + gap / 2, 4.4 * line
-    foot = line if note else 0.0
-    height = -(-count // per_row) * cell_height + below + foot
+    cell_height, height_below = (
+        image_height + caption_lines * line_height + gap / 2,
+        4.4 * line_height,
+    )
+    foot_height = line_height if note else 0.0
+    height = -(-count // per_row) * cell_height + height_below + foot_height
     figure = Figure(figsize=(width, height), dpi=style.dpi)
     boxes = FigureBoxes(figure)
-    place = boxes.place(gap / 2, 0.5 * line)
-    figure.text(*place, note, va="center", fontsize=0.9 * style.font_size)
+    text_place = boxes.place(gap / 2, 0.5 * line_height)
+    figure.text(*text_place, note, va="center", fontsize=0.9 * style.font_size)
     for i, (surface, layer, caption) in enumerate(zip(surfaces, layers, captions, strict=True)):
         panel = Background(surface, camera, 0, window).panel(layer, style)
-        left, low = i % per_row * cell_width, height - (i // per_row + 1) * cell_height
-        axes = boxes.axes(left + gap / 2, low, cell_width - gap, image_height)
+        left, lower = i % per_row * cell_width, height - (i // per_row + 1) * cell_height
+        axes = boxes.axes(left + gap / 2, lower, cell_width - gap, image_height)
         draw_panel(axes, panel, style)
-        place = boxes.place(left + cell_width / 2, low + image_height + caption_lines * line / 2)
-        figure.text(*place, caption, ha="center", va="center")
-    length = min(width - gap - 8 * line, 4.0)
-    box = boxes.axes((width - length) / 2, foot + 1.7 * line, length, 0.65 * line)
-    colour_bar(figure, box, panel.scale, room=length)
-    directions(boxes.axes(gap / 2, foot + 0.4 * line, 3.4 * line, 3.4 * line), camera, style)
+        text_place = boxes.place(
+            left + cell_width / 2, lower + image_height + caption_lines * line_height / 2
+        )
+        figure.text(*text_place, caption, ha="center", va="center")
+    bar_length = min(width - gap - 8 * line_height, 4.0)
+    bar_axes = boxes.axes(
+        (width - bar_length) / 2, foot_height + 1.7 * line_height, bar_length, 0.65 * line_height
+    )
+    colour_bar(figure, bar_axes, panel.scale, room=bar_length)
+    directions(
+        boxes.axes(gap / 2, foot_height + 0.4 * line_height, 3.4 * line_height, 3.4 * line_height),
+        camera,
+        style,
+    )
     return figure
 
 
 def solution_rows(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows of all solutions, and before those of a step the last point of its path."""
+    """Return the rows of all solutions that searches have found, in the order of `rows`.
+
+    Before the solutions of each step comes the last point of the path there.
+    """
     rows_of_solutions: list[Row] = []
     for number_of_row, row in enumerate(rows):
         if row["label"] == SOLUTION:
             previous = rows[number_of_row - 1]
             if previous["label"] != SOLUTION or previous["step"] != row["step"]:
-                path = [earlier for earlier in rows[:number_of_row] if earlier["branch"] == 0]
-                rows_of_solutions.append(path[-1])
+                earlier_path = [
+                    earlier_row
+                    for earlier_row in rows[:number_of_row]
+                    if earlier_row["branch"] == 0
+                ]
+                rows_of_solutions.append(earlier_path[-1])
             rows_of_solutions.append(row)
     return rows_of_solutions
 
@@ -126,7 +152,15 @@ def solution_rows(rows: Sequence[Row]) -> list[Row]:
 def solutions_figure(
     surfaces: Sequence[Surface], rows: Sequence[Row], h: float, style: OutputSection, camera: Camera
 ) -> "Figure":
-    """Return the figure of the deformed shells of some rows, with the same colours."""
+    """Return the figure of the deformed shells of some rows, coloured alike by w/h.
+
+    Parameters
+    ----------
+    surfaces, rows
+        Deformed shells, and their rows of path.csv, see `solution_rows`.
+    h
+        Thickness over R.
+    """
     lowest = min(float(surface.w.min()) for surface in surfaces)
     highest = max(float(surface.w.max()) for surface in surfaces)
     limits, caption = from_zero(lowest / h, highest / h), "inward normal displacement $w/h$"
@@ -186,7 +220,7 @@ def modes_figure(
 
 @dataclass(frozen=True)
 class StoredMode:
-    """Mode of stability.csv."""
+    """A mode as stability.csv has it: its label, and its eigenvalue over E h/R²."""
 
     label: str
     eigenvalue: float
@@ -195,15 +229,15 @@ class StoredMode:
 def mode_figures(
     folder: Path, rows: Sequence[Row], style: OutputSection, camera: Camera
 ) -> Iterator[tuple[str, "Figure"]]:
-    """Yield names and figures of the modes of a run.
+    """Yield names and figures of the modes whose files are in a run's folder.
 
-    `instabilities` has the null vectors, `modes_NNNN` the modes of a point in stability.csv.
+    `instabilities` shows the null vectors, `modes_NNNN` the modes of point NNNN in stability.csv.
     """
     numbers = instability_numbers(rows)
-    singular = [row for row in rows if row["label"] in LOCATED]
-    occurrences = _occurrences(singular)
-    distinct = [row for row in singular if int(row["point"]) in occurrences]
-    null_vectors = [_null_vector(folder, row, rows, numbers, occurrences) for row in distinct]
+    singular_rows = [row for row in rows if row["label"] in LOCATED]
+    occurrences = _occurrences(singular_rows)
+    distinct_rows = [row for row in singular_rows if int(row["point"]) in occurrences]
+    null_vectors = [_null_vector(folder, row, rows, numbers, occurrences) for row in distinct_rows]
     if panels := [panel for panel in null_vectors if panel]:
         yield "instabilities", _figure(panels, style, camera)
     table = folder / "stability.csv"
@@ -228,29 +262,37 @@ def mode_figures(
 def _figure(
     panels: Sequence[tuple[Surface, str]], style: OutputSection, camera: Camera
 ) -> "Figure":
-    """Return the figure of surfaces with modes, and their captions."""
+    """Return the figure of modes, from pairs of a surface with a mode and a caption."""
     surfaces, captions = zip(*panels, strict=True)
     return modes_figure(surfaces, captions, style, camera)
 
 
 def _occurrences(singular: Sequence[Row]) -> dict[int, list[Row]]:
-    """Return the distinct instabilities of a path, each with all rows at which the path meets it.
+    """Group the instabilities of a path: those that are the same one are met several times.
 
-    The key is the number of the first point; the path may come back to an instability.
+    Parameters
+    ----------
+    singular
+        Rows of all instabilities along the path.
+
+    Returns
+    -------
+    Number of the first point of each distinct instability -> all rows at which the path meets it.
     """
     occurrences: dict[int, list[Row]] = {}
     columns_here = singular[0] if singular else {}
     displacements = [
         name for name in columns_here if quantity(name).kind in ("displacement", "place")
     ]
-    sizes = {name: max(abs(float(row[name])) for row in singular) for name in displacements}
+    largest_sizes = {name: max(abs(float(row[name])) for row in singular) for name in displacements}
 
     def are_same(row: Row, other: Row) -> bool:
+        """Whether two rows are one instability: of one kind, with equal displacements."""
         if any(row[name] != other[name] for name in ("label", "mode", "amplitude")):
             return False
         return all(
-            abs(float(row[name]) - float(other[name])) <= SAME_INSTABILITY_TOLERANCE * size
-            for name, size in sizes.items()
+            abs(float(row[name]) - float(other[name])) <= SAME_INSTABILITY_TOLERANCE * largest
+            for name, largest in largest_sizes.items()
         )
 
     for row in singular:
@@ -269,9 +311,9 @@ def _null_vector(
     numbers: dict[int, int],
     occurrences: Mapping[int, Sequence[Row]],
 ) -> tuple[Surface, str] | None:
-    """Return the surface with a null vector, and its caption; None without a file.
+    """Return the surface with an instability's null vector and its caption; None without a file.
 
-    The caption has the numbers of the instability, its kind, and the load.
+    The caption has the numbers of the instability, its kind and the load.
 
     Parameters
     ----------
@@ -296,22 +338,24 @@ def _null_vector(
     if row["amplitude"]:
         column = amplitude(str(row["amplitude"])).column
         largest = max(abs(float(other_row[column])) for other_row in rows)
+        # the load at the end of a path is zero up to an error only
         is_zero = abs(float(row[column])) <= ZERO_LOAD * largest
         rounded = {**row, column: 0.0} if is_zero else row
         if rounded is not row:
             rounded[shown_quantity(column, row).name] = 0.0
         load_words = f"\n{named_value(column, rounded, 5)}"
-    same = occurrences[int(row["point"])]
-    number_words = ", ".join(str(numbers[int(other_row["point"])]) for other_row in same)
+    rows_of_same = occurrences[int(row["point"])]
+    number_words = ", ".join(str(numbers[int(other_row["point"])]) for other_row in rows_of_same)
     return surface, f"{number_words}: {row['label']}{kind}{load_words}"
 
 
 def gradients_figure(
     by_result: Mapping[str, Surface], style: OutputSection, camera: Camera
 ) -> "Figure":
-    """Return the figure of gradients, one panel for each result and field.
+    """Return the figure of gradients, with one panel for each result and field.
 
-    Red raises the result, blue lowers it; of vectors the length and arrows are shown.
+    Red raises the result, blue lowers it. Of a vector field the length is coloured, with arrows.
+    `by_result` maps a result to the surface with its gradients.
     """
     count = sum(name in surface.fields for surface in by_result.values() for name in WORDS)
     width = panel_width(style, columns(count))
@@ -325,7 +369,7 @@ def gradients_figure(
 def _panels(
     result: str, surface: Surface, style: OutputSection, camera: Camera, width: int
 ) -> Iterator[Panel]:
-    """Yield the panels of a result's gradients."""
+    """Yield the panels of one result's gradients, of the fields that `surface` has."""
     view = Background(surface, camera, width)
     for name in (name for name in WORDS if name in surface.fields):
         caption, values = f"{result.replace('_', ' ')}: {WORDS[name]}", surface.fields[name]
@@ -334,18 +378,20 @@ def _panels(
             limits = from_zero(max(float(values.min()), -limit), min(float(values.max()), limit))
             yield view.panel(ColouredField(name, values, limits, SIGNED, caption), style)
             continue
-        size = np.asarray(np.linalg.norm(values, axis=1))
-        panel = view.panel(ColouredField(name, size, (0.0, _limit(size)), "Reds", caption), style)
+        magnitude = np.asarray(np.linalg.norm(values, axis=1))
+        panel = view.panel(
+            ColouredField(name, magnitude, (0.0, _limit(magnitude)), "Reds", caption), style
+        )
         yield replace(panel, arrows=(_arrows(surface, values, view, camera),))
 
 
 def _limit(sizes: Array) -> float:
-    """Return the largest of some sizes, without peaks at few nodes; one if all are zero."""
+    """Return the largest of some magnitudes, without peaks at few nodes; 1 if all are zero."""
     return float(min(sizes.max(), PEAK * np.quantile(sizes, QUANTILE))) or 1.0
 
 
 def _arrows(surface: Surface, vectors: Array, view: Background, camera: Camera) -> Arrow:
-    """Return arrows of vectors (n, 3) at nodes, at some visible places."""
+    """Return arrows of vectors (n, 3) at nodes, at some visible nodes where vectors are long."""
     r, length = surface.r0 + surface.u, np.linalg.norm(vectors, axis=1)
     longest, extent = length.max() or 1.0, float(np.ptp(r, axis=0).max())
     visible = view.seen.shows(r, DEPTH_TOLERANCE * extent)

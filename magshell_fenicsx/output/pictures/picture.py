@@ -1,6 +1,4 @@
-"""Pictures of the deformed shell: displacement, strains, bending moments, magnetic fields and
-loads.
-"""
+"""Pictures of the deformed shell: displacement, strains, moments, magnetic fields and loads."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -58,16 +56,16 @@ SEGMENTS_PER_INTERVAL = 8  # of a line between two nodes
 
 @dataclass(frozen=True)
 class Content:
-    """Content of a picture.
+    """What a picture shows.
 
     Attributes
     ----------
     layers
-        One field for each panel.
+        One field for each panel; a picture without layers is not drawn.
     note
         Note at the foot.
     detail
-        Places (n, 3) around which the picture is; None for all of the shell.
+        Places (n, 3) that the picture is cut to; None to show the whole shell.
     """
 
     layers: Sequence[ColouredField]
@@ -76,7 +74,10 @@ class Content:
 
 
 def _arrows_content(surface: Surface, h: float) -> Content:
-    """Return the content of the picture of magnetic fields: a grey shell with arrows."""
+    """Return the content of the picture of magnetic fields: a grey shell with arrows.
+
+    It is empty without fields. `h` is the thickness over R.
+    """
     layers = list[ColouredField]()
     if field_arrows(surface):
         layers.append(ColouredField("", np.zeros(len(surface.r0)), (0, 1), "", ""))
@@ -84,7 +85,7 @@ def _arrows_content(surface: Surface, h: float) -> Content:
 
 
 def _contact_content(surface: Surface) -> Content:
-    """Return the content of the picture of contact."""
+    """Return the content of the picture of contact, cut to the contact if that is small."""
     layers = contact(surface)
     if not layers:
         return Content([])
@@ -107,11 +108,18 @@ PICTURES: dict[str, Callable[[Surface, float], Content]] = {
 def figures(
     surface: Surface, h: float, style: OutputSection, camera: Camera, names: Sequence[str] = ()
 ) -> dict[str, "Figure"]:
-    """Return pictures of a whole deformed shell by name, by default all of `PICTURES`.
+    """Return pictures of a whole deformed shell by name; empty pictures are left out.
 
-    Empty pictures are left out.
+    Parameters
+    ----------
+    surface
+        The whole shell with its fields.
+    h
+        Thickness over R.
+    names
+        Keys of `PICTURES` to draw; all of them by default.
     """
-    drawn, views = {}, dict[int, Background]()
+    drawn_figures, views = {}, dict[int, Background]()
     for name in names or PICTURES:
         content = PICTURES[name](surface, h)
         if not content.layers:
@@ -124,19 +132,27 @@ def figures(
             view = views[width] = views.get(width) or Background(surface, camera, width)
         with drawing(style):
             panels = [view.panel(layer, style) for layer in content.layers]
-            drawn[name] = panels_figure(panels, style, content.note)
-    return drawn
+            drawn_figures[name] = panels_figure(panels, style, content.note)
+    return drawn_figures
 
 
 class Background:
     """A shell in view, to be coloured by its fields, with outlines, sources and bodies.
 
     The outline of the undeformed shell is dashed.
+
+    Parameters
+    ----------
+    width
+        Width of the picture in pixels.
+    window
+        Part of the projection to draw; None for all of the shell and what is near.
     """
 
     def __init__(
         self, surface: Surface, camera: Camera, width: int, window: Window | None = None
     ) -> None:
+        """Render the shell, and find the visible parts of all lines."""
         self._surface, self._camera = surface, camera
         tessellation, r = tessellate(surface), surface.r0 + surface.u
         self.window = window or Window.around(
@@ -167,20 +183,20 @@ class Background:
         )
 
     def _not_behind(self, line: Array, undeformed_view: RenderedSurface) -> Array:
-        """Return a line (n, 2) around the undeformed shell, nan where the deformed one hides it."""
+        """Return a line (n, 2) of the undeformed outline, nan where the deformed shell hides it."""
         tolerance = MIN_OUTLINE_DISTANCE / self.window.scale
         depth = undeformed_view.depth_around(line)
         is_hidden = self.seen.depth_around(line) > depth + tolerance
         return np.where(is_hidden[:, None], np.nan, line)
 
     def _visible_part(self, line: Array) -> Array:
-        """Return a line (n, 3) in the projection (n, 2), nan where the shell hides it."""
+        """Return the projection (n, 2) of a line (n, 3) in space, nan where the shell hides it."""
         places = self._camera(line)[:, :2]
         places[~self.seen.shows(np.nan_to_num(line), DEPTH_TOLERANCE / self.window.scale)] = np.nan
         return places
 
     def panel(self, layer: ColouredField, style: OutputSection) -> Panel:
-        """Return the shell in a layer's colours; grey with arrows if it has none."""
+        """Return the shell in a layer's colours, or grey with arrows if the layer has none."""
         texts = tuple(self._bodies.poles)
         names = self._names() if layer.name in FIELDS_WITH_NAMES else ()
         if not layer.colours:
@@ -211,9 +227,9 @@ class Background:
         )
 
     def _names(self) -> tuple[tuple[float, float, str], ...]:
-        """Return place and name of each of several shells, as far as it is visible.
+        """Return (x, y, name) of each of several shells that is visible, in the projection.
 
-        The place is the node next to the middle of the visible part.
+        The place is the node nearest to the middle of the visible part.
         """
         r, shell_numbers = self._surface.r0 + self._surface.u, self._surface.fields.get(SHELL)
         if shell_numbers is None:
@@ -231,13 +247,13 @@ class Background:
         return self._with_bodies(self.seen.grey_image(grey))
 
     def _with_bodies(self, image: Image) -> Image:
-        """Return an image of the shell with the bodies and sources beside it."""
+        """Return an image of the shell with bodies and sources drawn over it."""
         for body in self._bodies.images:
             image = body.over(image)
         return image
 
     def _arrows(self) -> tuple[Arrow, ...]:
-        """Return the arrows of the magnetic fields at visible places."""
+        """Return the arrows of the magnetic fields at visible places of the shell."""
         extent = float(np.ptp(self._surface.r0 + self._surface.u, axis=0).max())
         tolerance = ARROW_DEPTH_TOLERANCE * extent
         return field_arrows(self._surface, self._camera, lambda r: self.seen.shows(r, tolerance))
@@ -246,7 +262,9 @@ class Background:
 def lines_away_from(
     lines: Sequence[Array], others: Sequence[Array], distance: float, min_length: float = 0.0
 ) -> list[Array]:
-    """Return lines (n, 2) with nan where they are near to others.
+    """Return lines (n, 2) in the projection, with nan where they are near to other lines.
+
+    Lines of which nothing remains are left out.
 
     Parameters
     ----------
@@ -266,6 +284,7 @@ def lines_away_from(
     for line in lines:
         is_far = places_of_others.query(np.nan_to_num(line))[0] > distance
         remaining = np.where(is_far[:, None], line, np.nan)
+        # each nan begins a part: places of one part have one number
         part_numbers = np.cumsum(np.isnan(remaining[:, 0]))
         steps = np.diff(remaining, axis=0, prepend=remaining[:1])
         lengths = np.nan_to_num(np.linalg.norm(steps, axis=1))
@@ -278,32 +297,34 @@ def lines_away_from(
 def edge_lines(surface: Surface) -> Array:
     """Return places (n, 3) along the edges of a deformed mid-surface, with nan after each edge.
 
-    An edge belongs to one triangle alone; a solid has none.
+    An edge is a side of one triangle only. A solid has no edges.
     """
     if surface.is_body:
         return np.zeros((0, 3))
-    inner = round((np.sqrt(8 * surface.cells.shape[1] + 1) - 3) / 2) - 1
+    # number of nodes within a side: a triangle of degree d has (d + 1)(d + 2)/2 nodes
+    nodes_within_side = round((np.sqrt(8 * surface.cells.shape[1] + 1) - 3) / 2) - 1
     # in VTK's order
     nodes_of_sides = [
-        [k, *range(3 + k * inner, 3 + (k + 1) * inner), (k + 1) % 3] for k in range(3)
+        [k, *range(3 + k * nodes_within_side, 3 + (k + 1) * nodes_within_side), (k + 1) % 3]
+        for k in range(3)
     ]
-    edges = surface.cells[:, nodes_of_sides].reshape(-1, inner + 2)
+    edges = surface.cells[:, nodes_of_sides].reshape(-1, nodes_within_side + 2)
     # nodes of two shells may be double
     rounded = np.round(surface.r0 / SAME_PLACE_TOLERANCE) + 0.0
     _, place_numbers = np.unique(rounded, axis=0, return_inverse=True)
     ends = np.sort(place_numbers.ravel()[edges[:, [0, -1]]], axis=1)
     _, first_side, count = np.unique(ends, axis=0, return_index=True, return_counts=True)
     lines = (surface.r0 + surface.u)[edges[first_side[count == 1]]]
-    positions = np.linspace(0, 1, SEGMENTS_PER_INTERVAL * (inner + 1) + 1)
-    node_positions = np.linspace(0, 1, inner + 2)
+    positions = np.linspace(0, 1, SEGMENTS_PER_INTERVAL * (nodes_within_side + 1) + 1)
+    node_positions = np.linspace(0, 1, nodes_within_side + 2)
     # values of the shape functions along an edge
-    table = np.vander(positions, inner + 2) @ np.linalg.inv(np.vander(node_positions))
+    table = np.vander(positions, nodes_within_side + 2) @ np.linalg.inv(np.vander(node_positions))
     lines_with_ends = np.concatenate([table @ lines, np.full((len(lines), 1, 3), np.nan)], axis=1)
     return np.asarray(lines_with_ends.reshape(-1, 3))
 
 
 def _divided(line: Array) -> Array:
-    """Return a line (n, 3) with places between its own."""
+    """Return a line (n, 3) with SEGMENTS_PER_INTERVAL segments between every two of its places."""
     positions = np.arange(SEGMENTS_PER_INTERVAL * (len(line) - 1) + 1) / SEGMENTS_PER_INTERVAL
     return np.column_stack([np.interp(positions, np.arange(len(line)), x) for x in line.T])
 
@@ -311,7 +332,7 @@ def _divided(line: Array) -> Array:
 def silhouette(view: RenderedSurface) -> list[Array]:
     """Return lines (n, 2) around the drawn part of a surface, in the projection.
 
-    There are none where the surface goes on beyond the window.
+    There is no line where the surface goes on beyond the window.
     """
     import contourpy
 
@@ -344,16 +365,18 @@ def field_arrows(
     camera: Camera | None = None,
     visible: Callable[[Array], NDArray[np.bool_]] | None = None,
 ) -> tuple[Arrow, ...]:
-    """Return the arrows of the magnetic fields of a surface; they begin at the place they belong
-    to.
+    """Return the arrows of the magnetic fields of a surface, which begin at their nodes.
 
-    Where one would cover the other their feet are left and right of it: opposite fields are
-    opposite arrows.
+    Where one arrow would cover another at the same place, their feet are moved left and right. So
+    opposite fields are opposite arrows side by side.
 
     Parameters
     ----------
-    camera, visible
-        Projection, and which places (n, 3) are visible; without them the arrows have no places.
+    camera
+        Projection.
+    visible
+        Function from places (n, 3) to a mask (n,) of the visible ones. Without `camera` or
+        `visible` the arrows have no places: they only tell which fields there are.
     """
     lengths = {
         name: np.nan_to_num(np.linalg.norm(surface.fields[name], axis=1))
@@ -382,7 +405,7 @@ def field_arrows(
 
 
 def _foot_offsets(fields: Sequence[Array]) -> Array:
-    """Return unit vectors (n, 3) in the picture, left of the first of several fields.
+    """Return unit vectors (n, 3) in the picture, to the left of the first of several fields.
 
     They are zero where the last field does not cover the first.
 
@@ -392,17 +415,19 @@ def _foot_offsets(fields: Sequence[Array]) -> Array:
         Projected vectors (n, 3) of each field.
     """
     (x, y), (last_x, last_y) = fields[0][:, :2].T, fields[-1][:, :2].T
-    size, last_size = np.hypot(x, y), np.hypot(last_x, last_y)
-    covers = np.abs(x * last_y - y * last_x) <= COVERING_ANGLE * size * last_size
-    to_the_left = np.column_stack([-y, x, 0 * x]) / np.maximum(size, TINY)[:, None]
-    offsets = np.where(size[:, None] > MIN_IN_PICTURE, to_the_left, np.array([-1.0, 0, 0]))
+    length, last_length = np.hypot(x, y), np.hypot(last_x, last_y)
+    # cross product of the projections: small where they are parallel
+    covers = np.abs(x * last_y - y * last_x) <= COVERING_ANGLE * length * last_length
+    to_the_left = np.column_stack([-y, x, 0 * x]) / np.maximum(length, TINY)[:, None]
+    offsets = np.where(length[:, None] > MIN_IN_PICTURE, to_the_left, np.array([-1.0, 0, 0]))
     return np.asarray(offsets * covers[:, None])
 
 
 def spread_points(r: Array, min_distance: float) -> NDArray[np.int64]:
-    """Return indices of well separated points of r (n, 3), at most `MAX_ARROWS`.
+    """Return indices of well separated points among r (n, 3), at most `MAX_ARROWS`.
 
-    Each is the farthest from those before, at least `min_distance` away.
+    The first is the highest point. Each further one is the farthest from all before, and at least
+    `min_distance` away.
     """
     indices = [int(np.argmax(r[:, 2]))]
     distance = np.full(len(r), np.inf)

@@ -49,19 +49,22 @@ MAX_FRAMES = 40
 
 
 class PicturedRun:
-    """Data of a run's folder for pictures; files are read once.
+    """Data of a run's folder for its pictures; files are read once.
 
     Parameters
     ----------
+    folder
+        Folder of the run.
     options
         Keys of the section `output` in place of those of the case.
 
     Attributes
     ----------
     rows, on_path
-        The rows of path.csv with fields, and those that are no solutions of a search.
+        The rows of path.csv whose points have fields, and those among them that are no solutions of
+        a search.
     resolved
-        The case of summary.json.
+        The case of summary.json or of the checkpoint.
     headline
         The row at which pictures show the shell.
 
@@ -98,7 +101,7 @@ class PicturedRun:
         return self._points[number]
 
     def maps_at(self, row: Row) -> list[tuple[MapGrid, float]]:
-        """Return the grids beside the shell at a point, and R in metres."""
+        """Return the grids outside the shell at a point, each with R in metres."""
         files = (
             self.folder / "fields" / grid_file(name, int(row["point"]))
             for name in self.resolved.get(MAPS) or ()
@@ -113,13 +116,20 @@ def plot(
     options: Mapping[str, Any] | None = None,
     shapes: Sequence[int] = (),
 ) -> list[str]:
-    """Draw the pictures again, also animation.gif if requested, and write report.html again.
+    """Draw the pictures of a run again, and write report.html again.
 
-    See `draw`. A foreign picture in the folder is refused, not replaced.
+    A foreign picture in the folder is refused, not replaced.
+
+    Parameters
+    ----------
+    point, options, shapes
+        See `draw`. With a point the report stays as it is.
+    animation
+        Whether to draw animation.gif too.
 
     Returns
     -------
-    The names of the files; whole.pvd lists those of `fields/whole_*`, which are left out.
+    The names of the files; whole.pvd lists the files `fields/whole_*`, which are left out.
     """
     _rows(folder)  # there is a run
     refuse_unwritten(folder)
@@ -136,7 +146,18 @@ def plot(
 def plot_folders(
     folders: Sequence[Path], out: Path, options: Mapping[str, Any], **options_of_one: Any
 ) -> str:
-    """Draw one run again, as `plot`, or the curves of several; return the files in words.
+    """Draw one run again, as `plot` does, or the curves of several; return the files in words.
+
+    Parameters
+    ----------
+    folders
+        Folders of the runs.
+    out
+        File of the picture of several curves.
+    options
+        Keys of the section `output` in place of those of the case.
+    options_of_one
+        Further arguments of `plot`.
 
     Raises
     ------
@@ -158,7 +179,7 @@ def plot_folders(
 def plot_runs(
     folders: Sequence[Path], file: Path, options: Mapping[str, Any] | None = None
 ) -> list[str]:
-    """Draw the curves of several runs in one picture.
+    """Draw the curves of several runs in one picture, `file` and its further formats.
 
     Returns
     -------
@@ -186,7 +207,7 @@ def draw(
     options: Mapping[str, Any] | None = None,
     shapes: Sequence[int] = (),
 ) -> list[str]:
-    """Draw every picture of a finished or interrupted run.
+    """Draw every picture of a finished or interrupted run into its folder.
 
     Parameters
     ----------
@@ -225,10 +246,10 @@ def draw(
 
 
 def _pictures_of_point(run: PicturedRun, point: int) -> Iterator[tuple[str, bytes]]:
-    """Yield names and contents of the pictures of one point."""
+    """Yield names and contents of the pictures of one point, named with its number."""
     surface, shell_data = run.surface_at(run.rows[point])
-    shown = without_zero_fields(surface, run.rows[point], run.rows)
-    for name, figure in figures(shown, shell_data.h, run.style, run.camera).items():
+    shown_surface = without_zero_fields(surface, run.rows[point], run.rows)
+    for name, figure in figures(shown_surface, shell_data.h, run.style, run.camera).items():
         yield from figure_files(figure, run.style, f"{name}_{point:04d}")
     if maps := run.maps_at(run.rows[point]):
         figure = field_maps_figure(maps, surface, shell_data.h, run.resolved, run.style)
@@ -236,10 +257,13 @@ def _pictures_of_point(run: PicturedRun, point: int) -> Iterator[tuple[str, byte
 
 
 def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[str, bytes]]:
-    """Yield names and contents of all pictures of a run; shells of some points on the curve."""
-    style, last = run.style, run.on_path[-1]
+    """Yield names and contents of all pictures of a run.
+
+    `shapes` are the numbers of points whose shells are put on the curve.
+    """
+    style, last_row = run.style, run.on_path[-1]
     surface, shell_data = run.surface_at(run.headline)
-    if amplitude := str(last["amplitude"]):
+    if amplitude := str(last_row["amplitude"]):
         curve = curve_figure(run.rows, amplitude, style, run.pole_name)
         if shapes:
             with drawing(style):
@@ -251,8 +275,8 @@ def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[
         if run.resolved.get("sensors"):
             figure = readings_figure(run.rows, amplitude, run.resolved, style)
             yield from figure_files(figure, style, "sensors")
-    shown = without_zero_fields(surface, run.headline, run.rows)
-    for name, figure in figures(shown, shell_data.h, style, run.camera).items():
+    shown_surface = without_zero_fields(surface, run.headline, run.rows)
+    for name, figure in figures(shown_surface, shell_data.h, style, run.camera).items():
         yield from figure_files(figure, style, name)
     if maps := run.maps_at(run.headline):
         figure = field_maps_figure(maps, surface, shell_data.h, run.resolved, style)
@@ -274,9 +298,9 @@ def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[
 
 
 def without_zero_fields(surface: Surface, row: Row, rows: Sequence[Row]) -> Surface:
-    """Return a surface without the direction of a field that is zero.
+    """Return a surface without the applied field Ba, if that is zero at the point of `row`.
 
-    The remanence is left out too, where no row has a field.
+    The remanence Br is left out too where no row has a field.
     """
     if row["lambda_m"]:
         return surface
@@ -286,21 +310,19 @@ def without_zero_fields(surface: Surface, row: Row, rows: Sequence[Row]) -> Surf
 
 
 def draw_animation(folder: Path, options: Mapping[str, Any] | None = None) -> str:
-    """Draw animation.gif: all steps of a programme, or the part in which the last amplitude varied.
+    """Draw animation.gif into a run's folder, and return its name.
 
-    After a motion it shows the motion alone, at equal times. See `draw`.
-
-    Returns
-    -------
-    The name of the file.
+    It shows all steps of a programme, or the part in which the last amplitude varied. After a
+    motion it shows the motion alone, at equal times. `options` are as of `draw`.
     """
     run = PicturedRun(folder, options)
     rows = run.on_path
     amplitude = str(rows[-1]["amplitude"])
     steps = curve_steps(rows, amplitude) if amplitude else []
-    part_of_path = rows if len(steps) != 1 else steps[0].rows
+    shown_rows = rows if len(steps) != 1 else steps[0].rows
     frame_rows = (
-        in_true_time(rows) if amplitude == "time" else evenly_chosen(part_of_path, MAX_FRAMES)
+        # of a motion: rows at equal times
+        in_true_time(rows) if amplitude == "time" else evenly_chosen(shown_rows, MAX_FRAMES)
     )
     surfaces, data_of_frames = zip(*(run.surface_at(row) for row in frame_rows), strict=True)
     shell_data: ShellData = data_of_frames[0]
@@ -312,7 +334,7 @@ def draw_animation(folder: Path, options: Mapping[str, Any] | None = None) -> st
 
 
 def in_true_time(rows: Sequence[Row]) -> list[Row]:
-    """Return the rows of a path's motions that are nearest to equal times."""
+    """Return the rows of a path's motions that are nearest to equal times, at most MAX_FRAMES."""
     motion = [row for row in rows if row["amplitude"] == "time"]
     times = np.array([float(row["time"]) for row in motion])
     shortest = np.diff(np.unique(times)).min(initial=np.ptp(times) or 1.0)
@@ -330,7 +352,7 @@ def evenly_chosen(rows: Sequence[Row], max_rows: int) -> list[Row]:
 
 
 def _rows(folder: Path) -> list[Row]:
-    """Return the rows of the points whose field files exist.
+    """Return the rows of path.csv whose points have field files.
 
     Raises
     ------

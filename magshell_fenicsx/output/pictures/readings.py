@@ -23,9 +23,9 @@ MILLI = 1e3
 def readings_figure(
     rows: Sequence[Row], amplitude: str, case: Mapping[str, Any], style: OutputSection
 ) -> "Figure":
-    """Return the figure of the components that each sensor reads over the load of the last step.
+    """Return the figure of what each magnetic sensor reads, over the load of the last step.
 
-    Unstable parts are dashed.
+    Each panel has the components B_x, B_y and B_z of one sensor. Unstable parts are dashed.
 
     Parameters
     ----------
@@ -70,7 +70,7 @@ def readings_figure(
 
 
 def unit_of(case: Mapping[str, Any]) -> tuple[float, str]:
-    r"""Return the size of one of a reading in the unit that is drawn, and that unit.
+    r"""Return the factor from readings in path.csv to the drawn unit, and that unit in words.
 
     Examples
     --------
@@ -81,8 +81,10 @@ def unit_of(case: Mapping[str, Any]) -> tuple[float, str]:
     """
     magnetic = case.get("magnetic") or {}
     shells = (case.get("shells") or {}).values()
-    of_shells = [shell["remanent"] for shell in shells if shell.get("remanent")]
-    remanences = [section for section in (magnetic.get("remanent"), *of_shells) if section]
+    remanences_of_shells = [shell["remanent"] for shell in shells if shell.get("remanent")]
+    remanences = [
+        section for section in (magnetic.get("remanent"), *remanences_of_shells) if section
+    ]
     if any(section.get("flux_density") for section in remanences):
         return MILLI, "(mT)"
     if remanences:

@@ -1,6 +1,7 @@
-"""Rendering of a surface: parallel projection, the triangle in front at each pixel, colours, shade.
+"""Rendering of a surface: parallel projection, hidden triangles, colours, shade.
 
-raster.c draws at `FINER` times the resolution of the picture.
+raster.c draws at `FINER` times the resolution of the picture. A "drawn pixel" is of that finer
+resolution.
 """
 
 from dataclasses import dataclass
@@ -67,14 +68,14 @@ class Camera:
 
 @dataclass(frozen=True)
 class Window:
-    """Drawn part of the projection.
+    """Part of the projection that a picture shows.
 
     Attributes
     ----------
     box
         (left, right, low, high) over R.
     scale
-        Pixels per R.
+        Pixels of the picture per R.
     """
 
     box: tuple[float, float, float, float]
@@ -88,9 +89,9 @@ class Window:
 
     @staticmethod
     def around(places: Array, width: int, tallest: float = 1.3) -> "Window":
-        """Return the window, `width` pixels wide, around all projected places (n, 2 or 3).
+        """Return the window around all projected places (n, 2 or 3).
 
-        Its height over its width is at most `tallest`.
+        Its width is `width` pixels, and its height over its width is at most `tallest`.
         """
         low, high = places[:, :2].min(axis=0), places[:, :2].max(axis=0)
         margin = WINDOW_MARGIN * max(high - low)
@@ -109,17 +110,23 @@ class RenderedSurface:
     tessellation
         Flat triangles of the surface.
     r
-        (n, 3) deformed places of the nodes.
+        (n, 3) deformed places of the nodes over R.
+    camera
+        Projection.
+    window
+        Part of the projection to draw.
     """
 
     def __init__(
         self, tessellation: Tessellation, r: Array, camera: Camera, window: Window
     ) -> None:
+        """Draw the triangles: number of the one in front, and depth, at each drawn pixel."""
         self._tessellation, self.camera, self.window = tessellation, camera, window
         height, width = (FINER * n for n in window.shape)
         left, _, _, high = window.box
         scale = FINER * window.scale
         places = camera(tessellation.at_points(r))
+        # drawn pixels: x to the right, y downwards, centres at whole numbers
         places[:, 0] = (places[:, 0] - left) * scale - 0.5
         places[:, 1] = (high - places[:, 1]) * scale - 0.5
         self._index = np.empty((height, width), np.int32)
@@ -131,11 +138,11 @@ class RenderedSurface:
 
     @cached_property
     def _light(self) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
-        """Cosines between the normals at points and the directions to the eye and to the lamp.
+        """Cosines of normals with the eye and with the lamp, and the cosine of full light.
 
-        The third value is the cosine of full light. What faces the eye has full light. If nothing
-        faces the lamp as well as that, what faces it best has full light: so a plate that is turned
-        away from the lamp has the colours of the bar too.
+        A surface that faces the eye has full light. If nothing faces the lamp that well, the place
+        that faces it best has full light. So a plate that is turned away from the lamp still has
+        the colours of the bar.
         """
         normals = self.camera(self._tessellation.normals(self._r))
         lamp = np.array(LAMP) / np.linalg.norm(LAMP)
@@ -152,13 +159,14 @@ class RenderedSurface:
 
     @property
     def coverage(self) -> Array:
-        """How much of each pixel of the picture (height, width) the surface covers."""
+        """Fraction of each pixel of the picture (height, width) that the surface covers."""
         return in_pixels(self.depth > -np.inf)
 
     @property
     def depth(self) -> NDArray[np.float32]:
-        """Depth of what is in front, towards the eye, at each drawn pixel; -inf beside the
-        surface.
+        """Depth, growing towards the eye, of the surface in front at each drawn pixel.
+
+        -inf where there is no surface.
         """
         return self._depth
 
@@ -177,7 +185,8 @@ class RenderedSurface:
     def coloured(self, values: Array, limits: tuple[float, float], colours: "Colormap") -> Image:
         """Return the image (height, width, 4) of values (n,) at nodes.
 
-        It is grey where they are nan, transparent beside the surface.
+        It is grey where values are nan, and transparent beside the surface. `limits` are the values
+        at the ends of the colours.
         """
         table = colours(np.arange(colours.N))[:, :3]
         values_at_points = self._tessellation.at_points(values)
@@ -195,7 +204,15 @@ class RenderedSurface:
         return self.painted(np.zeros(len(self._places)), (0.0, 1.0), np.full((1, 3), grey))
 
     def painted(self, values: Array, limits: tuple[float, float], table: Array) -> Image:
-        """Return the image of values at the points, in the colours (n, 3) of a table."""
+        """Return the image (height, width, 4) of values (m,) at the points of the tessellation.
+
+        Parameters
+        ----------
+        limits
+            Values at the ends of the colours.
+        table
+            (n, 3) colours from 0 to 1.
+        """
         height, width = self.window.shape
         image = np.empty((height, width, 4), np.uint8)
         numbers, colours = values.astype(np.float32), table.astype(np.float32)
@@ -217,7 +234,7 @@ class RenderedSurface:
         return image
 
     def shows(self, places: Array, tolerance: float) -> NDArray[np.bool_]:
-        """Whether places (n, 3) are visible, up to a depth `tolerance`; True outside the window."""
+        """Whether places (n, 3) are visible up to a depth `tolerance`; True outside the window."""
         projected = self.camera(places)
         left, _, _, high = self.window.box
         height, width = self._index.shape
@@ -230,7 +247,7 @@ class RenderedSurface:
 
 
 def in_pixels(drawn: NDArray[np.bool_]) -> Array:
-    """Return how much of each pixel of the picture a set of drawn pixels covers."""
+    """Return the fraction of each pixel of the picture that a set of drawn pixels covers."""
     covered = drawn.view(np.uint8)
     count = sum(covered[i::FINER, j::FINER] for i in range(FINER) for j in range(FINER))
     return np.asarray(count / FINER**2)
@@ -238,12 +255,12 @@ def in_pixels(drawn: NDArray[np.bool_]) -> Array:
 
 @cache
 def library() -> tuple[Any, Any]:
-    """Return the cffi objects of raster.c, compiled on first use."""
+    """Return the cffi objects (ffi, lib) of raster.c, compiled on first use."""
     return load_native(Path(__file__).with_name("raster.c"), FUNCTIONS, MPI.COMM_SELF)
 
 
 def _pointers(*arrays: NDArray[Any]) -> list[Any]:
-    """Return C pointers to arrays."""
+    """Return C pointers to the data of arrays."""
     kinds = {
         "float64": "double[]",
         "float32": "float[]",
@@ -254,7 +271,7 @@ def _pointers(*arrays: NDArray[Any]) -> list[Any]:
 
 
 def axes_on_screen(direction: Array) -> Array:
-    """Return components (3, 2) of e1, e2, e3 to the right and up, seen from a direction."""
+    """Return components (3, 2) of e1, e2, e3 to the right and up, seen from `direction` (3,)."""
     return Camera(direction).axes[:2].T
 
 
@@ -265,7 +282,11 @@ DEFAULT_AZIMUTH = -0.5  # rad, of other places
 
 
 def run_camera(surface: Surface, style: OutputSection) -> Camera:
-    """Return the camera of all pictures of a run, from the shell at the run's headline."""
+    """Return the camera of all pictures of a run.
+
+    It is that of the section `output`, or sees the largest displacement of `surface`, the shell at
+    the run's headline.
+    """
     if style.camera is None:
         return _best_camera(surface, deflected_place(surface))
     polar, azimuth = np.radians([style.camera.polar, style.camera.azimuth])
@@ -274,9 +295,10 @@ def run_camera(surface: Surface, style: OutputSection) -> Camera:
 
 
 def _best_camera(surface: Surface, place: Array) -> Camera:
-    """Return the camera from which a place is visible.
+    """Return a camera from which a place (3,) of the shell is visible.
 
-    Beside sources or bodies it is turned to where the shell fills more of the picture.
+    If there are sources or bodies nearby, it is turned to where the shell fills more of the
+    picture.
     """
     default, outlines = Camera(viewing_direction(place)), near_outlines(surface)
     if not outlines:
@@ -286,7 +308,7 @@ def _best_camera(surface: Surface, place: Array) -> Camera:
     places = np.concatenate([surface.r0, r, *outlines])
 
     def size(camera: Camera) -> float:
-        """Return the part of the picture that the shell covers."""
+        """Return the fraction of the picture that the shell's triangles fill, hidden ones too."""
         a, b, c = np.moveaxis(camera(corners)[..., :2], 1, 0)
         left, right, low, high = Window.around(camera(places), 1).box
         x, y = np.moveaxis(np.stack([b - a, c - a]), -1, 0)
@@ -298,9 +320,10 @@ def _best_camera(surface: Surface, place: Array) -> Camera:
 
 
 def viewing_direction(place: Array, turn: float = -0.5) -> Array:
-    """Return a camera direction (3,) from which a point (3,) of a shell is visible.
+    """Return a camera direction (3,) from which a place (3,) of a shell is visible.
 
-    It is from above and from the side: `turn` is its azimuth from that of the point, rad.
+    It is from above and from the side. `turn` (rad) is its azimuth, measured from that of the
+    place.
     """
     has_azimuth = np.hypot(*place[:2]) > MIN_RADIUS
     heading = (np.arctan2(place[1], place[0]) if has_azimuth else DEFAULT_AZIMUTH) + turn
@@ -308,9 +331,9 @@ def viewing_direction(place: Array, turn: float = -0.5) -> Array:
 
 
 def deflected_place(surface: Surface) -> Array:
-    """Return the middle (3,) of where the normal displacement is largest.
+    """Return the middle (3,) of the nodes with the largest normal displacement, undeformed.
 
-    For a ring it is on the axis, whichever node has the largest displacement.
+    For a ring-shaped dimple that is on the axis, whichever node has the largest displacement.
     """
     size = np.abs(surface.w)
     return np.asarray(surface.r0[size >= LARGEST_FRACTION * size.max()].mean(axis=0))
@@ -324,7 +347,7 @@ MEETING_TOLERANCE = 1e-3  # over that distance: lines as near as this meet
 
 
 def near_outlines(surface: Surface) -> tuple[Array, ...]:
-    """Return the outlines of sources and bodies that are near enough to be drawn.
+    """Return the outlines (n, 3) of sources and bodies that are near enough to be drawn.
 
     If one line of a source or body is too far, all of its lines are left out.
     """
@@ -356,18 +379,27 @@ def _farthest(line: Array, middle: Array) -> float:
 
 
 def _object_numbers(lines: Sequence[Array], tolerance: float) -> list[int]:
-    """Return a number for each line, the same for lines that meet.
+    """Return a number for each line (n, 3), the same for lines that meet.
 
-    Such lines are of one source or body.
+    Lines that meet belong to one source or body.
+
+    Parameters
+    ----------
+    tolerance
+        Largest distance, over R, of lines that meet.
     """
     numbers = list(range(len(lines)))
     for i, line in enumerate(lines):
-        for k, other in enumerate(lines[:i]):
-            ends = np.concatenate([line[[0, -1]], other[[0, -1]]])
-            distances = np.linalg.norm(ends[:, None] - np.concatenate([other, line])[None], axis=2)
-            distances[:2, len(other) :] = distances[2:, : len(other)] = (
+        for earlier, earlier_line in enumerate(lines[:i]):
+            ends = np.concatenate([line[[0, -1]], earlier_line[[0, -1]]])
+            distances = np.linalg.norm(
+                ends[:, None] - np.concatenate([earlier_line, line])[None], axis=2
+            )
+            distances[:2, len(earlier_line) :] = distances[2:, : len(earlier_line)] = (
                 np.inf
             )  # of a line from itself
             if distances.min() < tolerance:
-                numbers = [numbers[k] if number == numbers[i] else number for number in numbers]
+                numbers = [
+                    numbers[earlier] if number == numbers[i] else number for number in numbers
+                ]
     return numbers

@@ -45,10 +45,11 @@ class Scale:
 
 
 def colour_map(name: str, limits: tuple[float, float] = (-1.0, 1.0)) -> "Colormap":
-    """Return a colour map between limits.
+    """Return the colour map of a `name` between limits, as matplotlib's object.
 
-    That of fields with a sign is white at zero and equally dark at equal distances from it: between
-    zero and a positive limit it is its red half.
+    The map of fields with a sign is white at zero, and equally dark at equal distances from zero.
+    Between zero and a positive limit it is the red half alone. Other names are `DISTANCE` and those
+    of matplotlib.
     """
     from matplotlib import colormaps
     from matplotlib.colors import ListedColormap, to_rgb
@@ -68,7 +69,7 @@ def colour_map(name: str, limits: tuple[float, float] = (-1.0, 1.0)) -> "Colorma
 
 
 def from_zero(low: float, high: float, min_fraction: float = 0.01) -> tuple[float, float]:
-    """Return limits of a field with a sign: its own and zero.
+    """Return colour limits of a field with a sign, which include zero.
 
     A limit is zero if it is smaller than a part `min_fraction` of the other one.
 
@@ -92,10 +93,16 @@ def colour_bar(
     orientation: str = "horizontal",
     room: float = np.inf,
 ) -> None:
-    """Draw a colour bar with the values at its ends, which are pointed if values lie beyond them.
+    """Draw a colour bar with the values at its ends.
+
+    An end is pointed if values lie beyond it.
 
     Parameters
     ----------
+    axes
+        Axes that become the bar.
+    orientation
+        "horizontal" or "vertical".
     room
         Inches that the caption above a horizontal bar may be wide; a longer one is written smaller.
     """
@@ -144,7 +151,9 @@ def colour_bar(
 
 
 def numbers(values: Sequence[float]) -> tuple[list[str], str]:
-    r"""Return numbers with three digits, and their common power of ten; empty if they need none.
+    r"""Return texts of numbers with three digits, and their common power of ten.
+
+    The power is empty if the numbers need none.
 
     Examples
     --------
@@ -161,13 +170,17 @@ def numbers(values: Sequence[float]) -> tuple[list[str], str]:
 
 
 def number_format(limits: tuple[int, int] = (-3, 4)) -> "ScalarFormatter":
-    """Return a formatter of plain numbers, with a common power of ten beyond the limits."""
+    """Return a formatter of axis numbers, with a common power of ten beyond the limits.
+
+    `limits` are exponents of ten between which numbers are plain.
+    """
     from matplotlib.ticker import ScalarFormatter
 
     class AxisNumbers(ScalarFormatter):
         """Formatter whose power of ten is plain text."""
 
         def get_offset(self) -> str:
+            """Return the common power of ten and offset of all numbers; matplotlib calls it."""
             power, offset = self.orderOfMagnitude, self.offset
             if not len(self.locs):
                 return ""

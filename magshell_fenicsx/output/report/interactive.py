@@ -50,16 +50,16 @@ MIN_RANGE = 1e-12  # of a field; smaller ones are constant
 
 @dataclass(frozen=True)
 class SimplifiedSurface:
-    """Vertices that represent a surface, and triangles between them.
+    """Vertices that stand for a surface, and triangles between them.
 
     Attributes
     ----------
     tessellation
         Flat triangles of the surface.
     vertices
-        (n,) numbers of the points of the tessellation that are vertices.
+        (n,) numbers of those points of the tessellation that are kept as vertices.
     triangles
-        (m, 3) numbers of vertices.
+        (m, 3) positions in `vertices`.
     """
 
     tessellation: Tessellation
@@ -72,22 +72,24 @@ class SimplifiedSurface:
         return len(self.vertices)
 
     def at_vertices(self, values: Array) -> Array:
-        """Return values of nodes (k, ...) at the vertices (n, ...)."""
+        """Return values (k, ...) of the surface's nodes, interpolated at the vertices, (n, ...)."""
         return self.tessellation.at_points(values)[self.vertices]
 
 
 def simplify(surface: Surface, max_vertices: int) -> SimplifiedSurface:
     """Return a surface with at most about `max_vertices` vertices.
 
-    Where the surface has more, those within a small cube become one.
+    If it has more, the vertices within a small cube are merged. The cubes grow until few enough
+    remain.
     """
     tessellation = tessellate(surface, MAX_TRIANGLES)
-    r, size = tessellation.at_points(surface.r0), SAME_PLACE_TOLERANCE
-    vertices, triangles = _merge_vertices(r, tessellation.triangles, size)
-    size = 0.5 * float(np.ptp(r, axis=0).max()) / np.sqrt(max_vertices)
+    r, edge = tessellation.at_points(surface.r0), SAME_PLACE_TOLERANCE
+    vertices, triangles = _merge_vertices(r, tessellation.triangles, edge)
+    # edge of cubes over R: a first guess, which grows in the loop
+    edge = 0.5 * float(np.ptp(r, axis=0).max()) / np.sqrt(max_vertices)
     while len(vertices) > max_vertices:
-        vertices, triangles = _merge_vertices(r, tessellation.triangles, size)
-        size *= GROWTH_OF_CUBES
+        vertices, triangles = _merge_vertices(r, tessellation.triangles, edge)
+        edge *= GROWTH_OF_CUBES
     outwards = tessellation.at_points(surface.n0)[vertices][triangles].sum(axis=1)
     corners = r[vertices][triangles]
     normals = np.cross(*np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 0))
@@ -100,7 +102,7 @@ def simplify(surface: Surface, max_vertices: int) -> SimplifiedSurface:
 def _merge_vertices(
     r: Array, triangles: NDArray[np.int32], size: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Return one point of each cube with edges `size`, and the triangles between them.
+    """Merge the points within each cube of edge `size`, and return what remains.
 
     Parameters
     ----------
@@ -108,12 +110,18 @@ def _merge_vertices(
         (n, 3) points over R.
     triangles
         (m, 3) numbers of points.
+    size
+        Edge of the cubes, over R.
 
     Returns
     -------
-    Numbers of the points, and of these for the triangles whose corners remain distinct.
+    vertices
+        Numbers of the points that remain, one for each cube.
+    triangles
+        (k, 3) positions in `vertices`, of the triangles whose corners remain distinct.
     """
     cubes = np.rint((r - r.min(axis=0)) / size).astype(np.int64)
+    # three cube numbers as one: exclusive or, fast, suffices for large cubes
     if size > EXACT_SIZE:
         key = (cubes[:, 0] * (1 << 42)) ^ (cubes[:, 1] * (1 << 21)) ^ cubes[:, 2]
     else:
@@ -129,7 +137,7 @@ def _merge_vertices(
 
 
 def _rows_as_values(cubes: NDArray[np.int64]) -> NDArray[np.void]:
-    """Return the rows (n, 3) as single values (n,)."""
+    """Return rows (n, 3) as an array (n,) of single values, which numpy can compare at once."""
     return np.ascontiguousarray(cubes).view([("", cubes.dtype)] * 3).ravel()
 
 
@@ -141,16 +149,16 @@ SCRIPT = "interactive.js"
 
 @dataclass(frozen=True)
 class InteractivePart:
-    """Data for the script of the page.
+    """Data for the script of a report's page.
 
     Attributes
     ----------
     about
-        JSON: rows, columns, frames, fields, limits, and where each array begins.
+        JSON: rows, columns, frames, fields, limits, and where each array begins in `data`.
     data
         Base64 of the compressed arrays, see `_Packed`.
     library, script
-        Plotly in base64, compressed; the script of this package.
+        Plotly, compressed and in base64; the script of this package.
     """
 
     about: Markup
@@ -160,7 +168,19 @@ class InteractivePart:
 
 
 def interactive(folder: Path, case: Mapping[str, Any]) -> InteractivePart | None:
-    """Return the data of a run's folder; None without fields of two points, or without Plotly."""
+    """Return the data of the interactive report of a run's folder.
+
+    Parameters
+    ----------
+    folder
+        Folder of the run, with path.csv and fields.
+    case
+        The case, as in summary.json.
+
+    Returns
+    -------
+    None if fewer than two points have fields, or Plotly is not installed.
+    """
     fields = folder / "fields"
     all_rows = read_rows(folder / "path.csv")
     rows = [row for row in all_rows if (fields / point_file(int(row["point"]))).exists()]
@@ -171,8 +191,8 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> InteractivePart | None
     surface, shell_data = read_point(fields, int(headline_row["point"]))
     mesh = simplify(surface, MAX_VALUES // MIN_FRAMES)
     frames = chosen_frames(rows, min(MAX_FRAMES, MAX_VALUES // mesh.count))
-    surfaces = (read_point(fields, int(row["point"]))[0] for row in frames)
-    shells = [on_nodes_of(deformed, surface) for deformed in surfaces]
+    frame_surfaces = (read_point(fields, int(row["point"]))[0] for row in frames)
+    surfaces_on_nodes = [on_nodes_of(deformed, surface) for deformed in frame_surfaces]
     number_type = np.uint16 if mesh.count < 2**16 else np.uint32
     arrays = _Packed()
     content: dict[str, Any] = {
@@ -183,10 +203,12 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> InteractivePart | None
         "camera": run_camera(surface, style_of(case)).direction.tolist(),
         "r0": arrays.add(mesh.at_vertices(surface.r0), np.uint16),
         "triangles": arrays.raw(mesh.triangles.astype(number_type)),
-        "u": [arrays.add(mesh.at_vertices(shell.u), np.int16) for shell in shells],
-        "lines": [_lines(shell) for shell in shells],
-        "solids": [[_solid(solid, arrays) for solid in near_solids(shell)] for shell in shells],
-        "fields": _fields(shells, mesh, shell_data.h, arrays),
+        "u": [arrays.add(mesh.at_vertices(shell.u), np.int16) for shell in surfaces_on_nodes],
+        "lines": [_lines(shell) for shell in surfaces_on_nodes],
+        "solids": [
+            [_solid(solid, arrays) for solid in near_solids(shell)] for shell in surfaces_on_nodes
+        ],
+        "fields": _fields(surfaces_on_nodes, mesh, shell_data.h, arrays),
     }
     text = json.dumps(content).replace("<", "\\u003c")  # nothing in it can end the script
     script = Path(__file__).with_name(SCRIPT).read_text(encoding="utf-8")
@@ -194,12 +216,15 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> InteractivePart | None
 
 
 def _lines(shell: Surface) -> list[Any]:
-    """Return the outlines of bodies and sources near a shell."""
+    """Return the outlines (n, 3) of bodies and sources near a shell, as lists for JSON."""
     return [np.round(line, 4).tolist() for line in near_outlines(shell)]
 
 
 def _solid(solid: Solid, arrays: "_Packed") -> dict[str, Any]:
-    """Return the faces of a body or a magnet, and the sign of its poles at its corners."""
+    """Return a body or a magnet for the page: name, corners, faces and signs of its poles.
+
+    Corners and faces are put into `arrays`; the result says where they are.
+    """
     poles = [] if solid.poles is None else np.sign(solid.poles).tolist()
     triangles = arrays.raw(solid.triangles.astype(np.uint16))
     return {
@@ -213,30 +238,34 @@ def _solid(solid: Solid, arrays: "_Packed") -> dict[str, Any]:
 def chosen_frames(rows: Sequence[Row], max_rows: int) -> list[Row]:
     """Return about `max_rows` rows of a path at most, to be shown as frames.
 
-    The first, the last, instabilities and solutions are among them. Between them the shape changes
-    about equally: a snap has as many as the slow part before it.
+    The first row, the last row, instabilities and solutions are among them. Between them the shape
+    changes by about equal amounts: a snap has as many frames as the slow part before it.
     """
-    special = [row for row in rows if row["label"] in (*LOCATED, SOLUTION)][: max_rows // 2]
-    others = [row for row in rows if row not in special]
-    count = min(len(others), max(max_rows - len(special), 2))
-    change = _change_of_shape(others)
-    equal_changes = np.linspace(0, change[-1], count)
+    marked_rows = [row for row in rows if row["label"] in (*LOCATED, SOLUTION)][: max_rows // 2]
+    ordinary_rows = [row for row in rows if row not in marked_rows]
+    ordinary_count = min(len(ordinary_rows), max(max_rows - len(marked_rows), 2))
+    change = _change_of_shape(ordinary_rows)
+    equal_changes = np.linspace(0, change[-1], ordinary_count)
     frame_numbers = {int(np.abs(change - value).argmin()) for value in equal_changes}
-    frame_numbers |= {0, len(others) - 1}
-    remaining = [i for i in range(len(others)) if i not in frame_numbers]
-    missing = count - len(frame_numbers)
-    spacing = (len(remaining) - 1) / max(missing - 1, 1)
-    frame_numbers |= {remaining[round(i * spacing)] for i in range(min(missing, len(remaining)))}
+    frame_numbers |= {0, len(ordinary_rows) - 1}
+    unused_numbers = [i for i in range(len(ordinary_rows)) if i not in frame_numbers]
+    # several amounts may choose one row: rows at equal distances make up for it
+    missing_count = ordinary_count - len(frame_numbers)
+    spacing = (len(unused_numbers) - 1) / max(missing_count - 1, 1)
+    frame_numbers |= {
+        unused_numbers[round(i * spacing)] for i in range(min(missing_count, len(unused_numbers)))
+    }
     return sorted(
-        [*special, *(others[i] for i in frame_numbers)], key=lambda row: int(row["point"])
+        [*marked_rows, *(ordinary_rows[i] for i in frame_numbers)],
+        key=lambda row: int(row["point"]),
     )
 
 
 def _change_of_shape(rows: Sequence[Row]) -> Array:
-    """Return (n,) how far the shape has changed until each row.
+    """Return (n,) how far the shape has changed from the first row to each row.
 
-    That is the sum of the changes of all displacements over their ranges, plus a share per point:
-    all shares are half of that sum.
+    It is the sum of the changes of all displacements over their ranges, plus an equal share for
+    each row. All shares together are half of that sum.
     """
     columns = [name for name in rows[0] if quantity(name).kind in ("displacement", "place")]
     values = np.array([[float(row[name]) for name in columns] for row in rows]).reshape(
@@ -249,24 +278,27 @@ def _change_of_shape(rows: Sequence[Row]) -> Array:
 
 
 def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
-    """Return the numbers of path.csv that vary, names of columns, and the curves of all steps.
+    """Return the path for the page: varying columns of path.csv, labels and curves.
 
     Parameters
     ----------
+    rows
+        Rows of path.csv of the points that have fields.
     last
-        The last row that is no solution of a search.
+        The last row that is no solution of a search; its amplitude is the first choice of the
+        curve.
     pole
         Words for the point of w_pole_over_h.
     """
     amplitude_name = next(
         (str(row["amplitude"]) for row in [last, *reversed(rows)] if row["amplitude"]), ""
     )
-    parts = _steps_of_curve(rows, amplitude_name) if amplitude_name else []
+    steps = _steps_of_curve(rows, amplitude_name) if amplitude_name else []
     quantities = _quantities(rows[0])
     axes = list[str]()
-    for part in reversed(parts):  # its words say whose displacement it is
-        quantities |= {q.name: q for q in axes_for(part)}
-        axes += [q.name for q in axes_for(part)]
+    for step in reversed(steps):  # its words say whose displacement it is
+        quantities |= {q.name: q for q in axes_for(step)}
+        axes += [q.name for q in axes_for(step)]
     numeric = [name for name in rows[0] if not isinstance(rows[0][name], str)]
     varying = [name for name in numeric if len({row[name] for row in rows}) > 1]
     columns = {}
@@ -280,7 +312,7 @@ def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
         }
     return {
         "columns": columns,
-        "steps": [_step(part, rows) for part in parts],
+        "steps": [_step(step, rows) for step in steps],
         "points": [row["point"] for row in rows],
         "labels": [row["label"] for row in rows],
         "unstable": [is_unstable(row) for row in rows],
@@ -289,7 +321,7 @@ def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
 
 
 def _quantities(names: Iterable[str]) -> dict[str, Quantity]:
-    """Return column -> its quantity; a column in units has the words of that without units.
+    """Return column -> quantity; a column in units has the words of the column without units.
 
     Examples
     --------
@@ -304,7 +336,10 @@ def _quantities(names: Iterable[str]) -> dict[str, Quantity]:
 
 
 def _step(part: CurveStep, rows: Sequence[Row]) -> dict[str, Any]:
-    """Return a step for the page: numbers of its rows, and the lines between them."""
+    """Return a step of the curve for the page.
+
+    It has title, axes, numbers of its rows in `rows`, and the lines between these.
+    """
     row_of_point = {int(row["point"]): i for i, row in enumerate(rows)}
 
     def numbers_of(rows_of_line: Sequence[Row]) -> list[int]:
@@ -331,26 +366,30 @@ def _step(part: CurveStep, rows: Sequence[Row]) -> dict[str, Any]:
 
 
 def _steps_of_curve(rows: Sequence[Row], amplitude_name: str) -> list[CurveStep]:
-    """Return the steps of a curve as in curve.png, after those that it leaves out.
+    """Return the steps that curve.png draws, after those that curve.png leaves out.
 
-    Such is the step in which the field is applied before the loads.
+    It leaves out, for instance, the step in which the field is applied before the loads. A step of
+    one row alone has no curve and is dropped.
     """
     drawn_steps = curve_steps(rows, amplitude_name)
     drawn_points = {int(row["point"]) for part in drawn_steps for row in part.rows}
     earlier_rows = [row for row in rows if int(row["point"]) not in drawn_points]
     names = list(dict.fromkeys(str(row["amplitude"]) for row in earlier_rows if row["amplitude"]))
     earlier_steps = []
-    for name in names:
-        rows_of_step = [row for row in earlier_rows if row["amplitude"] == name]
+    for step_amplitude in names:
+        rows_of_step = [row for row in earlier_rows if row["amplitude"] == step_amplitude]
         first_number = max(rows.index(rows_of_step[0]) - 1, 0)
         if rows[first_number] is not rows_of_step[0]:
             rows_of_step = [rows[first_number], *rows_of_step]
-        earlier_steps.append(CurveStep(name, rows_of_step))
+        earlier_steps.append(CurveStep(step_amplitude, rows_of_step))
     return [part for part in (*earlier_steps, *drawn_steps) if len(part.rows) > 1]
 
 
 def label(of_axis: Quantity, row: Row, pole: str) -> str:
-    """Return the label of an axis, as in curve.png, in HTML."""
+    """Return the label of an axis as HTML, with the words of curve.png.
+
+    `row` names the case's points and units; `pole` names the point of w_pole_over_h otherwise.
+    """
     at_point = with_point_name(of_axis, row, pole)
     words = f"{at_point.words} {at_point.note}".strip()
     unit = f" ({at_point.shown_unit})" if at_point.shown_unit else ""
@@ -362,19 +401,30 @@ def label(of_axis: Quantity, row: Row, pole: str) -> str:
 def _fields(
     shells: Sequence[Surface], mesh: SimplifiedSurface, h: float, arrays: "_Packed"
 ) -> list[dict[str, Any]]:
-    """Return every scalar and every length of a vector, with colours and the limits of the whole
-    path.
+    """Return every scalar field and every length of a vector field, for the page.
 
-    The colours are those of the pictures.
+    Each has name, label, limits over the whole path, colours as in the pictures, and where its
+    values are in `arrays`. A field that is absent at a frame is left out.
+
+    Parameters
+    ----------
+    shells
+        The surface at each frame, on the nodes of one mesh.
+    mesh
+        Vertices at which values are shown.
+    h
+        Thickness over R.
     """
     fields = []
     for name, caption in SCALARS.items():
         values = [_values(shell, name, h) for shell in shells]
-        present = [values_of_shell for values_of_shell in values if values_of_shell is not None]
-        if len(present) < len(shells):
+        nodal_values = [
+            values_of_shell for values_of_shell in values if values_of_shell is not None
+        ]
+        if len(nodal_values) < len(shells):
             continue
-        low = min(float(values_of_shell.min()) for values_of_shell in present)
-        high = max(float(values_of_shell.max()) for values_of_shell in present)
+        low = min(float(values_of_shell.min()) for values_of_shell in nodal_values)
+        high = max(float(values_of_shell.max()) for values_of_shell in nodal_values)
         if high - low < MIN_RANGE:
             low, high = low - 1.0, low + 1.0
         colours: list[tuple[float, str]] = []  # plotly's own map
@@ -386,11 +436,12 @@ def _fields(
         if name == SHELL:
             names = [f"{i} {shell_name}" for i, shell_name in enumerate(shells[0].shells)]
             caption = f"{caption}: {', '.join(names)}"
-        at_vertices = [mesh.at_vertices(values_of_shell) for values_of_shell in present]
+        at_vertices = [mesh.at_vertices(values_of_shell) for values_of_shell in nodal_values]
+        # values between the limits become whole numbers from 0 to 255
         fractions = [np.clip((values - low) / (high - low), 0.0, 1.0) for values in at_vertices]
-        steps = [np.rint(255 * fraction).astype(np.uint8) for fraction in fractions]
-        is_constant = all((step == steps[0]).all() for step in steps)
-        places = [arrays.raw(step) for step in (steps[:1] if is_constant else steps)]
+        levels = [np.rint(255 * fraction).astype(np.uint8) for fraction in fractions]
+        is_constant = all((level == levels[0]).all() for level in levels)
+        locations = [arrays.raw(level) for level in (levels[:1] if is_constant else levels)]
         fields.append(
             {
                 "name": name,
@@ -398,14 +449,17 @@ def _fields(
                 "low": low,
                 "high": high,
                 "colours": colours,
-                "at": places,
+                "at": locations,
             }
         )
     return fields
 
 
 def _stops(name: str, limits: tuple[float, float] = (-1.0, 1.0)) -> list[tuple[float, str]]:
-    """Return a colour map of the pictures as Plotly takes it: pairs of a fraction and a colour."""
+    """Return a colour map of the pictures in Plotly's form: pairs of a fraction and a colour.
+
+    `limits` are the values at its ends, which place the neutral colour of a map with a sign.
+    """
     from matplotlib.colors import to_hex
 
     colours = colour_map(name, limits)
@@ -418,7 +472,7 @@ def _stops(name: str, limits: tuple[float, float] = (-1.0, 1.0)) -> list[tuple[f
 
 
 def _values(surface: Surface, name: str, h: float) -> Array | None:
-    """Return a field (n,) at the nodes, or the length of a vector; None where it is absent."""
+    """Return a field at the nodes (n,), or the length of a vector field; None if it is absent."""
     if name == "w_over_h":
         return np.asarray(surface.w / h)
     values = couple(surface) if name == "couple" else surface.fields.get(name)
@@ -430,14 +484,24 @@ def _values(surface: Surface, name: str, h: float) -> Array | None:
 
 
 class _Packed:
-    """Arrays one after the other, each at a multiple of four bytes."""
+    """Arrays in one block of bytes, each beginning at a multiple of four bytes."""
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []
         self._length = 0
 
     def add(self, values: Array, kind: type[np.integer[Any]]) -> dict[str, Any]:
-        """Add values (n, 3) as integers i: low + step i. Return where they are, low and step."""
+        """Add values (n, 3), rounded to integers i with value = low + step i.
+
+        Parameters
+        ----------
+        kind
+            Type of the integers; a signed one is symmetric to zero, with low = 0.
+
+        Returns
+        -------
+        Where the integers are, see `raw`, with `low` and `step`.
+        """
         min_integer, max_integer = np.iinfo(kind).min, np.iinfo(kind).max
         low, high = float(values.min()), float(values.max())
         if min_integer < 0:
@@ -446,7 +510,12 @@ class _Packed:
         return {**self.raw(np.rint((values - low) / step).astype(kind)), "low": low, "step": step}
 
     def raw(self, values: NDArray[Any]) -> dict[str, Any]:
-        """Add an array as it is, and return where it is, its size and its type."""
+        """Add an array unchanged.
+
+        Returns
+        -------
+        `at`: its first byte; `size`: its number of elements; `kind`: the name of its type.
+        """
         content = np.ascontiguousarray(values).tobytes()
         location = {"at": self._length, "size": int(values.size), "kind": values.dtype.name}
         self._parts.append(content + bytes(-len(content) % 4))
@@ -455,17 +524,21 @@ class _Packed:
 
     @property
     def content(self) -> str:
+        """All arrays, compressed and in base64."""
         return packed(b"".join(self._parts))
 
 
 def packed(content: bytes) -> str:
-    """Return a content compressed, in base64."""
+    """Return bytes compressed by zlib, in base64."""
     return base64.b64encode(zlib.compress(content, COMPRESSION_LEVEL)).decode()
 
 
 @cache
 def plotly() -> str | None:
-    """Return Plotly's script, packed; None if it is not installed. Its Python is not imported."""
+    """Return Plotly's script, compressed and in base64; None if Plotly is not installed.
+
+    Only its file is read: importing Plotly in Python would take long.
+    """
     package = importlib.util.find_spec("plotly")
     places = package.submodule_search_locations if package else None
     for place in places or []:
@@ -476,7 +549,7 @@ def plotly() -> str | None:
 
 
 def _packed_file(file: Path) -> str:
-    """Return a file, packed once for all runs."""
+    """Return a file compressed and in base64; the disk cache keeps the result for all runs."""
     file_status = file.stat()
     name = f"packed_{file.name}_{file_status.st_size}_{file_status.st_mtime_ns}_{COMPRESSION_LEVEL}"
     if cached := load_cached(name):

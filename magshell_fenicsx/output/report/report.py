@@ -75,7 +75,7 @@ TIMES = {
 
 
 def write_report(folder: Path, *, playable: bool = True) -> None:
-    """Write report.html from summary.json, path.csv, the pictures and the fields in a run's folder.
+    """Write report.html into a run's folder, from its summary, path.csv, pictures and fields.
 
     Parameters
     ----------
@@ -92,7 +92,10 @@ def write_report(folder: Path, *, playable: bool = True) -> None:
 
 
 def report(folder: Path, *, playable: bool = True) -> str:
-    """Return the content of report.html."""
+    """Return the content of report.html of the run in a folder.
+
+    `playable` is whether the report has the interactive part.
+    """
     # Jinja takes long to import
     from jinja2 import BytecodeCache, Environment, FileSystemLoader, StrictUndefined
     from jinja2.bccache import Bucket
@@ -101,10 +104,12 @@ def report(folder: Path, *, playable: bool = True) -> str:
         """Cache of the template's Python code; Jinja checks the file and the version of Python."""
 
         def load_bytecode(self, bucket: Bucket) -> None:
+            """Give Jinja the compiled template from the disk cache, if it is there."""
             if code := load_cached(f"template_{bucket.key}"):
                 bucket.bytecode_from_string(code)
 
         def dump_bytecode(self, bucket: Bucket) -> None:
+            """Put the compiled template into the disk cache."""
             save_cached(f"template_{bucket.key}", bucket.bytecode_to_string())
 
     loader = FileSystemLoader(Path(__file__).parent)
@@ -120,12 +125,12 @@ def report(folder: Path, *, playable: bool = True) -> str:
 
 
 def _content(folder: Path, playable: bool) -> dict[str, Any]:
-    """Return the values of the template."""
+    """Return name -> value of all variables of the report's template."""
     summary, lines = read_run(folder)
     case = summary["case"]
     pole = pole_of(case)
     first_line = lines[0] if lines else {}
-    played = interactive(folder, case) if playable else None  # it replaces the animation
+    interactive_part = interactive(folder, case) if playable else None  # it replaces the animation
     classical = not is_flat(case) or any(float(line["p_over_pc"]) for line in lines)
     length_unit = "m" if summary["dimensions"]["units"] == "SI" else ""
     path = path_table(lines, length_unit, pole)
@@ -142,13 +147,13 @@ def _content(folder: Path, playable: bool) -> dict[str, Any]:
         "verdict": verdict(summary, lines),
         "groups": _groups(summary, classical),
         "dimensions": _dimensions(summary, classical),
-        "pictures": list(_pictures(folder, pictured_point, played is None)),
-        "interactive": played,
+        "pictures": list(_pictures(folder, pictured_point, interactive_part is None)),
+        "interactive": interactive_part,
         "pole": pole_head(first_line, pole),
         "heads": {name: _head(name, first_line) for name in SOLUTION_COLUMNS},
         "instabilities": [_instability(line, summary, lines) for line in located(lines)],
-        "solutions": [_solution(it) for it in summary.get("solutions", [])],
-        "frequencies": [_frequency(it) for it in read_frequencies(folder)],
+        "solutions": [_solution(entry) for entry in summary.get("solutions", [])],
+        "frequencies": [_frequency(entry) for entry in read_frequencies(folder)],
         "sensitivities": [(name, number(v)) for name, v in summary["sensitivities"].items()],
         "sensitive": parameter,
         "gradients": gradients,
@@ -165,7 +170,7 @@ def _content(folder: Path, playable: bool) -> dict[str, Any]:
 
 
 def _head(name: str, line: Line) -> Markup:
-    """Return the heading of a column with its unit."""
+    """Return the heading of a column with its unit, as HTML; `line` is a row of path.csv."""
     of_column = shown_quantity(name, line)
     heading = pole_head(line) if name == "w_pole_over_h" else head(of_column)
     if not of_column.shown_unit:
@@ -174,9 +179,9 @@ def _head(name: str, line: Line) -> Markup:
 
 
 def _groups(summary: Summary, classical: bool) -> list[tuple[Markup, Markup]]:
-    """Return name and value of the dimensionless groups.
+    """Return (name, value) of the dimensionless groups, as HTML.
 
-    `classical` is whether the classical pressure p_c says something of the run.
+    `classical` is whether the classical pressure p_c means something for the run.
     """
     groups, magnetic = summary["dimensionless"], summary["case"].get("magnetic") or {}
     chi = magnetic.get("susceptibility")
@@ -196,9 +201,10 @@ def _groups(summary: Summary, classical: bool) -> list[tuple[Markup, Markup]]:
 
 
 def _dimensions(summary: Summary, classical: bool) -> list[tuple[Markup, Markup, str]]:
-    """Return name, value and unit of the quantities that the case gives with units.
+    """Return (name, value, unit) of the quantities that the case gives with units, as HTML.
 
-    `classical` is whether the classical pressure p_c says something of the run.
+    Quantities that the case lacks are left out. `classical` is whether the classical pressure p_c
+    means something for the run.
     """
     dimensions, measured = summary["dimensions"], summary.get("in_units", {})
     magnetic = summary["case"].get("magnetic") or {}
@@ -222,13 +228,15 @@ def _dimensions(summary: Summary, classical: bool) -> list[tuple[Markup, Markup,
 
 
 def _pictured_point(case: dict[str, Any], rows: Sequence[Row]) -> str:
-    """Return the point at which pictures show the shell, in words."""
+    """Return words for the point at which pictures show the shell; `rows` are those of path.csv."""
     row, path = headline(case, rows), [row for row in rows if row["label"] != SOLUTION]
     return "the last point" if row is path[-1] else f"point {row['point']}, the first instability"
 
 
 def _pictures(folder: Path, pictured_point: str, animated: bool) -> Iterator[tuple[str, str, bool]]:
-    """Yield source and caption of each picture in the folder, and whether it is shown small.
+    """Yield source, caption and smallness of each picture in a run's folder.
+
+    The source is a data URL of the picture; the last value is whether the picture is shown small.
 
     Parameters
     ----------
@@ -250,7 +258,10 @@ def _pictures(folder: Path, pictured_point: str, animated: bool) -> Iterator[tup
 
 
 def _instability(line: Line, summary: Summary, lines: Sequence[Line]) -> dict[str, Any]:
-    """Return the cells of a row of the table of instabilities, by column."""
+    """Return column -> cell of a row of the table of instabilities.
+
+    `lines` are all rows of path.csv; they show which displacements are as small as rounding.
+    """
     return {
         "point": line["point"],
         "kind": line["label"],
@@ -263,7 +274,10 @@ def _instability(line: Line, summary: Summary, lines: Sequence[Line]) -> dict[st
 
 
 def _solution(solution: dict[str, Any]) -> list[Markup | str]:
-    """Return the cells of a row of the table of solutions."""
+    """Return the cells of a row of the table of solutions, with stability and residual.
+
+    `solution` is an entry of "solutions" in summary.json.
+    """
     names = (shown_quantity(name, solution).name for name in SOLUTION_COLUMNS)
     numbers = (number(solution[name]) for name in names)
     return [
@@ -276,7 +290,7 @@ def _solution(solution: dict[str, Any]) -> list[Markup | str]:
 
 
 def _frequency(frequency: Frequency) -> list[Markup | str]:
-    """Return the cells of a row of the table of frequencies."""
+    """Return the cells of a row of the table of frequencies: point, wave, omega2, Hz."""
     return [
         f"{frequency.point}",
         frequency.wave or "–",
@@ -286,14 +300,14 @@ def _frequency(frequency: Frequency) -> list[Markup | str]:
 
 
 def _gradients(result: str, gradient: dict[str, Any]) -> Iterator[list[Markup | str]]:
-    """Yield rows of the table of gradients.
+    """Yield rows of the table of gradients of one result; `gradient` is its entry in summary.json.
 
     The cells are the result, its value, the parameter, the derivative, the largest derivative per
     area of a field, and where that is.
     """
     first_cells: list[Markup | str] = [result, number(gradient["value"])]
-    for parameter, slope in gradient["numbers"].items():
-        yield [*first_cells, parameter, number(slope), "–", "–"]
+    for parameter, derivative in gradient["numbers"].items():
+        yield [*first_cells, parameter, number(derivative), "–", "–"]
     for parameter, field in gradient["fields"].items():
         components = Markup(", ").join(number(v) for v in field["alike"])
         place = ", ".join(f"{x:.3g}" for x in field["at"])
@@ -301,7 +315,7 @@ def _gradients(result: str, gradient: dict[str, Any]) -> Iterator[list[Markup | 
 
 
 def _how_to_estimate(case: dict[str, Any]) -> str:
-    """Return how to get an error estimate, for a run that has none."""
+    """Return advice on how to get an error estimate, for a run that has none."""
     if "tolerance" in case["mesh"]:
         return (
             "mesh.tolerance was ignored because this run has no scalar result; "
@@ -336,7 +350,7 @@ def report_of(folder: Path) -> Path:
 
 
 def open_in_browser(file: Path) -> bool:
-    """Whether a web browser could be asked to show a file."""
+    """Ask a web browser to show a file, and return whether one could be asked."""
     import webbrowser
 
     try:
@@ -363,10 +377,7 @@ def _is_narrow(content: bytes) -> bool:
 
 
 def reduced_picture(content: bytes) -> bytes:
-    """Return a PNG file as it is, or if it is large with the page's width, in all its colours.
-
-    Other files are returned as they are.
-    """
+    """Return a picture with the page's width, if it is a large PNG file; other files unchanged."""
     if len(content) < LARGE_PICTURE or not content.startswith(b"\x89PNG"):
         return content
     from PIL import Image

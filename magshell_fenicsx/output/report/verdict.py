@@ -1,4 +1,4 @@
-"""The result of a run for its report: one sentence, and the path as a table of the varying columns.
+"""The result of a run for its report: sentences, and the path as a table of the varying columns.
 
 Input: summary.json and the lines of path.csv. Output: HTML, or text for a terminal.
 """
@@ -54,8 +54,7 @@ def number(value: float, digits: int = DIGITS) -> Markup:
 
 
 def above_rounding(value: float, path: Iterable[float] = ()) -> float:
-    """Return the value, or zero if it is as small as rounding, also over the largest value of a
-    path.
+    """Return the value, or zero if it is as small as rounding over the largest number of a path.
 
     Examples
     --------
@@ -69,9 +68,9 @@ def above_rounding(value: float, path: Iterable[float] = ()) -> float:
 def column(
     values: Sequence[float], other_columns: Sequence[float] = ()
 ) -> tuple[int, list[Markup]]:
-    """Return a column of numbers with a common power of ten and equally many decimals.
+    """Return numbers as cells with a common power of ten and equally many decimals.
 
-    nan is left empty.
+    A nan becomes an empty cell.
 
     Parameters
     ----------
@@ -109,12 +108,12 @@ def column(
 
 
 def power(exponent: int) -> Markup:
-    """Return a power of ten."""
+    """Return ten to the power of `exponent` in HTML."""
     return Markup("10<sup>{}</sup>").format(_signed(str(exponent)))
 
 
 def _signed(text: str) -> Markup:
-    """Return a number with a typographic minus sign, and none before zero."""
+    """Return the text of a number with a typographic minus sign, and with none before zero."""
     return Markup(text.removeprefix("-") if not text.strip("-0.") else text.replace("-", "−"))
 
 
@@ -138,7 +137,17 @@ UNIT_OF_KIND = {"place": "m", "reaction": "N", "moment": "N m"}
 
 @dataclass(frozen=True)
 class TableColumn:
-    """Column of the table of a path."""
+    """Column of the table that a report shows of a path.
+
+    Attributes
+    ----------
+    head, unit
+        Heading, and the line with power of ten and unit below it.
+    cells
+        Text of each row.
+    numeric
+        Whether the cells are numbers.
+    """
 
     head: Markup
     unit: Markup
@@ -160,45 +169,59 @@ def head(of_column: Quantity) -> Markup:
 
 
 def pole_head(line: Line, pole: str = POLE) -> Markup:
-    """Return the heading of w_pole_over_h, with the point that it belongs to."""
+    """Return the heading of w_pole_over_h with the name of the point, as HTML.
+
+    `pole` names the point in a case without named points.
+    """
     return Markup("{}, {}").format(
         head(shown_quantity("w_pole_over_h", line)), pole_name(line, pole).removeprefix("the ")
     )
 
 
 def path_table(lines: Sequence[Line], length_unit: str, pole: str = POLE) -> list[TableColumn]:
-    """Return the columns that vary, in the order of interest.
+    """Return the varying columns of a path for its table, in the order of interest.
 
-    A displacement equal to an earlier one is left out. Quantities in the case's units are shown in
-    these alone.
+    A displacement equal to an earlier one is left out. A quantity that also has a column in the
+    case's units is shown in these alone.
 
     Parameters
     ----------
+    lines
+        Rows of path.csv as text.
     length_unit
-        Unit of the displacements of named points.
+        Unit of the displacements of named points; empty for a case without units.
     pole
-        Name of the point of w_pole_over_h.
+        Name of the point of w_pole_over_h in a case without named points.
     """
     first_line = lines[0] if lines else {}
-    in_units = {
+    columns_in_units = {
         column_quantity.name
         for name in first_line
         if (column_quantity := shown_quantity(name, first_line)).name != name
     }
-    names = [name for name in first_line if name != "point" and name not in in_units]
-    order = ["point", *sorted(names, key=lambda name: COLUMN_ORDER.index(quantity(name).kind))]
-    varying: dict[str, list[str]] = {}
-    for name in order:
+    names = [name for name in first_line if name != "point" and name not in columns_in_units]
+    ordered_names = [
+        "point",
+        *sorted(names, key=lambda name: COLUMN_ORDER.index(quantity(name).kind)),
+    ]
+    varying_columns: dict[str, list[str]] = {}
+    for name in ordered_names:
         values = [line.get(name, "") for line in lines]
-        displacements = [other for key, other in varying.items() if key.startswith("w_")]
+        displacements = [
+            earlier_values
+            for key, earlier_values in varying_columns.items()
+            if key.startswith("w_")
+        ]
         is_repeated = name.startswith("w_") and any(
-            _are_equal(values, other) for other in displacements
+            _are_equal(values, earlier_values) for earlier_values in displacements
         )
         if name in ("point", "label") or (len(set(values)) > 1 and not is_repeated):
-            varying[name] = values
-    energies = _energies(lines, [name for name in varying if quantity(name).kind == "energy"])
+            varying_columns[name] = values
+    energies = _energies(
+        lines, [name for name in varying_columns if quantity(name).kind == "energy"]
+    )
     table = {}
-    for name in varying:
+    for name in varying_columns:
         column_quantity = shown_quantity(name, first_line)
         all_energies = energies if column_quantity.kind == "energy" else ()
         table[name] = _column(
@@ -213,9 +236,9 @@ def path_table(lines: Sequence[Line], length_unit: str, pole: str = POLE) -> lis
 
 
 def _energies(lines: Sequence[Line], names: Sequence[str]) -> list[float]:
-    """Return all energies of a path.
+    """Return all energies of a path, in the units in which they are shown.
 
-    Their columns have one power of ten, so that they can be compared.
+    `names` are the energy columns. They share one power of ten, so that they can be compared.
     """
     return [float(line[shown_quantity(name, line).name]) for line in lines for name in names]
 
@@ -226,16 +249,18 @@ def _column(
     length_unit: str,
     other_columns: Sequence[float] = (),
 ) -> TableColumn:
-    """Return a column of the table.
+    """Return a column of a path's table with heading, unit and cells.
 
     Parameters
     ----------
     of_column
-        Its quantity.
+        Quantity that the column shows.
     values
-        Its cells in path.csv.
+        Text of its cells in path.csv.
+    length_unit
+        As of `path_table`.
     other_columns
-        Numbers of other columns with the same power of ten.
+        Numbers of other columns that share the power of ten.
     """
     if of_column.kind == "text":
         texts = values
@@ -245,14 +270,14 @@ def _column(
     if of_column.kind == "count":
         return TableColumn(head(of_column), Markup(), values)
     exponent, cells = column([float(value) for value in values], other_columns)
-    size = power(exponent) if exponent else Markup()
+    power_of_ten = power(exponent) if exponent else Markup()
     title = head(of_column)
     if of_column.note:
         title = Markup("{} {}").format(title, of_column.note)
     unit = of_column.shown_unit
     if not unit and length_unit:
         unit = UNIT_OF_KIND.get(of_column.kind, "")
-    return TableColumn(title, Markup("{} {}").format(size, unit), cells)
+    return TableColumn(title, Markup("{} {}").format(power_of_ten, unit), cells)
 
 
 def _are_equal(values: Sequence[str], others: Sequence[str]) -> bool:
@@ -266,21 +291,31 @@ def _are_equal(values: Sequence[str], others: Sequence[str]) -> bool:
 
 
 def located(lines: Sequence[Line]) -> list[Line]:
-    """Return the folds and bifurcations among the rows of a path."""
+    """Return the rows of a path that are folds or bifurcations."""
     return [line for line in lines if line["label"] in LOCATED]
 
 
 def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
-    """Return the result of a run in sentences, and the reason if it stopped early."""
+    """Return the result of a run in sentences, as HTML, and the reason if it stopped early.
+
+    Parameters
+    ----------
+    summary
+        Content of summary.json.
+    lines
+        Rows of path.csv as text.
+    """
     loading = summary["case"].get("loading") or {}
     last_step = (loading[-1] or {}) if isinstance(loading, list) else loading
     until = last_step.get("until", "target")
-    first = next((line for line in located(lines) if line["branch"] == "0"), None)
-    sentences = [_end(summary, lines)] if not first or until in ("target", "points") else []
-    if first:
+    first_instability = next((line for line in located(lines) if line["branch"] == "0"), None)
+    sentences = (
+        [_end(summary, lines)] if not first_instability or until in ("target", "points") else []
+    )
+    if first_instability:
         points = summary.get("limit_points") or [{}]
-        point = points[min(located(lines).index(first), len(points) - 1)]
-        sentences.append(_instability(first, summary, lines, point.get("mode_at")))
+        point = points[min(located(lines).index(first_instability), len(points) - 1)]
+        sentences.append(_instability(first_instability, summary, lines, point.get("mode_at")))
     if solutions := summary.get("solutions"):
         stable = sum(solution["stable"] for solution in solutions)
         noun = "further solution" + "s" * (len(solutions) != 1)
@@ -306,10 +341,10 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
 
 
 def _snaps(summary: Summary) -> list[Markup]:
-    """Return a sentence on the first snap.
+    """Return a list with one sentence on the first snap; empty without a snap.
 
-    It says how long the snap takes from a tenth to nine tenths of its way, after its departure from
-    the fold, and how far beyond its end it goes.
+    The sentence says how long the snap takes from a tenth to nine tenths of its way after its
+    departure from the fold, and how far it goes beyond its end.
     """
     snaps = summary.get("snaps")
     if not snaps or "jump" not in snaps[0]:  # of an earlier version
@@ -335,9 +370,9 @@ def _snaps(summary: Summary) -> list[Markup]:
 
 
 def _error(summary: Summary) -> list[Markup]:
-    """Return a sentence on the estimated error of a run with a tolerance.
+    """Return a list with one sentence on the estimated error; empty for a run without a tolerance.
 
-    It has the best estimate of the rounds if that is another one.
+    If another mesh of the adaptive rounds had a smaller estimate, the sentence names that too.
     """
     tolerance = summary.get("tolerance") or {}
     if (estimate := tolerance.get("error_estimate")) is None:
@@ -359,35 +394,40 @@ def _error(summary: Summary) -> list[Markup]:
 
 
 def _barrier(summary: Summary) -> Markup:
-    """Return a sentence on the energy barrier, in E h R² and in mJ."""
+    """Return a sentence on the energy barrier, in E h R², and in mJ in a case with units."""
     measured = summary.get("in_units", {}).get("barrier_mJ")
     size = Markup(" ({} mJ)").format(number(measured)) if measured is not None else ""
     return Markup("The energy barrier is {} E h R²{}.").format(number(summary["barrier"]), size)
 
 
 def value(line: Line, summary: Summary) -> Markup:
-    """Return the amplitude that varied at a point, as "p/p_c = 0.326233 (53.7 Pa)".
+    """Return the amplitude that varied at a point, such as "p/p_c = 0.326233 (53.7 Pa)".
 
-    It is in units alone if it is so anyway, "t = 2 s", and for the pressure on a flat shell, which
-    p_c says nothing of.
+    It is in units alone, "t = 2 s", where the dimensionless number is the same. So is the pressure
+    on a flat shell, for which p_c means nothing.
     """
     name = amplitude(line["amplitude"]).column
     degrees = "°" if line["amplitude"] == "angle" else ""
-    size = shown_quantity(name, line)
-    has_unit = size.name != name
-    is_same_number = float(line[size.name]) == float(line[name])
-    in_that_unit = size.symbol == quantity(name).symbol and is_same_number
+    shown_column = shown_quantity(name, line)
+    has_unit = shown_column.name != name
+    is_same_number = float(line[shown_column.name]) == float(line[name])
+    # the column in units has the same symbol and the same numbers
+    in_that_unit = shown_column.symbol == quantity(name).symbol and is_same_number
     is_flat_pressure = name == "p_over_pc" and is_flat(summary["case"])
     if has_unit and (in_that_unit or is_flat_pressure):
-        return Markup("{} = {} {}").format(head(size), number(float(line[size.name])), size.si)
+        return Markup("{} = {} {}").format(
+            head(shown_column), number(float(line[shown_column.name])), shown_column.si
+        )
     measured = Markup()
     if has_unit:
-        measured = Markup(" ({} {})").format(number(float(line[size.name])), size.si)
+        measured = Markup(" ({} {})").format(
+            number(float(line[shown_column.name])), shown_column.si
+        )
     return Markup("{} = {}{}{}").format(symbol(name), number(float(line[name])), degrees, measured)
 
 
 def terminal_text(sentence: Markup) -> str:
-    """Return a sentence for a terminal.
+    """Return an HTML sentence as plain text for a terminal.
 
     Examples
     --------
@@ -399,17 +439,17 @@ def terminal_text(sentence: Markup) -> str:
 
 
 def sentence_of(folder: Path) -> str:
-    """Return the result of the run in a folder, for a terminal."""
+    """Return the result of the run in a folder as plain text for a terminal."""
     return terminal_text(verdict(*read_run(folder)))
 
 
 def read_run(folder: Path) -> tuple[Summary, Sequence[Line]]:
-    """Return summary.json and the rows of path.csv, as text.
+    """Return the content of summary.json and the rows of path.csv, as text, from a run's folder.
 
     Raises
     ------
     Damaged
-        If one of them cannot be read, or they do not belong together.
+        If one of the files cannot be read, or they do not belong together.
     """
     summary, lines = read_summary(folder), read_lines(folder / "path.csv")
     if len(lines) != summary["points"]:
@@ -423,7 +463,17 @@ def read_run(folder: Path) -> tuple[Summary, Sequence[Line]]:
 def _instability(
     line: Line, summary: Summary, lines: Sequence[Line], mode_at: Sequence[float] | None
 ) -> Markup:
-    """Return a sentence on the first instability `line`; its mode is largest at `mode_at`."""
+    """Return a sentence on the first instability of a path.
+
+    Parameters
+    ----------
+    line
+        Row of path.csv of the instability.
+    lines
+        All rows; they show which displacements are as small as rounding.
+    mode_at
+        Place (3,) over R at which the mode is largest; None if unknown.
+    """
     kind = line["label"]
     if line["mode"]:
         is_wave = line["mode"] not in (*OWN_MODES, "antisymmetric")
@@ -440,9 +490,9 @@ def _instability(
 
 
 def _place_of_mode(place: Sequence[float] | None, summary: Summary) -> Markup:
-    """Return words for where a mode is largest, as imperfections give their places.
+    """Return words for the place (3,) at which a mode is largest, as the case file gives places.
 
-    That is a direction on a sphere, coordinates on other shapes.
+    That is a direction on a sphere, and coordinates on other shapes. Empty for a place of None.
     """
     if place is None:
         return Markup("")
@@ -463,8 +513,9 @@ def _place_of_mode(place: Sequence[float] | None, summary: Summary) -> Markup:
 def place_in_units(
     place: Sequence[float], geometry: str, *, in_metres: bool
 ) -> dict[str, list[float]]:
-    """Return a place in the unit of the report: polar and azimuth on a sphere, elsewhere
-    coordinates.
+    """Return {unit: numbers} of a place over R, in the unit in which the report shows it.
+
+    On a sphere the numbers are polar angle and azimuth (degrees), elsewhere coordinates.
 
     Examples
     --------
@@ -481,50 +532,63 @@ def place_in_units(
 
 
 def _end(summary: Summary, lines: Sequence[Line]) -> Markup:
-    """Return a sentence on the end of the path."""
+    """Return a sentence on the last point of the path; empty if the run stopped before any."""
     path = [line for line in lines if line["branch"] == "0" and line["label"] not in LOCATED]
-    last = path[-1] if path else None
-    if last is None or not last["amplitude"]:
+    last_line = path[-1] if path else None
+    if last_line is None or not last_line["amplitude"]:
         if summary["stopped"]:
             return Markup("")
         return Markup("Nothing loads the shell: this is its undeformed state.")
-    arrived = last["label"] in ("target", "field") and not summary["stopped"]
+    arrived = last_line["label"] in ("target", "field") and not summary["stopped"]
     subject = "The run reached its target" if arrived else "The last point"
-    pole = pole_name(last, pole_of(summary["case"]))
+    pole = pole_name(last_line, pole_of(summary["case"]))
     sentence = Markup("{}: {}, {}.").format(
-        subject, value(last, summary), _displacement(last, pole, lines)
+        subject, value(last_line, summary), _displacement(last_line, pole, lines)
     )
-    return sentence + _untouched(last)
+    return sentence + _untouched(last_line)
 
 
 def _untouched(line: Line) -> Markup:
-    """Return a sentence that a body which moved has not met the shell; empty if it has."""
+    """Return a sentence that a moving body has not touched the shell; empty if it has.
+
+    It is also empty if the amplitude that varied is no approach of a body.
+    """
     if not line["amplitude"].startswith("approach"):
         return Markup("")
     name = f"penetration_over_h{line['amplitude'].removeprefix('approach')}"
     gap = -float(line[name])
     if above_rounding(gap, ()) <= 0:
         return Markup("")
-    of_gap = shown_quantity(name, line)
-    unit = f" {of_gap.shown_unit}" if of_gap.shown_unit else " h"
+    gap_quantity = shown_quantity(name, line)
+    unit = f" {gap_quantity.shown_unit}" if gap_quantity.shown_unit else " h"
     return Markup(" The body has not touched the shell: there is a gap of {}{}.").format(
-        number(-float(line[of_gap.name])), unit
+        number(-float(line[gap_quantity.name])), unit
     )
 
 
 def _displacement(line: Line, pole: str, lines: Sequence[Line]) -> Markup:
-    """Return the displacement at a point of a path, and the force on what moves."""
+    """Return in words the displacement at a point of a path, and the force on what moves.
+
+    Parameters
+    ----------
+    line
+        Row of the point.
+    pole
+        Name of the point of w_pole_over_h.
+    lines
+        All rows; they show which numbers are as small as rounding.
+    """
     varied_amplitude = amplitude(line["amplitude"])
     at_pole = Markup("{} at {}").format(
         _amount(shown_quantity("w_pole_over_h", line), line, lines), pole
     )
-    force = [
+    force_axes = [
         axis
         for axis in axes_of(line["amplitude"], line)
         if axis.kind == "reaction" or axis.name.startswith("force")
     ]
-    if force and varied_amplitude.column != "force":
-        return Markup("{}, {}").format(_amount(force[0], line, lines), at_pole)
+    if force_axes and varied_amplitude.column != "force":
+        return Markup("{}, {}").format(_amount(force_axes[0], line, lines), at_pole)
     if varied_amplitude.conjugate == "w_over_h" and line["w_over_h"] != line["w_pole_over_h"]:
         return Markup("{} {}").format(
             _amount(shown_quantity("w_over_h", line), line, lines), varied_amplitude.place
@@ -533,14 +597,17 @@ def _displacement(line: Line, pole: str, lines: Sequence[Line]) -> Markup:
 
 
 def amount(name: str, line: Line, lines: Sequence[Line]) -> Markup:
-    """Return a column at a point, zero where it is as small as rounding."""
+    """Return the number in column `name` of a row, zero where it is as small as rounding.
+
+    The largest number of the column in all `lines` sets what is small.
+    """
     return number(
         above_rounding(float(line[name]), (float(other_line[name]) for other_line in lines))
     )
 
 
 def _amount(of_column: Quantity, line: Line, lines: Sequence[Line]) -> Markup:
-    """Return symbol, value and unit of a column at a point."""
-    size = amount(of_column.name, line, lines)
+    """Return symbol, value and unit of a column at a point, such as "w/h = 0.5"."""
+    cell = amount(of_column.name, line, lines)
     unit = f" {of_column.shown_unit}" if of_column.shown_unit else ""
-    return Markup("{} = {}{}").format(head(of_column), size, unit)
+    return Markup("{} = {}{}").format(head(of_column), cell, unit)

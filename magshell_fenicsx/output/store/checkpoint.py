@@ -1,10 +1,12 @@
 """DIR/checkpoint: the case, then every result and finding of a run, each on disk before the next.
 
-A result is a point of a path or the reason of a failure; a finding is what is computed at a point,
-see `RecordedValues`. A resumed run replays them in place of computing them.
+A result is a point of a path, or the reason of a failure. A finding is an expensive value computed
+at a point, see `RecordedValues`. A resumed run reads results and findings in place of computing
+them again.
 
-Rank 0 alone writes one file, so that a full disk stops all ranks together. ADIOS2 (2.10, through
-adios4dolfinx 0.9.3) raises on one rank in `Close` then, and the other ranks wait for ever.
+Rank 0 alone writes one file, so that a full disk stops all ranks together. With ADIOS2 (2.10,
+through adios4dolfinx 0.9.3) a full disk raises on one rank in `Close`, and the other ranks wait for
+ever.
 """
 
 import json
@@ -35,7 +37,7 @@ MARK = b"MSF1"
 
 
 def framed(content: bytes) -> bytes:
-    """Return the bytes to append for one element of the file.
+    """Return one element of the file as bytes: mark, length and checksum, then its content.
 
     Examples
     --------
@@ -48,9 +50,9 @@ def framed(content: bytes) -> bytes:
 
 
 def read_frame(stream: BinaryIO) -> bytes | None:
-    """Return the element at the stream's position.
+    """Return the content of the element at the stream's position, and go on to the next one.
 
-    None, with the position unchanged, if there is no complete one.
+    None if there is no complete element with a right checksum; the position is then unchanged.
     """
     start = stream.tell()
     head = stream.read(FRAME_HEAD.size)
@@ -72,7 +74,9 @@ SAME_PLACE_TOLERANCE = 1e-9  # distance of equal nodes over the mesh's size
 
 
 class Ordering:
-    """Order of the nodes of a function space: numbered once and identified by their positions.
+    """Order of the nodes of a function space that does not depend on the number of ranks.
+
+    Nodes are numbered once and identified by their positions.
 
     Parameters
     ----------
@@ -81,8 +85,8 @@ class Ordering:
     comm
         The communicator of all ranks.
     places
-        On rank 0, the (n, 3) positions on the affine mesh in the order to use, or None for the
-        present order.
+        On rank 0, positions (n, 3) on the affine mesh in the order to use; None for the present
+        order.
 
     Raises
     ------
@@ -94,10 +98,11 @@ class Ordering:
     places
         (n, 3) positions in the order in use.
     size, last
-        Number of values on this rank, and whether it is the last rank of the space.
+        Number of this rank's values, and whether it is the last rank of the space.
     """
 
     def __init__(self, V: fem.FunctionSpace, comm: MPI.Comm, places: Array | None = None) -> None:
+        """Number the nodes of all ranks; collective."""
         self._space_comm, self._comm = V.mesh.comm, comm
         self._values_per_node = V.dofmap.index_map_bs
         own_places = V.tabulate_dof_coordinates()[: V.dofmap.index_map.size_local]
@@ -105,7 +110,10 @@ class Ordering:
         places = comm.bcast(places)
         if places is None:
             self.places: Array = np.concatenate(places_of_ranks)
-            first_number = sum(len(part) for part in places_of_ranks[: self._space_comm.rank])
+            # in the present order, nodes are numbered rank after rank
+            first_number = sum(
+                len(places_of_rank) for places_of_rank in places_of_ranks[: self._space_comm.rank]
+            )
             self._own_numbers: NDArray[np.int64] = first_number + np.arange(len(own_places))
         else:
             self.places, self._own_numbers = places, self._numbers_of(places, own_places, comm)
@@ -114,7 +122,10 @@ class Ordering:
         self.last = self._space_comm.rank == self._space_comm.size - 1
 
     def _numbers_of(self, places: Array, own_places: Array, comm: MPI.Comm) -> NDArray[np.int64]:
-        """Return the numbers of this rank's nodes among the places; collective."""
+        """Return the number in `places` of each node of this rank; collective.
+
+        Raises CaseError on every rank if nodes and places do not match one to one.
+        """
         distance, number = scipy.spatial.cKDTree(places).query(own_places)
         numbers_of_ranks = self._space_comm.allgather(number)
         one_to_one = np.array_equal(
@@ -130,22 +141,27 @@ class Ordering:
 
     @property
     def is_present(self) -> bool:
-        """Whether each rank has the nodes that it had in the run of the file."""
+        """Whether the order in use is that of the ranks now: no node has changed its rank."""
         return np.array_equal(np.concatenate(self._numbers_of_ranks), np.arange(len(self.places)))
 
     def gather(self, u: Vector) -> Array:
-        """Return all values (n, components) of a displacement on rank 0 of its space.
+        """Return a displacement as values (n, components) in the order in use; collective.
 
-        Empty on other ranks.
+        On rank 0 of the space; empty on other ranks.
+
+        Parameters
+        ----------
+        u
+            This rank's values.
         """
-        parts = self._space_comm.gather(u)
-        values = np.empty((len(self.places) if parts else 0, self._values_per_node))
-        for numbers, part in zip(self._numbers_of_ranks, parts or [], strict=False):
-            values[numbers] = part.reshape(-1, self._values_per_node)
+        vectors_of_ranks = self._space_comm.gather(u)
+        values = np.empty((len(self.places) if vectors_of_ranks else 0, self._values_per_node))
+        for numbers, vector in zip(self._numbers_of_ranks, vectors_of_ranks or [], strict=False):
+            values[numbers] = vector.reshape(-1, self._values_per_node)
         return values
 
     def scatter(self, values: Array) -> Vector:
-        """Return this rank's part of values (n, components) that every rank has."""
+        """Return this rank's part of values (n, components) in the order in use."""
         return np.asarray(values.reshape(-1, self._values_per_node)[self._own_numbers].ravel())
 
 
@@ -173,7 +189,7 @@ def check_resumable(file: Path, document: Document) -> None:
 
 
 def identity_in(file: Path) -> dict[str, Any] | None:
-    """Return the `identity` of the run that began a checkpoint; None if there is no checkpoint.
+    """Return the `identity` of the run that began a checkpoint; None if there is no such file.
 
     Raises
     ------
@@ -195,29 +211,32 @@ def identity_in(file: Path) -> dict[str, Any] | None:
 
 
 def identity(document: Document) -> dict[str, Any]:
-    """Return everything that a run depends on: the case, the files that it names, the program."""
+    """Return everything on which the results of a run depend.
+
+    These are the case, the files that it names, and the program's sources.
+    """
     data = {"case": document.data, **document.outside, "sources": code_version()}
     return dict(json.loads(json.dumps(data)))  # as read back from a file
 
 
 class OtherSources(CaseError):
-    """The saved results were computed by other sources of this program."""
+    """Error: the saved results were computed by other sources of this program."""
 
 
 def refuse_other_case(saved: dict[str, Any], document: Document, folder: Path) -> None:
-    """Check that saved results belong to this case and these sources.
+    """Check that saved results belong to this case and to these sources.
 
     Raises
     ------
     CaseError
         With the first difference; `OtherSources` if only the sources differ.
     """
-    present, saved = _without_appearance(identity(document)), _without_appearance(saved)
-    saved_sources, sources = saved.get("sources", saved.get("version")), present["sources"]
+    identity_now, saved = _without_appearance(identity(document)), _without_appearance(saved)
+    saved_sources, sources = saved.get("sources", saved.get("version")), identity_now["sources"]
     saved_case = _without_program(saved)
-    if saved_case != _without_program(present):
+    if saved_case != _without_program(identity_now):
         raise CaseError(
-            f"--resume: {folder} belongs to another run: {_difference(saved_case, present)}; "
+            f"--resume: {folder} belongs to another run: {_difference(saved_case, identity_now)}; "
             "give another folder, or --overwrite in place of --resume"
         )
     if saved_sources != sources:
@@ -229,7 +248,10 @@ def refuse_other_case(saved: dict[str, Any], document: Document, folder: Path) -
 
 
 def belongs_to(saved: dict[str, Any], document: Document) -> bool:
-    """Whether saved results belong to this case, by whatever sources."""
+    """Whether saved results belong to this case, whichever sources computed them.
+
+    `saved` is the `identity` of their run.
+    """
     return _without_program(_without_appearance(saved)) == _without_program(
         _without_appearance(identity(document))
     )
@@ -241,22 +263,25 @@ def _without_program(data: dict[str, Any]) -> dict[str, Any]:
 
 
 def _without_appearance(data: dict[str, Any]) -> dict[str, Any]:
-    """Return an identity without the name of the case file and the section `output`.
+    """Return an identity without the name of the case file and without the section `output`.
 
-    They change no result.
+    Neither of them changes a result.
     """
     case = {key: value for key, value in (data.get("case") or {}).items() if key != "output"}
     return {**{key: value for key, value in data.items() if key != CASE_FILE}, "case": case}
 
 
 class Checkpoint:
-    """The journal of a run in its folder; every rank calls, rank 0 reads and writes.
+    """The journal of a run in its folder; every rank calls it, rank 0 reads and writes.
+
+    A journal keeps the results of all solves in their order. While the file has results, they are
+    replayed; further ones are appended.
 
     Parameters
     ----------
     file
         The file of a run that begins (`empty_content`), or of an earlier run; an incomplete last
-        entry is cut off.
+        element is cut off.
     V
         The displacement's space.
     comm
@@ -276,13 +301,14 @@ class Checkpoint:
         self.begin(V)
 
     def _open(self) -> None:
-        """Open the file for reading, after its head."""
+        """Open the file for reading, at the first element after its head; on rank 0."""
         self._reading = open_result(self._file)
         read_frame(self._reading)
 
     def begin(self, space: fem.FunctionSpace) -> None:
-        """Begin results with the values of a space, whose nodes come first in the file;
-        collective.
+        """Announce results whose vectors are values in `space`; collective.
+
+        The places of its nodes come first in the file. They are read there, or appended.
         """
         places = (
             access_disk(self._comm, self._places_in_file, "cannot be read")
@@ -295,12 +321,15 @@ class Checkpoint:
             self._append(self._ordering.places.tobytes())
 
     def _places_in_file(self) -> Array | None:
-        """Return the positions (n, 3) of the nodes, if the file has them."""
+        """Return the positions (n, 3) of the nodes from the file; None at its end. On rank 0."""
         content = read_frame(self._reading)
         return None if content is None else np.frombuffer(content).reshape(-1, 3)
 
     def replay(self) -> Point | str | None:
-        """Return the next result in the file; None at its end. Collective."""
+        """Return the next result in the file; None at its end. Collective.
+
+        A result is a point, or the reason of a failed solve.
+        """
         content = self._next_content()
         if content is None:
             return None
@@ -308,7 +337,7 @@ class Checkpoint:
         return self._decoded(content)
 
     def _next_content(self) -> bytes | None:
-        """Return the next element of the file; None at its end. Collective."""
+        """Return the content of the next element of the file; None at its end. Collective."""
         if not self._replaying:
             return None
         content = access_disk(self._comm, lambda: read_frame(self._reading), "cannot be read")
@@ -316,43 +345,45 @@ class Checkpoint:
         return content
 
     def recorded_values(self, find: Callable[[], RecordedValues]) -> RecordedValues:
-        """Return the next finding in the file; at its end that of `find`, which is put there.
-        Collective.
+        """Return the next finding in the file; at its end call `find`, and append its finding.
+
+        A finding is an expensive value at a point, with this rank's part of a vector or None.
+        Collective; `find` is called on every rank.
         """
         if content := self._next_content():
             return self._read(content)
         finding = find()
-        parts = self._comm.gather(finding.vector)
-        vectors = [part for part in parts or () if part is not None]
+        vectors_of_ranks = self._comm.gather(finding.vector)
+        vectors = [vector for vector in vectors_of_ranks or () if vector is not None]
         head = json.dumps(
-            {"values": finding.values, "parts": [part.size for part in vectors]},
+            {"values": finding.values, "parts": [vector.size for vector in vectors]},
             default=_python_number,
         )
-        self._append(b"\n".join([head.encode(), b"".join(part.tobytes() for part in vectors)]))
+        self._append(b"\n".join([head.encode(), b"".join(vector.tobytes() for vector in vectors)]))
         return finding
 
     def _read(self, content: bytes) -> RecordedValues:
-        """Return a finding, with this rank's part of its vector.
+        """Return the finding in an element of the file, with this rank's part of its vector.
 
-        There is no vector if the ranks do not have the nodes that they had.
+        The vector is None if the ranks do not have the nodes that they had when it was written.
         """
         text, _, data = content.partition(b"\n")
         decoded = json.loads(text)
         self._refuse_other_kind(is_other="values" not in decoded)
-        parts, rank = decoded["parts"], self._comm.rank
-        if len(parts) != self._comm.size or not self._ordering.is_present:
+        sizes, rank = decoded["parts"], self._comm.rank
+        if len(sizes) != self._comm.size or not self._ordering.is_present:
             return RecordedValues(decoded["values"])
         return RecordedValues(
-            decoded["values"], np.split(np.frombuffer(data), np.cumsum(parts[:-1]))[rank]
+            decoded["values"], np.split(np.frombuffer(data), np.cumsum(sizes[:-1]))[rank]
         )
 
     def _refuse_other_kind(self, *, is_other: bool) -> None:
-        """Check that the file has a result where a result is due, and a finding where one is due.
+        """Check that an element is a result where a result is due, and a finding where one is due.
 
         Raises
         ------
         Damaged
-            If it is the other: the run has taken another way than that of the file.
+            If `is_other`: the run has then taken another way than the run of the file.
         """
         if is_other:
             raise Damaged(
@@ -360,11 +391,12 @@ class Checkpoint:
             )
 
     def record(self, result: Point | str) -> None:
-        """Put a result on disk. Collective."""
+        """Append a result: a point, or the reason of a failed solve. Collective."""
         if isinstance(result, str):
             self._append(json.dumps({"failure": result}).encode())
             return
         size = self._ordering.size
+        # a loading device adds unknowns, which the last rank has after its nodes
         values_beyond_nodes = [
             self._comm.bcast(vector[size:].tolist(), root=self._comm.size - 1)
             for vector in (result.state.u, result.du)
@@ -390,7 +422,7 @@ class Checkpoint:
         access_disk(self._comm, self._file.unlink)
 
     def _append(self, content: bytes) -> None:
-        """Put an element on disk. Collective."""
+        """Append an element with `content` to the file, on rank 0. Collective."""
 
         def write() -> None:
             if self._writing is None:  # cut off an incomplete last entry
@@ -400,7 +432,7 @@ class Checkpoint:
         access_disk(self._comm, write)
 
     def _decoded(self, content: bytes) -> Point | str:
-        """Return a result from its content, with this rank's part of its vectors."""
+        """Return the result in an element of the file, with this rank's part of its vectors."""
         text, _, data = content.partition(b"\n")
         decoded = json.loads(text)
         self._refuse_other_kind(is_other="values" in decoded)
@@ -418,14 +450,19 @@ class Checkpoint:
 
 
 def _python_number(number: Any) -> Any:
-    """Return a number of NumPy as one of Python."""
+    """Return a number of NumPy as one of Python, which JSON can write."""
     return number.item()
 
 
 def _encoded(point: Point, u: Array, du: Array, values_beyond_nodes: list[list[float]]) -> bytes:
-    """Return the content of a point: a line of JSON with its numbers, then its two vectors.
+    """Return a point as bytes: a line of JSON with its numbers, then its two vectors.
 
-    `values_beyond_nodes` are the values of u and du that belong to no node.
+    Parameters
+    ----------
+    u, du
+        Displacement and its tangent (n, components), in the order of the file.
+    values_beyond_nodes
+        Values of u and of du that belong to no node.
     """
     names = [field.name for field in fields(point) if field.name not in ("state", "du")]
     numbers = {name: getattr(point, name) for name in names}
@@ -434,7 +471,15 @@ def _encoded(point: Point, u: Array, du: Array, values_beyond_nodes: list[list[f
 
 
 def _difference(saved: Any, present: Any, key: str = "") -> str:
-    """Return the first key with different values, and both values, in words."""
+    """Return in words the first key at which two cases differ, and both its values.
+
+    Parameters
+    ----------
+    saved, present
+        Parts of the two cases at `key`.
+    key
+        Key path of these parts; empty for the whole case.
+    """
     if isinstance(saved, dict) and isinstance(present, dict):
         name = next(name for name in {**saved, **present} if saved.get(name) != present.get(name))
         inner_key = f"{key}.{name}".removeprefix(".").removeprefix("case.")

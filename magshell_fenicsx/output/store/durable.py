@@ -1,7 +1,7 @@
 """Files that stay readable after a kill, a crash or a full disk.
 
-Writing is atomic (`write_whole`) or by complete pieces (`AppendedFile`); reading refuses what is no
-regular file.
+Writing is atomic (`write_whole`) or by complete pieces (`AppendedFile`). Reading refuses anything
+that is no regular file.
 """
 
 import json
@@ -22,11 +22,11 @@ SYNC_INTERVAL = 1.0
 
 
 class Damaged(CaseError):
-    """File of results that is not what the program wrote; the message names it and says why."""
+    """Error: a file of results is not what the program wrote; the message names it and says why."""
 
 
 def read_result(file: Path) -> bytes:
-    """Return the content of a file of results; raises as `open_result`."""
+    """Return the content of a file of results; it raises as `open_result`."""
     try:
         return read_bounded(file)
     except OSError as e:
@@ -34,7 +34,7 @@ def read_result(file: Path) -> bytes:
 
 
 def open_result(file: Path) -> BinaryIO:
-    """Return a file of results, open for reading.
+    """Open a file of results for reading.
 
     Raises
     ------
@@ -52,7 +52,8 @@ def open_result(file: Path) -> BinaryIO:
 def _error_for(e: OSError) -> Exception:
     """Return the exception to raise for an error of the disk.
 
-    `Damaged` for a file that no run has written: runs write regular files.
+    That is `Damaged` where the file is no regular file, which a run does not write; otherwise the
+    error itself.
     """
     if e.errno in (EFBIG, EINVAL, EISDIR):
         return Damaged(f"{e.filename}: is damaged: {e.strerror}")
@@ -65,7 +66,7 @@ def read_object(file: Path) -> dict[str, Any]:
     Raises
     ------
     Damaged
-        If there is none.
+        If the file has no JSON object; otherwise as `open_result`.
     """
     try:
         content = json.loads(read_result(file))
@@ -82,10 +83,13 @@ def write_object(file: Path, content: Mapping[str, Any], indent: int = 1) -> Non
 
 
 def write_whole(file: Path, content: bytes, *, waits: bool = True) -> None:
-    """Write a file; at every moment either the complete old file or the complete new one exists.
+    """Write a file so that at every moment the complete old or the complete new one exists.
 
-    Without `waits` a failure of power may lose it: for files that a resumed run writes again where
-    they are not whole.
+    Parameters
+    ----------
+    waits
+        Whether to wait until the disk has the file. Otherwise a power failure may lose it, which
+        suits files that a resumed run writes again.
 
     Raises
     ------
@@ -110,7 +114,7 @@ def write_whole(file: Path, content: bytes, *, waits: bool = True) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Write the directory entries of a folder to disk."""
+    """Wait until the disk has the directory entries of a folder."""
     number = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(number)
@@ -121,13 +125,16 @@ def sync_folder(folder: Path) -> None:
 class AppendedFile:
     """File that grows by complete pieces.
 
-    A killed process loses none. A failure of power may lose the pieces since the last sync: a sync
-    is at the first piece, at later ones if `SYNC_INTERVAL` seconds have passed, and at the end.
+    A killed process loses no piece. A power failure may lose the pieces since the last sync with
+    the disk. There is a sync at the first piece, at later ones if `SYNC_INTERVAL` seconds have
+    passed, and at the end.
 
     Parameters
     ----------
+    file
+        The file; it is created if it is not there.
     length
-        Bytes of an existing file to keep; None keeps all.
+        Number of bytes of an existing file to keep; None keeps all.
     """
 
     def __init__(self, file: Path, length: int | None = None) -> None:
@@ -139,17 +146,18 @@ class AppendedFile:
         self._synced_length = self._length
 
     def append(self, content: bytes, *, waits: bool = True) -> None:
-        """Add a piece.
+        """Append a piece to the file.
 
         Parameters
         ----------
         waits
-            Whether the disk is waited for, if `SYNC_INTERVAL` has passed.
+            Whether to sync with the disk, if `SYNC_INTERVAL` has passed since the last time.
 
         Raises
         ------
         OSError
-            With the file's name; the file keeps its length, or that which was on disk.
+            With the file's name. The file is cut to its length before the piece, or to that at the
+            last sync if the sync has failed.
         """
         remaining = memoryview(content)
         try:
@@ -163,7 +171,10 @@ class AppendedFile:
         self._length += len(content)
 
     def _sync(self, length: int) -> None:
-        """Wait until the file's first `length` bytes are on disk."""
+        """Wait until the disk has the file's first `length` bytes.
+
+        If that fails, the pieces since the last sync count as lost.
+        """
         try:
             os.fsync(self._stream.fileno())
         except OSError:
@@ -172,7 +183,7 @@ class AppendedFile:
         self._synced_length, self._last_sync = length, time.monotonic()
 
     def close(self) -> None:
-        """Close the file, whose last pieces are on disk then.
+        """Sync the last pieces with the disk, and close the file.
 
         Raises
         ------

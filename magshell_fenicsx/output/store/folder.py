@@ -1,4 +1,4 @@
-"""The output folder: making it, locking it, and disk access through rank 0."""
+"""The output folder: making and locking it, and access to the disk through rank 0."""
 
 import fcntl
 import json
@@ -21,17 +21,16 @@ KEYS_OF_POINTS = {"outcome", "evaluation", "samples"}  # of the files in points/
 
 
 class DiskError(RuntimeError):
-    """Error that a file could not be written or read; the message has its name and the reason."""
+    """Error: a file could not be written or read; the message has its name and the reason."""
 
 
 def user_folder(out: Path | str) -> Path:
-    """Return the folder that a user names.
+    """Return the folder that a user names; it need not exist.
 
     Raises
     ------
     CaseError
-        If the name is empty, as that of a variable which is not set: the working folder is `.`. If
-        no folder may have it, or none can be looked for there.
+        If the name is empty, as that of a variable which is not set, or cannot be a folder's name.
     """
     if out == "":
         raise CaseError("--out: is empty; give the name of a folder, . for the working folder")
@@ -51,19 +50,21 @@ def user_folder(out: Path | str) -> Path:
 
 
 def refuse_foreign(folder: Path, names: Iterable[str], new_files: str) -> None:
-    """Refuse to replace files that are not known as results.
+    """Raise an error if files would be replaced that are not known as results.
 
     Parameters
     ----------
+    folder
+        The folder of these files.
     names
         Names of the unknown files, relative to the folder.
     new_files
-        Words for what would replace them.
+        Words for the new files.
 
     Raises
     ------
     CaseError
-        With their names, if there are any.
+        With the names, if there are any.
     """
     if foreign := sorted(names):
         further = f" and {len(foreign) - MAX_NAMED_FILES} more" * (len(foreign) > MAX_NAMED_FILES)
@@ -77,24 +78,26 @@ def refuse_foreign(folder: Path, names: Iterable[str], new_files: str) -> None:
 def refuse_other_tables(
     folder: Path, names: Sequence[str], keys: Collection[str], new_files: str, case: str = ""
 ) -> None:
-    """Refuse a folder for the tables of many runs that has tables of another case, or foreign
-    files.
+    """Refuse a folder for tables of many runs that has tables of another case, or foreign files.
 
     Parameters
     ----------
+    folder
+        The folder, which may be missing.
     names
-        Names of the tables; the first is a JSON object.
+        Names of the tables; the first one is a JSON object.
     keys
-        Keys of that object, besides the name of the case file as `case`.
+        Keys by which that object is known as a result. Its key `case` has the name of the case
+        file.
     new_files
-        Words for what would replace the files.
+        Words for the new files.
     case
-        The name of the case file, if another one is refused.
+        Name of the present case file, to refuse tables of another case; empty to accept any.
 
     Raises
     ------
     CaseError
-        On the rank that calls.
+        On the calling rank.
     """
     content = _object(folder / names[0])
     if content.keys() >= set(keys):
@@ -112,7 +115,7 @@ def refuse_other_tables(
 
 
 def _object(file: Path) -> dict[str, Any]:
-    """Return the JSON object in a file; empty if there is none."""
+    """Return the JSON object in a file; empty if there is none or it cannot be read."""
     try:
         content = json.loads(read_bounded(file))
     except (OSError, ValueError, RecursionError):
@@ -121,12 +124,16 @@ def _object(file: Path) -> dict[str, Any]:
 
 
 def _is_filled(file: Path) -> bool:
-    """Whether there is anything but an empty file."""
+    """Whether there is a file with content, or anything else that is no file."""
     return file.exists() and (not file.is_file() or file.stat().st_size > 0)
 
 
 def prepare_folder(out: Path, comm: "MPI.Comm", make: Callable[[Path], None]) -> Path:
-    """Let rank 0 prepare a folder; collective.
+    """Let rank 0 prepare the folder `out` by calling `make` on it; collective.
+
+    Returns
+    -------
+    The folder.
 
     Raises
     ------
@@ -135,6 +142,7 @@ def prepare_folder(out: Path, comm: "MPI.Comm", make: Callable[[Path], None]) ->
     """
 
     def prepared() -> Path:
+        """Call `make` on rank 0, with an error of the disk turned into a CaseError."""
         try:
             make(out)
         except OSError as e:
@@ -150,7 +158,7 @@ def prepare_folder(out: Path, comm: "MPI.Comm", make: Callable[[Path], None]) ->
 def locked_folder(out: Path, comm: "MPI.Comm", make: bool) -> Iterator[None]:
     """Lock a folder against other runs inside `with`; collective.
 
-    Ranks of a killed mpirun may still be writing.
+    Rank 0 alone holds the lock, also a rank 0 that a killed mpirun has left behind.
 
     Parameters
     ----------
@@ -160,11 +168,12 @@ def locked_folder(out: Path, comm: "MPI.Comm", make: bool) -> Iterator[None]:
     Raises
     ------
     CaseError
-        On every rank, if the folder cannot be made, or a run is writing to it.
+        On every rank, if the folder cannot be made, or another run is writing to it.
     """
     descriptors: list[int] = []
 
     def lock(folder: Path) -> None:
+        """Make the folder if that is due, and lock it; on rank 0."""
         if make:
             folder.mkdir(parents=True, exist_ok=True)
         descriptors.append(os.open(folder, os.O_RDONLY))
@@ -192,8 +201,14 @@ def access_disk(
     operation: Callable[[], T],
     failed: Literal["cannot be written", "cannot be read"] = "cannot be written",
 ) -> T:
-    """Return the result of rank 0's reading or writing on every rank; see `on_first_rank`.
-    Collective.
+    """Read or write on rank 0, and return the result on every rank; collective.
+
+    Parameters
+    ----------
+    operation
+        Function that rank 0 calls.
+    failed
+        Words for what went wrong if it raises OSError.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""Manifest of a folder: which files a run has written, so that another run replaces these alone."""
+"""Manifest of a folder: which files a run has written, so that another run replaces only these."""
 
 import re
 import stat
@@ -40,9 +40,9 @@ RUN_NAMES = re.compile(
 
 
 def files_with_run_names(folder: Path) -> set[str]:
-    """Return what a folder has under names that a run writes, as `path.csv` and `fields/path.pvd`.
+    """Return the names in a folder that a run may write, such as `path.csv` and `fields/path.pvd`.
 
-    No link is followed.
+    They are relative to the folder, whoever wrote the files. No link is followed.
     """
     files = list(folder.iterdir())
     has_fields = _irregular_kind(folder / "fields") == "a folder"
@@ -54,7 +54,7 @@ def files_with_run_names(folder: Path) -> set[str]:
 
 
 def _irregular_kind(file: Path) -> str:
-    """Return words for what is there, empty if it is nothing or a regular file."""
+    """Return words for something that is no regular file; empty for a regular file or nothing."""
     kinds = {stat.S_IFREG: "", stat.S_IFDIR: "a folder", stat.S_IFLNK: "a link"}
     with suppress(FileNotFoundError):
         return kinds.get(stat.S_IFMT(file.lstat().st_mode), "a device or a pipe")
@@ -62,34 +62,39 @@ def _irregular_kind(file: Path) -> str:
 
 
 def files_of_runs(folder: Path) -> set[str]:
-    """Return the names of `files_with_run_names` that a run is known to have written.
+    """Return those names of `files_with_run_names` that a run is known to have written.
 
-    They are listed in written.txt at the end of a run. Without it they are all, if summary.json is
-    a run's, as of earlier versions. The files of a path are, if checkpoint is, also after a kill,
-    or without the list path.csv. What is no regular file is no run's.
+    With a manifest they are the names listed there. Without one they are all names, as of earlier
+    versions, if summary.json is a run's. The files of a path count too if the checkpoint is a
+    run's, for instance after a kill; or if there is no manifest, but a path.csv. Only regular files
+    count.
     """
-    present = {name for name in files_with_run_names(folder) if not _irregular_kind(folder / name)}
-    names = {name for name in present if name.endswith(".unfinished")}  # left by a kill
-    text = read_result(folder / NAME).decode(errors="replace") if NAME in present else ""
+    regular_names = {
+        name for name in files_with_run_names(folder) if not _irregular_kind(folder / name)
+    }
+    names = {name for name in regular_names if name.endswith(".unfinished")}  # left by a kill
+    text = read_result(folder / NAME).decode(errors="replace") if NAME in regular_names else ""
     if is_replacement_unfinished(folder):
         names.add(NEW_CHECKPOINT)
     if text.startswith(HEADER):
-        names |= present & {NAME, *text.splitlines()}
+        names |= regular_names & {NAME, *text.splitlines()}
     elif _is_of_run(lambda: read_object(folder / "summary.json")):
-        return present
+        return regular_names
     has_checkpoint = _is_of_run(lambda: checkpoint.identity_in(folder / checkpoint.NAME))
     if has_checkpoint or (NAME not in names and is_path(folder / "path.csv")):
-        names |= {name for name in present if name in FILES_OF_PATH or name.startswith("fields/")}
+        names |= {
+            name for name in regular_names if name in FILES_OF_PATH or name.startswith("fields/")
+        }
     return names
 
 
 def is_replacement_unfinished(folder: Path) -> bool:
-    """Whether a new run was killed while it removed the files of an earlier one."""
+    """Whether a run was killed while it removed the files of an earlier run from a folder."""
     return _is_of_run(lambda: checkpoint.identity_in(folder / NEW_CHECKPOINT))
 
 
 def _is_of_run(read_content: Callable[[], dict[str, Any] | None]) -> bool:
-    """Whether a file has the case and the program of a run."""
+    """Whether a file has the case and the program of a run; `read_content` returns its content."""
     with suppress(OSError, Damaged):
         content = read_content() or {}
         has_program = bool(content.keys() & {"sources", "versions"})
@@ -98,12 +103,12 @@ def _is_of_run(read_content: Callable[[], dict[str, Any] | None]) -> bool:
 
 
 def refuse_unwritten(folder: Path) -> None:
-    """Refuse to write where a file that no run has written has a name that runs use.
+    """Check that no file under a run's name in a folder is foreign.
 
     Raises
     ------
     CaseError
-        With the names of these files.
+        With the names of the foreign files.
     """
     foreign = files_with_run_names(folder) - files_of_runs(folder)
     kinds = {name: _irregular_kind(folder / name) for name in foreign}
@@ -112,14 +117,17 @@ def refuse_unwritten(folder: Path) -> None:
 
 
 def write_manifest(folder: Path, added: Iterable[str] = ()) -> None:
-    """List what a run has written, and what `plot` has added."""
+    """Write the list of all files in a folder that runs have written.
+
+    `added` are names of further files, such as pictures that `plot` has drawn.
+    """
     names = {*files_of_runs(folder), NAME, *added}
     lines = "".join(f"{name}\n" for name in sorted(names))
     write_whole(folder / NAME, (HEADER + lines).encode())
 
 
 def remove(folder: Path, names: Iterable[str]) -> None:
-    """Delete files that a run has written, the manifest last; and fields/ if it is empty then."""
+    """Delete files that a run has written, the manifest last, and `fields` if it is empty."""
     for name in sorted(names, key=lambda name: name == NAME):
         (folder / name).unlink(missing_ok=True)
     with suppress(OSError):  # it is not there, or has files of others

@@ -1,4 +1,4 @@
-"""Stored results of a run: its case and summary.json, checked; the row that pictures show.
+"""Stored results of a run: its case and summary.json, checked, and the row that pictures show.
 
 Runs may be finished or interrupted.
 """
@@ -72,14 +72,17 @@ POLE_NAMES = {
 
 
 def case_in(folder: Path) -> dict[str, Any]:
-    """Return the resolved case of a folder's summary.json or checkpoint; empty without both."""
+    """Return the resolved case from a folder's summary.json, or from its checkpoint.
+
+    Empty if there is neither.
+    """
     if (folder / SUMMARY).exists():
         return dict(read_summary(folder)["case"])
     return dict((checkpoint.identity_in(folder / checkpoint.NAME) or {}).get("case") or {})
 
 
 def read_summary(folder: Path) -> dict[str, Any]:
-    """Return the content of summary.json.
+    """Return the content of summary.json of a run's folder.
 
     Raises
     ------
@@ -93,27 +96,34 @@ def read_summary(folder: Path) -> dict[str, Any]:
 
 
 def _first_error(value: Any, kind: Any, key: str = "") -> str:
-    """Return the first place where a value is none that a run writes, in words.
+    """Return in words the first place where a value is none that a run writes; empty without one.
 
-    Empty if there is none. `kind` is a type or a structure as `SUMMARY_TYPES`.
+    Parameters
+    ----------
+    value
+        The value, or a part of summary.json.
+    kind
+        Its type, or a structure of types as in `SUMMARY_TYPES`.
+    key
+        Key path of the value; empty for all of summary.json.
     """
-    inner_values: list[tuple[Any, Any, str]] = []
+    entries: list[tuple[Any, Any, str]] = []
     if isinstance(kind, list) and isinstance(value, list):
-        inner_values = [(entry, kind[0], f"{key}.{i}") for i, entry in enumerate(value)]
+        entries = [(entry, kind[0], f"{key}.{i}") for i, entry in enumerate(value)]
     elif isinstance(kind, dict) and isinstance(value, dict):
-        inner = dict.fromkeys(value, kind["*"]) if "*" in kind else kind
-        missing = [name for name in inner if not name.endswith("?") and name not in value]
+        types_of_keys = dict.fromkeys(value, kind["*"]) if "*" in kind else kind
+        missing = [name for name in types_of_keys if not name.endswith("?") and name not in value]
         for name in missing:
             return f"it has no {key}.{name}".replace(" .", " ")
-        names = {name: name.removesuffix("?") for name in inner}
-        inner_values = [
-            (value[inner_key], inner[name], f"{key}.{inner_key}")
+        names = {name: name.removesuffix("?") for name in types_of_keys}
+        entries = [
+            (value[inner_key], types_of_keys[name], f"{key}.{inner_key}")
             for name, inner_key in names.items()
             if inner_key in value
         ]
     elif isinstance(kind, list | dict) or not isinstance(value, kind):
         return f"its {key.removeprefix('.')} is {json.dumps(value)[:40]}"
-    errors = (_first_error(*entry) for entry in inner_values)
+    errors = (_first_error(*entry) for entry in entries)
     return next((error for error in errors if error), "")
 
 
@@ -131,8 +141,8 @@ def style_of(case: Mapping[str, Any], options: Mapping[str, Any] | None = None) 
     CaseError
         If an option is wrong: the option, the value, what is allowed.
     """
-    section, options = case.get("output") or {}, options or {}
-    source = Source("options", {"output": {**section, **options}})
+    output_data, options = case.get("output") or {}, options or {}
+    source = Source("options", {"output": {**output_data, **options}})
     for key in options:
         source.places["output", key] = f"--{key.replace('_', '-')}"
     try:
@@ -142,30 +152,30 @@ def style_of(case: Mapping[str, Any], options: Mapping[str, Any] | None = None) 
 
 
 def headline(case: Mapping[str, Any], rows: Sequence[Row]) -> Row:
-    """Return the row that a run is about, at which its pictures show the shell.
+    """Return the row of path.csv that a run is about, at which its pictures show the shell.
 
-    With `until: limit` at its end that is the first instability, even if the path goes on from
-    there.
+    It is the last row of the path. For a last step with `until: limit` and no continuation it is
+    the first instability, if there is one.
     """
     path = [row for row in rows if row["label"] != SOLUTION]
     loading = case.get("loading") or {}
-    last = loading[-1] if isinstance(loading, list) else loading
-    goes_on = last.get("then") or last.get("branches")
-    ends_at_limit = last.get("until") == "limit" and not goes_on
+    last_load = loading[-1] if isinstance(loading, list) else loading
+    goes_on = last_load.get("then") or last_load.get("branches")
+    ends_at_limit = last_load.get("until") == "limit" and not goes_on
     instabilities = (row for row in path if row["label"] in LOCATED and not row["branch"])
     return next(instabilities, path[-1]) if ends_at_limit else path[-1]
 
 
 def shell_of(case: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return the section of the shell in a case; several shells are one of geometry: mesh."""
+    """Return the section of the shell in a resolved case.
+
+    Several shells are one of geometry: mesh.
+    """
     return case.get("shell") or ({"geometry": "mesh"} if case.get("shells") else {})
 
 
 def is_flat(case: Mapping[str, Any]) -> bool:
-    """Whether the shell of a case is drawn flat.
-
-    The pressure p_c of a sphere says nothing of such a shell.
-    """
+    """Whether the shell of a case is flat, so that a sphere's pressure p_c means nothing."""
     return shell_of(case).get("geometry") in FLAT_GEOMETRIES
 
 

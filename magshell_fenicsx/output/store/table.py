@@ -1,4 +1,4 @@
-"""Tables of results: how they are written and read; path.csv, on disk point by point."""
+"""Tables of results: writing and reading CSV files, and path.csv, on disk row by row."""
 
 import csv
 import io
@@ -25,13 +25,14 @@ NAN_COLUMNS = ("stretching", "bending", "energy")
 def pole_name(row: Mapping[str, object], pole: str = POLE) -> str:
     """Return the name of the point of `w_pole_over_h`.
 
-    That is the first named point, or what is there in place of a pole, see `pole_of`.
+    It is the first named point, whose columns are in `row`. Without one it is `pole`, see
+    `pole_of`.
     """
     return next((key.removesuffix("_ux") for key in row if key.endswith("_ux")), pole)
 
 
 def stability(row: Mapping[str, object]) -> str:
-    """Return in words whether a point is stable.
+    """Return in words whether a point of a path is stable, from its row of path.csv.
 
     Examples
     --------
@@ -40,34 +41,46 @@ def stability(row: Mapping[str, object]) -> str:
     >>> stability({"negative_pivots": 0, "excluded_pivots": 0})
     'stable'
     """
-    symmetric, excluded = (
+    model_pivots, excluded_pivots = (
         int(str(row.get(key, 0))) for key in ("negative_pivots", "excluded_pivots")
     )
-    if not symmetric + excluded:
+    if not model_pivots + excluded_pivots:
         return "stable"
     beginning = (
-        f"unstable in {symmetric} direction{'s' * (symmetric != 1)}" if symmetric else "unstable in"
+        f"unstable in {model_pivots} direction{'s' * (model_pivots != 1)}"
+        if model_pivots
+        else "unstable in"
     )
     return beginning + (
-        f"{' and' * bool(symmetric)} {excluded} that the model excludes" if excluded else ""
+        f"{' and' * bool(model_pivots)} {excluded_pivots} that the model excludes"
+        if excluded_pivots
+        else ""
     )
 
 
 class PathTable:
-    """Writer of path.csv, row by row, after the rows of an interrupted run.
+    """Writer of path.csv, which appends rows to those of an interrupted run.
 
     Parameters
     ----------
+    file
+        The table; an existing one is continued.
     extra
         Columns besides those of every run.
+
+    Raises
+    ------
+    Damaged
+        If an existing file is no table of a run, or has other columns.
 
     Attributes
     ----------
     complete_rows
-        The complete rows of an existing file; an incomplete last row is cut off.
+        The complete rows of an existing file, as text; an incomplete last row is cut off.
     """
 
     def __init__(self, file: Path, extra: Sequence[str] = ()) -> None:
+        """Open the file after its complete rows, or begin it with its header."""
         self._columns = (*COLUMNS, *extra)
         header = table_text([self._columns])
         content = read_result(file) if file.exists() else b""
@@ -80,7 +93,7 @@ class PathTable:
             self._file.append(header.encode())
 
     def write(self, row: Row) -> None:
-        """Add a row, unless the file has it.
+        """Append a row, unless the existing file already has the row of that point.
 
         Raises
         ------
@@ -91,11 +104,12 @@ class PathTable:
             self._file.append(table_text([[row[key] for key in self._columns]]).encode())
 
     def close(self) -> None:
+        """Close the file, whose last rows are then on disk."""
         self._file.close()
 
 
 def table_text(lines: Iterable[Iterable[Any]], end: str = "\r\n") -> str:
-    r"""Return lines as text of a CSV file, with numbers in full precision.
+    r"""Return lines of cells as the text of a CSV file, with numbers in full precision.
 
     Examples
     --------
@@ -111,18 +125,23 @@ def table_text(lines: Iterable[Iterable[Any]], end: str = "\r\n") -> str:
 
 
 def write_csv(rows: Iterable[Mapping[str, Any]], columns: Sequence[str], file: Path) -> None:
-    """Write columns of rows; what a row does not have is left empty."""
+    """Write columns of rows as a CSV file with a header; a missing value is left empty."""
     lines = ([row.get(column, "") for column in columns] for row in rows)
     file.write_text(table_text([columns, *lines]), encoding="utf-8", newline="")
 
 
 def read_csv(file: Path, convert: Callable[[Mapping[str, str]], Read]) -> list[Read]:
-    """Return what a function makes of each row of a table, by the names of its header.
+    """Return what `convert` makes of each row of a CSV file, in their order.
+
+    Parameters
+    ----------
+    convert
+        Function of a row: name in the header -> text.
 
     Raises
     ------
     Damaged
-        If it is no table, or the function raises for a row.
+        If the file is no table, or `convert` raises a KeyError, ValueError or TypeError.
     """
     try:
         with file.open(encoding="utf-8", newline="") as stream:
@@ -132,7 +151,7 @@ def read_csv(file: Path, convert: Callable[[Mapping[str, str]], Read]) -> list[R
 
 
 def is_path(file: Path) -> bool:
-    """Whether a file begins as a path.csv does."""
+    """Whether a file begins as a path.csv does; False if it cannot be read."""
     try:
         with open_result(file) as stream:
             return stream.readline(1000).startswith(",".join(COLUMNS[:4]).encode())
@@ -141,7 +160,10 @@ def is_path(file: Path) -> bool:
 
 
 def read_rows(file: Path) -> list[Row]:
-    """Return the complete rows of a path.csv, also after a kill; see `read_lines`."""
+    """Return the complete rows of a path.csv, with numbers where columns are numbers.
+
+    It also reads the table of a killed run; it raises as `read_lines`.
+    """
     return [
         {key: v if key in TEXTS else _number(v) for key, v in row.items()}
         for row in read_lines(file)
@@ -154,7 +176,7 @@ def read_lines(file: Path) -> list[dict[str, str]]:
     Raises
     ------
     Damaged
-        With the first line that is not a run's.
+        If a column is missing or a line is not from a run; the message names the first such line.
     """
     try:
         text = read_result(file).decode()
@@ -183,12 +205,22 @@ def read_lines(file: Path) -> list[dict[str, str]]:
 
 
 def _wrong_column(number: int, row: Mapping[str, str], counts: Collection[str]) -> str:
-    """Return the first column whose value no run writes; empty if there is none."""
+    """Return the first column whose value no run writes; empty if there is none.
+
+    Parameters
+    ----------
+    number
+        Number that the row's point must have.
+    row
+        Column -> text.
+    counts
+        Columns whose values are whole numbers.
+    """
     for key, text in row.items():
         try:
             value = 0.0 if key in TEXTS else float(text)
-            absent = isnan(value) and (key.startswith(NAN_COLUMNS) or key not in COLUMNS)
-            if not (abs(value) <= MAX_NUMBER or absent):
+            may_be_nan = isnan(value) and (key.startswith(NAN_COLUMNS) or key not in COLUMNS)
+            if not (abs(value) <= MAX_NUMBER or may_be_nan):
                 return key
             if key in counts and not value.is_integer():
                 return key

@@ -30,49 +30,57 @@ class Distance(ABC):
 
     @abstractmethod
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
-        """Return the distance (n,), gradient (n, 3) and Hessian (n, 3, 3) at places (n, 3)."""
+        """Return the distance (n,), gradient (n, 3) and Hessian (n, 3, 3) at places x (n, 3).
+
+        All are over R, for a body at approach zero.
+        """
 
     @property
     @abstractmethod
     def lines(self) -> list[Array]:
-        """The outline of the body: places (n, 3) along lines."""
+        """The outline of the body for drawings: polylines of places (n, 3) over R."""
 
     @property
     def solid(self) -> Solid | None:
-        """The faces of the body; None without."""
+        """The faces of the body for drawings; None if it has none."""
         return None
 
     @property
     def mirror_vectors(self) -> Sequence[Array]:
-        """Vectors (3,) that a mirror plane through e3 must contain, of a body that is round about
-        them.
+        """Vectors (3,) that each mirror plane of the body must contain.
+
+        They belong to bodies that are round about an axis. Only mirror planes through e3 are
+        considered.
         """
         return ()
 
     @property
     def possible_mirror_vectors(self) -> Sequence[Array]:
-        """Vectors (3,) of which each may lie in a mirror plane through e3, of a body with several
-        planes.
+        """Vectors (3,) each of which spans a possible mirror plane together with e3.
+
+        They belong to bodies with several planes of symmetry, such as a box.
         """
         return ()
 
 
 @dataclass(frozen=True)
 class PlacedBody:
-    """A body's place, dimensionless and in the model's frame.
+    """A body's place and direction of approach, in the model's frame and over R.
 
     Attributes
     ----------
     key
-        Of the case file, for messages.
-    front, centre
-        The place (3,) of its surface that goes ahead, and its reference point behind that.
+        Key of the body in the case file, for messages.
+    front
+        Place (3,) of the point of its surface that touches first.
+    centre
+        Its reference point (3,), behind `front` against the direction of approach.
     direction
         Unit vector (3,) of the approach.
     Q
-        Turns vectors of the case into the model's frame.
+        (3, 3) rotation from the case's frame to the model's frame.
     R
-        The length that lengths are over.
+        The length, in the case's unit, by which lengths are divided.
     """
 
     key: str
@@ -83,12 +91,17 @@ class PlacedBody:
     R: float
 
     def axis_across(self, axis: list[float]) -> Array:
-        """Return the unit vector along the part of an axis that is across the approach.
+        """Return the unit vector (3,) along the part of an axis that is across the approach.
+
+        Parameters
+        ----------
+        axis
+            Vector (3,) in the case's frame, of any length. The result is in the model's frame.
 
         Raises
         ------
         CaseError
-            If there is none.
+            If the axis is along the approach.
         """
         v = self.Q @ unit(np.array(axis))
         v = v - (v @ self.direction) * self.direction
@@ -97,9 +110,15 @@ class PlacedBody:
         return np.asarray(v / size)
 
     def axes(self, axis: list[float]) -> Array:
-        """Return unit vectors as rows (3, 3).
+        """Return the body's orthonormal axes as rows (3, 3), in the model's frame.
 
-        They are along an axis, across it and the approach, and along the approach.
+        The first is along the given axis, as far as that is across the approach. The second is
+        across the first and the approach. The third is along the approach.
+
+        Raises
+        ------
+        CaseError
+            If the given axis is along the approach.
         """
         first = self.axis_across(axis)
         return np.stack([first, np.cross(self.direction, first), self.direction])
@@ -142,19 +161,25 @@ class BodySection(Section):
         return float(getattr(self, "radius", inf))
 
     def words(self, *, with_units: bool) -> str:
-        """Return its description in `magshell check`."""
+        """Return the description of the body in `magshell check`, such as "sphere of radius 0.2".
+
+        Parameters
+        ----------
+        with_units
+            Whether the case has units: its radius, in metres, is then given in mm.
+        """
         radius = getattr(self, "radius", None)
         if radius is None:
             return self.kind
         return f"{self.kind} of radius " + (f"{1e3 * radius:g} mm" if with_units else f"{radius:g}")
 
     def distance(self, placed_body: PlacedBody) -> Distance:
-        """Return its signed distance where it is.
+        """Return the signed distance function of the body at its place.
 
         Raises
         ------
         CaseError
-            If its axis is along the approach.
+            If the body's axis is along the approach.
         """
         raise NotImplementedError
 
@@ -162,22 +187,31 @@ class BodySection(Section):
 def place_body(
     section: BodySection, key: str, place: Array, normal: Array, half: float, Q: Array, R: float
 ) -> PlacedBody:
-    """Return where a body is.
+    """Return the place and the direction of approach of a body, in the model's frame.
+
+    By default the body's front touches the shell's face, and it approaches along the normal.
 
     Parameters
     ----------
+    key
+        Key of the body in the case file, for messages.
     place, normal
-        Of the undeformed mid-surface where it touches first, in the case's frame over R.
+        Place (3,) of the undeformed mid-surface where the body touches first, and unit normal
+        there; in the case's frame over R.
     half
-        Half the thickness over R.
+        Half the thickness there, over R.
+    Q
+        (3, 3) rotation from the case's frame to the model's frame.
+    R
+        The length by which lengths are divided.
     """
     outward = normal if section.side == "outside" else -normal
-    d = unit(-outward if section.direction is None else np.array(section.direction))
-    d, front_offset = Q @ d, section.front_offset / R
+    direction = unit(-outward if section.direction is None else np.array(section.direction))
+    direction, front_offset = Q @ direction, section.front_offset / R
     front = Q @ (place + half * outward)
     if section.position is not None:
-        front = Q @ (np.array(section.position) / R) + front_offset * d
-    return PlacedBody(key, front, front - front_offset * d, d, Q, R)
+        front = Q @ (np.array(section.position) / R) + front_offset * direction
+    return PlacedBody(key, front, front - front_offset * direction, direction, Q, R)
 
 
 class RigidBodies(KeyAbility[Mapping[str, BodySection]]):
@@ -186,7 +220,13 @@ class RigidBodies(KeyAbility[Mapping[str, BodySection]]):
     key = "bodies"
 
     def refuse_unfit(self, context: Context) -> None:
-        """Refuse names and places, and bodies beside a solid."""
+        """Refuse a case whose bodies have unfit names or places, or press on a solid.
+
+        Raises
+        ------
+        ValueError
+            With the key of the body and what is allowed.
+        """
         for name, body in self.sections.items():
             context.on_shell(f"bodies.{name}", 0.0 if body.at.point else body.at.polar)
             if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,39}", name):
@@ -197,25 +237,32 @@ class RigidBodies(KeyAbility[Mapping[str, BodySection]]):
                 raise ValueError(
                     f"bodies.{name}: is taken, by columns in this unit; choose another name"
                 )
-        patch = "of a solid give a force on a patch (kind: indentation, patch)"
-        context.needs("bodies", "a mid-surface", hint=patch)
+        hint = "of a solid give a force on a patch (kind: indentation, patch)"
+        context.needs("bodies", "a mid-surface", hint=hint)
 
 
 def rounded(q: Array, edge: float) -> tuple[Array, Array, Array]:
-    """Return the signed distance from a rounded convex corner, with derivatives by q.
+    """Return the signed distance from a convex corner with a rounded edge, and its derivatives.
 
-    The corner is in two or three coordinates.
+    The corner is that of a core, moved outwards by the radius of the rounding.
 
     Parameters
     ----------
     q
-        (n, m) coordinates from the corner of the core, which is where all are negative.
+        (n, m) coordinates from the corner of the core in m = 2 or 3 dimensions. All of them are
+        negative inside the core.
     edge
-        Radius that rounds the core.
+        Radius of the rounding.
+
+    Returns
+    -------
+    distance, n, H
+        (n,) the distance, with its gradient (n, m) and Hessian (n, m, m) by q.
     """
     outside_part = np.maximum(q, 0.0)
     distance = np.linalg.norm(outside_part, axis=1)
     is_outside = distance > 0
+    # inside the core the nearest face is that of the largest coordinate
     nearest = np.eye(q.shape[1])[q.argmax(axis=1)]
     n = np.where(is_outside[:, None], outside_part / np.maximum(distance, 1e-300)[:, None], nearest)
     active = (outside_part > 0)[:, :, None] * np.eye(q.shape[1])

@@ -45,32 +45,33 @@ PRESSURE_THRESHOLD = 1e-3  # over the largest pressure: less does not count as c
 
 @dataclass(frozen=True)
 class ContactBody:
-    """A rigid body, dimensionless and in the model's frame.
+    """A rigid body in contact with a shell, dimensionless and in the model's frame.
 
     Attributes
     ----------
     body
-        Its name.
+        Its name in the case.
     amplitude
-        Name of its approach, over h.
+        Name of the load parameter that is its approach, over h.
     distance
-        Its signed distance at approach zero.
+        Its signed distance function at approach zero.
     direction
         Unit vector (3,) of the approach.
     front
-        Place (3,) of its surface that goes ahead: radii of contact are distances from the axis
-        through it.
+        Place (3,) over R of the point of its surface that goes ahead. Radii of contact are
+        distances from the axis through this point along the approach.
     stiffness
-        k of the penalty, over E h/R^2.
+        Stiffness k of the penalty, over E h/R^2.
     max_penetration
         Largest penetration that is allowed, over h.
     size
-        Radius over R of what touches, such as a ball's; infinite for a plane.
+        Radius over R of the part that touches, such as a ball's; infinite for a plane.
     has_given_stiffness
-        Whether the case gives its stiffness, which then stays.
+        Whether the case gives the stiffness, which then stays.
     start, lift
-        Of a body that starts at the shell's face: the place (3,) of the mid-surface there, and from
-        it to the face; None of one with a position of its own.
+        Only for a body that starts at the shell's face: the place (3,) of the mid-surface there,
+        and the vector (3,) from this place to the body's front. None for a body that has a position
+        of its own.
     """
 
     body: str
@@ -86,31 +87,44 @@ class ContactBody:
     lift: Array | None = None
 
     def gap(self, x: Array, approach: float, half: float | Array) -> tuple[Array, Array, Array]:
-        """Return the gap at places (n, 3) over R, with its gradient and Hessian.
+        """Return the gap (n,) between the body and the shell's face, with its gradient and Hessian.
+
+        All lengths are over R; derivatives (n, 3) and (n, 3, 3) are by the place.
 
         Parameters
         ----------
-        approach, half
-            The approach, and half the thickness, over R.
+        x
+            (n, 3) places of the mid-surface.
+        approach
+            Displacement of the body along its direction.
+        half
+            Half the thickness of the shell, one number or (n,).
         """
         g, n, N = self.distance(x - approach * self.direction)
         return g - half, n, N
 
     @property
     def setting(self) -> str:
-        """The name of its stiffness in a state, where it was raised."""
+        """The name under which a state stores the body's stiffness if it was raised."""
         return f"stiffness_{self.body}"
 
 
 def contact_energy(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr) -> Expr:
-    """Return psi per undeformed area from its polynomial P (`POLYNOMIAL_SIZE`,).
+    """Return the penalty psi per undeformed area from its polynomial, as a UFL expression.
 
     Parameters
     ----------
+    r0, u
+        Jets (values and derivatives) of the undeformed placement and of the displacement.
+    P
+        (`POLYNOMIAL_SIZE`,) coefficients at the point, see `BodyContact.polynomial`.
     motion
-        d for an approach of one.
+        Displacement (3,) of the body over R for an approach of one thickness.
+    approach
+        The approach of the body over h.
     face
-        Where the thickness varies: the derivatives by it (`FACE_SIZE`,), and its factor (1,).
+        Only where the thickness varies: derivatives by the thickness (`FACE_SIZE`,), and the
+        thickness over h, (1,).
     """
     s = _off_expansion_point(u, P, motion, approach)
     psi = _polynomial(P, s)
@@ -128,21 +142,29 @@ def thinned_energy(
     natural: Forms | None = None,
     thins: Expr | int = 1,
 ) -> Expr:
-    """Return `contact_energy` of a shell that gets thinner as it stretches.
+    """Return the penalty psi per undeformed area of a shell that thins as it stretches.
+
+    It is `contact_energy` with the deformed thickness, which follows from the stretch.
 
     Parameters
     ----------
+    r0, u, P, motion, approach
+        See `contact_energy`.
     F
-        The derivatives by the thickness (`FACE_SIZE`,).
+        (`FACE_SIZE`,) derivatives of psi by the thickness factor.
     factor
-        The factor of the thickness, if it varies.
+        The undeformed thickness over h, (1,), if it varies.
+    natural
+        The natural shape, whose volume stays; None if it is the undeformed shape.
+    thins
+        1 where the shell keeps its volume, else 0.
     """
     s, t = _off_expansion_point(u, P, motion, approach), thickness_ratio(r0, u, natural, thins)
     return _polynomial(P, s) + _face_term(F, factor[0][0] * t if factor else t, s)
 
 
 def _polynomial(P: Expr, s: Expr) -> Expr:
-    """Return the polynomial at an offset s from its expansion point."""
+    """Return psi at an offset s (3,) from the expansion point of the polynomial P."""
     pairs = enumerate(zip(*INDEX_PAIRS, strict=True))
     return (
         P[3]
@@ -152,7 +174,11 @@ def _polynomial(P: Expr, s: Expr) -> Expr:
 
 
 def _face_term(F: Expr, t: Expr, s: Expr) -> Expr:
-    """Return what psi changes by with the thickness factor t, at an offset s."""
+    """Return the change of psi with the thickness factor t, at an offset s from the expansion.
+
+    F (`FACE_SIZE`,) has the factor at the expansion, the first derivative of psi by the factor, the
+    mixed derivatives (3,) by place, and the second derivative.
+    """
     change = t - F[0]
     return change * (
         F[1] + ufl.dot(ufl.as_vector([F[2 + i] for i in range(3)]), s) + change / 2 * F[5]
@@ -162,14 +188,27 @@ def _face_term(F: Expr, t: Expr, s: Expr) -> Expr:
 def contact_pressure(
     r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr, **options: Forms
 ) -> Expr:
-    """Return the pressure on the shell per undeformed area, at the state of P."""
+    """Return the contact pressure per undeformed area over E h/R, as a UFL expression.
+
+    It is the norm of the gradient of psi at the expansion point, that is at the state for which P
+    was computed. The other parameters only serve to make it a density like `contact_energy`.
+    """
     return ufl.sqrt(ufl.dot(_gradient(P), _gradient(P)))
 
 
 def radius_density(front: Expr, axis: Expr) -> Callable[..., Expr]:
-    """Return the density of the pressure times the distance from the axis of the approach."""
+    """Return a density: the contact pressure times the distance from the axis of the approach.
+
+    Its integral over the total force is the mean radius of the contact.
+
+    Parameters
+    ----------
+    front, axis
+        A place (3,) of the axis over R, and its unit vector (3,).
+    """
 
     def density(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face: Expr) -> Expr:
+        """Return the pressure times the distance of the deformed place from the axis."""
         x = r0.r + u.r - front
         from_axis = x - ufl.dot(x, axis) * axis
         return contact_pressure(r0, u, P, motion, approach) * ufl.sqrt(
@@ -180,25 +219,29 @@ def radius_density(front: Expr, axis: Expr) -> Callable[..., Expr]:
 
 
 def _off_expansion_point(u: Jet, P: Expr, motion: Expr, approach: Expr) -> Expr:
-    """Return the offset of the place from the expansion point of the polynomial."""
+    """Return the offset (3,) of y = u - a d from the expansion point of the polynomial P.
+
+    Here u is the displacement, a the approach and d its direction.
+    """
     return u.r - approach * motion - ufl.as_vector([P[i] for i in range(3)])
 
 
 def _gradient(P: Expr) -> Expr:
+    """Return the gradient (3,) of psi at the expansion point of the polynomial P."""
     return ufl.as_vector([P[4 + i] for i in range(3)])
 
 
 @dataclass(frozen=True)
 class Region:
-    """The region in which a body touches; lengths are over R.
+    """The region in which a body touches the shell; lengths are over R.
 
     Attributes
     ----------
     penetration
-        The largest; while nothing touches it is negative, minus the least gap.
+        Largest penetration. While nothing touches it is negative: minus the least gap.
     radius, inner, outer
-        Mean distance of the pressure from the axis of the approach, and its least and largest one;
-        0 without.
+        Mean, least and largest distance of the contact pressure from the axis of the approach; 0
+        without contact.
     """
 
     penetration: float
@@ -209,16 +252,16 @@ class Region:
 
 @dataclass(frozen=True)
 class _ActivePenalty:
-    """The penalty at the points that are pressed.
+    """The penalty and its derivatives at the quadrature points where the gap is closed.
 
     Attributes
     ----------
     is_pressed
-        (points,).
+        (points,) flags of these points among all; m of them are set.
     value, first, second
-        psi and its derivatives by the penetration.
+        (m, 1) psi with its first and second derivative by the penetration.
     n, N
-        Normals, and Hessians of the distance.
+        Gradients (m, 3) and Hessians (m, 3, 3) of the body's signed distance.
     """
 
     is_pressed: NDArray[np.bool_]
@@ -229,7 +272,13 @@ class _ActivePenalty:
     N: Array
 
     def penalty(self) -> tuple[NDArray[np.bool_], Array]:
-        """Return which points are pressed, and psi with its gradient and half its Hessian there."""
+        """Return the flags of the pressed points, and the polynomial coefficients of psi there.
+
+        Returns
+        -------
+        is_pressed, coefficients
+            (points,) the flags, and (m, 10) the coefficients of `_flattened` at pressed points.
+        """
         H = (
             self.second[..., None] * self.n[:, :, None] * self.n[:, None, :]
             - self.first[..., None] * self.N
@@ -238,37 +287,50 @@ class _ActivePenalty:
 
 
 def _flattened(value: Array, gradient: Array, H: Array) -> Array:
-    """Return the polynomial of a function, without its expansion point."""
+    """Return the Taylor coefficients (m, 10) of psi: value, gradient, and Hessian by pairs i <= j.
+
+    Diagonal entries of the Hessian are halved, so that the polynomial is the sum of H_ij s_i s_j
+    over pairs i <= j.
+
+    Parameters
+    ----------
+    value, gradient, H
+        (m, 1), (m, 3) and (m, 3, 3).
+    """
     pairs = H[:, *INDEX_PAIRS] * np.where(INDEX_PAIRS[0] == INDEX_PAIRS[1], 0.5, 1.0)
     return np.concatenate([value, gradient, pairs], axis=1)
 
 
 class BodyContact:
-    """The polynomials of a contact at the quadrature points of a shell or a meridian.
+    """Contact of a rigid body with a shell: Taylor polynomials of its penalty at quadrature points.
+
+    The polynomials are coefficients of the densities `contact_energy` and `thinned_energy`. They
+    are computed again where the state has changed.
 
     Parameters
     ----------
     h
         Thickness over R.
     r0, u
-        Placement and displacement in one space; on a meridian along e_rho and e_z.
+        Placement and displacement over R in one space; on a meridian along e_rho and e_z.
     approach
-        The constant in the forms, over h.
+        The approach over h, as a constant in the forms.
     degree
-        Of the quadrature.
+        Degree of the quadrature.
     thickness
-        Factor of h; None for 1.
+        The thickness over h; None where it is h.
     ratio_at_points
         The deformed over the undeformed thickness, see `gap.thickness_ratio_at_points`; None for 1.
 
     Attributes
     ----------
     parameters
-        Of the densities.
+        Arguments of the densities after the jets: polynomial, motion, approach, and where the
+        thickness varies the derivatives by it and the thickness factor.
     polynomial
-        The first of them.
+        (cells, points, `POLYNOMIAL_SIZE`) coefficients at quadrature points.
     stiffness
-        k of the penalty, over E h/R^2.
+        Stiffness k of the penalty, over E h/R^2.
     """
 
     def __init__(
@@ -282,6 +344,7 @@ class BodyContact:
         thickness: fem.Function | None = None,
         ratio_at_points: ThicknessRatio | None = None,
     ) -> None:
+        """Create the polynomials as functions of the state, with memos of what they depend on."""
         V = u.function_space
         self.contact, self._h, self._u, self._approach = contact, h, u, approach
         self.polynomial = PointField(V.mesh, degree, POLYNOMIAL_SIZE)
@@ -290,14 +353,17 @@ class BodyContact:
         ratio_memo = ratio_at_points and ratio_at_points(self._points)
 
         def factor() -> float | Array:
+            # thickness over h at all points, in one array; 1 where it neither varies nor changes
             factor: float | Array = 1.0
             if thickness is not None:
                 factor = at_quadrature(thickness, self._points)[..., 0].ravel()
             return factor if ratio_memo is None else factor * ratio_memo.renew()
 
         def thicknesses() -> tuple[Array, ...]:
-            has_given_stiffness = () if thickness is None else (thickness.x.array,)
-            return (*has_given_stiffness, ratio_memo.renew()) if ratio_memo else has_given_stiffness
+            undeformed_thickness = () if thickness is None else (thickness.x.array,)
+            return (
+                (*undeformed_thickness, ratio_memo.renew()) if ratio_memo else undeformed_thickness
+            )
 
         self._factor_memo = Memo(factor, thicknesses)
         self._face_field: PointField | None = None
@@ -314,6 +380,7 @@ class BodyContact:
         self._step_derivatives: tuple[Array, ...] = ()
         self._expansion_gap: tuple[Array, ...] = ()  # about which the penalty is expanded
 
+        # inputs of the memos: what gaps depend on, and what the penalty depends on besides
         def places() -> tuple[Array, ...]:
             return r0.x.array, u.x.array, approach.value, *thicknesses()
 
@@ -342,12 +409,23 @@ class BodyContact:
         return self._gap_memo.renew()[0]
 
     def _gap_at(self, y: Array, factor: float | Array) -> tuple[Array, Array, Array]:
-        """Return the gap and its derivatives at places y (see `place`), of a thickness factor."""
-        x = (self._placement_memo.renew() + y).reshape(-1, 3)
-        return self.contact.gap(x, 0.0, self._h / 2 * factor)
+        """Return the gap (points,), its gradient (points, 3) and its Hessian (points, 3, 3).
+
+        Parameters
+        ----------
+        y
+            (cells, points, 3) displacements relative to the body, see `place`.
+        factor
+            Thickness over h, one number or (cells * points,).
+        """
+        relative_places = (self._placement_memo.renew() + y).reshape(-1, 3)
+        return self.contact.gap(relative_places, 0.0, self._h / 2 * factor)
 
     def _active_penalty(self) -> "_ActivePenalty":
-        """Return the penalty where points are pressed, few of all."""
+        """Return the penalty at the points whose gap is closed, which are few of all.
+
+        The gap is that of `expand_about`, where this was called.
+        """
         gap, n, N = self._gap_memo.renew()
         expansion_gap = self._expansion_gap[0] if self._expansion_gap else gap
         is_pressed = expansion_gap < 0
@@ -359,7 +437,10 @@ class BodyContact:
         return _ActivePenalty(is_pressed, value, first, second, n[is_pressed], N[is_pressed])
 
     def _compute_polynomials(self) -> Array:
-        """Return psi, its gradient and its Hessian at the places of the points."""
+        """Return the coefficients (cells, points, `POLYNOMIAL_SIZE`) of psi at the present state.
+
+        Where the forces of a step count (`average`), they are those of the step.
+        """
         y = self.place
         polynomials = np.zeros((*y.shape[:2], POLYNOMIAL_SIZE))
         polynomials[..., :3] = y
@@ -370,13 +451,20 @@ class BodyContact:
         return polynomials
 
     def _step_mean(self) -> tuple[NDArray[np.bool_], Array]:
+        """Return the flags of all points, and the coefficients of the mean force of a step there.
+
+        They are in the form of `_ActivePenalty.penalty`, with zero for the value of psi.
+        """
         gradient, H, _ = self._step_derivatives
         return np.ones(len(gradient), dtype=bool), _flattened(
             np.zeros((len(gradient), 1)), gradient, H
         )
 
     def _compute_face_terms(self) -> Array:
-        """Return the thickness factor, and what psi changes by with it."""
+        """Return the thickness factor t and derivatives of psi by t: (cells, points, `FACE_SIZE`).
+
+        After t come the first derivative, the mixed ones by t and place (3), and the second one.
+        """
         active, half = self._penalty_memo.renew(), self._h / 2
         by_t = np.zeros((len(active.is_pressed), FACE_SIZE))
         by_t[:, 0] = self.factor
@@ -389,56 +477,65 @@ class BodyContact:
         return by_t.reshape(*self.polynomial.values.shape[:2], FACE_SIZE)
 
     def expand_about(self, gap: Array) -> None:
-        """Take in place of the penalty its Taylor polynomial about a gap, of the same contact
-        elsewhere.
+        """Replace the penalty by its Taylor polynomial about given gaps, for all later states.
 
-        For differences by a number of the case: a body that is hard closes or opens within a far
-        smaller way.
+        This serves differences by a number of the case. A hard body closes or opens within a far
+        smaller distance than such a difference moves the shell.
+
+        Parameters
+        ----------
+        gap
+            (points,) over R, of the same contact at the state to expand about; see `gap`.
         """
         self._expansion_gap = (gap,)
 
     @property
     def place(self) -> Array:
-        """The places y = u - a d of the points, (cells, points, 3)."""
+        """The displacements y = u - a d of the points relative to the body, (cells, points, 3).
+
+        Here u is the shell's displacement and a the approach along d, all over R.
+        """
         return at_quadrature(self._u, self._points) - float(self._approach.value) * self.motion
 
     @property
     def factor(self) -> float | Array:
-        """The thickness over h at the points, (cells * points,) where it varies."""
+        """The thickness over h at the points, (cells * points,); one number where it is uniform."""
         return self._factor_memo.renew()
 
     @property
     def point_state(self) -> tuple[Array, float | Array]:
-        """`place` and `factor`."""
+        """The relative displacements and the thickness factors: `place` and `factor`."""
         return self.place, self.factor
 
     def average(
         self, begin: tuple[Array, float | Array], end: tuple[Array, float | Array], part: float
     ) -> None:
-        """Take the forces of a step in place of the present ones, until `use_present_forces`.
+        """Use the mean forces of a step in time, until `use_present_forces` is called.
 
-        Their product with the change of y is that of psi, plus what the step dissipates: the mean
-        gradient is that of psi along the normal, over the penetration and not over time, so that it
-        counts where contact sets in or ceases. See docs/theory.md, Motion.
+        The product of the mean force with the change of y is the change of psi, plus the energy
+        that the step dissipates. The mean gradient is the mean of that of psi over the penetration,
+        not over time. So contact that sets in or ceases within the step counts in full. See
+        docs/theory.md, Motion.
 
         Parameters
         ----------
         begin, end
             `point_state` at both ends of the step.
         part
-            Of the step at which the system has its forces.
+            Position within the step, from 0 to 1, at which the system takes its forces.
         """
         k, soft_penetration, half = (
             float(self.stiffness.value),
             SOFT_PENETRATION * self._h,
             self._h / 2,
         )
+        # normals by Simpson's rule; the middle depends on the end of the step by half
         middle = (begin[0] + end[0]) / 2, (begin[1] + end[1]) / 2
         gaps, n, N = zip(*(self._gap_at(*state) for state in (begin, middle, end)), strict=True)
         s0, _, s1 = (-gap for gap in gaps)
-        mean, slope = mean_pressure(s0, s1, k, soft_penetration)
-        normal, bend = (n[0] + 4 * n[1] + n[2]) / 6, (2 * N[1] + N[2]) / 6
-        (_, p0, _), (_, p1, stiff) = (
+        mean_slope, mean_curvature = mean_pressure(s0, s1, k, soft_penetration)
+        normal, mean_hessian = (n[0] + 4 * n[1] + n[2]) / 6, (2 * N[1] + N[2]) / 6
+        (_, p0, _), (_, p1, k1) = (
             penalty(s0, k, soft_penetration),
             penalty(s1, k, soft_penetration),
         )
@@ -449,16 +546,18 @@ class BodyContact:
         def times(c: Array, a: Array) -> Array:
             return c.reshape(-1, *[1] * (a.ndim - 1)) * a
 
+        # the terms with off_middle are what generalised alpha dissipates
         off_middle = part - 0.5
-        gradient = -times(mean, normal) - off_middle * (times(p1, n[2]) - times(p0, n[0]))
+        gradient = -times(mean_slope, normal) - off_middle * (times(p1, n[2]) - times(p0, n[0]))
         H = (
-            times(slope, outer(normal))
-            - times(mean, bend)
-            + off_middle * (times(stiff, outer(n[2])) - times(p1, N[2]))
+            times(mean_curvature, outer(normal))
+            - times(mean_slope, mean_hessian)
+            + off_middle * (times(k1, outer(n[2])) - times(p1, N[2]))
         )
-        by_t = half * (mean + off_middle * (p1 - p0))
-        mixed = -half * (times(slope, normal) + off_middle * times(stiff, n[2])) / part
-        second_by_t = half**2 * (slope + off_middle * stiff) / part
+        by_t = half * (mean_slope + off_middle * (p1 - p0))
+        mixed = -half * (times(mean_curvature, normal) + off_middle * times(k1, n[2])) / part
+        second_by_t = half**2 * (mean_curvature + off_middle * k1) / part
+        # second derivatives are by the displacement at `part`, hence the division
         self._step_derivatives = (
             gradient,
             np.asarray(H / part),
@@ -466,35 +565,45 @@ class BodyContact:
         )
 
     def use_present_forces(self) -> None:
-        """Take the present forces again."""
+        """Use the forces of the present state again, after `average`."""
         self._step_derivatives = ()
 
     def cell_pressures(self) -> Array:
-        """Return the mean pressure in each local cell, over E h/R.
+        """Return the mean contact pressure (cells,) in each local cell, over E h/R.
 
-        The ring of a contact is narrower than that of nodes.
+        Values at nodes would not resolve the ring of a contact, which is narrower than a cell.
         """
         V = self._u.function_space
         weights = basix.make_quadrature(V.mesh.basix_cell(), self._degree)[1]
         return np.asarray(self._pressures() @ weights / weights.sum())
 
     def evenly_pressed(self) -> NDArray[np.bool_]:
-        """Return whether all points of each local cell are pressed, and its mean is near its
-        pressure.
+        """Return the flags (cells,) of local cells that are pressed evenly.
+
+        All points of such a cell are pressed, and the largest pressure is at most
+        `LARGEST_OVER_MEAN_PRESSURE` times the mean.
         """
         pressures = self._pressures()
         is_even = pressures.max(axis=1) <= LARGEST_OVER_MEAN_PRESSURE * self.cell_pressures()
         return np.asarray((pressures > 0).all(axis=1) & is_even)
 
     def _pressures(self) -> Array:
-        """Return the pressure at the points of local cells, over E h/R."""
+        """Return the contact pressure at the points of local cells (cells, points), over E h/R."""
         self.polynomial.renew()
         return np.asarray(np.linalg.norm(self.polynomial.values[..., 4:7], axis=-1))
 
     def region(self, comm: MPI.Comm, radius: float) -> Region:
-        """Return where the body touches; `radius` is the mean one."""
+        """Return the region where the body touches the shell; collective.
+
+        Parameters
+        ----------
+        comm
+            Communicator of the mesh.
+        radius
+            Mean radius of the contact over R, which the caller integrates.
+        """
         owned = slice(0, self._owned * len(self._points))
-        gap, x = (
+        gap, from_front = (
             self.gap[owned],
             (self._placement_memo.renew() + self.place).reshape(-1, 3)[owned] - self.contact.front,
         )
@@ -503,7 +612,7 @@ class BodyContact:
             self.contact.direction,
         )
         largest = comm.allreduce(float(pressure.max(initial=0.0)), MPI.MAX)
-        from_axis = np.linalg.norm(x - (x @ d)[:, None] * d, axis=1)[
+        from_axis = np.linalg.norm(from_front - (from_front @ d)[:, None] * d, axis=1)[
             pressure > PRESSURE_THRESHOLD * largest
         ]
         penetration = comm.allreduce(float(-gap.min(initial=np.inf)), MPI.MAX)

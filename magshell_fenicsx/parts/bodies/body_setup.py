@@ -41,19 +41,23 @@ def contact_bodies(
     driven_amplitudes: Collection[str],
     reference: ReferenceShell,
 ) -> tuple[ContactBody, ...]:
-    """Return the bodies of a case as a model has them.
+    """Return the rigid bodies of a case as a model needs them.
 
     Parameters
     ----------
+    bodies
+        Name of each body -> its section of the case.
     approaches
-        Body -> name of its approach, the amplitude.
+        Name of each body -> name of the load parameter that is its approach.
     driven_amplitudes
-        The amplitudes that steps drive.
+        Load parameters that the steps of the case drive.
+    reference
+        The undeformed shell.
 
     Raises
     ------
     CaseError
-        If a body penetrates the undeformed shell, or one that moves overlaps another.
+        If a body penetrates the undeformed shell, or a body that moves overlaps another.
     """
     contacts = [_contact(name, body, approaches[name], reference) for name, body in bodies.items()]
     for i, body in enumerate(contacts):
@@ -71,6 +75,24 @@ def contact_bodies(
 def _contact(
     name: str, section: BodySection, approach: str, reference: ReferenceShell
 ) -> ContactBody:
+    """Return one rigid body of a case at its place, with the stiffness of its penalty.
+
+    The body is placed so that it touches the shell at the section's `at`. If the section gives a
+    `position` instead, the shell's place nearest to it counts. The default stiffness is that of a
+    plane for a plane, and larger for a body of finite radius.
+
+    Parameters
+    ----------
+    name, section
+        Name of the body, and its section of the case.
+    approach
+        Name of the load parameter that is its approach.
+
+    Raises
+    ------
+    CaseError
+        If the body penetrates the undeformed shell at approach zero.
+    """
     key, h, Q = f"bodies.{name}", reference.h, reference.Q
     has_own_place = section.position is not None and "at" not in section.model_fields_set
     if has_own_place and (reference.geometry == "mesh" or section.direction is not None):
@@ -83,13 +105,13 @@ def _contact(
     chart = reference.perfect.inverse(place)
     normal = reference.perfect.normal_near(chart)
     start = place if len(chart) == 3 else reference.imperfect.embedding(chart[None])[0]
-    half = float(reference.half_thickness(start[None])[0])
+    half_thickness = float(reference.half_thickness(start[None])[0])
     placed_body = place_body(
-        section, key, start, normal / np.linalg.norm(normal), half, Q, reference.R
+        section, key, start, normal / np.linalg.norm(normal), half_thickness, Q, reference.R
     )
-    D, size = h**2 / (12 * (1 - reference.nu**2)), section.blunt_radius / placed_body.R
-    k = section.stiffness or DEFAULT_STIFFNESS * D / h**2 * (
-        1.0 if size == inf else POINTED_STIFFNESS_FACTOR * (1 + 1 / size)
+    D, body_radius = h**2 / (12 * (1 - reference.nu**2)), section.blunt_radius / placed_body.R
+    stiffness = section.stiffness or DEFAULT_STIFFNESS * D / h**2 * (
+        1.0 if body_radius == inf else POINTED_STIFFNESS_FACTOR * (1 + 1 / body_radius)
     )
     contact = ContactBody(
         name,
@@ -97,9 +119,9 @@ def _contact(
         section.distance(placed_body),
         placed_body.direction,
         placed_body.front,
-        k,
+        stiffness,
         section.penetration,
-        size,
+        body_radius,
         section.stiffness is not None,
         *((Q @ start, placed_body.front - Q @ start) if section.position is None else ()),
     )
@@ -117,16 +139,16 @@ def _contact(
 
 @dataclass(frozen=True)
 class ContactZone:
-    """The zone in which a body presses, for the sizes of elements; over R.
+    """The zone in which a body presses, for the sizes of elements; lengths are over R.
 
     Attributes
     ----------
     place
-        Of its middle in the chart.
+        Middle of the zone in the shell's chart.
     reach
         Radius of the zone.
     size
-        Radius of what touches.
+        Radius of the body's part that touches; infinite for a plane.
     """
 
     place: Array
@@ -137,17 +159,24 @@ class ContactZone:
     def of_body(
         cls, contact: ContactBody, loads: Iterable[Step], reference: ReferenceShell
     ) -> "ContactZone":
-        """Return the zone up to the largest approach of steps.
+        """Return the zone in which a body presses, up to the largest approach of the steps.
 
-        Of a plane it is a ring up to sqrt(2 R a), of other bodies their front.
+        For a plane its radius is about that of a ring, sqrt(2 R a) at an approach a. For other
+        bodies it is at most their radius and a margin.
         """
         h, size = reference.h, contact.size
-        ring = 1.1 * sqrt(2 * (largest_approach(loads) or 10.0) * h)
-        reach = min(ring + 0.5 * sqrt(h), size + sqrt(h))
+        ring_radius = 1.1 * sqrt(2 * (largest_approach(loads) or 10.0) * h)
+        reach = min(ring_radius + 0.5 * sqrt(h), size + sqrt(h))
         return cls(reference.imperfect.inverse(contact.front), reach, size)
 
     def features(self, outline: Outline, sizing: SizingContext, growth: float) -> list[Feature]:
-        """Return small elements that show the ring of a contact, and a small body."""
+        """Return the discs of small elements that resolve the ring of the contact and a small body.
+
+        Parameters
+        ----------
+        growth
+            Growth of the element size with the distance from the disc.
+        """
         x, y = map(float, self.place)
         ring_width, size = sqrt(sizing.h), self.size
         small_body = (
@@ -162,7 +191,10 @@ class ContactZone:
 
 
 def largest_approach(loads: Iterable[Step]) -> float:
-    """Return the largest approach over h that a target of steps asks for; 0 without."""
+    """Return the largest approach, over h, among the targets of contact steps.
+
+    It is 0 if no step has such a target.
+    """
     return max(
         (abs(load.approach or 0.0) for load in loads if isinstance(load, ContactSection)),
         default=0.0,
@@ -170,19 +202,25 @@ def largest_approach(loads: Iterable[Step]) -> float:
 
 
 def body_symmetry(contact: ContactBody) -> SymmetryConstraint:
-    """Return the symmetry that a body preserves, found at random places."""
-    x = np.random.default_rng(17).uniform(-2, 2, (40, 3))
-    g, d = contact.distance(x)[0], contact.direction
+    """Return the symmetry constraint of a rigid body: the mirrors and turns that preserve it.
+
+    The signed distances at random places and at their images are compared.
+    """
+    random_places = np.random.default_rng(17).uniform(-2, 2, (40, 3))
+    distances, direction = contact.distance(random_places)[0], contact.direction
 
     def is_image(S: Array, image: Array) -> bool:
-        other = contact.distance(image)[0]
+        """Return whether a map S preserves the direction, and distances at the places' images."""
+        image_distances = contact.distance(image)[0]
         return bool(
-            np.abs(S @ d - d).max() < SYMMETRY_TOLERANCE
-            and np.abs(other - g).max() < SYMMETRY_TOLERANCE * (1 + np.abs(g).max())
+            np.abs(S @ direction - direction).max() < SYMMETRY_TOLERANCE
+            and np.abs(image_distances - distances).max()
+            < SYMMETRY_TOLERANCE * (1 + np.abs(distances).max())
         )
 
-    is_turned = all(is_image(Q, x @ Q.T) for Q in (rotation(1.0), rotation(2.5)))
-    held_vectors = [contact.front, d, *contact.distance.mirror_vectors]
+    # two turns by angles that no symmetry of finite order has
+    is_turned = all(is_image(Q, random_places @ Q.T) for Q in (rotation(1.0), rotation(2.5)))
+    held_vectors = [contact.front, direction, *contact.distance.mirror_vectors]
     azimuths = tuple(
         atan2(v[1], v[0])
         for v in contact.distance.possible_mirror_vectors
@@ -190,7 +228,7 @@ def body_symmetry(contact: ContactBody) -> SymmetryConstraint:
     )
 
     def mirrors(mirror: Mirror) -> bool:
-        return is_image(mirror.reflection, mirror.image(x))
+        return is_image(mirror.reflection, mirror.image(random_places))
 
     return SymmetryConstraint(
         None if is_turned else f"bodies.{contact.body} is not turned about e3",
@@ -201,7 +239,10 @@ def body_symmetry(contact: ContactBody) -> SymmetryConstraint:
 
 
 def least_gap(contact: ContactBody, reference: ReferenceShell) -> float:
-    """Return the least gap over R between a body and the face of the undeformed shell."""
+    """Return the least gap over R between a body at approach zero and the undeformed shell's face.
+
+    It is searched at samples of the shell, and refined where the shell has a chart.
+    """
     outline = reference.imperfect
 
     def gap(x: Array) -> Array:
@@ -220,9 +261,9 @@ def least_gap(contact: ContactBody, reference: ReferenceShell) -> float:
 
 
 def overlap(body: ContactBody, other: ContactBody) -> float:
-    """Return how deep two bodies overlap near the shell at approach zero, over R.
+    """Return the depth over R by which two bodies overlap near the shell, at approach zero.
 
-    Negative if they are apart.
+    It is negative if they are apart. The depth is minus the least value of the larger distance.
     """
 
     def larger_distance(x: Array) -> Array:
@@ -243,26 +284,35 @@ def overlap(body: ContactBody, other: ContactBody) -> float:
 def _refined_minimum(
     f: Callable[[Array], Array], best: Array, minimum: float, reach: Array
 ) -> float:
-    """Return the minimum near a place.
+    """Return the minimum of a function near a place, by random search.
 
-    Random places are tried in a box that shrinks around the best one.
+    Random places are tried in a box that shrinks around the best place.
+
+    Parameters
+    ----------
+    f
+        Returns values (n,) at places (n, dim).
+    best, minimum
+        (dim,) the place to begin at, and the value there.
+    reach
+        (dim,) half the sides of the first box.
     """
     rng = np.random.default_rng(5)
     for _ in range(SEARCH_ROUNDS):
-        x = best + reach * rng.uniform(-1, 1, (200, len(best)))
-        values = f(x)
+        trial_places = best + reach * rng.uniform(-1, 1, (200, len(best)))
+        values = f(trial_places)
         if values.min() < minimum:
-            best, minimum = x[values.argmin()], float(values.min())
+            best, minimum = trial_places[values.argmin()], float(values.min())
         reach = RANGE_REDUCTION * reach
     return minimum
 
 
 def account(context: Context, loads: Loads) -> Account:
-    """Return which bodies press, and how stiff the penalty is."""
+    """Return the lines of `magshell check` on the bodies and the stiffness of their penalties."""
     bodies, with_units = context.sections["bodies"], context.shell.with_units
-    words = [
+    lines = [
         f"body {contact.body}: {bodies[contact.body].words(with_units=with_units)} without "
         f"friction, stiffness k R²/(E h) = {contact.stiffness:.4g}"
         for contact in loads.contacts
     ]
-    return Account(words)
+    return Account(lines)

@@ -58,12 +58,14 @@ class BoxSection(BodySection):
 
 @dataclass(frozen=True)
 class Box(Distance):
-    """A box with rounded edges.
+    """Signed distance of a box with rounded edges; lengths are over R.
 
     Attributes
     ----------
+    centre
+        (3,) its middle.
     axes, half
-        (3, 3) its unit vectors as rows, and half its sizes along them.
+        (3, 3) its unit vectors as rows, and (3,) half its sizes along them.
     edge
         Radius of the rounding.
     """
@@ -74,6 +76,8 @@ class Box(Distance):
     edge: float
 
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return signed distance (n,), gradient (n, 3), Hessian (n, 3, 3) at places x (n, 3)."""
+        # in the octant of positive coordinates, from which signs lead back to the place's own
         y = (x - self.centre) @ self.axes.T
         g, n, N = rounded(np.abs(y) - self.half + self.edge, self.edge)
         basis = np.where(y < 0, -1.0, 1.0)[:, :, None] * self.axes

@@ -70,11 +70,19 @@ class ContactSection(PathStep):
         return self.body
 
     def name_in(self, context: Context, loads: Sequence[Step]) -> str:
+        """Return the name of the load parameter that this step drives."""
         names = approaches(context.sections["bodies"], loads)
         body = str(self.body or next(iter(names), ""))
         return names.get(body, self.amplitude)
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        """Refuse a step whose body is not in the case, or is missing where there are several.
+
+        Raises
+        ------
+        ValueError
+            With the key and the names that are allowed.
+        """
         bodies: Mapping[str, object] = context.sections["bodies"]
         if (self.body is None and len(bodies) != 1) or (
             self.body is not None and self.body not in bodies
@@ -87,14 +95,23 @@ class ContactSection(PathStep):
         return "load" if self.control == "approach" else super().prescribed
 
     def course(self, step_start: StepStart) -> StepCourse:
+        """Return the course of the step, with step control fit for contact."""
         return replace(super().course(step_start), finer=contact_step_options)
 
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
+        """Return the first change of the approach, over h.
+
+        By load it is the change over the number of points. Towards a force it is `FIRST_APPROACH`,
+        forward if the force is to grow: the conjugate is minus the force on the body.
+        """
         return change / self.points if by_load else copysign(FIRST_APPROACH, -change)
 
 
 def contact_step_options(options: "StepOptions") -> "StepOptions":
-    """Return the step control of a path along which contact sets in, grows and ceases."""
+    """Return step control for a path along which contact sets in, grows and ceases.
+
+    It allows smaller steps and more Newton iterations than the given options.
+    """
     return replace(
         options,
         easy_factorisations=EASY_ITERATIONS,
@@ -105,9 +122,9 @@ def contact_step_options(options: "StepOptions") -> "StepOptions":
 
 
 def approaches(bodies: Collection[str], loads: Sequence[Step]) -> dict[str, str]:
-    """Return body -> name of its approach, the amplitude.
+    """Return a mapping: name of each body -> name of its approach, the load parameter.
 
-    A single one needs no name beside it, unless a load is `force`.
+    A single body has plain "approach", unless a step is a force; otherwise the name is appended.
     """
     is_single = len(bodies) == 1 and not any(load.amplitude == "force" for load in loads)
     return {name: "approach" if is_single else f"approach_{name}" for name in bodies}
@@ -176,29 +193,46 @@ class BodiesObservables(Observables):
     )
 
     def amplitudes(self, loads: "Loads") -> tuple[str, ...]:
+        """Return the load parameters of all bodies: approach, and stored stiffness."""
         return tuple(
             name for contact in loads.contacts for name in (contact.amplitude, contact.setting)
         )
 
     def conjugates(self, loads: "Loads") -> dict[str, str]:
+        """Return a mapping: name of each approach -> column of the force on that body."""
         return {
             contact.amplitude: contact_columns(contact.amplitude)[1] for contact in loads.contacts
         }
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
+        """Return the columns of all bodies, except `force`, which every run has."""
         names = (
             column for contact in loads.contacts for column in contact_columns(contact.amplitude)
         )
         return tuple(column for column in names if column != "force")
 
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
+        """Return the values of all bodies' columns at a state, in the units of the view.
+
+        The mapping is column -> number; see `contact_columns`. Collective.
+        """
         model, h, values = view.model, view.h, dict[str, float]()
         for name in model.contacts:
             region, force = model.region(state, name), view.potential(state, name)
-            numbers = (state.mu[name], -force / self._unit(view), region.penetration / h)
+            approach_force_penetration = (
+                state.mu[name],
+                -force / self._unit(view),
+                region.penetration / h,
+            )
             radii = (view.length * radius for radius in (region.radius, region.inner, region.outer))
-            k = float(model.contacts[name][0].stiffness.value)
-            values |= dict(zip(contact_columns(name), (*numbers, *radii, k), strict=True))
+            stiffness = float(model.contacts[name][0].stiffness.value)
+            values |= dict(
+                zip(
+                    contact_columns(name),
+                    (*approach_force_penetration, *radii, stiffness),
+                    strict=True,
+                )
+            )
         return values
 
     def conjugate_unit(self, view: ModelView, name: str) -> float | None:
@@ -209,6 +243,9 @@ class BodiesObservables(Observables):
 
 
 def contact_columns(approach: str) -> tuple[str, ...]:
-    """Return the columns of a body: its approach, the force on it, and the rest."""
+    """Return the columns of one body: its approach, the force on it, then the other quantities.
+
+    The part of the approach's name after "approach", such as "_ball", ends each column's name.
+    """
     first, *others = (q.name for q in BodiesObservables.quantities)
     return tuple(column + approach.removeprefix("approach") for column in (first, "force", *others))

@@ -37,13 +37,17 @@ class CylinderBodySection(BodySection):
 
 @dataclass(frozen=True)
 class Cylinder(Distance):
-    """A cylinder without ends: the distance of a sphere, across the unit vector `axis`."""
+    """Signed distance of a cylinder without ends; lengths are over R.
+
+    It is the distance of a sphere after projection across the unit vector `axis` (3,).
+    """
 
     centre: Array
     axis: Array
     radius: float
 
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return signed distance (n,), gradient (n, 3), Hessian (n, 3, 3) at places x (n, 3)."""
         projection = np.eye(3) - np.outer(self.axis, self.axis)
         g, n, N = Sphere(np.zeros(3), self.radius)((x - self.centre) @ projection)
         return g, n, projection @ N @ projection

@@ -52,7 +52,7 @@ class EllipsoidSection(BodySection):
 
 @dataclass(frozen=True)
 class Ellipsoid(Distance):
-    """An ellipsoid.
+    """Signed distance of an ellipsoid; lengths are over R.
 
     The nearest place of the surface to y has the coordinates a_i² y_i/(t + a_i²), with the largest
     root t of F(t) = sum (a_i y_i/(t + a_i²))² - 1. F falls and is convex there, so Newton's method
@@ -60,8 +60,10 @@ class Ellipsoid(Distance):
 
     Attributes
     ----------
+    centre
+        (3,) its middle.
     axes, semi
-        (3, 3) its unit vectors as rows, and its semi-axes a_i along them.
+        (3, 3) its unit vectors as rows, and (3,) its semi-axes a_i along them.
     """
 
     centre: Array
@@ -69,27 +71,37 @@ class Ellipsoid(Distance):
     semi: Array
 
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return signed distance (n,), gradient (n, 3), Hessian (n, 3, 3) at places x (n, 3).
+
+        The Hessian has the curvatures k/(1 + g k) of the parallel surface at distance g, where k
+        are those of the ellipsoid at the nearest place.
+        """
         y = (x - self.centre) @ self.axes.T
         foot = self.nearest(y)
         normal = foot / self.semi**2
-        steep = np.linalg.norm(normal, axis=1)
-        n = normal / steep[:, None]
+        normal_length = np.linalg.norm(normal, axis=1)
+        n = normal / normal_length[:, None]
         g = np.einsum("ni,ni->n", y - foot, n)
-        tangent = np.eye(3) - n[:, :, None] * n[:, None, :]
+        # projection onto the tangent plane, and the curvatures of the surface as a tensor
+        tangent_projection = np.eye(3) - n[:, :, None] * n[:, None, :]
         S = (
-            tangent @ (np.eye(3) / self.semi**2 / steep[:, None, None]) @ tangent
-        )  # the curvatures of the surface
+            tangent_projection
+            @ (np.eye(3) / self.semi**2 / normal_length[:, None, None])
+            @ tangent_projection
+        )
         curvatures, directions = np.linalg.eigh(S)
-        parallel = curvatures / np.maximum(
-            1 + g[:, None] * curvatures, MIN_CURVATURE_FACTOR
-        )  # and of its parallel one
+        parallel = curvatures / np.maximum(1 + g[:, None] * curvatures, MIN_CURVATURE_FACTOR)
         N = np.einsum("nia,na,nja->nij", directions, parallel, directions)
         return g, n @ self.axes, np.einsum("ai,nab,bj->nij", self.axes, N, self.axes, optimize=True)
 
     def nearest(self, y: Array) -> Array:
-        """Return the nearest places (n, 3) of its surface to places (n, 3), along its axes."""
+        """Return the places (n, 3) of the surface that are nearest to places y (n, 3).
+
+        Both are coordinates along the ellipsoid's axes, from its centre.
+        """
         a = self.semi
         size = np.maximum(np.abs(y), PLANE_OFFSET * a)
+        # the largest term of F + 1 is then 1, so that 0 <= F <= 2
         t = (a * size - a**2).max(axis=1)
         for _ in range(MAX_NEWTON_ITERATIONS):
             ratio = a * size / (t[:, None] + a**2)

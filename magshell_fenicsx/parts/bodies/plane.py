@@ -25,20 +25,21 @@ class PlaneSection(BodySection):
 
 @dataclass(frozen=True)
 class Plane(Distance):
-    """A half-space.
+    """Signed distance of a half-space; lengths are over R.
 
     Attributes
     ----------
     front
-        A place of its face.
+        A place (3,) of its face.
     along
-        Unit vector from the body to the shell's side, along the approach.
+        Unit vector (3,) of the approach, out of the face towards the shell.
     """
 
     front: Array
     along: Array
 
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return signed distance (n,), gradient (n, 3), Hessian (n, 3, 3) at places x (n, 3)."""
         n = np.broadcast_to(self.along, x.shape)
         return (x - self.front) @ self.along, n, np.zeros((len(x), 3, 3))
 

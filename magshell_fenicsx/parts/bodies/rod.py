@@ -42,16 +42,18 @@ class RodSection(BodySection):
 
 @dataclass(frozen=True)
 class Rod(Distance):
-    """A cylinder along the approach with a flat, rounded end.
+    """Signed distance of a cylinder along the approach with a flat, rounded end; over R.
 
     Attributes
     ----------
     end
-        The middle of its end.
+        The middle (3,) of its end.
     along
-        Unit vector of the approach, out of the end.
+        Unit vector (3,) of the approach, out of the end.
+    radius
+        Radius of the cylinder.
     edge
-        Radius of the rounding.
+        Radius of the edge's rounding.
     """
 
     end: Array
@@ -60,14 +62,19 @@ class Rod(Distance):
     edge: float
 
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return signed distance (n,), gradient (n, 3), Hessian (n, 3, 3) at places x (n, 3).
+
+        In cylinder coordinates (rho, z) the rod is a rounded corner; the Hessian also has n_rho/rho
+        around the axis.
+        """
         r, d = x - self.end, self.along
-        off = r - (r @ d)[:, None] * d
-        from_axis = np.linalg.norm(off, axis=1)
-        e = off / np.maximum(from_axis, 1e-300)[:, None]
+        radial = r - (r @ d)[:, None] * d
+        from_axis = np.linalg.norm(radial, axis=1)
+        e_rho = radial / np.maximum(from_axis, 1e-300)[:, None]
         q = np.column_stack([from_axis - self.radius + self.edge, r @ d + self.edge])
         g, n, N = rounded(q, self.edge)
-        basis = np.stack([e, np.broadcast_to(d, e.shape)], axis=1)  # d(rho, z)/dx
-        circumferential = np.eye(3) - np.outer(d, d) - e[:, :, None] * e[:, None, :]
+        basis = np.stack([e_rho, np.broadcast_to(d, e_rho.shape)], axis=1)  # d(rho, z)/dx
+        circumferential = np.eye(3) - np.outer(d, d) - e_rho[:, :, None] * e_rho[:, None, :]
         by_rotation = (n[:, 0] / np.maximum(from_axis, 1e-300))[:, None, None] * circumferential
         H = np.einsum("nai,nab,nbj->nij", basis, N, basis) + np.where(
             from_axis[:, None, None] > 0, by_rotation, 0.0

@@ -31,12 +31,13 @@ class SphereBodySection(BodySection):
 
 @dataclass(frozen=True)
 class Sphere(Distance):
-    """A ball: the distance from its centre, less its radius."""
+    """Signed distance of a ball over R: the distance from its centre (3,), less its radius."""
 
     centre: Array
     radius: float
 
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return signed distance (n,), gradient (n, 3), Hessian (n, 3, 3) at places x (n, 3)."""
         r = x - self.centre
         from_centre = np.maximum(np.linalg.norm(r, axis=1), 1e-300)
         n = r / from_centre[:, None]

@@ -53,14 +53,17 @@ class ClosestPointSearch:
 
     Parameters
     ----------
+    cells
+        All cells of all ranks.
     rule
-        Points on all cells of this rank.
+        Quadrature points on all cells of this rank.
     may_touch
-        Whether points of cells (n,) may touch cells (n,).
+        Of cell numbers i and j, (n,) each, returns flags (n,): whether points of cell i may touch
+        cell j.
     h
         Thickness over R.
     r0
-        (nodes, 3) undeformed.
+        (nodes, 3) undeformed places over R.
     offsets
         Half the thickness where it varies, or changes with the state; None where it is h/2.
 
@@ -80,6 +83,7 @@ class ClosestPointSearch:
         offsets: FaceOffsets | None,
         comm: MPI.Comm,
     ) -> None:
+        """Find the cells that are near within the undeformed surface, and the undeformed points."""
         self._cells, self._rule, self._may_touch, self._h = cells, rule, may_touch, h
         self._r0, self._offsets, self._comm = r0, offsets, comm
         self.half_thickness: Array = np.full(len(r0), h / 2)
@@ -95,9 +99,10 @@ class ClosestPointSearch:
         self._tracked = dict[float, tuple[Array, float, tuple[Longs, Longs]]]()
 
     def places_of_nodes(self, u: Array, *, to_faces: bool = True) -> Array:
-        """Return the places (nodes, 3) of all nodes at a displacement.
+        """Return the places (nodes, 3) of all nodes at a displacement u (nodes, 3), over R.
 
-        (nodes, 4) where the thickness varies and faces are asked for: with half of it less h/2.
+        Where the thickness varies and `to_faces` is set, they are (nodes, 4). The fourth component
+        is half the thickness less h/2, see `projection`.
         """
         r = self._r0 + u
         if not (to_faces and self._offsets):
@@ -105,17 +110,31 @@ class ClosestPointSearch:
         return np.column_stack([r, self._offsets.half_thickness(u) - self._h / 2])
 
     def _bound(self, nodal: Array) -> float:
-        """Return an upper bound of the field with values (nodes,) at nodes."""
+        """Return an upper bound of the field with values `nodal` (nodes,) at nodes."""
         return polynomial_bound(nodal[self._cells.nodes], self._cells.lebesgue_constant)
 
     def places_of_points(self, points: ContactPoints, r: Array, which: Any = slice(None)) -> Array:
-        """Return the places of some points; see `points_in_cells`."""
+        """Return the places (n, 3 or 4) of some contact points, over R; see `points_in_cells`.
+
+        Parameters
+        ----------
+        r
+            Places of nodes, see `places_of_nodes`.
+        which
+            Numbers or flags of these points, or a slice; by default all.
+        """
         return points_in_cells(self._cells, r, points.cell[which], points.shape[which])
 
     def come_near(self, u: Array, v: Array) -> bool:
-        """Return whether any cells that may touch come near each other on the way from u to v.
+        """Return whether cells that may touch come near each other from u to v; collective.
 
-        Collective.
+        They do if spheres around the cells on the whole straight way are nearer than the largest
+        thickness.
+
+        Parameters
+        ----------
+        u, v
+            (nodes, 3) displacements over R.
         """
         spheres = [self._bounding_spheres(self._r0 + displacement) for displacement in (u, v)]
         centres = (spheres[0][0] + spheres[1][0]) / 2
@@ -127,7 +146,7 @@ class ClosestPointSearch:
         return bool(self._comm.allreduce(len(pairs[0])))
 
     def _bounding_spheres(self, r: Array, cell: Any = slice(None)) -> tuple[Array, Array]:
-        """Return centres and radii of spheres around cells."""
+        """Return centres (n, 3) and radii (n,) of spheres around cells at places r of nodes."""
         nodal = r[self._cells.nodes[cell]]
         centres = nodal.mean(axis=1)
         radii = np.linalg.norm(nodal - centres[:, None], axis=2).max(axis=1)
@@ -136,10 +155,16 @@ class ClosestPointSearch:
     def _select_pairs(
         self, i: Longs, j: Longs, reach: float, *surfaces: Array
     ) -> tuple[Longs, Longs]:
-        """Return the pairs of cells that may touch.
+        """Return the pairs of cells i and j, (n,) each, that may touch.
 
-        Of cells that are near within the surface those where one of some deformed surfaces is
-        folded.
+        Cells that are near within the surface count only if they are folded onto each other.
+
+        Parameters
+        ----------
+        reach
+            Distance over R up to which folded cells count.
+        surfaces
+            Deformed places (nodes, 3); a fold in one of them is enough.
         """
         allowed = self._may_touch(i, j)
         i, j = i[allowed], j[allowed]
@@ -150,14 +175,27 @@ class ClosestPointSearch:
         return i[is_selected], j[is_selected]
 
     def _are_near_in_surface(self, keys: Longs) -> Flags:
-        """Return whether pairs i * cells + j are of cells that are near within the surface."""
+        """Return flags (n,): whether cells i and j are near within the undeformed surface.
+
+        The keys (n,) are i * cells + j.
+        """
         position = np.minimum(np.searchsorted(self._near_keys, keys), len(self._near_keys) - 1)
         return np.asarray(self._near_keys[position] == keys)
 
     def _are_folded(self, i: Longs, j: Longs, r: Array, reach: float) -> Flags:
-        """Return whether places of cells i (n,) may be nearer than the reach to those of cells j.
+        """Return flags (n,): whether cells i and j of one surface are folded onto each other.
 
-        Only places that are not near within the undeformed surface count.
+        Places of both must be nearer than the reach at r, but not near within the undeformed
+        surface. Nodes stand for all places of a cell, with a margin for the distance between nodes.
+
+        Parameters
+        ----------
+        i, j
+            (n,) cells that are near within the surface.
+        r
+            (nodes, 3) deformed places over R.
+        reach
+            Distance over R.
         """
         is_folded, nodes = np.zeros(len(i), dtype=bool), self._cells.nodes
         _, radii = self._bounding_spheres(r)
@@ -166,24 +204,34 @@ class ClosestPointSearch:
         chunks = 1 + len(i) * nodes.shape[1] ** 2 // MAX_DISTANCES_AT_ONCE
         for chunk in np.array_split(np.arange(len(i)), chunks):
             corners = nodes[i[chunk], :3, None], nodes[j[chunk], None, :3]
+            # a fold brings corners nearer to each other: most pairs end here
             has_shrunk = _distances_of_nodes(r, *corners) < (
                 FOLD_SHRINKAGE * _distances_of_nodes(self._r0, *corners)
             )
             pairs = chunk[has_shrunk.any(axis=(1, 2))]
-            own_nodes, other = nodes[i[pairs], :, None], nodes[j[pairs], None, :]
+            own_nodes, other_nodes = nodes[i[pairs], :, None], nodes[j[pairs], None, :]
             margin = spacing * (radii[i[pairs]] + radii[j[pairs]])
-            is_close = _distances_of_nodes(r, own_nodes, other) < reach + margin[:, None, None]
+            is_close = (
+                _distances_of_nodes(r, own_nodes, other_nodes) < reach + margin[:, None, None]
+            )
             margin = spacing * (undeformed_radii[i[pairs]] + undeformed_radii[j[pairs]])
-            thickness = self.half_thickness[own_nodes] + self.half_thickness[other]
+            thickness = self.half_thickness[own_nodes] + self.half_thickness[other_nodes]
             least_separation = SELF_CONTACT_DISTANCE * thickness - margin[:, None, None]
-            was_apart = _distances_of_nodes(self._r0, own_nodes, other) > least_separation
+            was_apart = _distances_of_nodes(self._r0, own_nodes, other_nodes) > least_separation
             is_folded[pairs] = (is_close & was_apart).any(axis=(1, 2))
         return is_folded
 
     def _near_pairs(self, u: Array, reach: float) -> tuple[Longs, Longs]:
-        """Return pairs of a cell with points of this rank and any cell near by.
+        """Return pairs (i, j) of cells that are near each other; i are modelled cells of this rank.
 
-        They are cached while nodes move little.
+        The pairs are searched with a margin and cached until nodes have moved that far.
+
+        Parameters
+        ----------
+        u
+            (nodes, 3) displacement over R.
+        reach
+            Distance between the cells over R.
         """
         if reach in self._tracked:
             tracked_u, margin, pairs = self._tracked[reach]
@@ -198,10 +246,17 @@ class ClosestPointSearch:
         return pairs
 
     def gap_at_supports(self, supported_nodes: Longs, u: Array) -> float:
-        """Return the least gap over R between faces at nodes that supports hold, at a displacement.
+        """Return the least gap over R between the faces at supported nodes, at a displacement.
 
-        Of nodes that may touch and are no neighbours undeformed; infinite without, or if the shell
-        thins.
+        Only nodes count that may touch and are not near within the undeformed surface. The gap is
+        infinite if there are none, and if the thickness depends on the displacement.
+
+        Parameters
+        ----------
+        supported_nodes
+            Numbers (n,) of nodes that supports hold.
+        u
+            (nodes, 3) displacement over R.
         """
         if self._offsets and not self._offsets.is_constant:
             return np.inf
@@ -222,19 +277,20 @@ class ClosestPointSearch:
         to_faces: bool = True,
         least_only: bool = False,
     ) -> Projections:
-        """Return the places that points face at a displacement.
+        """Return the closest places that contact points face at a displacement.
 
         Parameters
         ----------
+        u
+            (nodes, 3) displacement over R.
         reach
-            Largest distance between faces, or mid-surfaces, over R.
+            Largest distance over R: between mid-surfaces, or with `to_faces` between faces plus h.
         points
             By default those of the rule.
         to_faces
-            Whether the reach is between faces.
+            Whether a variable thickness counts in distances.
         least_only
-            Whether only the places of each point's least distance are needed; some others are among
-            them.
+            Whether only each point's nearest place is needed; the result may have some others.
         """
         points = points or self._rule
         r = self.places_of_nodes(u, to_faces=to_faces)
@@ -244,8 +300,19 @@ class ClosestPointSearch:
     def least_distance(
         self, u: Array, max_reach: float, points: ContactPoints | None = None
     ) -> float:
-        """Return the least distance of any point at a displacement, up to a reach; collective."""
-        for reach in (*(part * max_reach for part in FIRST_REACHES), max_reach):
+        """Return the least distance over R between any point and its place; collective.
+
+        It is at most `max_reach`, which is returned where nothing is nearer. Small reaches are
+        searched first, since they cost less.
+
+        Parameters
+        ----------
+        u
+            (nodes, 3) displacement over R.
+        points
+            By default those of the rule.
+        """
+        for reach in (*(share * max_reach for share in FIRST_REACHES), max_reach):
             places = self.projections(u, reach, points, least_only=True)
             own_least = float(places.distance.min(initial=max_reach))
             least_distance = float(self._comm.allreduce(own_least, MPI.MIN))
@@ -255,25 +322,36 @@ class ClosestPointSearch:
 
     @cached_property
     def _separate_surfaces(self) -> tuple[Longs, Flags]:
-        """Connected surfaces: the number (n,) of each cell's, and which face each other wholly.
+        """The number of each cell's connected surface, and which surfaces face each other wholly.
 
-        The flags (m, m) say of two surfaces whether places of one face all of the other. Then each
-        point's nearest place counts: the surface goes on from there to none that is nearer, and no
-        place of it is near the point in the point's own surface.
+        The first array is (cells,). The flags (m, m) say of two surfaces whether each place of one
+        may touch each place of the other. Then the nearest place of each point counts: the surface
+        goes on from there to none that is nearer, and no place of it is near the point in the
+        point's own surface.
         """
         cell, side = np.nonzero(self._cells.neighbours >= 0)
         n, neighbour = len(self._cells.nodes), self._cells.neighbours[cell, side]
+        # cells that share a side are connected
         adjacency = scipy.sparse.coo_array((np.ones(len(cell)), (cell, neighbour)), (n, n))
-        count, number = scipy.sparse.csgraph.connected_components(adjacency, directed=False)
-        sizes, (_, first_cells) = np.bincount(number), np.unique(number, return_index=True)
-        faced = np.zeros((count, count), dtype=np.int64)  # cells of one surface that another faces
+        count, surface_of_cell = scipy.sparse.csgraph.connected_components(
+            adjacency, directed=False
+        )
+        sizes, (_, first_cells) = (
+            np.bincount(surface_of_cell),
+            np.unique(surface_of_cell, return_index=True),
+        )
+        # numbers of cells of one surface that another faces
+        faced = np.zeros((count, count), dtype=np.int64)
         for surface, cell in enumerate(first_cells):
             faced_cells = self._may_touch(np.full(n, cell), np.arange(n))
-            faced[surface] = np.bincount(number[faced_cells], minlength=count)
+            faced[surface] = np.bincount(surface_of_cell[faced_cells], minlength=count)
         is_near = np.zeros((count, count), dtype=bool)
-        is_near[number[self._near_keys // n], number[self._near_keys % n]] = True
+        is_near[
+            surface_of_cell[self._near_keys // n],
+            surface_of_cell[self._near_keys % n],
+        ] = True
         faces_all = faced == sizes
-        return number, faces_all & faces_all.T & ~is_near & ~np.eye(count, dtype=bool)
+        return surface_of_cell, faces_all & faces_all.T & ~is_near & ~np.eye(count, dtype=bool)
 
     def _limits(
         self,
@@ -284,49 +362,66 @@ class ClosestPointSearch:
         cell: Longs,
         max_distance: float,
     ) -> ProjectionLimits:
-        """Return how far the nearest place of a separate surface is at most.
+        """Return bounds of the distance from points to their nearest places on separate surfaces.
 
-        Its nearest node within the largest distance is a place.
+        The nearest node of such a surface bounds the distance, since it is a place of the surface.
 
         Parameters
         ----------
         searched, cell
-            (m,) numbers of the points x that are searched, and their cells.
+            (m,) numbers of the points that are searched, and their cells.
+        x, r
+            (n, 3 or 4) places of all points, and (nodes, 3 or 4) of nodes.
+        pairs
+            Pairs (i, j) of near cells, see `_near_pairs`.
+        max_distance
+            Distance over R beyond which nodes are not looked for.
         """
-        number, are_separate = self._separate_surfaces
+        surface_of_cell, are_separate = self._separate_surfaces
         variation = 0.0
         if r.shape[1] > 3:
             variation = self._bound(r[:, 3]) + self._bound(-r[:, 3])
-        reach, surface = np.full(len(x), np.inf), number[cell]
+        reach, surface_of_point = np.full(len(x), np.inf), surface_of_cell[cell]
         is_near = np.zeros(len(self._cells.nodes), dtype=bool)
         is_near[pairs[1]] = True
-        for number_of_surface in np.unique(surface):
-            near_separate_cells = is_near & are_separate[number_of_surface][number]
+        for number_of_surface in np.unique(surface_of_point):
+            near_separate_cells = is_near & are_separate[number_of_surface][surface_of_cell]
             nodes = np.unique(self._cells.nodes[near_separate_cells])
             if len(nodes):
-                own_points = searched[surface == number_of_surface]
+                own_points = searched[surface_of_point == number_of_surface]
                 tree = scipy.spatial.cKDTree(r[nodes, :3])
                 distance, _ = tree.query(x[own_points, :3], distance_upper_bound=max_distance)
                 reach[own_points] = distance + variation + 2 * DISTANCE_TOLERANCE * self._h
-        return ProjectionLimits(are_separate[number[pairs[0]], number[pairs[1]]], reach)
+        return ProjectionLimits(
+            are_separate[surface_of_cell[pairs[0]], surface_of_cell[pairs[1]]], reach
+        )
 
     def projections_in_cells(
         self, points: ContactPoints, u: Array, r: Array, reach: float, *, least_only: bool = False
     ) -> Projections:
-        """Return the nearest place of each near cell to points, within a distance.
+        """Return the nearest place in each near cell to each point, within a distance.
+
+        A point has one place for each cell near by; see `projections` for those that count.
 
         Parameters
         ----------
-        r
-            Nodes as of `places_of_nodes`, at the displacement u.
+        points
+            Contact points.
+        u, r
+            (nodes, 3) displacement, and nodes at it as of `places_of_nodes`.
+        reach
+            Largest distance over R, see `projections`.
+        least_only
+            See `projections`.
         """
         largest_offset = self._bound(r[:, 3]) if r.shape[1] > 3 else 0.0
         face_reach, reach = reach, reach + 2 * largest_offset
         i, j = self._near_pairs(u, reach)
-        order, cell_of = points.by_cell
-        first = np.searchsorted(cell_of, i)
-        count = np.searchsorted(cell_of, i, "right") - first
-        searched = order[np.isin(cell_of, i)]
+        # points of cell i are order[first_position : first_position + count]
+        order, cell_in_order = points.by_cell
+        first_position = np.searchsorted(cell_in_order, i)
+        count = np.searchsorted(cell_in_order, i, "right") - first_position
+        searched = order[np.isin(cell_in_order, i)]
         x = np.zeros((len(order), r.shape[1]))
         x[searched] = self.places_of_points(points, r, searched)
         if self._undeformed_points[0] is not points:
@@ -338,19 +433,19 @@ class ClosestPointSearch:
         limits = None
         if least_only:
             limits = self._limits(searched, x, r, (i, j), points.cell[searched], reach)
-        pairs = j, first, count, order
+        pairs = j, first_position, count, order
         return nearest_places(self._cells, r, x, pairs, reach, face_reach, undeformed, limits)[1]
 
     def select_distant_cells(self, points: ContactPoints, places: Projections) -> Projections:
-        """Return the places in cells that are not near within the surface.
+        """Return the places whose cells are not near the point's own cell within the surface.
 
-        Only such cells are cut along each other.
+        Only such cells are cut along each other, see `Segments`.
         """
         keys = points.cell[places.point] * len(self._cells.nodes) + places.cell
         return places.select(~self._are_near_in_surface(keys))
 
     def thickness(self, points: ContactPoints, places: Projections) -> Array:
-        """Return the mean undeformed thickness (n,) at points and their places, over R."""
+        """Return the mean (n,) of the undeformed thicknesses at points and places, over R."""
         half = self.half_thickness[self._cells.nodes]
         nodal = half[places.cell][..., None]
         (_, half_at_places), *_ = jets(self._cells.element, places.X, nodal, 0)
@@ -359,25 +454,29 @@ class ClosestPointSearch:
         return np.asarray(half_at_points + half_at_places[:, 0])
 
     def _select_nearest(self, points: ContactPoints, places: Projections) -> Projections:
-        """Return the places from which the surface goes on to no nearer one.
+        """Return the places from which the surface goes on to no nearer place.
 
-        Each point has one in each direction at most: on both sides of its own surface, and before
-        its edge. Places at the same distance in neighbouring cells stay, see `JoinedPlaces`.
+        A point has at most one such place in each direction: on both sides of its own surface, and
+        before its edge. Places at the same distance in neighbouring cells all stay, see
+        `JoinedPlaces`.
         """
-        cells, number = self._cells, len(self._cells.nodes)
-        keys = places.point * number + places.cell
+        cells, cell_count = self._cells, len(self._cells.nodes)
+        keys = places.point * cell_count + places.cell
         order = np.argsort(keys, kind="stable")
         places, keys = places.select(order), keys[order]
         on_sides = np.column_stack([1 - places.X.sum(axis=1), places.X]) == 0.0
-        key_of_point_cell = points.cell[places.point] * number
+        key_of_point_cell = points.cell[places.point] * cell_count
         is_nearest = np.ones(len(keys), dtype=bool)
+        # a place on a side counts unless the neighbour across the side has a nearer one
         for side in range(3):
             neighbour = cells.neighbours[places.cell, side]
             is_on_side = on_sides[:, side] & (neighbour >= 0)
-            neighbour_key = places.point * number + neighbour
-            row = np.minimum(np.searchsorted(keys, neighbour_key), max(len(keys) - 1, 0))
-            is_listed = keys[row] == neighbour_key
-            is_nearer = places.distance[row] < places.distance - DISTANCE_TOLERANCE * self._h
+            neighbour_key = places.point * cell_count + neighbour
+            neighbour_row = np.minimum(np.searchsorted(keys, neighbour_key), max(len(keys) - 1, 0))
+            is_listed = keys[neighbour_row] == neighbour_key
+            is_nearer = (
+                places.distance[neighbour_row] < places.distance - DISTANCE_TOLERANCE * self._h
+            )
             # the surface that goes on there is not searched
             is_folded = places.is_above & self._are_near_in_surface(key_of_point_cell + neighbour)
             is_nearest &= ~is_on_side | (is_listed & ~is_nearer) | is_folded
@@ -392,16 +491,19 @@ class ClosestPointSearch:
     def are_left_to_edges(
         self, points: ContactPoints, places: Projections, normals: Array
     ) -> Flags:
-        """Return which places (n,) do not count, since an edge's own points are there.
+        """Return flags (n,): which places do not count, because points of an edge press there.
 
-        They are those of points inside a surface that face an edge of another one, steeply. Such
-        points see a line, which is narrower than they are apart: it would be held back where it
-        slides over one of them. Places of one point and direction are as the nearest.
+        They are places on an edge of another surface that a point inside a surface faces steeply.
+        Such points see a line, which is narrower than their distance. The line would be held back
+        where it slides over one of them. All places of one point and direction have the flag of the
+        nearest.
 
         Parameters
         ----------
+        places
+            In the order of points, directions and distances.
         normals
-            (cells, 3) where the cuts were made.
+            (cells, 3) unit normals where the cuts were made.
         """
         first = places.firsts
         nearest = places.select(first)
@@ -410,14 +512,16 @@ class ClosestPointSearch:
         return np.asarray(np.repeat(is_left, np.diff([*first, len(places.point)])))
 
     def are_edges_alone(self, points: ContactPoints, nearest: Projections, normals: Array) -> Flags:
-        """Return which points are of an edge that presses on a face alone.
+        """Return flags (n,): which points belong to an edge that presses on a face alone.
 
         The face's own points are left to the edge, see `are_left_to_edges`.
 
         Parameters
         ----------
         nearest
-            The nearest place of each point.
+            The nearest place of each of n points.
+        normals
+            (cells, 3) unit normals where the cuts were made.
         """
         is_on_edge, is_steep = self._edge_and_steepness(points, nearest, normals)
         return np.asarray(is_steep & ~is_on_edge)
@@ -425,7 +529,17 @@ class ClosestPointSearch:
     def _edge_and_steepness(
         self, points: ContactPoints, nearest: Projections, normals: Array
     ) -> tuple[Flags, Flags]:
-        """Return which places are on an edge, and which are steep to their point's cell."""
+        """Return two flags (n,): whether places are on an edge, and steep to their point's cell.
+
+        Cells are steep to each other if their normals have a cosine below `STEEP_COSINE`.
+
+        Parameters
+        ----------
+        nearest
+            n places.
+        normals
+            (cells, 3) unit normals.
+        """
         on_side = np.column_stack([1 - nearest.X.sum(axis=1), nearest.X]) == 0.0
         moves_along_side = nearest.free_directions.any(axis=(1, 2)) & (
             nearest.free_directions[:, :, 1] == 0
@@ -445,7 +559,10 @@ def _distances_of_nodes(r: Array, nodes: Longs, others: Longs) -> Array:
 
 
 def _number_directions(places: Projections) -> Projections:
-    """Give places in one direction from their point one number, `side`, and order them by it.
+    """Return the places with a number `side` for each direction from their point, in that order.
+
+    The number is 0 for the direction of the nearest place, then 1, and at last `MAX_DIRECTIONS` -
+    1.
 
     Parameters
     ----------
@@ -454,6 +571,7 @@ def _number_directions(places: Projections) -> Projections:
     """
     direction_numbers = np.full(len(places.point), MAX_DIRECTIONS - 1)
     remaining = np.arange(len(places.point))
+    # the nearest place that remains of each point gives a direction, to those within an angle
     for direction in range(MAX_DIRECTIONS - 1):
         first = np.flatnonzero(np.diff(places.point[remaining], prepend=-1))
         nearest = np.repeat(remaining[first], np.diff([*first, len(remaining)]))
@@ -473,16 +591,23 @@ def gap_between_supports(
     half_thickness: Array,
     may_touch: Callable[[Longs, Longs], Flags],
 ) -> float:
-    """Return the least gap over R between faces at supported nodes, at a displacement.
+    """Return the least negative gap over R between faces at supported nodes; infinite if none.
 
     See `ClosestPointSearch.gap_at_supports`.
 
     Parameters
     ----------
+    supported_nodes
+        Numbers (n,) of nodes that supports hold.
     nodes
-        (cells, functions) of all cells.
+        (cells, functions) nodes of all cells.
+    r0, u
+        (nodes, dim) undeformed places and displacement over R.
+    half_thickness
+        (nodes,) over R.
     may_touch
-        Whether cells (n,) may touch others and are not near them within the surface.
+        Of cell numbers i and j, (n,) each, returns flags (n,): whether they may touch and are not
+        near within the surface.
     """
     cell_of = np.zeros(len(r0), dtype=np.int64)
     cell_of[nodes.ravel()] = np.repeat(np.arange(len(nodes)), nodes.shape[1])
@@ -498,7 +623,7 @@ def gap_between_supports(
 
 
 def no_projections() -> Projections:
-    """Return no places."""
+    """Return an empty set of places."""
     no_numbers = np.zeros(0, dtype=np.int64)
     X, free_directions, distance, direction = (np.zeros((0, *shape)) for shape in PLACE_SHAPES)
     return Projections(

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class ContactObservables(Observables):
-    """The columns of each pair that may touch."""
+    """The observables of each pair that may touch: columns of path.csv."""
 
     quantities = (
         Quantity(
@@ -53,15 +53,16 @@ class ContactObservables(Observables):
     )
 
     def amplitudes(self, loads: "Loads") -> tuple[str, ...]:
+        """Return the names of the penalty's stiffness of all pairs in a state."""
         return tuple(pair.setting for pair in loads.pairs)
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
-        """Check that the surface has the patches of all pairs, and that no place is in two pairs.
+        """Check that the surface has the patches of all pairs, and that pairs share no cells.
 
         Raises
         ------
         MeshError
-            With the name or the pairs.
+            With the name of the missing patch, or the two pairs.
         """
         patches = {**surface.patches, WHOLE_SHELL: np.ones(len(surface.cells), dtype=bool)}
         for number, pair in enumerate(loads.pairs):
@@ -79,24 +80,35 @@ class ContactObservables(Observables):
                     )
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
+        """Return the names of the columns of all pairs."""
         return tuple(column for pair in loads.pairs for column in _columns(pair))
 
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
+        """Return column -> value of all pairs at a state, in the units of the view; collective.
+
+        They are the contact force, the least gap over h, and the stiffness of the penalty.
+        """
         model, values = view.model, dict[str, float]()
         for contact in model.shell_contacts:
             evaluation = model.system.at_state(state)
             force, gap = evaluation.evaluate(contact.force), evaluation.evaluate(contact.least_gap)
-            numbers = force / model.force_unit, gap / view.h, contact.stiffness.value
-            values |= dict(zip(_columns(contact.pair), numbers, strict=True))
+            numbers_of_pair = force / model.force_unit, gap / view.h, contact.stiffness.value
+            values |= dict(zip(_columns(contact.pair), numbers_of_pair, strict=True))
         return values
 
 
 def _share_cells(pair: "Pair", other: "Pair", patches: Mapping[str, NDArray[np.bool_]]) -> bool:
-    """Return whether both members of a pair have cells in those of another, in either order."""
-    first, second = (patches[name] for name in other.names)
+    """Return whether two pairs share cells on both sides, in either order of their members.
+
+    Parameters
+    ----------
+    patches
+        Name of a member -> flags (cells,) of its cells.
+    """
+    other_first, other_second = (patches[name] for name in other.names)
     own_first, own_second = (patches[name] for name in pair.names)
-    straight = (own_first & first).any() and (own_second & second).any()
-    crossed = (own_second & first).any() and (own_first & second).any()
+    straight = (own_first & other_first).any() and (own_second & other_second).any()
+    crossed = (own_second & other_first).any() and (own_first & other_second).any()
     return bool(straight or crossed)
 
 

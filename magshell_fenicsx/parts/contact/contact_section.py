@@ -44,7 +44,7 @@ Pairs = Annotated[list[GivenPair], Field(max_length=20)]
 
 
 def names_of(pair: GivenPair) -> list[str]:
-    """Return the names of both members of a pair, as a case has it."""
+    """Return the names of both members of a pair of the case."""
     return pair.between if isinstance(pair, PairSection) else pair
 
 
@@ -55,15 +55,15 @@ class Pair:
     Attributes
     ----------
     names
-        Of both: `shell`, or a patch.
+        Names of both: `shell`, or a patch.
     suffix
         End of the names of its columns.
     stiffness
-        k of the penalty, over E h/R^2.
+        Stiffness k of the penalty, over E h/R^2.
     max_penetration
         Largest penetration that is allowed, over the thickness there.
     has_given_stiffness
-        Whether the case gives its stiffness, which then stays.
+        Whether the case gives the stiffness, which then stays.
     """
 
     names: tuple[str, str]
@@ -73,12 +73,12 @@ class Pair:
     has_given_stiffness: bool = False
 
     def has(self, shell: str) -> bool:
-        """Return whether one of several shells, with this name, is in the pair."""
+        """Return whether a shell is in the pair; `shell` stands for the name of one of several."""
         return shell in self.names or WHOLE_SHELL in self.names
 
     @property
     def setting(self) -> str:
-        """The name of its stiffness in a state; no name of a user has a space."""
+        """The name under which a state stores the stiffness; no name of a user has a space."""
         return f"stiffness between {self.names[0]} and {self.names[1]}"
 
     @property
@@ -88,7 +88,7 @@ class Pair:
 
     @property
     def words(self) -> str:
-        """The pair in messages."""
+        """The pair in messages, such as "top and bottom"."""
         return (
             "the shell and itself" if self.names == ("shell", "shell") else " and ".join(self.names)
         )
@@ -100,16 +100,18 @@ class ShellContact(KeyAbility[Sequence[GivenPair]]):
     key = "contact"
 
     def refuse_unfit(self, context: Context) -> None:
+        """Refuse pairs that the model of the case cannot have, see `refuse_unfit_pairs`."""
         refuse_unfit_pairs(self.sections, context)
 
     def symmetry_constraints(
         self, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
-        """Return all symmetry, but no meridian if a patch of a shell may touch."""
+        """Return the symmetry that contact preserves: all, but no meridian if a patch may touch."""
         names = {name for pair in self.sections for name in names_of(pair)} - {WHOLE_SHELL}
         return [patch_constraint("contact", names, context.shell)]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
+        """Return `pairs` of the model's `Loads`: the pairs that may touch, dimensionless."""
         assembly = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
         return {
             "pairs": model_pairs(
@@ -121,30 +123,42 @@ class ShellContact(KeyAbility[Sequence[GivenPair]]):
 def model_pairs(
     sections: Sequence[GivenPair], nu: float, moduli: Mapping[str, float]
 ) -> tuple[Pair, ...]:
-    """Return the pairs of a case as a model has them.
+    """Return the pairs of a case as a model needs them, with the stiffness of their penalties.
+
+    The default stiffness is that of a plane, times the modulus of the softer shell.
 
     Parameters
     ----------
+    sections
+        The pairs of the case.
     nu
         Poisson's ratio.
     moduli
-        Of several shells: name -> Young's modulus over E; the penalty is that of the softer one.
+        Name of each of several shells -> Young's modulus over E; empty for one shell.
     """
-    default, pairs = RELATIVE_STIFFNESS / (12 * (1 - nu**2)), list[Pair]()
+    default_stiffness, pairs = RELATIVE_STIFFNESS / (12 * (1 - nu**2)), list[Pair]()
     for pair in sections:
         first, second = names_of(pair)
         moduli_of_pair = [_values_of_shells(name, moduli) for name in (first, second)]
-        softer = min([*moduli_of_pair[0], *moduli_of_pair[1]], default=1.0)
+        softer_modulus = min([*moduli_of_pair[0], *moduli_of_pair[1]], default=1.0)
         given_stiffness = pair.stiffness if isinstance(pair, PairSection) else None
         suffix = f"_{first}_{second}" if len(sections) > 1 else ""
-        stiffness = given_stiffness or default * softer
+        stiffness = given_stiffness or default_stiffness * softer_modulus
         is_given = given_stiffness is not None
         pairs.append(Pair((first, second), suffix, stiffness, has_given_stiffness=is_given))
     return tuple(pairs)
 
 
 def _values_of_shells(name: str, values: Mapping[str, float]) -> list[float]:
-    """Return the values of all shells, of the named one, or of that which has the named patch."""
+    """Return the values of the shells that a name stands for.
+
+    The name is that of all (`WHOLE_SHELL`), of one shell, or of a patch "SHELL_...".
+
+    Parameters
+    ----------
+    values
+        Name of each shell -> value.
+    """
     return [
         value
         for shell, value in values.items()
@@ -153,7 +167,7 @@ def _values_of_shells(name: str, values: Mapping[str, float]) -> list[float]:
 
 
 def refuse_unfit_pairs(sections: Sequence[GivenPair], context: Context) -> None:
-    """Check that a model can have these contacts.
+    """Check that a model can have contact of these pairs.
 
     Raises
     ------
@@ -189,6 +203,13 @@ def refuse_unfit_pairs(sections: Sequence[GivenPair], context: Context) -> None:
 
 
 def _refuse_step(step: "ProgrammeStep", context: Context) -> None:
+    """Refuse a step that multiplies imperfections, since undeformed gaps would change.
+
+    Raises
+    ------
+    ValueError
+        With the key of the step.
+    """
     if step.load.multiplies(step, context):
         key = f"{step.key}.kind: {step.kind}"
         raise ValueError(
@@ -197,7 +218,7 @@ def _refuse_step(step: "ProgrammeStep", context: Context) -> None:
 
 
 def account(context: Context, loads: "Loads") -> Account:
-    """Return which shells may touch, and how stiff the penalty is."""
+    """Return the lines of `magshell check` on pairs that may touch, with their stiffness."""
     return Account(
         [
             f"contact of {pair.words} without friction, stiffness k R²/(E h) = {pair.stiffness:.4g}"

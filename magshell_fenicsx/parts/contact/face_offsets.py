@@ -36,7 +36,7 @@ class _AreaVectors:
     normal
         (cells, places, 3) their directions.
     by_node
-        (cells, places, 3 nodes, 3): derivatives of a_1 x a_2 by the components of all nodes.
+        (cells, places, 3 nodes, 3) derivatives of a_1 x a_2 by the components of all nodes.
     """
 
     J: Array
@@ -59,12 +59,14 @@ class CellsWithNodes(Protocol):
 
 
 class FaceOffsets:
-    """Half the thickness at all nodes of a mid-surface, over R.
+    """Half the thickness H at all nodes of a mid-surface, over R, with its derivatives.
 
     Parameters
     ----------
+    cells
+        All cells with their element.
     r0
-        (nodes, 3) undeformed.
+        (nodes, 3) undeformed places over R.
     h
         Thickness over R.
     volume_factors
@@ -73,8 +75,7 @@ class FaceOffsets:
     keeps_volume
         (cells,) whether the thickness follows from the area.
     same_place
-        (nodes,) for each node the first of those at its place: images share what is on their
-        planes.
+        (nodes,) for each node the first node at its place: images share the nodes on their planes.
     amplitude
         The natural stretch, on which V depends; None without.
 
@@ -94,6 +95,7 @@ class FaceOffsets:
         same_place: Longs,
         amplitude: SettableNumber | None = None,
     ) -> None:
+        """Sum the volumes and the undeformed areas at nodes."""
         self._cells, self._r0, self._keeps_volume = cells, r0, keeps_volume
         self._thinning_cells = np.flatnonzero(keeps_volume)
         self._same_place, self.amplitude = same_place, amplitude
@@ -117,7 +119,7 @@ class FaceOffsets:
 
     @property
     def growth(self) -> float:
-        """The present value of the amplitude; 0 without."""
+        """The present value of the natural stretch; 0 without."""
         return float(self.amplitude.value) if self.amplitude is not None else 0.0
 
     def half_thickness(self, u: Array) -> Array:
@@ -125,35 +127,42 @@ class FaceOffsets:
         return np.asarray(self._half_volumes() / self._areas_at_nodes(u))
 
     def growth_derivative(self, u: Array, order: int = 1) -> Array:
-        """Return the derivative (nodes,) of H by the amplitude."""
+        """Return a derivative (nodes,) of H by the natural stretch, at u (nodes, 3)."""
         return np.asarray(self._half_volumes(order) / self._areas_at_nodes(u))
 
     def slope(self, u: Array, f: Array) -> Array:
-        """Return the derivative (nodes, 3) of sum f H by the displacement, with f (nodes,)."""
+        """Return the gradient (nodes, 3) of sum f H by u (nodes, 3), for f (nodes,)."""
         if self.is_constant:
             return np.zeros_like(u)
         return np.asarray((self.jacobian(u, f != 0).T @ f).reshape(len(u), -1))
 
     def jacobian(self, u: Array, is_needed: NDArray[np.bool_]) -> Any:
-        """Return the sparse derivative (nodes, 3 nodes) of H, with rows of the needed nodes."""
+        """Return the sparse derivative (nodes, 3 nodes) of H by the displacement u (nodes, 3).
+
+        Rows of nodes that are not needed, by the flags (nodes,), are zero.
+        """
         area = self._areas_at_nodes(u)
         return scipy.sparse.diags_array(
             np.where(is_needed, -self._half_volumes() / area**2, 0.0)
         ) @ self._area_jacobian(u, is_needed)
 
     def change(self, u: Array, w: Array) -> Array:
-        """Return the derivative (nodes,) of H along w (nodes, 3)."""
+        """Return the derivative (nodes,) of H at u along a motion w (nodes, 3)."""
         if self.is_constant:
             return 0 * u[:, 0]
         return np.asarray(self.jacobian(u, np.ones(len(u), dtype=bool)) @ w.ravel())
 
     def volumes_and_areas(self, u: Array) -> tuple[Array, Array]:
-        """Return the volumes and areas (nodes,) whose ratio is H."""
+        """Return (h/2) sum V and sum A at nodes (nodes,), whose ratio is H, at u (nodes, 3)."""
         return self._half_volumes(), self._areas_at_nodes(u)
 
     def by_factor(self, by_volume: Array) -> Array:
-        """Return derivatives (cells, functions) by the factor of h, of those (nodes,) by the
-        volumes.
+        """Return derivatives (cells, functions) by the thickness factor t in the cells.
+
+        Parameters
+        ----------
+        by_volume
+            (nodes,) derivatives of the same function by the volumes (h/2) sum V at nodes.
         """
         by_place_volume = np.bincount(self._same_place, by_volume, len(by_volume))[
             self._place_numbers
@@ -162,17 +171,23 @@ class FaceOffsets:
         return np.asarray(by_place_volume * volume_per_factor * self._areas(self._r0, slice(None)))
 
     def by_area(self, by_volume: Array, by_area: Array) -> Array:
-        """Return derivatives (nodes, 3) by the undeformed place, of those by volumes and areas.
+        """Return derivatives (nodes, 3) by the undeformed places, through the undeformed areas J0.
 
-        Only what of these depends on the undeformed place alone counts.
+        J0 is in the volumes V, and in the areas A of cells that do not keep their volume. The
+        deformed areas J also depend on the place, as they do on u; that part is not included.
+
+        Parameters
+        ----------
+        by_volume, by_area
+            (nodes,) derivatives of the same function by the volumes and the areas at nodes.
         """
-        at_volumes, at_areas = (
+        by_place_volume, by_place_area = (
             np.bincount(self._same_place, f, len(f))[self._place_numbers]
             for f in (by_volume, by_area)
         )
         volume_per_factor = np.polynomial.polynomial.polyval(self.growth, self._volume_per_factor)
-        by_J0 = at_volumes * volume_per_factor * self._thickness_factor
-        by_J0 += at_areas * ~self._keeps_volume[:, None]
+        by_J0 = by_place_volume * volume_per_factor * self._thickness_factor
+        by_J0 += by_place_area * ~self._keeps_volume[:, None]
         loaded_cells = np.flatnonzero((by_J0 != 0).any(axis=1))
         forces = np.zeros(self._r0.size)
         by_place = np.einsum(
@@ -182,12 +197,19 @@ class FaceOffsets:
         return forces.reshape(self._r0.shape)
 
     def slope_by_growth(self, u: Array, f: Array) -> Array:
-        """Return the derivative (nodes, 3) of sum f dH, with dH by the amplitude."""
+        """Return the gradient (nodes, 3) of sum f H_g by u, with H_g = dH/d(natural stretch).
+
+        The weights f are (nodes,), the displacement u (nodes, 3).
+        """
         weight = -f * self._half_volumes(1) / self._areas_at_nodes(u) ** 2
         return np.asarray((self._area_jacobian(u, f != 0).T @ weight).reshape(len(u), -1))
 
     def hessian(self, u: Array, f: Array) -> Any:
-        """Return the sparse second derivative (3 nodes, 3 nodes) of sum f H."""
+        """Return the sparse Hessian (3 nodes, 3 nodes) of sum f H by u, for f (nodes,).
+
+        H = V/A at each node, so it has a term of first derivatives of A, and one of second
+        derivatives.
+        """
         loaded_cells, areas = self._cells_around(f != 0), self._areas_at_nodes(u)
         area_jacobian = self._area_jacobian(u, f != 0)
         weight = -f * self._half_volumes() / areas**2
@@ -200,10 +222,16 @@ class FaceOffsets:
         return of_areas + scipy.sparse.coo_array(blocks, of_areas.shape).tocsr()
 
     def entries(self, u: Array, entries: Entries, f: Array) -> Entries:
-        """Return entries of a second derivative by u, of one by the places and H of nodes.
+        """Return the entries of a second derivative by the displacement u alone.
+
+        Those given are by the places and offsets H of nodes. The chain rule adds the Hessian of H.
 
         Parameters
         ----------
+        u
+            (nodes, 3) displacement over R.
+        entries
+            Rows, columns and values by places, then offsets; see `unknown_numbers`.
         f
             (nodes,) the first derivative by H.
         """
@@ -215,6 +243,7 @@ class FaceOffsets:
             return rows[is_of_places], columns[is_of_places], values[is_of_places]
         is_coupled = np.zeros(size, dtype=bool)
         is_coupled[rows] = True
+        # derivative of all places and offsets by the displacement
         unknowns_by_u = scipy.sparse.vstack(
             [scipy.sparse.eye_array(count), self.jacobian(u, is_coupled[count:])]
         ).tocsr()
@@ -223,7 +252,15 @@ class FaceOffsets:
         return i.astype(np.int64), j.astype(np.int64), v
 
     def coupled_pairs(self, rows: Longs, columns: Longs) -> tuple[Longs, Longs]:
-        """Return pairs of nodes that act on each other, where places and H at pairs of nodes do."""
+        """Return the pairs of nodes whose displacements are coupled where places and H are.
+
+        H at a node depends on the displacement of all nodes of the cells around.
+
+        Parameters
+        ----------
+        rows, columns
+            Pairs (n,) of nodes whose places and offsets are coupled.
+        """
         if self.is_constant:
             return rows, columns
         nodes, count = self._place_numbers, len(self._r0)
@@ -237,6 +274,7 @@ class FaceOffsets:
         to_place_numbers = scipy.sparse.coo_array(
             (np.ones(count), (np.arange(count), self._same_place)), (count, count)
         ).tocsr()
+        # (nodes, nodes): nodes on whose displacement the place and H of each node depend
         nodes_of_thickness = (
             scipy.sparse.eye_array(count) + to_place_numbers @ cells_to_places.T @ cells_to_nodes
         )
@@ -247,29 +285,44 @@ class FaceOffsets:
         return i.astype(np.int64), j.astype(np.int64)
 
     def _half_volumes(self, order: int = 0) -> Array:
-        """Return (h/2) sum V at all nodes, or its derivative of an order by the amplitude."""
+        """Return (h/2) sum V (nodes,), or its derivative of an order by the natural stretch."""
         powers = np.polynomial.polynomial
         return np.asarray(
             powers.polyval(self.growth, powers.polyder(self._volume_coefficients, order))
         )
 
     def _areas_at_nodes(self, u: Array) -> Array:
+        """Return the sums of A (nodes,) over the cells around nodes, at u (nodes, 3)."""
         return self._fixed_area + self._sum_at_nodes(
             self._thinning_cells, self._areas(self._r0 + u, self._thinning_cells)
         )
 
     def _sum_at_nodes(self, cells: Any, values: Array) -> Array:
-        """Return sums at nodes of values (cells, functions) in some cells."""
+        """Return sums (nodes,) over the cells around each node, all copies of it included.
+
+        Parameters
+        ----------
+        cells
+            Numbers or flags of the cells that count, or a slice.
+        values
+            (cells, functions) values of these cells at their nodes.
+        """
         sums = np.bincount(self._place_numbers[cells].ravel(), values.ravel(), len(self._r0))
         return np.asarray(sums[self._same_place], dtype=float)
 
     def _cells_around(self, is_needed: NDArray[np.bool_]) -> Longs:
-        """Return the cells that keep their volume and have any of the needed nodes."""
+        """Return the numbers of cells that keep their volume and have a needed node.
+
+        The flags are (nodes,). A node stands for all copies at its place.
+        """
         needs_place = np.bincount(self._same_place, is_needed, len(is_needed)) > 0
         return np.flatnonzero(needs_place[self._place_numbers].any(axis=1) & self._keeps_volume)
 
     def _area_jacobian(self, u: Array, is_needed: NDArray[np.bool_]) -> Any:
-        """Return derivatives (nodes, 3 nodes) of the areas, with rows of the needed nodes."""
+        """Return sparse derivatives (nodes, 3 nodes) by u of the areas at nodes.
+
+        Rows of nodes that are not needed, by the flags (nodes,), may be missing terms.
+        """
         cells = self._cells_around(is_needed)
         slope, places = self._area_slopes(u, cells), self._place_numbers[cells]
         rows, columns = np.broadcast_arrays(
@@ -281,7 +334,7 @@ class FaceOffsets:
         ).tocsr()[self._same_place]
 
     def _unknowns_of_cells(self, cells: Longs) -> Longs:
-        """Return numbers of the displacement's unknowns in some cells."""
+        """Return numbers (n, dofs) of the displacement's unknowns in n cells."""
         return unknown_numbers(
             self._cells.nodes[cells], len(self._r0), self._components, self._components
         )
@@ -294,6 +347,7 @@ class FaceOffsets:
         return np.asarray(self._cells.element.tabulate(1, self._cells.element.points)[1:, :, :, 0])
 
     def _areas(self, r: Array, cells: Any) -> Array:
+        """Return the areas J (cells, places) at the nodes of cells, at places r (nodes, 3)."""
         a1, a2 = np.einsum("dqk,cki->dcqi", self._slope_table, r[self._cells.nodes[cells]])
         return np.asarray(np.linalg.norm(np.cross(a1, a2), axis=-1))
 
@@ -302,11 +356,21 @@ class FaceOffsets:
         return self._area_vectors(u, cells).slope
 
     def _area_hessians(self, u: Array, cells: Longs, w: Array) -> Array:
-        """Return second derivatives (cells, dofs, dofs) of areas times w (cells, places)."""
+        """Return Hessians (cells, dofs, dofs) of the sums of w J over each cell's nodes.
+
+        J is the length of the area vector a_1 x a_2. Its Hessian has a part of first derivatives of
+        that vector, and a part of second ones, which is antisymmetric in components.
+
+        Parameters
+        ----------
+        u, w
+            (nodes, 3) displacement, and weights (cells, places).
+        """
         vectors = self._area_vectors(u, cells)
         T, slope = vectors.by_node, vectors.slope
         H = np.einsum("cqmi,cqni->cmn", T * (w / vectors.J)[..., None, None], T)
         H -= np.einsum("cqm,cqn->cmn", slope * (w / vectors.J)[..., None], slope)
+        # the second derivative of a_1 x a_2 by components i and j of nodes is along e_k
         for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
             twist = np.einsum("cq,qm,qn->cmn", w * vectors.normal[..., k], *self._slope_table)
             twist -= np.swapaxes(twist, 1, 2)
@@ -315,6 +379,7 @@ class FaceOffsets:
         return np.asarray(H)
 
     def _area_vectors(self, u: Array, cells: Longs) -> _AreaVectors:
+        """Return the area vectors of cells at their nodes, with derivatives, at u (nodes, 3)."""
         a1, a2 = np.einsum(
             "dqk,cki->dcqi", self._slope_table, (self._r0 + u)[self._cells.nodes[cells]]
         )
@@ -328,10 +393,10 @@ class FaceOffsets:
 
 
 def unknown_numbers(nodes: Longs, count: int, components: int = 3, dim: int = 3) -> Longs:
-    """Return numbers (n, components functions) of the unknowns at nodes (n, functions).
+    """Return the numbers (n, components functions) of the unknowns at nodes (n, functions).
 
-    The unknowns of places come first, `dim` of each of `count` nodes; those of H, the last of the
-    components where these are more than `dim`, come after all of them.
+    The unknowns of places come first, `dim` for each of `count` nodes. The offsets H come after all
+    of them, one for each node, if `components` is dim + 1.
     """
     of_place = dim * nodes[:, :, None] + np.arange(dim)
     dofs = np.concatenate([of_place, dim * count + nodes[:, :, None]], axis=2)[..., :components]

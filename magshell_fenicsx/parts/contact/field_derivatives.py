@@ -43,11 +43,11 @@ class ContactFields:
     Attributes
     ----------
     r0, thickness
-        The undeformed place, and the factor of h; None for 1.
+        The undeformed placement over R, and the factor of h; None for 1.
     nodes
-        (cells, functions) of all cells that are modelled.
+        (cells, functions) node numbers of all cells that are modelled.
     own
-        The rows of this rank's cells.
+        Slice of this rank's cells among them.
     """
 
     r0: fem.Function
@@ -56,7 +56,13 @@ class ContactFields:
     own: slice
 
     def shared_by_cells(self, forces: Array) -> Array:
-        """Return forces (nodes, d) as parts (own cells, functions, d), equal in all cells."""
+        """Return forces on nodes, split equally among the cells around each node.
+
+        Parameters
+        ----------
+        forces
+            (nodes, d) on all nodes. The result is (own cells, functions, d).
+        """
         count = np.bincount(self.nodes.ravel(), minlength=len(forces))
         shares = forces / np.maximum(count, 1)[:, None]
         return np.asarray(shares[self.nodes[self.own]])
@@ -64,20 +70,26 @@ class ContactFields:
 
 @dataclass(frozen=True)
 class ContactState:
-    """A contact at a state; all is of this rank's points.
+    """A contact at one state, with this rank's contact points.
 
     Attributes
     ----------
+    cells
+        All cells with their element and nodes.
     r0, u
-        (nodes, 3) of all nodes.
+        (nodes, 3) undeformed places and displacement of all nodes.
+    offsets
+        Half the thickness where it varies; None where it is h/2.
+    points, places, joined_places
+        Contact points, the places that they face, and which of these are joined as one.
     penalties
-        The penalty of joined places, with its derivatives by the penetration.
+        The penalty of joined places, with its two derivatives by the penetration.
     forces
-        (nodes, 3 or 4) derivatives of the energy by places and H.
+        (nodes, 3 or 4) derivatives of the energy by places and by H.
     find_entries_by_place_and_offset, find_entries
-        Return second derivatives by places and H, and by u.
+        Return entries of the second derivative by places and H, and by u.
     geometry
-        Returns distances, normals, and beta with its nodes, of places; see `gap_geometry`.
+        Returns distances, normals, and beta with its nodes, for places; see `gap_geometry`.
     """
 
     cells: CellsWithNodes
@@ -100,7 +112,7 @@ class ContactState:
         return self.offsets
 
     def force_rates(self, rates: Array) -> Array:
-        """Return the rates (nodes, 4) of the forces, of those of places and H."""
+        """Return the rates (nodes, 4) of the forces for rates (nodes, 4) of places and H."""
         rows, columns, values = self.find_entries_by_place_and_offset()
         flat = np.concatenate([rates[:, :-1].ravel(), rates[:, -1]])
         product = np.bincount(rows, values * flat[columns], len(flat))
@@ -108,7 +120,7 @@ class ContactState:
         return np.column_stack([product[:count].reshape(self.r0.shape), product[count:]])
 
     def unknown_rates(self, w: Array) -> Array:
-        """Return the rates of places and H along w (nodes, 3)."""
+        """Return the rates (nodes, 3 or 4) of places and H along a motion w (nodes, 3)."""
         return np.column_stack([w, self.offsets.change(self.u, w)]) if self.offsets else w
 
     def forces_on_nodes(self, forces: Array) -> Array:
@@ -116,13 +128,16 @@ class ContactState:
         return forces_on_nodes(self.offsets, self.u, forces)
 
     def weight_slopes(self, tables: Array, places: Array) -> Array:
-        """Return relative derivatives (n, functions, 3) of the points' weights by nodes.
+        """Return derivatives (n, functions, 3) of the logarithm of the points' weights by nodes.
+
+        A weight is proportional to the undeformed area J0 = |a_1 x a_2|.
 
         Parameters
         ----------
-        tables, places
-            Shape functions at points with their derivatives (3, n, functions), and so the places
-            (3, n, 3).
+        tables
+            (3, n, functions) shape functions at points, and their two derivatives.
+        places
+            (3, n, 3) the undeformed places, and their derivatives a_1 and a_2.
         """
         n = np.cross(*places[1:])
         n = n / np.sum(n * n, axis=1)[:, None]
@@ -131,7 +146,7 @@ class ContactState:
         return np.asarray(tables[1][..., None] * by_first + tables[2][..., None] * by_second)
 
     def penetration_rates(self, w: Array) -> Array:
-        """Return the rates of the penetrations of joined places along w (nodes, 3)."""
+        """Return the rates (m,) of joined places' penetrations along w (nodes, 3)."""
         _, n, beta, nodes = self.geometry(self.places)
         rates = self.unknown_rates(w)
         slopes = distance_slopes(n, beta, rates.shape[1])
@@ -145,16 +160,18 @@ class ContactState:
 
 @dataclass(frozen=True)
 class GrowthDerivative:
-    """A derivative of the energy by the natural stretch, on which the offsets of faces depend.
+    """A derivative of the contact energy by the natural stretch, on which the faces depend.
 
     Attributes
     ----------
     find_state
-        Returns the contact at the present state.
+        Returns the contact at the present state; collective.
     add
         Adds forces (nodes, 3) to a vector; collective.
     order
-        Of the derivative, 1 or 2.
+        Order of the derivative, 1 or 2.
+    amplitude
+        The amplitude that multiplies it; None without.
     """
 
     find_state: Callable[[], ContactState]
@@ -163,7 +180,10 @@ class GrowthDerivative:
     amplitude: str | None = None
 
     def energy(self) -> float:
-        """Return the derivative of this rank's energy."""
+        """Return this derivative of this rank's contact energy, by the natural stretch.
+
+        The first is Pi,H dH; the second adds the change of Pi,H.
+        """
         state = self.find_state()
         offsets, u = state.required_offsets, state.u
         of_forces = 0.0
@@ -172,7 +192,7 @@ class GrowthDerivative:
         return of_forces + float(state.forces[:, -1] @ offsets.growth_derivative(u, self.order))
 
     def add_residual(self, b: Array, factor: float) -> None:
-        """Add factor times the gradient of the first derivative; collective."""
+        """Add factor times the gradient of the first derivative by u to b; collective."""
         state = self.find_state()
         forces = state.forces_on_nodes(_growth_forces(state))
         forces = forces + state.required_offsets.slope_by_growth(state.u, state.forces[:, -1])
@@ -184,7 +204,15 @@ def with_growth(
     find_state: Callable[[], ContactState],
     add: Callable[[Array, Array], None],
 ) -> FreeParameter:
-    """Return the parameter of growth with the derivatives of a contact by it among its own."""
+    """Return the parameter of growth with a contact's derivatives added to its own.
+
+    Parameters
+    ----------
+    growth
+        The natural stretch as a free parameter, a number in the energies.
+    find_state, add
+        See `GrowthDerivative`.
+    """
 
     def second_derivatives(q: object) -> Sequence[Derivative]:
         of_contact = [GrowthDerivative(find_state, add, 2)] if q is growth.constant else []
@@ -195,14 +223,14 @@ def with_growth(
 
 
 def _growth_forces(state: ContactState) -> Array:
-    """Return the rates of the forces (nodes, 4) as the faces grow and nothing moves."""
+    """Return the rates of the forces (nodes, 4) by the natural stretch, at fixed displacement."""
     rates = state.required_offsets.growth_derivative(state.u)
     return state.force_rates(np.column_stack([0 * state.u, rates]))
 
 
 @dataclass(frozen=True)
 class EnergyWeights:
-    """Weights of the sum energy Pi + force w . Pi,u, with w (nodes, 3)."""
+    """Weights of the sum `energy` Pi + `force` w . Pi,u, with w (nodes, 3)."""
 
     w: Array
     energy: float
@@ -210,12 +238,15 @@ class EnergyWeights:
 
 
 def by_factor(state: ContactState, weights: EnergyWeights) -> Array:
-    """Return the sum's derivatives (cells, functions) by the factor of h in the cells."""
+    """Return derivatives (cells, functions) of the weighted sum by the thickness factor."""
     return state.required_offsets.by_factor(_by_volumes(state, weights)[0])
 
 
 def by_place(state: ContactState, weights: EnergyWeights) -> Array:
-    """Return the sum's derivatives (nodes, 3) by the undeformed place."""
+    """Return derivatives (nodes, 3) of the weighted sum by the undeformed places.
+
+    They are those by u, and those through the areas in weights of points and in offsets.
+    """
     rows, columns, values = state.find_entries()
     rates = np.bincount(rows, values * weights.w.ravel()[columns], state.r0.size)
     forces = weights.energy * state.forces_on_nodes(state.forces)
@@ -224,7 +255,10 @@ def by_place(state: ContactState, weights: EnergyWeights) -> Array:
 
 
 def _by_volumes(state: ContactState, weights: EnergyWeights) -> tuple[Array, Array]:
-    """Return the sum's derivatives (nodes,) by the volumes V, and by the areas A."""
+    """Return derivatives (nodes,) of the weighted sum by the volumes V and by the areas A.
+
+    See the module's formula of g_V; V and A are those at nodes.
+    """
     H_w = state.required_offsets.change(state.u, weights.w)
     force_rates = state.force_rates(np.column_stack([weights.w, H_w]))
     g = weights.energy * state.forces[:, -1] + weights.force * force_rates[:, -1]
@@ -234,19 +268,19 @@ def _by_volumes(state: ContactState, weights: EnergyWeights) -> tuple[Array, Arr
 
 
 def _by_weights(state: ContactState, weights: EnergyWeights) -> Array:
-    """Return what the sum (nodes, 3) changes by as the areas around the points do."""
+    """Return derivatives (nodes, 3) of the weighted sum through the areas around points."""
     forces = np.zeros_like(state.r0)
     if not len(state.places.point):
         return forces
-    value, first, _ = state.penalties
+    value, pressure, _ = state.penalties
     points, point = state.points, state.places.point[state.joined_places.first]
     rates = state.penetration_rates(weights.w)
-    of_places = (weights.energy * value + weights.force * first * rates) / 2
-    per_weight = np.bincount(point, of_places, len(points.cell))
+    value_of_places = (weights.energy * value + weights.force * pressure * rates) / 2
+    per_weight = np.bincount(point, value_of_places, len(points.cell))
     pressed_points = np.unique(point)
     element, nodes = state.cells.element, state.cells.nodes[points.cell[pressed_points]]
     tables = element.tabulate(1, points.shape[pressed_points] @ element.points)[..., 0]
     slopes = state.weight_slopes(tables, np.einsum("dnk,nki->dni", tables, state.r0[nodes]))
-    of_points = per_weight[pressed_points] * points.weight[pressed_points]
-    np.add.at(forces, nodes, of_points[:, None, None] * slopes)
+    value_of_points = per_weight[pressed_points] * points.weight[pressed_points]
+    np.add.at(forces, nodes, value_of_points[:, None, None] * slopes)
     return forces

@@ -30,14 +30,18 @@ Penalty = tuple[Array, Array, Array]
 
 @dataclass(frozen=True)
 class FrozenContact:
-    """The active set of a contact at a state.
+    """The active set of a contact at one state, which stays while numbers of the case change.
 
     Attributes
     ----------
+    cells, points
+        All cells, and the contact points.
+    places, joined_places
+        The places in contact, and which of them are joined as one.
     penetration
-        (m,) of joined places, over R.
+        (m,) penetrations of the joined places over R, about which the penalty is expanded.
     area_ratio
-        (points,) undeformed areas per area of the reference cell.
+        (points,) undeformed area per area of the reference cell.
     """
 
     cells: Cells
@@ -57,12 +61,18 @@ class FrozenContact:
         places: Projections,
         joined_places: JoinedPlaces,
     ) -> "FrozenContact":
-        """Return the active set of a state on an undeformed surface r0 (nodes, 3)."""
+        """Return the active set of a state on an undeformed surface r0 (nodes, 3).
+
+        The places are those of this state; h is the thickness over R.
+        """
         area_ratio = _area_ratio(cells, r0, points)
         return cls(cells, points, places, joined_places, h - joined_places.distance, area_ratio)
 
     def on_surface(self, r0: Array) -> "FrozenContact":
-        """Return the same active set on another undeformed surface r0 (nodes, 3)."""
+        """Return the same active set on another undeformed surface r0 (nodes, 3).
+
+        Weights of points change with the areas around them.
+        """
         area_ratio = _area_ratio(self.cells, r0, self.points)
         weight = self.points.weight * area_ratio / self.area_ratio
         return replace(self, points=replace(self.points, weight=weight), area_ratio=area_ratio)
@@ -70,12 +80,18 @@ class FrozenContact:
     def evaluate(
         self, search: ClosestPointSearch, u: Array, k: float, h: float, *, with_third_order: bool
     ) -> tuple[Projections, JoinedPlaces, Penalty]:
-        """Return the places at a displacement, how they are joined, and `expanded_penalty`.
+        """Return the places at a displacement, how they are joined, and the expanded penalty.
+
+        The penalty (m,) of joined places has its two derivatives, see `expanded_penalty`.
 
         Parameters
         ----------
+        search
+            Gives the places of nodes and points.
+        u
+            (nodes, 3) displacement over R.
         k, h
-            Stiffness of the penalty, and mean thickness.
+            Stiffness of the penalty over E h/R^2, and thickness over R.
         with_third_order
             See `expanded_penalty`.
         """
@@ -90,14 +106,15 @@ class FrozenContact:
         (_, y), *_ = jets(cells.element, X, nodal, 0)
         off, distance = (x - y)[:, :3], distances(x - y)
         change = distance - places.distance
-        mean = np.bincount(
+        mean_change = np.bincount(
             joined_places.group, joined_places.weight * change, len(joined_places.first)
         )
+        # the smoothed minimum to first order in the changes of its distances
         weight = joined_places.weight * (
-            1 - (change - mean[joined_places.group]) / (BLUR_DISTANCE * h)
+            1 - (change - mean_change[joined_places.group]) / (BLUR_DISTANCE * h)
         )
         joined_places = replace(
-            joined_places, distance=joined_places.distance + mean, weight=weight
+            joined_places, distance=joined_places.distance + mean_change, weight=weight
         )
         direction = off / np.linalg.norm(off, axis=1)[:, None]
         places = replace(places, X=X, distance=distance, direction=direction)
@@ -112,7 +129,10 @@ class FrozenContact:
 
 
 def _area_ratio(cells: Cells, r0: Array, points: ContactPoints) -> Array:
-    """Return undeformed areas (points,) per area of the reference cell, on a surface r0."""
+    """Return the undeformed area (points,) per area of the reference cell.
+
+    The undeformed surface has the places r0 (nodes, 3).
+    """
     if not len(points.cell):
         return np.zeros(0)
     X = points.shape @ cells.element.points

@@ -27,20 +27,30 @@ Array = NDArray[np.float64]
 def gap_geometry(
     cells: Cells, points: ContactPoints, r: Array, places: Projections
 ) -> tuple[Array, Array, Array, Longs]:
-    """Return distances (n,), normals (n, 3), beta and its nodes (n, functions of both cells).
+    """Return the distances between points and places, their normals, and beta with its nodes.
 
     Parameters
     ----------
+    points, places
+        Contact points, and n places that they face.
     r
-        (nodes, 3) places of all nodes.
+        (nodes, 3) places of all nodes over R.
+
+    Returns
+    -------
+    d, n
+        (n,) distances of mid-surfaces over R, and (n, 3) unit vectors from places to points.
+    beta, nodes
+        (n, functions of both cells) shape functions of the point, minus those of the place; and the
+        numbers of their nodes.
     """
     own_nodes = cells.nodes[points.cell[places.point]]
     nodes = np.concatenate([own_nodes, cells.nodes[places.cell]], axis=1)
-    half, N = nodes.shape[1] // 2, points.shape[places.point]
-    (shape, y), *_ = jets(cells.element, places.X, r[nodes[:, half:]], 0)
-    off = np.einsum("nk,nki->ni", N, r[nodes[:, :half]]) - y
+    half, shape_of_points = nodes.shape[1] // 2, points.shape[places.point]
+    (shape_of_places, y), *_ = jets(cells.element, places.X, r[nodes[:, half:]], 0)
+    off = np.einsum("nk,nki->ni", shape_of_points, r[nodes[:, :half]]) - y
     d = np.linalg.norm(off, axis=1)
-    return d, off / d[:, None], np.concatenate([N, -shape], axis=1), nodes
+    return d, off / d[:, None], np.concatenate([shape_of_points, -shape_of_places], axis=1), nodes
 
 
 def distance_slopes(n: Array, beta: Array, components: int) -> Array:
@@ -49,10 +59,10 @@ def distance_slopes(n: Array, beta: Array, components: int) -> Array:
     Parameters
     ----------
     n, beta
-        Normals (n, dim), and beta (n, functions of both cells).
+        Normals (n, dim), and beta (n, functions of both cells), see `gap_geometry`.
     components
-        dim, or one more: then the last is the derivative by H, which is -1 times the shape function
-        on either side.
+        Unknowns of a node: dim, or dim + 1 with the offset H as the last one. The derivative by H
+        is -1 times the shape function, of the point and of the place.
     """
     half = beta.shape[1] // 2
     by_offset = np.concatenate([-beta[:, :half], beta[:, half:]], axis=1)
@@ -69,61 +79,75 @@ def gap_hessians(
 ) -> Array:
     """Return the Hessians (n, dofs, dofs) of the weighted penalty by the nodes of both cells.
 
+    The formula is that of the module `surface_contact`: the first derivative times d,uu, and the
+    second times d,u d,u. It is a product of row vectors with a 4 by 4 matrix, less the terms of
+    places.
+
     Parameters
     ----------
     geometry
         Distances, normals, beta and its nodes, see `gap_geometry`.
     r
-        (nodes, components) all nodes, see `distance_slopes`.
+        (nodes, components) of all nodes, see `distance_slopes`.
     penalties
-        Weights, and first and second derivatives of the penalty by the penetration.
+        (n,) weights, and first and second derivatives of the penalty by the penetration.
     """
     (d, n, beta, nodes), (weight, first, second) = geometry, penalties
     half, components = nodes.shape[1] // 2, r.shape[1]
-    shapes, y = zip(*jets(cells.element, places.X, r[nodes[:, half:]]), strict=True)
+    shapes, place_jets = zip(*jets(cells.element, places.X, r[nodes[:, half:]]), strict=True)
     normal = np.column_stack([n, 0 * d])[:, None, :components]
     off = d[:, None, None] * np.column_stack([n, np.ones_like(d)])[:, None, :components]
-    A = slopes(off[:, 0], *y[1:])[1]
+    A = slopes(off[:, 0], *place_jets[1:])[1]
     free_directions = places.free_directions
+    # the inverse of A in the directions in which the place can move
     M = np.einsum(
         "nik,nkl,njl->nij",
         free_directions,
         inverse_in_free_directions(free_directions, A),
         free_directions,
     )
-    C = np.zeros((len(d), 2, *beta.shape[1:], components))
+    # rows C_a: how a change of the nodes moves the closest place along y_a
+    place_motion = np.zeros((len(d), 2, *beta.shape[1:], components))
     for a in range(2):
-        tangential = y[1 + a][:, None] * (COMPONENT_SIGNS[:components] > 0)
+        tangential = place_jets[1 + a][:, None] * (COMPONENT_SIGNS[:components] > 0)
         tangential -= np.sum(normal * tangential, axis=2, keepdims=True) * normal
-        C[:, a] = -beta[:, :, None] * tangential
-        C[:, a, half:] -= shapes[1 + a][:, :, None] * off
-    pull = weight * first / d
+        place_motion[:, a] = -beta[:, :, None] * tangential
+        place_motion[:, a, half:] -= shapes[1 + a][:, :, None] * off
+    pressure_over_distance = weight * first / d
     along_normal = beta[:, :, None] * normal
-    rows = [distance_slopes(n, beta, components)[:, None], along_normal[:, None], C]
-    row_vectors = np.concatenate(rows, axis=1).reshape(len(d), 4, -1)
-    middle = np.zeros((len(d), 4, 4))
-    middle[:, 0, 0] = weight * second
-    middle[:, 1, 1] = pull
-    middle[:, 2:, 2:] = pull[:, None, None] * M
-    H = row_vectors.transpose(0, 2, 1) @ (middle @ row_vectors)
-    of_places = pull[:, None, None] * beta[:, :, None] * beta[:, None, :]
+    row_groups = [
+        distance_slopes(n, beta, components)[:, None],
+        along_normal[:, None],
+        place_motion,
+    ]
+    row_vectors = np.concatenate(row_groups, axis=1).reshape(len(d), 4, -1)
+    # rows: d,u by all unknowns, d,u by places, and C_1, C_2
+    coefficients = np.zeros((len(d), 4, 4))
+    coefficients[:, 0, 0] = weight * second
+    coefficients[:, 1, 1] = pressure_over_distance
+    coefficients[:, 2:, 2:] = pressure_over_distance[:, None, None] * M
+    H = row_vectors.transpose(0, 2, 1) @ (coefficients @ row_vectors)
+    isotropic_part = pressure_over_distance[:, None, None] * beta[:, :, None] * beta[:, None, :]
     for i in range(3):
-        H[:, i::components, i::components] -= of_places
+        H[:, i::components, i::components] -= isotropic_part
     return np.asarray(H)
 
 
 def joint_entries(
     slopes_of_places: Array, nodes: Longs, group: Longs, weight: Array, count: int
 ) -> Entries:
-    """Return the entries that joined places have besides those of each place.
+    """Return the tangent's entries that joined places have besides those of each place.
 
     Parameters
     ----------
-    slopes_of_places, nodes, group
-        Of all places: the weighted derivative (n, functions, components) of the distance, its
-        nodes (n, functions), and the number (n,) of the joined place that it belongs to.
+    slopes_of_places
+        (n, functions, components) weighted derivatives of the distances of all places.
+    nodes
+        (n, functions) nodes of these functions.
+    group
+        (n,) number of the joined place to which each place belongs.
     weight
-        (m,) of each joined place.
+        (m,) factors of the products of derivatives, for each joined place.
     count
         Number of all nodes.
     """
@@ -131,11 +155,20 @@ def joint_entries(
     dofs = unknown_numbers(nodes, count, components)
     rows = np.repeat(group, dofs.shape[1])
     values = slopes_of_places.ravel(), (rows, dofs.ravel())
+    # derivatives of the joined distances by all unknowns
     G = scipy.sparse.coo_array(values, (len(weight), components * count)).tocsr()
     hessian = (G.T @ scipy.sparse.diags_array(weight) @ G).tocoo()
     return hessian.row.astype(np.int64), hessian.col.astype(np.int64), hessian.data
 
 
 def forces_on_nodes(offsets: FaceOffsets | None, u: Array, forces: Array) -> Array:
-    """Return the forces by the displacement u (nodes, dim), of those by places and offsets."""
+    """Return the forces by the displacement u (nodes, dim), where offsets H depend on u.
+
+    Parameters
+    ----------
+    offsets
+        None where the thickness is uniform: then `forces` is returned.
+    forces
+        (nodes, dim + 1) derivatives of the energy by places and by H.
+    """
     return np.asarray(forces[:, :-1] + offsets.slope(u, forces[:, -1])) if offsets else forces

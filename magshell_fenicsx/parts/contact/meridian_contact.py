@@ -83,18 +83,18 @@ class ModelMeridian:
     Attributes
     ----------
     r0, u
-        Undeformed placement (rho, z) and displacement, in one space.
+        Undeformed placement (rho, z) and displacement over R, in one space.
     patches
-        Name -> whether each cell belongs to the patch.
+        Name of a patch or shell -> whether each cell belongs to it.
     h
         Thickness over R; where it varies, that of the first shell.
     degree
-        Of the quadrature.
+        Degree of the quadrature.
     thickness
         Factor of h, (1,) per node; None for 1.
     thins
-        1 in the cells (cells, 1) whose thickness follows from their area, as of rubber, or for all;
-        else 0.
+        (cells, 1) or one number for all: 1 in cells whose thickness follows from their area, as of
+        rubber, else 0.
     natural
         The natural shape; None if it is the undeformed one.
     """
@@ -131,7 +131,7 @@ class ModelMeridian:
 
     @cached_property
     def offsets(self) -> MeridianOffsets | None:
-        """Half the thickness where it varies or changes with the state; None where it is h/2."""
+        """Half the thickness at nodes; None where it is h/2 everywhere and in all states."""
         keeps_volume = np.broadcast_to(np.asarray(self.thins) > 0, (len(self.nodes), 1))[:, 0]
         if self.thickness is None and not keeps_volume.any():
             return None
@@ -153,11 +153,16 @@ class MeridianContact(ContactTerm):
 
     Parameters
     ----------
+    pair
+        The two members, with the stiffness of their penalty.
+    model
+        The meridians of the model.
     sides
-        (cells,) whether each cell belongs to the first shell, and to the second.
+        (cells,) flags of the cells of the first shell, and of the second.
     """
 
     def __init__(self, pair: Pair, model: ModelMeridian, sides: tuple[Flags, Flags]) -> None:
+        """Prepare the points and the search; places are looked for at the first evaluation."""
         super().__init__(pair, model.fields, model.offsets)
         self._h, self._u, self._curves = model.h, model.u, model.curves
         self._meridian_offsets = model.offsets
@@ -174,8 +179,10 @@ class MeridianContact(ContactTerm):
         if np.any(sides[0] & sides[1]):
             undeformed = np.column_stack([self._r0, self._half])
             nodal = undeformed[self._nodes]
-            x = self._places_of_points(undeformed)
-            self._material = NeighbouringMaterial(x, nodal, self._nodes, self._points.cell)
+            undeformed_points = self._places_of_points(undeformed)
+            self._material = NeighbouringMaterial(
+                undeformed_points, nodal, self._nodes, self._points.cell
+            )
         self._at = np.full_like(self._r0, np.nan)
         self._growth = 0.0  # the natural stretch at that displacement
         self._places = no_projections()
@@ -194,10 +201,14 @@ class MeridianContact(ContactTerm):
         return float(self._points.weight[places.point] @ self._penalty(places)[0]) / 2
 
     def _add(self, b: Array, forces: Array) -> None:
+        """Add forces (nodes, 2) to the vector b; every rank has all nodes."""
         b[: forces.size] += forces.ravel()
 
     def _forces(self) -> Array:
-        """Return the derivative (nodes, 2) by the places of all nodes, or with H (nodes, 3)."""
+        """Return derivatives (nodes, 2 or 3) of the energy by the places of all nodes.
+
+        Where the thickness varies, the third component is the derivative by the offset H.
+        """
         places = self._active_set()
         weight = self._points.weight[places.point] / 2 * self._penalty(places)[1]
         _, n, beta, nodes = self._geometry(places)
@@ -207,10 +218,11 @@ class MeridianContact(ContactTerm):
         return forces
 
     def _entries_by_place_and_offset(self) -> Entries:
-        """Return entries of the second derivative by the places of nodes and the offsets H."""
+        """Return entries of the second derivative by places (rho, z) and offsets H of nodes."""
         return self._block_entries(*self._second_derivative(0.0), [0, 2])
 
     def _entries(self) -> Entries:
+        """Return the entries of the tangent by the displacement (U, W) of nodes."""
         entries = self._entries_by_place_and_offset()
         if not self._offsets:
             return entries
@@ -222,9 +234,9 @@ class MeridianContact(ContactTerm):
         Parameters
         ----------
         H, nodes
-            (n, dofs, dofs) blocks by (U, V, W, H), at nodes (n, functions).
+            (n, dofs, dofs) blocks by (U, V, W, H) at nodes (n, functions).
         of_place
-            The components among (U, V, W) that are unknowns.
+            Components among (U, V, W) that are unknowns: numbers 0, 1 and 2.
         """
         components = [*of_place, 3] if self._offsets else of_place
         rows_of_block = np.flatnonzero(np.isin(np.arange(H.shape[1]) % 4, components))
@@ -235,7 +247,7 @@ class MeridianContact(ContactTerm):
 
     @property
     def pattern_key(self) -> float:
-        """A number of the pairs of cells in contact, see `NonlocalTerm`."""
+        """A number that identifies the pairs of cells in contact, see `NonlocalTerm`."""
         return float(crc32(self._cells_in_contact().tobytes()))
 
     def coupled_pairs(self) -> tuple[Longs, Longs]:
@@ -244,7 +256,10 @@ class MeridianContact(ContactTerm):
         return self._offsets.coupled_pairs(*pairs_of(nodes)) if self._offsets else pairs_of(nodes)
 
     def _cells_in_contact(self) -> Longs:
-        """Return pairs (n, 2) of cells, of the point and of its place."""
+        """Return the pairs (n, 2) of cells in contact: cell of the point, cell of the place.
+
+        In a step in time they are those of all its samples.
+        """
         pairs = [
             np.column_stack([self._points.cell[places.point], places.cell])
             for places in at_each_sample(self, self._active_set)
@@ -252,7 +267,7 @@ class MeridianContact(ContactTerm):
         return np.asarray(np.unique(np.concatenate(pairs), axis=0))
 
     def entries_of_waves(self, m: float) -> Entries:
-        """Return the entries of the second variation along waves of m theta.
+        """Return the entries of the second variation along waves (U cos, V sin, W cos) of m theta.
 
         They are by the coefficients (U + V, V, W), as in `Waves`.
         """
@@ -272,9 +287,22 @@ class MeridianContact(ContactTerm):
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
     ) -> tuple[fem.Function, Array] | None:
-        """Return the derivative by the thickness or the placement.
+        """Return derivatives of energy Pi + force w . dPi/du by the thickness or the placement.
 
-        See `FieldDifferentiable` of `assembly.nonlocal_terms`.
+        Parameters
+        ----------
+        name
+            Name of the field: "thickness" or "r0".
+        direction
+            The displacement w.
+        energy, force
+            The two weights.
+
+        Returns
+        -------
+        field, values
+            The field and derivatives (cells, functions, components) by its values; None for any
+            other name. See `FieldDifferentiable` of `assembly.nonlocal_terms`.
         """
         field = {"thickness": self._fields.thickness, "r0": self._fields.r0}.get(name)
         if field is None:
@@ -286,6 +314,10 @@ class MeridianContact(ContactTerm):
         return field, self._fields.shared_by_cells(by_place(state, weights))
 
     def _state(self) -> ContactState:
+        """Return the contact at the present state, for derivatives by fields.
+
+        On a meridian each place stands alone: joined places have one place each.
+        """
         places = self._active_set()
         numbers, ones = np.arange(len(places.point)), np.ones(len(places.point))
         joined_places = JoinedPlaces(numbers, numbers, places.distance, ones, ones == 0)
@@ -298,12 +330,12 @@ class MeridianContact(ContactTerm):
     # what is observed
 
     def force(self) -> float:
-        """Return the integral of the pressure over the contact, over E h R."""
+        """Return the integral of the contact pressure, over E h R, at the present state."""
         places = self._active_set()
         return float(self._points.weight[places.point] @ self._penalty(places)[1]) / 2
 
     def least_gap(self) -> float:
-        """Return the least gap over R; nan where no faces are within the reach."""
+        """Return the least gap over R at present; nan where no faces are within the reach."""
         u = self._displacement()
         reach = self._reach
         if not self._material:  # no place is farther than nodes
@@ -312,7 +344,13 @@ class MeridianContact(ContactTerm):
         return float(least_distance - self._h) if np.isfinite(least_distance) else np.nan
 
     def _distance_to_nodes(self, u: Array) -> float:
-        """Return the least distance of points from the nodes of the other shell."""
+        """Return the least distance over R of points from the nodes of the other shell.
+
+        Parameters
+        ----------
+        u
+            (nodes, 2) displacement over R.
+        """
         r = self._places_of_nodes(u)
         x, is_first = self._places_of_points(r), self._points.is_first
         first, second = (np.unique(self._nodes[side]) for side in self._sides)
@@ -324,7 +362,10 @@ class MeridianContact(ContactTerm):
         return float((self._h - self._active_set().distance).max(initial=0.0))
 
     def relative_penetration(self) -> float:
-        """Return the largest penetration over the undeformed thickness there."""
+        """Return the largest penetration over the undeformed thickness there, 0 without contact.
+
+        The thickness is the mean of those at the point and at its place.
+        """
         places, half = self._active_set(), self._half[self._nodes]
         shape, own_cell = self._points.shape[places.point], self._points.cell[places.point]
         at_points = np.sum(shape * half[own_cell], axis=1)
@@ -333,9 +374,10 @@ class MeridianContact(ContactTerm):
         return float((penetration / (at_points + at_places)).max(initial=0.0))
 
     def gap_at_supports(self, supported_nodes: Longs, u: Array) -> float:
-        """Return the least gap over R at nodes that supports hold.
+        """Return the least gap over R at nodes that supports hold, at a displacement u (nodes, 2).
 
-        See `ClosestPointSearch.gap_at_supports`.
+        It is infinite if the thickness depends on the displacement, see
+        `ClosestPointSearch.gap_at_supports`.
         """
         if self._offsets and not self._offsets.is_constant:
             return np.inf
@@ -357,7 +399,7 @@ class MeridianContact(ContactTerm):
         Raises
         ------
         MeshError
-            With the place.
+            With the place of the deepest penetration.
         """
         places = self._projections(0 * self._r0, self._h)
         penetration = self._h - places.distance
@@ -371,16 +413,21 @@ class MeridianContact(ContactTerm):
             )
 
     def cell_pressures_and_gaps(self) -> tuple[Array, Array, Flags]:
-        """Return what each cell has; see `SurfaceContact.cell_pressures_and_gaps`.
+        """Return pressure, gap and full contact of each cell.
 
         Returns
         -------
         pressure
-            (cells,) the mean over E h/R^2.
+            (cells,) the mean over E h/R.
         gap
-            (cells,) the least over R, up to the reach.
+            (cells,) the least over R, at most the reach less h.
         is_full
             (cells,) whether all of the cell is pressed.
+
+        Notes
+        -----
+        Where an end alone presses on a face, half of its point's force acts on each; see
+        `SurfaceContact.cell_pressures_and_gaps`.
         """
         places, count = self._active_set(), len(self._nodes)
         cell, weight = self._points.cell, self._points.weight
@@ -401,8 +448,8 @@ class MeridianContact(ContactTerm):
     def passes_through(self, u: Array, v: Array) -> bool:
         """Return whether points pass through a curve on the straight way from u to v (nodes, 2).
 
-        Between two samples no point moves, relative to another, by more than a part of the least
-        thickness.
+        Curves are looked at in samples of the way. Between two samples no point moves, relative to
+        another, by more than a part of the least thickness.
         """
         halves = [
             self._half_at(displacement)[self._nodes_of_pair] for displacement in (0 * u, u, v)
@@ -429,7 +476,13 @@ class MeridianContact(ContactTerm):
         return np.array(self._displacement())
 
     def sample_rates(self, motion: Array) -> SampleRates:
-        """Return the penalty of the points with its rates along a motion (nodes, 2)."""
+        """Return the penalty of the points at the present sample, with its rates along a motion.
+
+        Parameters
+        ----------
+        motion
+            (nodes, 2) displacement of the whole step.
+        """
         places = self._active_set()
         if self._offsets:
             motion = np.column_stack([motion, self._offsets.change(self._at, motion)])
@@ -448,12 +501,17 @@ class MeridianContact(ContactTerm):
     # geometry
 
     def _displacement(self) -> Array:
+        """Return the displacement (nodes, 2), at present or at the sample."""
         if self.sample:
             return self.sample.u
         return np.asarray(self._u.x.array.reshape(-1, 2)[: len(self._r0)])
 
     def _active_set(self) -> MeridianProjections:
-        """Return the places in contact at the present state, or sample."""
+        """Return the places in contact at the present state, or at the sample of a step.
+
+        They are cached while the state stays. A frozen contact keeps its places, which move on in
+        their cells.
+        """
         u, growth = self._displacement(), self._offsets.growth if self._offsets else 0.0
         if self._frozen:
             self._at, places = np.array(u), self._frozen[0]
@@ -466,12 +524,12 @@ class MeridianContact(ContactTerm):
         return self._places
 
     def _find_places(self, u: Array) -> tuple[Array, MeridianProjections]:
-        """Return a displacement with its places that count."""
+        """Return a displacement u (nodes, 2) together with its places that count."""
         places = self._projections(u, self._h)
         return u, places.select(~self._are_left_to_edges(places))
 
     def _penalty(self, places: MeridianProjections) -> tuple[Array, Array, Array]:
-        """Return the penalty of places, with its derivatives by the penetration."""
+        """Return the penalty (n,) of places, with its two derivatives by the penetration."""
         penetration, k = self._h - places.distance, self.stiffness.value
         soft_penetration = SOFT_PENETRATION * self._h
         if self._frozen:
@@ -483,45 +541,64 @@ class MeridianContact(ContactTerm):
         return self.sample.weigh(places.point, penalties) if self.sample else penalties
 
     def freeze(self) -> tuple[MeridianProjections, Array]:
-        """Return the active set of the present state, and its penetrations over R."""
+        """Return the active set of the present state, and its penetrations (n,) over R."""
         places = self._active_set()
         return places, self._h - places.distance
 
     def expand_about(self, frozen: tuple[MeridianProjections, Array]) -> None:
-        """Take the frozen contact of another scene on the same mesh, see `frozen_contact`."""
+        """Use the frozen contact of another scene on the same mesh for all later states.
+
+        See `frozen_contact`.
+        """
         self._frozen = frozen
 
     def _follow(self, places: MeridianProjections) -> MeridianProjections:
-        """Return places after a small change, free ones also beyond an end of their cells."""
+        """Return places moved on to where points project at present, by Newton's method.
+
+        Free places may move beyond an end of their cells; the others stay.
+        """
         r, X = self._places_of_nodes(self._at), places.X
         x, nodal = self._places_of_points(r)[places.point], r[self._nodes[places.cell]]
         for _ in range(FOLLOW_ITERATIONS):
-            pull, curvature, _ = slopes(x, self._curves.jets(X, nodal))
-            X = X + np.where(places.is_free, pull / np.where(places.is_free, curvature, 1.0), 0.0)
+            descent, curvature, _ = slopes(x, self._curves.jets(X, nodal))
+            X = X + np.where(
+                places.is_free, descent / np.where(places.is_free, curvature, 1.0), 0.0
+            )
         return replace(places, X=X, distance=distances(x - self._curves.jets(X, nodal)[0]))
 
     def _places_of_nodes(self, u: Array, *, to_faces: bool = True) -> Array:
-        """Return all nodes (nodes, 3), the third component half the thickness less h/2, or 0."""
+        """Return all nodes (nodes, 3) at a displacement: rho, z, and half the thickness less h/2.
+
+        The last component is 0 unless `to_faces` is set. All are over R.
+        """
         offset = (self._half_at(u) - self._h / 2) * to_faces
         return np.column_stack([self._r0 + u, offset])
 
     def _half_at(self, u: Array) -> Array:
+        """Return half the thickness (nodes,) over R at a displacement u (nodes, 2)."""
         return self._offsets.half_thickness(u) if self._offsets else self._half
 
     def _places_of_points(self, r: Array) -> Array:
-        """Return the points, with the third component of the other sign, see `distances`."""
+        """Return the points (n, dim) for nodes r (nodes, dim), dim 2 or 3.
+
+        The third component has the other sign, see `distances`.
+        """
         nodal = r[self._nodes[self._points.cell]] * COMPONENT_SIGNS[: r.shape[1]]
         return np.asarray(np.einsum("nk,nki->ni", self._points.shape, nodal))
 
     def _projections(
         self, u: Array, face_reach: float, *, to_faces: bool = True
     ) -> MeridianProjections:
-        """Return the places that points face at a displacement, one on each side at most.
+        """Return the places that points face at a displacement, at most one on each side.
 
         Parameters
         ----------
+        u
+            (nodes, 2) displacement over R.
         face_reach
-            Largest distance of faces, or of mid-surfaces, over R.
+            Largest distance over R: between mid-surfaces, or with `to_faces` between faces plus h.
+        to_faces
+            Whether a variable thickness counts in distances.
         """
         r = self._places_of_nodes(u, to_faces=to_faces)
         x, nodal = self._places_of_points(r), r[self._nodes]
@@ -535,17 +612,17 @@ class MeridianContact(ContactTerm):
         return self._curves.select_nearest(near_places, x, nodal, self._material)
 
     def _are_left_to_edges(self, places: MeridianProjections) -> Flags:
-        """Return which places do not count, since the point of a free end is there too.
+        """Return flags (n,): which places do not count, because a free end presses there.
 
-        They are those of points inside a shell that face the end of another one, steeply; see
-        `ClosestPointSearch.are_left_to_edges`. Normals are undeformed ones, so that the energy is a
+        They are places at the end of a shell that a point inside another shell faces steeply. See
+        `ClosestPointSearch.are_left_to_edges`. Normals are undeformed, so that the energy is a
         function of the state.
         """
         at_end, is_steep = self._end_and_steepness(places)
         return np.asarray(at_end & is_steep & ~self._points.is_on_edge[places.point])
 
     def _end_and_steepness(self, places: MeridianProjections) -> tuple[Flags, Flags]:
-        """Return which places are at a free end, and in a cell that is steep to the point's."""
+        """Return two flags (n,): whether places are at a free end, and steep to the point."""
         end = (places.X == 1.0).astype(np.int64)
         at_end = ~places.is_free & (self._curves.neighbours[places.cell, end] < 0)
         normals = self._points.normal[places.point] * self._normals[places.cell]
@@ -553,7 +630,16 @@ class MeridianContact(ContactTerm):
         return np.asarray(at_end), np.asarray(cosine < STEEP_COSINE)
 
     def _geometry(self, places: MeridianProjections) -> tuple[Array, Array, Array, Longs]:
-        """Return distances, normals, and beta (n, functions of both cells) with its nodes."""
+        """Return the distances between points and places, their normals, and beta with its nodes.
+
+        Returns
+        -------
+        d, n
+            (n,) distances of mid-surfaces over R, and (n, 2) unit vectors from places to points.
+        beta, nodes
+            (n, functions of both cells) shape functions of the point, minus those of the place; and
+            the numbers of their nodes.
+        """
         own_nodes = self._nodes[self._points.cell[places.point]]
         nodes = np.concatenate([own_nodes, self._nodes[places.cell]], axis=1)
         r = self._r0 + self._at
@@ -564,10 +650,11 @@ class MeridianContact(ContactTerm):
         return d, off / d[:, None], beta, nodes
 
     def _second_derivative(self, m: float) -> tuple[Array, Longs]:
-        """Return second derivatives (n, dofs, dofs) of the energy of each place.
+        """Return second derivatives (n, dofs, dofs) of the energy of each place, and its nodes.
 
-        They are by (U, V, W, H) at the nodes of both cells, over the whole circumference, for waves
-        of m theta.
+        They are by (U, V, W, H) at the nodes (n, functions) of both cells, over the whole
+        circumference, for waves of m theta. The formula is that of the module: four row vectors
+        with a factor each, and the term D . D.
         """
         places = self._active_set()
         _, first, second = self._penalty(places)
@@ -580,26 +667,28 @@ class MeridianContact(ContactTerm):
         A = slopes(self._places_of_points(r)[places.point], jets)[1]
         y, tangent = jets[0], jets[1, :, :2]
         tangential = tangent - np.sum(tangent * n, axis=1)[:, None] * n
+        # rows: change of the distance, its part n . D by places, C_s, and C_theta
         rows = np.zeros((4, *beta.shape, 4))
-        normal, closing, slide, turn = rows
+        normal, closing, slide, circumferential = rows
         normal[..., IN_PLANE] = closing[..., IN_PLANE] = beta[..., None] * n[:, None]
         normal[..., 3] = np.concatenate([-beta[:, :half], beta[:, half:]], axis=1)
         slide[..., IN_PLANE] = -beta[..., None] * tangential[:, None]
         slide[:, half:, IN_PLANE] -= shape_slope[..., None] * off[:, None]
         slide[:, half:, 3] -= shape_slope * d[:, None]
-        turn[..., 1] = -beta * y[:, :1]
-        turn[:, half:, 0] += m * off[:, :1] * shape
-        turn[:, half:, 1] += off[:, :1] * shape
-        turn[:, half:, 2] += m * off[:, 1:] * shape
-        turn[:, half:, 3] += m * d[:, None] * shape
+        circumferential[..., 1] = -beta * y[:, :1]
+        circumferential[:, half:, 0] += m * off[:, :1] * shape
+        circumferential[:, half:, 1] += off[:, :1] * shape
+        circumferential[:, half:, 2] += m * off[:, 1:] * shape
+        circumferential[:, half:, 3] += m * d[:, None] * shape
+        # factors of the squared rows; the terms of d,uu have the tension over the distance
         B, tension = y[:, 0] * (y[:, 0] + off[:, 0]), -weight * first / d
         by_A, by_B = _inverse_where(places.is_free, A), _inverse_where(B > 0, B)
         flat = rows.reshape(4, count, 4 * functions).swapaxes(0, 1)
         factors = np.column_stack([weight * second, -tension, -tension * by_A, -tension * by_B])
         H = flat.transpose(0, 2, 1) @ (factors[..., None] * flat)
-        of_places = tension[:, None, None] * beta[:, :, None] * beta[:, None]
+        isotropic_part = tension[:, None, None] * beta[:, :, None] * beta[:, None]
         for i in range(3):
-            H[:, i::4, i::4] += of_places
+            H[:, i::4, i::4] += isotropic_part
         return H, nodes
 
 
@@ -612,6 +701,10 @@ class MeridianContactState(ContactState):
     """A contact on a meridian at a state."""
 
     def weight_slopes(self, tables: Array, places: Array) -> Array:
+        """Return relative derivatives (n, functions, 2) of the points' weights by nodes.
+
+        The weight is rho |r'|, see `ContactState.weight_slopes`.
+        """
         tangent = places[1]
         direction = tangent / np.sum(tangent**2, axis=1)[:, None]
         by_place = tables[1][..., None] * direction[:, None]
@@ -625,7 +718,7 @@ def meridian_contacts(pairs: Sequence[Pair], model: ModelMeridian) -> list[Merid
     Raises
     ------
     MeshError
-        If shells of a pair overlap undeformed.
+        If the shells of a pair overlap undeformed.
     """
     patches = {WHOLE_SHELL: np.ones(len(model.nodes), dtype=bool), **model.patches}
     contacts = list[MeridianContact]()

@@ -28,10 +28,12 @@ IN_PLANE = [0, 2]  # of (U, V, W)
 
 
 class MeridianOffsets(FaceOffsets):
-    """Half the thickness at all nodes of meridians, over R.
+    """Half the thickness H at all nodes of meridians, over R, with its derivatives.
 
     Parameters
     ----------
+    curves
+        The meridians.
     r0
         (nodes, 2) undeformed rho and z.
     h, volume_factors, keeps_volume, amplitude
@@ -49,6 +51,7 @@ class MeridianOffsets(FaceOffsets):
         keeps_volume: NDArray[np.bool_],
         amplitude: SettableNumber | None = None,
     ) -> None:
+        """Tabulate shape functions at nodes; on the axis those of |rho'| stand for rho's."""
         self._slopes, rho = curves.slopes_at_nodes, r0[curves.nodes, 0]
         slope = np.einsum("qk,ck->cq", self._slopes, rho)
         on_axis = (np.abs(rho) < AXIS_TOLERANCE)[..., None]
@@ -59,34 +62,50 @@ class MeridianOffsets(FaceOffsets):
         super().__init__(curves, r0, h, volume_factors, keeps_volume, np.arange(len(r0)), amplitude)
 
     def waves(self, m: float) -> "MeridianOffsets":
-        """Return the offsets for waves (U, V, W) of m theta at a displacement (U, W).
+        """Return these offsets with derivatives by waves (U cos, V sin, W cos) of m theta.
 
-        H then changes as cos m theta.
+        The displacement stays (U, W). H changes as cos m theta.
         """
         other = copy(self)
         other._wave_number, other._components = m, 3
         return other
 
     def undeformed_tangents(self) -> Array:
-        """Return tangents (2, cells, nodes, 3) along the undeformed meridian, and around."""
+        """Return undeformed tangents (2, cells, nodes, 3): along the meridian, and around the axis.
+
+        The second has the length rho.
+        """
         rho, tangent = self._radius_and_tangent(self._r0, slice(None))
         tangents = np.zeros((2, *rho.shape, 3))
         tangents[0, ..., IN_PLANE], tangents[1, ..., 1] = np.moveaxis(tangent, -1, 0), rho
         return tangents
 
     def _radius_and_tangent(self, r: Array, cells: Any) -> tuple[Array, Array]:
-        """Return rho and r' at the nodes of some cells."""
+        """Return rho (cells, places) and r' (cells, places, 2) at the nodes of some cells.
+
+        On the axis |rho'| stands for rho.
+
+        Parameters
+        ----------
+        r
+            (nodes, 2) places of nodes.
+        cells
+            Numbers or flags of the cells, or a slice.
+        """
         nodal = r[self._cells.nodes[cells]]
         rho = np.einsum("cqk,ck->cq", self._value_table[cells], nodal[..., 0])
         return rho, np.einsum("qk,cki->cqi", self._slopes, nodal)
 
     def _areas(self, r: Array, cells: Any) -> Array:
+        """Return the areas rho |r'| (cells, places) over 2 pi at places r (nodes, 2)."""
         rho, tangent = self._radius_and_tangent(r, cells)
         return np.asarray(rho * np.linalg.norm(tangent, axis=-1))
 
     def _area_rows(self, u: Array, cells: Longs) -> tuple[Array, Array, Array, Array]:
-        """Return rho, |r'|, and the rows a and b (cells, places, functions, 3) by (U, V, W) of
-        nodes.
+        """Return rho, |r'|, and the rows a and b of the module's formulas, at u (nodes, 2).
+
+        Rows are (cells, places, functions, 3) by (U, V, W) of nodes; rho and |r'| are (cells,
+        places).
         """
         rho, tangent = self._radius_and_tangent(self._r0 + u, cells)
         a, b = np.zeros((2, *rho.shape, rho.shape[1], 3))
@@ -98,11 +117,15 @@ class MeridianOffsets(FaceOffsets):
         return rho, np.linalg.norm(tangent, axis=-1), a, b
 
     def _by_unknowns(self, rows: Array) -> Array:
-        """Return rows by the unknowns (cells, places, dofs), of those by (U, V, W)."""
+        """Return rows by the unknowns (cells, places, dofs), from rows by (U, V, W).
+
+        Without waves the unknowns are (U, W).
+        """
         rows = rows if self._wave_number is not None else rows[..., IN_PLANE]
         return np.asarray(rows.reshape(*rows.shape[:2], rows.shape[2] * rows.shape[3]))
 
     def _area_slopes(self, u: Array, cells: Longs) -> Array:
+        """Return derivatives (cells, places, dofs) of areas by the unknowns of cells."""
         rho, speed, a, b = self._area_rows(u, cells)
         slopes = self._by_unknowns(speed[..., None, None] * b + (rho / speed)[..., None, None] * a)
         if not self._wave_number:
@@ -111,9 +134,19 @@ class MeridianOffsets(FaceOffsets):
         return np.where(self._on_axis[cells][..., None], 0.0, slopes)
 
     def _area_hessians(self, u: Array, cells: Longs, w: Array) -> Array:
+        """Return Hessians (cells, dofs, dofs) of the sums of w J over each cell's nodes.
+
+        The formula is that of the module, for waves of m theta, or for m = 0.
+
+        Parameters
+        ----------
+        u, w
+            (nodes, 2) displacement, and weights (cells, places).
+        """
         rho, speed, a, b = self._area_rows(u, cells)
         m, tangent = self._wave_number or 0.0, self._radius_and_tangent(self._r0 + u, cells)[1]
         rho1, z1 = np.moveaxis(tangent, -1, 0)[..., None]
+        # rows of q, P, m W, f and V' in the module's formula
         q, p, c, f, v = np.zeros((5, *a.shape))
         value = self._value_table[cells]
         q[..., 0], q[..., 2] = (row * self._slopes / speed[..., None] for row in (-z1, rho1))

@@ -38,15 +38,18 @@ class MeridianPoints:
 
     Attributes
     ----------
-    cell, shape, weight
-        (n,) number, (n, functions) shape functions of that cell, and undeformed area over R^2, all
-        around.
+    cell
+        (n,) number of the point's cell.
+    shape
+        (n, functions) shape functions of that cell at the point.
+    weight
+        (n,) undeformed area over R^2, all around the axis.
     is_first
-        (n,) whether it is on the first shell.
+        (n,) whether the point is on the first shell.
     normal
-        (n, 2) undeformed.
+        (n, 2) undeformed unit normal (rho, z).
     is_on_edge
-        (n,) whether it is next to a free end.
+        (n,) whether the point is next to a free end.
     """
 
     cell: Longs
@@ -59,14 +62,16 @@ class MeridianPoints:
 
 @dataclass(frozen=True)
 class MeridianProjections:
-    """Points and the places of a meridian that are nearest to them.
+    """Places of a meridian that are nearest to points: one row for each pair of point and place.
 
     Attributes
     ----------
-    point, cell, X
-        (n,) number of the point, cell of the place, and where it is in that.
+    point, cell
+        (n,) numbers of the points, and of the cells of the places.
+    X
+        (n,) place in the reference cell, from 0 to 1.
     is_free
-        (n,) whether it may move along the curve.
+        (n,) whether the place may move along the curve.
     distance
         (n,) over R.
     """
@@ -85,39 +90,41 @@ class MeridianProjections:
 
 
 def neighbours_of(nodes: Longs) -> Longs:
-    """Return the cell beyond each end (cells, 2); -1 where there is none.
+    """Return the cell beyond each end of each cell (cells, 2); -1 where there is none.
 
     Parameters
     ----------
     nodes
-        (cells, functions) the ends first.
+        (cells, functions) node numbers, those of the ends first.
     """
     neighbours = np.full((len(nodes), 2), -1, dtype=np.int64)
     end_at_vertex = dict[int, tuple[int, int]]()
     for cell, end in np.ndindex(len(nodes), 2):
         vertex = int(nodes[cell, end])
-        other = end_at_vertex.get(vertex)
-        if other:
-            neighbours[cell, end], neighbours[other] = other[0], cell
+        earlier_end = end_at_vertex.get(vertex)
+        if earlier_end:
+            neighbours[cell, end], neighbours[earlier_end] = earlier_end[0], cell
         end_at_vertex[vertex] = cell, end
     return neighbours
 
 
 class NeighbouringMaterial:
-    """The material around a point, which it does not touch; see `projection`.
+    """The material around a point, which the point does not touch; see `projection`.
 
     Parameters
     ----------
-    points, cells
-        Undeformed places of the points (n, 3) and of the nodes of all cells (cells, functions, 3),
-        the last component half the thickness, of points with the other sign.
+    points
+        (n, 3) undeformed points: rho, z, and minus half the thickness.
+    cells
+        (cells, functions, 3) undeformed nodes of all cells: rho, z, and half the thickness.
     nodes
-        (cells, functions) of all cells, the ends first.
+        (cells, functions) node numbers of all cells, those of the ends first.
     cells_of_points
-        (n,).
+        (n,) number of each point's cell.
     """
 
     def __init__(self, points: Array, cells: Array, nodes: Longs, cells_of_points: Longs) -> None:
+        """Find the cells that are near each other along the undeformed curve."""
         self._points, self._cells, self.cells_of_points = points, cells, cells_of_points
         count = len(nodes)
         r0 = np.zeros((int(nodes.max()) + 1, 3))
@@ -128,11 +135,17 @@ class NeighbouringMaterial:
         self._near = is_near.reshape(count, count)
 
     def are_near(self, cell: Longs, other: Longs) -> Flags:
-        """Return whether the way from cells (n,) to others, -1 for none, is short on the curve."""
+        """Return flags (n,): whether the way along the curve from cells to others is short.
+
+        Another cell of -1 stands for none, and is not near.
+        """
         return np.asarray(self._near[cell, other] & (other >= 0))
 
     def may_touch(self, cell: Longs, other: Longs, nodal: Array) -> Flags:
-        """Return whether cells (n,) may touch others: near on the curve where one is folded.
+        """Return flags (n,): whether cells may touch others.
+
+        Cells that are near along the curve may if the curve is folded between them. A cell does not
+        touch itself.
 
         Parameters
         ----------
@@ -150,14 +163,17 @@ class NeighbouringMaterial:
         return may_touch
 
     def are_distinct(self, places: MeridianProjections, shape: Array, is_above: Flags) -> Flags:
-        """Return which places count: those that are not the material around their point.
+        """Return flags (n,): which places count, as they are not the material around their point.
 
-        They are far along the curve, or else far undeformed and above or below their points.
+        Either their cell is far along the curve. Or they were far undeformed, and are now above or
+        below their point.
 
         Parameters
         ----------
         shape
-            (n, functions) at the places.
+            (n, functions) shape functions at the places.
+        is_above
+            (n,) whether points are above or below their places, not beside them.
         """
         is_near = self.are_near(self.cells_of_points[places.point], places.cell)
         undeformed = np.einsum("nk,nki->ni", shape, self._cells[places.cell])
@@ -170,18 +186,20 @@ class NeighbouringMaterial:
 class CandidateSearch:
     """The search for cells of the other shell that points may be near to.
 
-    First by circles about cells, then by their chords.
+    Cells are searched first by circles around them, then by their chords.
 
     Parameters
     ----------
+    points
+        The quadrature points of both shells, in the order of cells.
     nodes
-        (cells, functions) of all cells, the ends first.
+        (cells, functions) node numbers of all cells, those of the ends first.
     sides
-        Whether each cell belongs to the first shell, and to the second.
+        (cells,) flags of the cells of the first shell, and of the second.
     element
-        Of basix.
+        The basix element of the curves.
     material
-        Of a shell that may touch itself; both sides are then the same.
+        For a shell that may touch itself; both sides are then the same. Else None.
     """
 
     def __init__(
@@ -192,6 +210,7 @@ class CandidateSearch:
         element: Any,
         material: NeighbouringMaterial | None,
     ) -> None:
+        """Count the points of each cell, and bound the bulge of curves over their chords."""
         self._first_cells, self._second_cells = (np.flatnonzero(side) for side in sides)
         self._material = material
         self._counts = np.bincount(points.cell, minlength=len(nodes))
@@ -204,26 +223,39 @@ class CandidateSearch:
         self._inner_nodes = element.points[2:, :1]
 
     def __call__(self, x: Array, nodal: Array, reach: float) -> tuple[Longs, Longs]:
-        """Return points and cells, among them all pairs of less than this distance.
+        """Return pairs of points and cells, among them all that are nearer than a reach.
 
         Parameters
         ----------
-        x, nodal
-            Places of all points (n, 2), and of the nodes of all cells (cells, functions, 2).
+        x
+            (n, 2) places of all points over R.
+        nodal
+            (cells, functions, 2) places of the nodes of all cells.
+        reach
+            Distance over R.
+
+        Returns
+        -------
+        point, cell
+            (m,) numbers.
         """
         point, cell = self._in_circles(nodal, reach)
-        a, chord = nodal[:, 0], nodal[:, 1] - nodal[:, 0]
-        off = nodal[:, 2:] - a[:, None] - self._inner_nodes * chord[:, None]
-        bulge = self._bulge * np.linalg.norm(off, axis=2).max(axis=1, initial=0.0)
-        offset, chords = x[point] - a[cell], chord[cell]
+        begins, chord = nodal[:, 0], nodal[:, 1] - nodal[:, 0]
+        off_chord = nodal[:, 2:] - begins[:, None] - self._inner_nodes * chord[:, None]
+        bulge = self._bulge * np.linalg.norm(off_chord, axis=2).max(axis=1, initial=0.0)
+        offset, chords = x[point] - begins[cell], chord[cell]
         squares = np.sum(chord * chord, axis=1)
-        part = np.clip(np.sum(offset * chords, axis=1) / squares[cell], 0.0, 1.0)
-        distance = np.linalg.norm(offset - part[:, None] * chords, axis=1)
+        # distance from the chord, less the largest distance of the curve from its chord
+        chord_share = np.clip(np.sum(offset * chords, axis=1) / squares[cell], 0.0, 1.0)
+        distance = np.linalg.norm(offset - chord_share[:, None] * chords, axis=1)
         is_near = distance - bulge[cell] < reach
         return point[is_near], cell[is_near]
 
     def _in_circles(self, nodal: Array, reach: float) -> tuple[Longs, Longs]:
-        """Return points and cells whose circles are near each other."""
+        """Return pairs of points and cells whose circles are nearer than the reach.
+
+        The circle of a point is that of its cell. Both shells have points.
+        """
         first, second, centres = self._first_cells, self._second_cells, nodal.mean(axis=1)
         squares = np.sum((nodal - centres[:, None]) ** 2, axis=2)
         radii = CELL_RADIUS_FACTOR * np.sqrt(squares.max(axis=1))
@@ -237,12 +269,13 @@ class CandidateSearch:
         else:
             own_cell, cell = np.concatenate([own_cell, cell]), np.concatenate([cell, own_cell])
         count = self._counts[own_cell]
+        # numbers of all points of the first cells, one cell after the other
         start = np.repeat(self._starts[own_cell] - np.cumsum(count) + count, count)
         return start + np.arange(len(start)), np.repeat(cell, count)
 
 
 def no_projections() -> MeridianProjections:
-    """Return no places."""
+    """Return an empty set of places."""
     no_numbers = np.zeros(0, dtype=np.int64)
     return MeridianProjections(
         no_numbers, no_numbers, np.zeros(0), np.zeros(0, dtype=bool), np.zeros(0)
@@ -250,19 +283,21 @@ def no_projections() -> MeridianProjections:
 
 
 def slopes(x: Array, jets: Array) -> tuple[Array, Array, Array]:
-    """Return how places are drawn to points x (n, 3) along their curves, times the distance.
+    """Return derivatives of the distance by the place along the curve, times the distance.
 
     Parameters
     ----------
+    x
+        (n, 3) the points.
     jets
-        (3, n, 3) the places and their derivatives along the curve.
+        (3, n, 3) the places and their two derivatives along the curve.
 
     Returns
     -------
     pull
-        (n,) minus the derivative of the distance along the curve.
+        (n,) minus the first derivative.
     curvature
-        (n,) A, the second derivative of the distance along the curve.
+        (n,) the second derivative, A of `meridian_contact`.
     speed
         (n,) A of a straight line.
     """
@@ -279,30 +314,31 @@ def distances(off: Array) -> Array:
 
 
 class MeridianCurves:
-    """The meridians of all shells.
+    """The meridians of all shells as curves.
 
     Parameters
     ----------
     element
-        Of basix, with its nodes.
+        The basix element of places, whose nodes are points.
     nodes
-        (cells, functions), the ends first.
+        (cells, functions) node numbers, those of the ends first.
     r0
-        (nodes, 2) undeformed.
+        (nodes, 2) undeformed places over R.
     h
         Thickness over R.
 
     Attributes
     ----------
     neighbours
-        (cells, 2): the cell beyond each end; -1 where there is none.
+        (cells, 2) the cell beyond each end; -1 where there is none.
     lebesgue_constant
-        A bound of the element's, see `projection.polynomial_bound`.
+        A bound of the element's Lebesgue constant, see `projection.polynomial_bound`.
     slopes_at_nodes
-        (places, functions): derivatives of shape functions at the nodes.
+        (places, functions) derivatives of shape functions at the nodes.
     """
 
     def __init__(self, element: Any, nodes: Longs, r0: Array, h: float) -> None:
+        """Tabulate the starts of Newton's method and the slopes at nodes."""
         self.element, self.nodes, self._r0, self._h = element, nodes, r0, h
         self.neighbours = neighbours_of(nodes)
         starts = STARTS_PER_DEGREE * element.degree
@@ -318,22 +354,31 @@ class MeridianCurves:
         return np.asarray(self.element.tabulate(order, X[:, None])[..., 0])
 
     def jets(self, X: Array, nodal: Array) -> Array:
-        """Return places and two derivatives (3, n, 3) of curves through nodes (n, functions, 3)."""
+        """Return places and their first two derivatives (3, n, 3) along curves.
+
+        Parameters
+        ----------
+        X
+            (n,) places in the reference cell.
+        nodal
+            (n, functions, 3) nodes of each place's cell.
+        """
         return np.asarray(np.einsum("dnk,nki->dni", self.table(2, X), nodal))
 
     def rule(self, count: int, sides: tuple[Flags, Flags]) -> MeridianPoints:
-        """Return the points of Gauss's rule in each cell; with a free end this is among them.
+        """Return the quadrature points in each cell: Gauss's, and with one next to each free end.
 
         Parameters
         ----------
         count
             Number of points in a cell.
         sides
-            Whether each cell belongs to the first shell, and to the second.
+            (cells,) flags of the cells of the first shell, and of the second.
         """
         off_axis = np.abs(self._r0[self.nodes[:, :2], 0]) > AXIS_TOLERANCE
         is_free_end = (self.neighbours < 0) & off_axis
-        parts = list[tuple[Longs, Array, Array, Flags, Array, Flags]]()
+        point_groups = list[tuple[Longs, Array, Array, Flags, Array, Flags]]()
+        # cells are in groups: with a free end at neither side, at one, or at both
         for begins, ends in ((False, False), (True, False), (False, True), (True, True)):
             has_ends = (is_free_end == [begins, ends]).all(axis=1)
             cells = np.flatnonzero(np.any(sides, axis=0) & has_ends)
@@ -347,35 +392,41 @@ class MeridianCurves:
             is_on_edge = np.tile(at_begin | at_end, len(cells))
             cell, shape = np.repeat(cells, len(X)), np.tile(table[0], (len(cells), 1))
             flat_normal = normal.reshape(-1, 2)
-            parts.append((cell, shape, area.ravel(), sides[0][cell], flat_normal, is_on_edge))
-        return MeridianPoints(*(np.concatenate(arrays) for arrays in zip(*parts, strict=True)))
+            point_groups.append(
+                (cell, shape, area.ravel(), sides[0][cell], flat_normal, is_on_edge)
+            )
+        return MeridianPoints(
+            *(np.concatenate(arrays) for arrays in zip(*point_groups, strict=True))
+        )
 
     def project(self, x: Array, nodal: Array, point: Longs, cell: Longs) -> MeridianProjections:
-        """Return the closest place of each cell to its point, by Newton's method.
+        """Return the closest place in each cell to its point, by Newton's method.
 
         Parameters
         ----------
-        x, nodal
-            Places of all points (n, 3), and of the nodes of all cells (cells, functions, 3).
+        x
+            (n, 3) places of all points.
+        nodal
+            (cells, functions, 3) places of the nodes of all cells.
         point, cell
-            (m,) numbers of points and cells.
+            (m,) numbers of points and cells to pair.
         """
         shape = self.table(0, self._starts)[0]
-        off = x[point][:, None] - np.einsum("mk,nki->nmi", shape, nodal[cell])
-        X = self._starts[distances(off).argmin(axis=1)]
+        start_offsets = x[point][:, None] - np.einsum("mk,nki->nmi", shape, nodal[cell])
+        X = self._starts[distances(start_offsets).argmin(axis=1)]
         moving = np.arange(len(X))
         for _ in range(MAX_NEWTON_ITERATIONS):
             jets = self.jets(X[moving], nodal[cell[moving]])
-            pull, curvature, speed = slopes(x[point[moving]], jets)
-            step = pull / np.where(curvature > MIN_CURVATURE_RATIO * speed, curvature, speed)
+            descent, curvature, speed = slopes(x[point[moving]], jets)
+            step = descent / np.where(curvature > MIN_CURVATURE_RATIO * speed, curvature, speed)
             previous = X[moving]
             X[moving] = np.clip(previous + np.clip(step, -0.25, 0.25), 0.0, 1.0)
             moving = moving[np.abs(X[moving] - previous) >= STEP_TOLERANCE]
             if not len(moving):
                 break
         jets = self.jets(X, nodal[cell])
-        pull, *_ = slopes(x[point], jets)
-        is_fixed = (X == 0.0) & (pull <= 0) | (X == 1.0) & (pull >= 0)
+        descent, *_ = slopes(x[point], jets)
+        is_fixed = (X == 0.0) & (descent <= 0) | (X == 1.0) & (descent >= 0)
         return MeridianProjections(point, cell, X, ~is_fixed, distances(x[point] - jets[0]))
 
     def select_nearest(
@@ -385,28 +436,30 @@ class MeridianCurves:
         nodal: Array,
         material: NeighbouringMaterial | None,
     ) -> MeridianProjections:
-        """Return the places from which the curve goes on to no nearer one.
+        """Return the places from which the curve goes on to no nearer place.
 
-        One on each side of a point at most.
+        A point keeps its nearest place, and at most one on its other side.
 
         Parameters
         ----------
         x, nodal
-            See `project`.
+            Points and nodes of cells, see `project`.
+        material
+            The material around points of a shell that may touch itself; else None.
         """
-        number = len(self.nodes)
-        places = places.select(np.argsort(places.point * number + places.cell))
+        cell_count = len(self.nodes)
+        places = places.select(np.argsort(places.point * cell_count + places.cell))
         is_above: Flags = np.ones(len(places.point), dtype=bool)
         if material:
             is_above = self._are_above(places, x, nodal)
             shape = self.table(0, places.X)[0]
             is_distinct = material.are_distinct(places, shape, is_above)
             places, is_above = places.select(is_distinct), is_above[is_distinct]
-        keys = places.point * number + places.cell
+        keys = places.point * cell_count + places.cell
         is_nearest: Flags = np.ones(len(keys), dtype=bool)
         for end, X in enumerate((0.0, 1.0)):
             neighbour = self.neighbours[places.cell, end]
-            neighbour_key = places.point * number + neighbour
+            neighbour_key = places.point * cell_count + neighbour
             row = np.minimum(np.searchsorted(keys, neighbour_key), max(len(keys) - 1, 0))
             is_listed = keys[row] == neighbour_key
             tolerance = DISTANCE_TOLERANCE * self._h
@@ -423,11 +476,12 @@ class MeridianCurves:
             return places
         offset = (x[places.point] - self.jets(places.X, nodal[places.cell])[0])[:, :2]
         offset = offset / np.maximum(np.linalg.norm(offset, axis=1), 1e-300)[:, None]
-        begins = np.flatnonzero(np.diff(places.point, prepend=-1))
-        nearest = np.repeat(begins, np.diff([*begins, len(offset)]))
+        first_of_point = np.flatnonzero(np.diff(places.point, prepend=-1))
+        nearest = np.repeat(first_of_point, np.diff([*first_of_point, len(offset)]))
+        # besides the nearest place of a point, the nearest one on its other side is chosen
         is_opposite = np.sum(offset * offset[nearest], axis=1) < SAME_DIRECTION_COSINE
         is_chosen = np.zeros(len(offset), dtype=bool)
-        is_chosen[begins] = True
+        is_chosen[first_of_point] = True
         opposite = np.flatnonzero(is_opposite)
         is_chosen[opposite[np.flatnonzero(np.diff(places.point[opposite], prepend=-1))]] = True
         return places.select(is_chosen)
@@ -439,22 +493,32 @@ class MeridianCurves:
         is_above: Flags,
         material: NeighbouringMaterial | None,
     ) -> Flags | bool:
-        """Return whether the curve beyond places is near their point's cell, and not searched."""
+        """Return flags (n,): whether the curve goes on into a cell that is not searched.
+
+        That is the cell beyond a place, if it is near the point's own cell along the curve.
+
+        Parameters
+        ----------
+        neighbour
+            (n,) cells beyond the places; -1 for none.
+        is_above
+            (n,) whether points are above or below their places.
+        """
         if not material:
             return False
         own_cell = material.cells_of_points[places.point]
         return np.asarray(is_above & material.are_near(own_cell, neighbour))
 
     def _are_above(self, places: MeridianProjections, x: Array, nodal: Array) -> Flags:
-        """Return whether points are above or below their places.
+        """Return flags (n,): whether points are above or below their places.
 
-        Else they are beside them, as in one curve that is straight.
+        The others are beside their places, as in one straight curve.
         """
         y, tangent, _ = self.jets(places.X, nodal[places.cell])[..., :2]
         offset = x[places.point, :2] - y
         height = np.abs(offset[:, 0] * tangent[:, 1] - offset[:, 1] * tangent[:, 0])
-        size = np.linalg.norm(offset, axis=1) * np.linalg.norm(tangent, axis=1)
-        return np.asarray(height > ABOVE_SINE * size)
+        product_of_lengths = np.linalg.norm(offset, axis=1) * np.linalg.norm(tangent, axis=1)
+        return np.asarray(height > ABOVE_SINE * product_of_lengths)
 
     def cell_normals(self) -> Array:
         """Return the undeformed unit normals (cells, 2) of the lines between the ends."""

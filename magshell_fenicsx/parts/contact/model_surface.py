@@ -38,22 +38,22 @@ class ModelSurface:
     Attributes
     ----------
     r0, u
-        Undeformed placement and displacement, in one space.
+        Undeformed placement and displacement over R, in one space.
     patches
-        Name -> whether each cell of this rank, ghosts included, belongs to the patch.
+        Name of a patch -> whether each cell of this rank, ghosts included, belongs to it.
     h
         Thickness over R; where it varies, that of the first shell.
     degree
-        Of the quadrature.
+        Degree of the quadrature.
     thickness
         Factor of h, (1,) per node; None for 1.
     thins
-        1 in the cells (cells, 1) whose thickness follows from their area, as of rubber, or for all;
-        else 0.
+        (cells, 1) or one number for all: 1 in cells whose thickness follows from their area, as of
+        rubber, else 0.
     images
-        Of a half or a sector the copies that make the whole, itself first; none of a whole.
+        For a half or a sector: the copies that make the whole, itself first. Empty for a whole.
     facets_on_planes
-        Of a half or a sector the facets of this rank on its planes of symmetry.
+        For a half or a sector: the facets of this rank on each of its planes of symmetry.
     natural
         The natural shape; None if it is the undeformed one.
     planes
@@ -96,14 +96,14 @@ class ModelSurface:
 
     @property
     def grows(self) -> bool:
-        """Whether the volume depends on an amplitude."""
+        """Whether the volume depends on an amplitude, the natural stretch."""
         return self.natural is not None and self.natural.stretch is not None
 
     @property
     def volume_factors(self) -> Array:
-        """(powers, own cells, functions): the volume over h J0 at nodes, by powers of the growth.
+        """The volume over h J0 at nodes, (powers, own cells, functions), by powers of the growth.
 
-        One power where nothing grows: the factor of the thickness.
+        Where nothing grows there is one power: the factor of the thickness.
         """
         factor = np.ones(self.own_nodes.shape)
         if self.thickness is not None:
@@ -116,27 +116,29 @@ class ModelSurface:
         slopes = element.tabulate(1, element.points)[1:, ..., 0]
         nodal = self.r0.x.array.reshape(-1, 3)[V.dofmap.list]
         tangents = np.einsum("dqk,nki->dnqi", slopes, nodal)
-        rates = self.natural.volume_coefficients(tangents, element.points)
-        rates[:, ~self.keeps_volume] = np.eye(4)[0][:, None, None]
-        return np.asarray(factor * rates[:, : len(factor)])
+        coefficients = self.natural.volume_coefficients(tangents, element.points)
+        coefficients[:, ~self.keeps_volume] = np.eye(4)[0][:, None, None]
+        return np.asarray(factor * coefficients[:, : len(factor)])
 
 
 @dataclass(frozen=True)
 class _AllCells:
-    """The cells that contacts search, with what each has; of all ranks.
+    """The cells of all ranks that contacts search, with the values in each cell.
 
     Attributes
     ----------
+    cells
+        The cells with their element and nodes.
     r0
-        (nodes, 3) undeformed.
+        (nodes, 3) undeformed places over R.
     same_place
-        (nodes,) for each node the first of those at its place.
+        (nodes,) for each node the first node at its place.
     volume_factors, keeps_volume
         See `ModelSurface`.
     patches
-        Name -> whether each cell belongs to the patch; with that of all.
+        Name of a patch -> whether each cell belongs to it; `WHOLE_SHELL` has all cells.
     images
-        The copies among the cells; None without.
+        The copies among the cells; None without symmetry.
     """
 
     cells: Cells
@@ -149,7 +151,7 @@ class _AllCells:
 
     @classmethod
     def gather(cls, surface: ModelSurface, global_cells: GlobalCells) -> "_AllCells":
-        """Gather the cells of all ranks; collective."""
+        """Return the cells of all ranks, without images; collective."""
         topology, count = surface.topology, len(global_cells.own_range)
         own_corners = topology.connectivity(2, 0).array[: 3 * count].astype(np.int32)
         corners = topology.index_map(0).local_to_global(own_corners).reshape(-1, 3)
@@ -170,7 +172,10 @@ class _AllCells:
         return cls(cells, r0, same_place, np.array(factors), keeps_volume, patches)
 
     def with_images(self, surface: ModelSurface) -> "_AllCells":
-        """Return the cells of all copies of a half or a sector; collective."""
+        """Return the cells of all copies of a half or a sector; collective.
+
+        The copies share vertices on planes of symmetry, and nodes there count as one place.
+        """
         images, facets = Images(surface.images, len(self.r0)), surface.facets_on_planes
         nodes = _nodes_of_facets(surface.space, facets)
         vertices = _vertices_of_facets(surface.topology, facets)
@@ -190,6 +195,11 @@ class _AllCells:
 
 def surface_contacts(pairs: Sequence[Pair], surface: ModelSurface) -> list[SurfaceContact]:
     """Return the contacts of pairs on a mid-surface; collective.
+
+    Parameters
+    ----------
+    pairs
+        Pairs of shells or patches that may touch.
 
     Raises
     ------
@@ -225,7 +235,13 @@ def _contact_geometry(
     all_cells: _AllCells,
     own_dofs: tuple[int, int],
 ) -> ContactGeometry:
-    """Return what the contacts of all pairs share."""
+    """Return the cells of the model with all that the contacts of its pairs share.
+
+    Parameters
+    ----------
+    own_dofs
+        Number of the first degree of freedom of this rank in the model, and how many it has.
+    """
     cells, r0, images = all_cells.cells, all_cells.r0, all_cells.images
     element, first_cell = surface.space.element.basix_element, global_cells.own_range.start
     if images:
@@ -260,14 +276,20 @@ def _contact_geometry(
 
 
 def _displacement_of(surface: ModelSurface, images: Images | None) -> Callable[[], Array]:
-    """Return what gives the present displacement (nodes, 3) of all cells; it is collective."""
+    """Return a function that gives the present displacement (nodes, 3) of all cells; collective."""
     if images is None:
         return partial(global_values, surface.u)
     return lambda: images.displacements(global_values(surface.u))
 
 
 def _refuse_overlap(contact: SurfaceContact, h: float) -> None:
-    """Raise a MeshError if the surfaces of a contact overlap undeformed; collective."""
+    """Check that the surfaces of a contact do not overlap undeformed; collective.
+
+    Raises
+    ------
+    MeshError
+        On every rank, with the depth and the place.
+    """
     penetration, x = contact.deepest_penetration()
     if penetration > PENETRATION_TOLERANCE * h:
         place = ", ".join(f"{coordinate:.4g}" for coordinate in x + 0.0)
@@ -278,7 +300,7 @@ def _refuse_overlap(contact: SurfaceContact, h: float) -> None:
 
 
 def _nodes_of_facets(V: fem.FunctionSpace, facets: Sequence[NDArray[np.int32]]) -> Longs:
-    """Return the global numbers of the nodes of facets of all ranks; collective."""
+    """Return the global numbers of the nodes on facets of all ranks; collective."""
     all_facets = np.concatenate([*facets, np.empty(0, np.int32)])
     local = fem.locate_dofs_topological(V, 1, all_facets, remote=False)
     numbers = V.dofmap.index_map.local_to_global(local)

@@ -63,11 +63,11 @@ class Cells:
     Attributes
     ----------
     element
-        Of basix, with its nodes.
+        The basix element of places, whose nodes are points.
     nodes
-        (cells, functions): global numbers.
+        (cells, functions) global numbers of nodes.
     corners
-        (cells, 3): global numbers of vertices.
+        (cells, 3) global numbers of vertices.
     """
 
     element: Any
@@ -82,9 +82,10 @@ class Cells:
         keys = pairs[..., 0] * (self.corners.max() + 1) + pairs[..., 1]
         order = np.argsort(keys.ravel(), kind="stable")
         is_shared_with_next = np.flatnonzero(np.diff(keys.ravel()[order]) == 0)
+        # two cells share a side if its key comes twice
         neighbours = np.full(keys.size, -1)
-        a, b = order[is_shared_with_next], order[is_shared_with_next + 1]
-        neighbours[a], neighbours[b] = b // 3, a // 3
+        first_sides, second_sides = order[is_shared_with_next], order[is_shared_with_next + 1]
+        neighbours[first_sides], neighbours[second_sides] = second_sides // 3, first_sides // 3
         return np.asarray(neighbours.reshape(-1, 3))
 
     @cached_property
@@ -97,12 +98,14 @@ class Cells:
         return np.asarray(is_on_edge[self.corners])
 
     def edge_turns(self, r0: Array, cosine: float) -> NDArray[np.bool_]:
-        """Return whether an undeformed edge turns at each corner (cells, 3), by more than an angle.
+        """Return flags (cells, 3): whether the undeformed edge turns sharply at each corner.
 
         Parameters
         ----------
+        r0
+            (nodes, 3) undeformed places.
         cosine
-            Of the angle.
+            Cosine of the angle above which a turn counts.
         """
         cell, side = np.nonzero(self.neighbours < 0)
         slopes = self.element.tabulate(1, CORNERS)[1:, :, :, 0]
@@ -118,8 +121,9 @@ class Cells:
 
     @cached_property
     def lattices(self) -> list[tuple[Array, Array]]:
-        """Places (m, 2) spread over the reference cell with the shape functions there: coarse,
-        fine.
+        """The coarse and the fine lattice of places in the reference cell, with shape functions.
+
+        Places are (m, 2), shape functions (m, functions).
         """
         spread = [
             np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
@@ -149,7 +153,15 @@ class Cells:
         ).T
 
     def near_within_surface(self, r0: Array, distance: Array) -> Longs:
-        """Return `near_along_surface` of a placement (nodes, 3) and a reach (nodes,)."""
+        """Return keys of the pairs of cells that are near within the surface.
+
+        See `near_along_surface`.
+
+        Parameters
+        ----------
+        r0, distance
+            (nodes, 3) undeformed places, and (nodes,) reach.
+        """
         x, reach = np.zeros((int(self.corners.max()) + 1, 3)), np.zeros(int(self.corners.max()) + 1)
         x[self.corners], reach[self.corners] = (
             self.at_corners @ r0[self.nodes],
@@ -161,33 +173,39 @@ class Cells:
 def near_along_surface(corners: Longs, x: Array, reach: Array) -> Longs:
     """Return which cells are near each other within a surface, along the sides of cells.
 
-    The way between any of their corners is shorter than the mean of the reach at its ends.
+    Two cells are near if the way between any of their corners is at most the mean of the reach at
+    its two ends.
 
     Parameters
     ----------
     corners
-        (cells, 3), or (cells, 2) of a curve.
+        (cells, 3) vertices, or (cells, 2) of a curve.
     x, reach
-        (vertices, dim) undeformed, and (vertices,).
+        (vertices, dim) undeformed places, and (vertices,).
 
     Returns
     -------
     keys
-        i * cells + j of pairs of cells, ascending.
+        Numbers i * cells + j of pairs of cells, ascending.
     """
-    count, (n, per_cell) = len(x), corners.shape
+    vertex_count, (cell_count, per_cell) = len(x), corners.shape
     farthest = float(reach.max())
     starts, ends = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
-    numbers = np.minimum(starts, ends), np.maximum(starts, ends)
-    edges = scipy.sparse.coo_array((np.ones(len(starts)), numbers), (count, count))
+    vertex_numbers = np.minimum(starts, ends), np.maximum(starts, ends)
+    edges = scipy.sparse.coo_array(
+        (np.ones(len(starts)), vertex_numbers), (vertex_count, vertex_count)
+    )
     edges = edges.tocsr().tocoo()  # each once
     lengths = np.linalg.norm(x[edges.row] - x[edges.col], axis=1)
-    graph = scipy.sparse.coo_array((lengths, (edges.row, edges.col)), (count, count)).tocsr()
+    graph = scipy.sparse.coo_array(
+        (lengths, (edges.row, edges.col)), (vertex_count, vertex_count)
+    ).tocsr()
+    # strips of vertices along the longest axis keep the matrices of ways small
     axis = int(np.ptp(x, axis=0).argmax())
     order = np.argsort(x[:, axis], kind="stable")
     near_pairs = list[tuple[Longs, Longs]]()
     sorted_x = x[order, axis]
-    for strip_vertices in np.array_split(order, max(1, count // VERTICES_PER_STRIP)):
+    for strip_vertices in np.array_split(order, max(1, vertex_count // VERTICES_PER_STRIP)):
         # ways that short leave a strip by no more than their length
         low, high = x[strip_vertices[0], axis] - farthest, x[strip_vertices[-1], axis] + farthest
         begin, end = np.searchsorted(sorted_x, low), np.searchsorted(sorted_x, high, "right")
@@ -198,37 +216,41 @@ def near_along_surface(corners: Longs, x: Array, reach: Array) -> Longs:
         mean_reach = (reach[candidates[rows], None] + reach[candidates]) / 2
         row, column = np.nonzero(lengths <= mean_reach)
         near_pairs.append((candidates[rows[row]], candidates[column]))
-    i, j = (np.concatenate(numbers) for numbers in zip(*near_pairs, strict=True))
-    vertex_pairs = scipy.sparse.coo_array((np.ones(len(i)), (i, j)), (count, count)).tocsr()
-    of_cell = np.repeat(np.arange(n), per_cell)
-    flags = np.ones(len(of_cell)), (of_cell, corners.ravel())
-    vertices_of_cells = scipy.sparse.coo_array(flags, (n, count)).tocsr()
+    i, j = (np.concatenate(vertex_numbers) for vertex_numbers in zip(*near_pairs, strict=True))
+    # cells are near if any of their vertices are
+    vertex_pairs = scipy.sparse.coo_array(
+        (np.ones(len(i)), (i, j)), (vertex_count, vertex_count)
+    ).tocsr()
+    cell_of_corner = np.repeat(np.arange(cell_count), per_cell)
+    flags = np.ones(len(cell_of_corner)), (cell_of_corner, corners.ravel())
+    vertices_of_cells = scipy.sparse.coo_array(flags, (cell_count, vertex_count)).tocsr()
     i, j = (vertices_of_cells @ vertex_pairs @ vertices_of_cells.T).nonzero()
-    return np.asarray(np.unique(i.astype(np.int64) * n + j))
+    return np.asarray(np.unique(i.astype(np.int64) * cell_count + j))
 
 
 @dataclass(frozen=True)
 class Projections:
-    """Points and the places of a surface nearest to them.
+    """Places of a surface that are nearest to points: one row for each pair of point and place.
 
     Attributes
     ----------
     point, cell
         (n,) numbers of the points, and of the cells of the places.
     X
-        (n, 2) in the reference cell.
+        (n, 2) place in the reference cell.
     free_directions
-        (n, 2, 2): columns are directions in which a place can move: both inside a cell, along a
-        side, none in a corner.
+        (n, 2, 2) matrices whose columns are directions in which the place can move: two inside a
+        cell, one along a side, none in a corner. Other columns are zero.
     distance
         (n,) over R.
     side
-        (n,): places in one direction from their point have one number, less than
-        `MAX_DIRECTIONS`; 0 that of the nearest.
+        (n,) number of the direction from the point to the place, less than `MAX_DIRECTIONS`; 0 is
+        that of the nearest place.
     direction
-        (n, 3) unit vectors to the points.
+        (n, 3) unit vectors from the places to the points.
     is_above
-        (n,) whether the point is above the place, and not beside it as in one surface that is flat.
+        (n,) whether the point is above or below the place, and not beside it as in one flat
+        surface.
     """
 
     point: Longs
@@ -242,14 +264,14 @@ class Projections:
 
     @property
     def firsts(self) -> Longs:
-        """Numbers of the first place of each point and direction, of places in their order.
+        """Rows of the first place of each point and direction, which is the nearest one.
 
-        The order is by points, directions and distances.
+        Places must be in the order of points, directions and distances.
         """
         return np.flatnonzero(np.diff(MAX_DIRECTIONS * self.point + self.side, prepend=-1))
 
     def select(self, selection: Any) -> "Projections":
-        """Return the selected places: numbers, flags or a slice."""
+        """Return the selected places; a selection is row numbers, flags or a slice."""
         return Projections(
             *(getattr(self, attribute.name)[selection] for attribute in fields(self))
         )
@@ -257,17 +279,17 @@ class Projections:
 
 @dataclass(frozen=True)
 class UndeformedPairs:
-    """The pairs of points and places that are near each other within the undeformed surface.
+    """Undeformed places, to find out which pairs of points and places are the same material.
 
     Attributes
     ----------
     is_near
         (pairs,) whether the cells are near in the surface; only there r and x matter.
     r, x
-        (nodes, 4) and (n, 4) places of nodes and points, with half the thickness, of points with
-        the other sign.
+        (nodes, 4) and (n, 4) undeformed places of nodes and points. The fourth component is half
+        the thickness, with a minus sign for points.
     least_distance_ratio
-        Least distance of a place that counts, over the mean of both thicknesses.
+        Least undeformed distance of a place that counts, over the mean of both thicknesses.
     """
 
     is_near: NDArray[np.bool_]
@@ -278,14 +300,14 @@ class UndeformedPairs:
 
 @dataclass(frozen=True)
 class ProjectionLimits:
-    """How far the nearest place of a point is at most, where no other one is asked for.
+    """Bounds of the distance from points to their nearest places, where only these are needed.
 
     Attributes
     ----------
     is_bounded
-        (pairs,) whether places of these cells that are farther may be left out.
+        (pairs,) whether places in these cells may be left out if they are farther.
     reach
-        (n,) of each point.
+        (n,) bound for each point, over R.
     """
 
     is_bounded: NDArray[np.bool_]
@@ -297,25 +319,31 @@ def polynomial_bound(values: Array, lebesgue_constant: float) -> float:
 
     Parameters
     ----------
-    lebesgue
-        Lebesgue's constant of the element.
+    lebesgue_constant
+        Lebesgue's constant of the element: it bounds how far a polynomial exceeds its nodal values.
     """
-    largest, smallest = values.max(axis=1, initial=-np.inf), values.min(axis=1, initial=np.inf)
+    nodal_max, nodal_min = values.max(axis=1, initial=-np.inf), values.min(axis=1, initial=np.inf)
     return float(
-        ((largest + smallest + lebesgue_constant * (largest - smallest)) / 2).max(initial=-np.inf)
+        ((nodal_max + nodal_min + lebesgue_constant * (nodal_max - nodal_min)) / 2).max(
+            initial=-np.inf
+        )
     )
 
 
 def jets(element: Any, X: Array, nodal: Array, order: int = 2) -> Iterator[tuple[Array, Array]]:
-    """Yield shape functions (n, functions) at places (n, 2), and the field (n, 3 or 4) there.
+    """Yield shape functions (n, functions) at places (n, 2), with the field (n, 3 or 4) there.
 
-    First themselves, then their derivatives by the first coordinate, the second, and both twice, up
-    to the order.
+    The first pair has values. Further pairs have derivatives by the first coordinate, by the
+    second, and then the three second derivatives, up to the order.
 
     Parameters
     ----------
+    element
+        A basix element.
+    X
+        (n, 2) places in the reference cell.
     nodal
-        (n, functions, 3 or 4) the field's values at the nodes of each place's cell.
+        (n, functions, 3 or 4) values of the field at the nodes of each place's cell.
     """
     for table in element.tabulate(order, X)[..., 0]:
         yield table, np.einsum("nk,nki->ni", table, nodal)
@@ -333,21 +361,30 @@ def nearest_places(
 ) -> tuple[Longs, Projections]:
     """Return the places of cells nearest to points, with the numbers of their pairs.
 
-    Newton's method begins at the nearest place of a lattice. Compiled, see projection.c.
+    Newton's method begins at the nearest place of a lattice. It is compiled, see projection.c.
 
     Parameters
     ----------
     r
-        (nodes, 3) places of all nodes, or (nodes, 4).
+        (nodes, 3 or 4) places of all nodes over R.
     x
-        (n, 3) points, or (n, 4).
+        (n, 3 or 4) points over R.
     pairs
-        Of a cell with points: the cells, the first of the points in the last array, how many there
-        are; and the numbers of points.
+        Four arrays. For each pair of a cell with several points: the cell, the position of its
+        first point in the last array, and the number of its points. The last array lists points.
     reach
-        Between points and mid-surfaces.
+        Largest distance over R between points and mid-surfaces.
     max_distance
-        Places that are farther are left out.
+        Places with a larger distance are left out.
+    undeformed
+        Undeformed places, which exclude the material around a point; None: nothing is excluded.
+    limits
+        Bounds of the distance; None: all places are returned.
+
+    Returns
+    -------
+    pair, places
+        (m,) number of each place's pair, and the m places; their `side` is 0.
     """
     cell, first, number, order = pairs
     used_cells, row_of_cell = np.unique(cell, return_inverse=True)
@@ -355,6 +392,7 @@ def nearest_places(
     no_flags = np.zeros(len(cell), dtype=bool)
     positions, reference = nodal[..., :3], undeformed or UndeformedPairs(no_flags, r, x, 0.0)
     search_limits = limits or ProjectionLimits(no_flags, np.zeros(len(x)))
+    # spheres around cells, and the distance of a cell's places from each lattice
     centres = positions.mean(axis=1)
     radii = CELL_RADIUS_FACTOR * np.linalg.norm(positions - centres[:, None], axis=2).max(axis=1)
     bounds = np.column_stack(
@@ -365,10 +403,10 @@ def nearest_places(
         cells.monomials @ _as_four_components(array)
         for array in (nodal, reference.r[cells.nodes[used_cells]])
     ]
-    numbers = cells.element.degree, *(len(X) for X, _ in cells.lattices)
-    (ffi, lib), p = library(), _pointers
+    c_sizes = cells.element.degree, *(len(X) for X, _ in cells.lattices)
+    (ffi, lib), pointers = library(), _pointers
     c_cells = ffi.new(
-        "Cells *", [*numbers, *p(*monomials, *lattice_places, cells.lattices[-1][0], bounds)]
+        "Cells *", [*c_sizes, *pointers(*monomials, *lattice_places, cells.lattices[-1][0], bounds)]
     )
     capacity = int(number.sum())
     point, pair = np.empty((2, capacity), dtype=np.int64)
@@ -376,7 +414,7 @@ def nearest_places(
     results = point, pair, *floats, np.empty(capacity, dtype=bool)
     pair_arguments = row_of_cell.ravel(), first, number, reference.is_near, search_limits.is_bounded
     point_arguments = order, _as_four_components(x), _as_four_components(reference.x)
-    arguments = p(*pair_arguments, search_limits.reach, *point_arguments)
+    arguments = pointers(*pair_arguments, search_limits.reach, *point_arguments)
     count = lib.nearest(
         c_cells,
         len(cell),
@@ -384,7 +422,7 @@ def nearest_places(
         reach,
         max_distance,
         reference.least_distance_ratio,
-        *p(*results),
+        *pointers(*results),
     )
     X, free_directions, distance, direction = (array[:count] for array in results[2:6])
     point, pair, is_above = point[:count], pair[:count], results[6][:count]
@@ -395,12 +433,14 @@ def nearest_places(
 
 
 def points_in_cells(cells: Cells, r: Array, cell: Longs, shape: Array) -> Array:
-    """Return places (n, 3) or (n, 4) of points, with the sign of points.
+    """Return the places (n, 3 or 4) of points in cells.
+
+    A fourth component has the sign of points: minus half the thickness, plus h/2.
 
     Parameters
     ----------
     r
-        (nodes, 3) or (nodes, 4) all nodes.
+        (nodes, 3 or 4) places of all nodes.
     cell, shape
         (n,) cells of the points, and (n, functions) shape functions there.
     """
@@ -412,6 +452,10 @@ def points_in_cells(cells: Cells, r: Array, cell: Longs, shape: Array) -> Array:
 
 
 def _pointers(*arrays: NDArray[Any]) -> list[Any]:
+    """Return C pointers to arrays of int64, float64 or bool.
+
+    An array that is not contiguous is copied, so results must be contiguous.
+    """
     kinds = {"int64": "int64_t[]", "float64": "double[]", "bool": "uint8_t[]"}
     return [
         library()[0].from_buffer(kinds[array.dtype.name], np.ascontiguousarray(array))
@@ -420,7 +464,7 @@ def _pointers(*arrays: NDArray[Any]) -> list[Any]:
 
 
 def _as_four_components(vectors: Array) -> Array:
-    """Return vectors of three or four components with four."""
+    """Return vectors (..., 3 or 4) with four components; a missing one is zero."""
     return np.concatenate(
         [vectors, np.zeros((*vectors.shape[:-1], 4 - vectors.shape[-1]))], axis=-1
     )
@@ -428,14 +472,23 @@ def _as_four_components(vectors: Array) -> Array:
 
 @cache
 def library() -> tuple[Any, Any]:
-    """Return the cffi objects of projection.c, compiled on first use."""
+    """Return the cffi objects (ffi, lib) of projection.c, compiled on first use."""
     return load_native(Path(__file__).with_name("projection.c"), C_DECLARATIONS, MPI.COMM_SELF)
 
 
 def follow_places(cells: Cells, x: Array, nodal: Array, X: Array, free_directions: Array) -> Array:
-    """Return the places X (n, 2) after a small change, in the same free directions.
+    """Return the places X (n, 2) after a small motion, in the same free directions.
 
-    They may be beyond a side.
+    They stay in their cells' coordinates, but may be beyond a side.
+
+    Parameters
+    ----------
+    x
+        (n, 3 or 4) the points after the motion.
+    nodal
+        (n, functions, 3 or 4) nodes of each place's cell after the motion.
+    X, free_directions
+        Places before the motion, and where they can move: see `Projections`.
     """
     for _ in range(FOLLOW_ITERATIONS):
         (_, y), *derivatives = jets(cells.element, X, nodal)
@@ -445,29 +498,35 @@ def follow_places(cells: Cells, x: Array, nodal: Array, X: Array, free_direction
 
 
 def distances(off: Array) -> Array:
-    """Return distances (n,) of the differences (n, 3) or (n, 4) between points and places."""
+    """Return the distances (n,) for differences (n, 3 or 4) between points and places.
+
+    A fourth component is added to the length of the first three.
+    """
     return np.asarray(np.linalg.norm(off[:, :3], axis=1) + off[:, 3:].sum(axis=1))
 
 
 def with_length(off: Array) -> Array:
-    """Return differences (n, 3 or 4) with their length as the fourth component, if there is one."""
+    """Return differences (n, 3 or 4) with the length of the first three as fourth component.
+
+    Differences of three components stay.
+    """
     return np.column_stack([off[:, :3], np.linalg.norm(off[:, :3], axis=1)])[:, : off.shape[1]]
 
 
 def slopes(
     off: Array, y1: Array, y2: Array, y11: Array, y12: Array, y22: Array
 ) -> tuple[Array, Array]:
-    """Return the gradient (n, 2) of half the squared distance by the place, and its Hessian.
+    """Return gradient (n, 2) and Hessian (n, 2, 2) of half the squared distance by the place.
 
-    The Hessian is (n, 2, 2). With a fourth component both are |x - y| times those of the distance,
-    the Hessian where the gradient is zero.
+    With a fourth component both are |x - y| times those of the distance. The Hessian is then right
+    where the gradient is zero.
 
     Parameters
     ----------
     off
-        (n, 3 or 4) from the places to the points.
+        (n, 3 or 4) from the places to the points, see `with_length`.
     y1, y2, y11, y12, y22
-        Derivatives of the surface at the places.
+        (n, 3 or 4) derivatives of the surface at the places.
     """
 
     def dot(a: Array, b: Array) -> Array:
@@ -482,7 +541,7 @@ def slopes(
 
 
 def _solve_in_free_directions(free_directions: Array, A: Array, g: Array) -> Array:
-    """Return A^-1 g in the free directions."""
+    """Return A^-1 g (n, 2) in the free directions, for A (n, 2, 2) and g (n, 2)."""
     return np.asarray(
         np.einsum(
             "nij,nj->ni",
@@ -497,11 +556,15 @@ def _solve_in_free_directions(free_directions: Array, A: Array, g: Array) -> Arr
 
 
 def _in_free_directions(free_directions: Array, g: Array) -> Array:
+    """Return the components (n, 2) of vectors g (n, 2) along the free directions."""
     return np.asarray(np.einsum("nji,nj->ni", free_directions, g))
 
 
 def inverse_in_free_directions(free_directions: Array, A: Array) -> Array:
-    """Return the inverse (n, 2, 2) of A in the free directions, one where there is none."""
+    """Return the inverse (n, 2, 2) of A (n, 2, 2), in components along the free directions.
+
+    Along a direction that is not free the matrix is taken as one.
+    """
     is_fixed = np.asarray(~free_directions.any(axis=1))
     reduced = np.einsum("nji,njk,nkl->nil", free_directions, A, free_directions)
     reduced[:, 0, 0] += is_fixed[:, 0]
@@ -520,28 +583,31 @@ def determinant(A: Array) -> Array:
 def near_spheres(
     centres: Array, radii: Array, reach: float, own_spheres: Longs
 ) -> tuple[Longs, Longs]:
-    """Return pairs i != j of spheres that are nearer to each other than a reach.
+    """Return pairs (i, j), i != j, of spheres whose surfaces are nearer to each other than a reach.
 
-    They are searched in classes of similar radii.
+    Spheres are searched in classes of similar radii, so that large ones do not slow down small
+    ones.
 
     Parameters
     ----------
+    centres, radii
+        (n, 3) and (n,).
     own_spheres
-        Numbers of the spheres that i is among.
+        Numbers of the spheres among which i is.
     """
     size_class = np.floor(np.log2(np.maximum(radii, 1e-300) / radii.max())).astype(int)
     classes = [np.flatnonzero(size_class == k) for k in np.unique(size_class)]
     own_classes = [own_spheres[size_class[own_spheres] == k] for k in np.unique(size_class)]
     classes_with_trees = [(spheres, scipy.spatial.cKDTree(centres[spheres])) for spheres in classes]
     pairs = list[tuple[Longs, Longs]]()
-    for first in filter(len, own_classes):
-        first_tree = scipy.spatial.cKDTree(centres[first])
-        for second, second_tree in classes_with_trees:
-            distance = radii[first].max() + radii[second].max() + reach
-            near_in_trees = first_tree.sparse_distance_matrix(
-                second_tree, distance, output_type="ndarray"
+    for own_class in filter(len, own_classes):
+        own_tree = scipy.spatial.cKDTree(centres[own_class])
+        for other_class, other_tree in classes_with_trees:
+            distance = radii[own_class].max() + radii[other_class].max() + reach
+            near_in_trees = own_tree.sparse_distance_matrix(
+                other_tree, distance, output_type="ndarray"
             )
-            i, j = first[near_in_trees["i"]], second[near_in_trees["j"]]
+            i, j = own_class[near_in_trees["i"]], other_class[near_in_trees["j"]]
             is_near = (near_in_trees["v"] < radii[i] + radii[j] + reach) & (i != j)
             pairs.append((i[is_near], j[is_near]))
     no_numbers = np.zeros(0, dtype=np.int64)
@@ -554,20 +620,22 @@ def near_spheres(
 
 @dataclass(frozen=True)
 class JoinedPlaces:
-    """Places of a point in one direction, in neighbouring cells, as one: no jump at a fold.
+    """Places of a point in one direction, in neighbouring cells, joined as one place.
+
+    So the distance has no jump where the nearest place changes cells at a fold.
 
     Attributes
     ----------
     first
-        (m,) the nearest place of each.
+        (m,) row of the nearest of each joined place's places.
     group
-        (n,) the joined place that a place belongs to.
+        (n,) number of the joined place to which each place belongs.
     distance
-        (m,) -e log sum exp(-d/e) of the distances d of its places, with a small e.
+        (m,) -e log sum exp(-d/e) over R, of the distances d of its places with a small e.
     weight
-        (n,) its derivatives by these.
+        (n,) derivatives of these distances by those of the places.
     several
-        (m,) whether it has several places.
+        (m,) whether a joined place has several places.
     """
 
     first: Longs
@@ -578,12 +646,19 @@ class JoinedPlaces:
 
     @classmethod
     def join(cls, places: Projections, blur: float) -> "JoinedPlaces":
-        """Join places in the order of points, sides and distances; `blur` is e."""
+        """Join places; e of the smoothed minimum is `blur`, over R.
+
+        Parameters
+        ----------
+        places
+            In the order of points, directions and distances.
+        """
         first = places.firsts
         counts = np.diff([*first, len(places.point)])
         group = np.repeat(np.arange(len(first)), counts)
         nearest = places.distance[first]
-        size = np.exp((nearest[group] - places.distance) / blur)
-        total = np.bincount(group, size, len(first))
-        distance = nearest - blur * np.log(total)
-        return cls(first, group, distance, size / total[group], counts > 1)
+        # relative to the nearest place, so that nothing overflows
+        exponential = np.exp((nearest[group] - places.distance) / blur)
+        sum_of_exponentials = np.bincount(group, exponential, len(first))
+        distance = nearest - blur * np.log(sum_of_exponentials)
+        return cls(first, group, distance, exponential / sum_of_exponentials[group], counts > 1)

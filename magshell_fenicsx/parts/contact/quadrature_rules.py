@@ -16,24 +16,26 @@ COVER_DIVISIONS = 60  # of a side, at whose ends the distance from a rule's poin
 
 
 def triangle_rule(degree: int) -> tuple[Array, Array]:
-    """Return points (n, 2) in the reference triangle and weights, exact to a polynomial degree."""
+    """Return points (n, 2) and weights (n,) in the reference triangle, exact to a degree."""
     return basix.make_quadrature(basix.CellType.triangle, degree)  # type: ignore[no-any-return]
 
 
 @cache
 def edge_rule(degree: int, turning_ends: int = 0, corner: float = 0.0) -> tuple[Array, Array]:
-    """Return `triangle_rule` with points next to the side opposite to the first corner.
+    """Return a rule for a triangle whose third side is an edge: points (n, 2) and weights (n,).
 
-    So an edge there has points. On lines from that corner they are Radau's, for the weight of their
-    distance from it, with one `EDGE_OFFSET` before the side: an edge often lies exactly opposite
-    another one, where the second derivative of the gap jumps. Along the side they are Gauss's, so
-    that none is opposite a corner, where several cells meet.
+    It is exact to the degree and has points next to the side opposite to the first corner, so that
+    an edge there has points. On lines from that corner the rule is Radau's, with the distance from
+    the corner as weight. Its last point is `EDGE_OFFSET` before the side: an edge often lies
+    exactly opposite another one, where the second derivative of the gap jumps. Along the side the
+    points are Gauss's, so that none is opposite a corner, where several cells meet.
 
     Parameters
     ----------
     turning_ends
-        Where the edge turns: 1 at the begin of the side, 2 at the end, 3 at both, 0 nowhere. There
-        a point on it is a part `corner` of the side before that.
+        Where the edge turns: 1 at the begin of the side, 2 at the end, 3 at both, 0 nowhere.
+    corner
+        Distance over the side's length of a further point on it from each turning end.
     """
     t, weights_t = _rule_with_points((degree + 1) // 2, [1 - EDGE_OFFSET], 1)
     fixed_points = [corner] if turning_ends & 1 else []
@@ -50,7 +52,9 @@ def edge_rule(degree: int, turning_ends: int = 0, corner: float = 0.0) -> tuple[
 
 
 def line_rule(count: int, begins: bool, ends: bool) -> tuple[Array, Array]:
-    """Return points and weights on [0, 1]: Gauss's, or Radau's and Lobatto's next to ends.
+    """Return points (n,) and weights (n,) on [0, 1]: Gauss's rule, or Radau's or Lobatto's.
+
+    The latter have points `EDGE_OFFSET` before one end or both ends.
 
     Parameters
     ----------
@@ -62,6 +66,7 @@ def line_rule(count: int, begins: bool, ends: bool) -> tuple[Array, Array]:
     from scipy.special import roots_jacobi  # takes long to import
 
     x, w = roots_jacobi(count - begins - ends, float(ends), float(begins))
+    # Jacobi's rule has the factors of the fixed ends as weight, which are divided out
     w = w / ((1 - x) ** int(ends) * (1 + x) ** int(begins))
     end_weight = 2 / (count * (count - 1)) if begins and ends else 2 / count**2
     x = np.concatenate([[-1 + 2 * EDGE_OFFSET] * begins, x, [1 - 2 * EDGE_OFFSET] * ends])
@@ -70,11 +75,11 @@ def line_rule(count: int, begins: bool, ends: bool) -> tuple[Array, Array]:
 
 
 def _rule_with_points(count: int, fixed_points: Sequence[float], power: int) -> tuple[Array, Array]:
-    """Return points from 0 to 1 and weights for the weight x^power, of the highest degree.
+    """Return points and weights on [0, 1] of the highest degree, for the weight x^power.
 
-    The free points are the roots of a polynomial that is orthogonal to all lower ones, in
-    Legendre's, by the weight times what is zero at the fixed ones. G. H. Golub, SIAM Review 15
-    (1973) 318-334.
+    The free points are the roots of a polynomial. It is orthogonal to all lower ones, by the weight
+    times the polynomial that is zero at the fixed points. G. H. Golub, SIAM Review 15 (1973)
+    318-334.
 
     Parameters
     ----------
@@ -82,23 +87,33 @@ def _rule_with_points(count: int, fixed_points: Sequence[float], power: int) -> 
         Number of free points.
     fixed_points
         Further points.
+    power
+        Exponent of the weight.
     """
     x, w = scipy.special.roots_legendre(2 * count + 4)
     legendre, point_count = np.polynomial.legendre.legvander, count + len(fixed_points)
     weight = w / 2 * ((1 + x) / 2) ** power
-    signed = weight * np.prod([(1 + x) / 2 - point for point in fixed_points], axis=0)
-    P = legendre(x, count - 1)
-    signed = np.sign(signed.sum()) * signed[:, None] * P
-    free_points = scipy.linalg.eigh(P.T @ (x[:, None] * signed), P.T @ signed, eigvals_only=True)
+    weighted_polynomials = weight * np.prod([(1 + x) / 2 - point for point in fixed_points], axis=0)
+    polynomials = legendre(x, count - 1)
+    weighted_polynomials = (
+        np.sign(weighted_polynomials.sum()) * weighted_polynomials[:, None] * polynomials
+    )
+    # the roots are eigenvalues of the multiplication by x among polynomials of lower degree
+    free_points = scipy.linalg.eigh(
+        polynomials.T @ (x[:, None] * weighted_polynomials),
+        polynomials.T @ weighted_polynomials,
+        eigvals_only=True,
+    )
     points = np.sort([*((1 + free_points) / 2), *fixed_points])
+    # weights that integrate Legendre's polynomials exactly
     moments = legendre(x, point_count - 1).T @ weight
     return points, np.linalg.solve(legendre(2 * points - 1, point_count - 1).T, moments)
 
 
 def cover_distance(X: Array) -> float:
-    """Return how far a place of a triangle is from the nearest of some points, at most.
+    """Return the largest distance of a place of a triangle from the nearest of some points.
 
-    The triangle is equilateral, and the distance is over its side.
+    The triangle is equilateral, and the distance is over its side. It is an upper bound.
 
     Parameters
     ----------

@@ -70,17 +70,17 @@ class ContactPoints:
     Attributes
     ----------
     cell
-        (n,) global number.
+        (n,) global number of the cell.
     shape
-        (n, functions) shape functions of that cell.
+        (n, functions) shape functions of that cell at the point.
     weight
         (n,) undeformed area over R^2.
     faces
-        (n,) the cell that a point faced where the cuts were made; `NO_CELL` where it faced none.
+        (n,) the cell that the point faced where the cuts were made; `NO_CELL` where it faced none.
     is_on_edge
-        (n,) whether it is on an edge of the surface.
+        (n,) whether the point is on an edge of the surface.
     divisions
-        (n,) how often its triangle was divided.
+        (n,) how often the point's triangle was divided.
     """
 
     cell: Longs
@@ -92,7 +92,7 @@ class ContactPoints:
 
     @cached_property
     def by_cell(self) -> tuple[Longs, Longs]:
-        """The order of the points by cells, and their cells in this order."""
+        """The order (n,) of the points by cells, and the cells (n,) of points in this order."""
         order = np.argsort(self.cell, kind="stable")
         return order, self.cell[order]
 
@@ -104,7 +104,7 @@ class ContactPoints:
 
     @classmethod
     def concatenate(cls, parts: Sequence["ContactPoints"]) -> "ContactPoints":
-        """Return all points of several sets."""
+        """Return the points of several sets as one set."""
         return cls(
             *(
                 np.concatenate([getattr(part, attribute.name) for part in parts])
@@ -122,9 +122,10 @@ class Triangles:
     cell, faces
         (n,) their cells, and the cells that they face.
     first, e1, e2
-        (n, 2) a corner, and the sides from there.
+        (n, 2) the first corner, and the two sides from there.
     ends
-        (n,) `NOT_ON_EDGE`, or where the edge turns on which the third side is: see `edge_rule`.
+        (n,) `NOT_ON_EDGE` if the third side is not on an edge of the surface. Otherwise it says
+        where the edge turns: 0 nowhere, 1 at the side's begin, 2 at its end, 3 at both.
     """
 
     cell: Longs
@@ -148,7 +149,8 @@ class Triangles:
     def divide(self) -> "Triangles":
         """Return the four quarters of each triangle.
 
-        They are at the first corner, at both ends of the third side, and in the middle.
+        They are at the first corner, at both ends of the third side, and in the middle. Only the
+        quarters at the third side can be on an edge.
         """
         half1, half2, middle = self.e1 / 2, self.e2 / 2, self.first + (self.e1 + self.e2) / 2
         not_on_edge = np.full_like(self.ends, NOT_ON_EDGE)
@@ -183,7 +185,7 @@ class Polygons:
 
     @classmethod
     def cells(cls, cell: Longs) -> "Polygons":
-        """Return whole cells, which face none."""
+        """Return whole cells with numbers (n,) as polygons; they face no cell."""
         return cls(
             cell, np.full(len(cell), NO_CELL), np.array(np.broadcast_to(CORNERS, (len(cell), 3, 2)))
         )
@@ -193,7 +195,7 @@ class Polygons:
         return Polygons(self.cell[selection], self.faces[selection], self.corners[selection])
 
     def with_faces(self, faces: Longs) -> "Polygons":
-        """Return these polygons, facing other cells."""
+        """Return these polygons, facing the cells with numbers (n,)."""
         return Polygons(self.cell, faces, self.corners)
 
     def with_area(self) -> "Polygons":
@@ -201,7 +203,7 @@ class Polygons:
         return self.select(area(self.corners) > AREA_TOLERANCE)
 
     def concatenate_with(self, other: "Polygons") -> "Polygons":
-        """Return these polygons and others."""
+        """Return these polygons followed by others; missing corners repeat the last one."""
         corner_count = max(self.corners.shape[1], other.corners.shape[1])
         corners = list[Array]()
         for polygons in (self, other):
@@ -214,73 +216,89 @@ class Polygons:
         )
 
     def triangles(self, open_sides: Flags, edge_turns: Flags) -> Triangles:
-        """Return the triangles between the centroids and each side.
+        """Return triangles: each polygon is cut from its centroid to its corners.
 
-        A triangle with one side on an edge of the surface, or none, is one by itself. So they do
+        A triangle with at most one side on an edge of the surface stays whole. So the triangles do
         not depend on which corner is the first.
 
         Parameters
         ----------
-        open_sides, edge_turns
-            (cells, 3) whether the side opposite to each corner is on an edge, and whether the edge
-            turns in the corner.
+        open_sides
+            (cells, 3) whether the side opposite to each corner is on an edge of the surface.
+        edge_turns
+            (cells, 3) whether the edge turns in the corner.
         """
-        c, next_corners = self.corners, np.roll(self.corners, -1, axis=1)
-        has_side = np.linalg.norm(c - next_corners, axis=2) > SAME_CORNER_TOLERANCE
-        coordinates = np.stack([1 - c.sum(axis=2), c[..., 0], c[..., 1]], axis=2)
+        corners, next_corners = self.corners, np.roll(self.corners, -1, axis=1)
+        has_side = np.linalg.norm(corners - next_corners, axis=2) > SAME_CORNER_TOLERANCE
+        coordinates = np.stack([1 - corners.sum(axis=2), corners[..., 0], corners[..., 1]], axis=2)
         on_side = np.abs(coordinates) < SAME_CORNER_TOLERANCE
+        # side k of a polygon is on an edge if both its ends are on the same open side of the cell
         on_open_side = on_side & np.roll(on_side, -1, axis=1) & open_sides[self.cell][:, None]
         is_edge = has_side & on_open_side.any(axis=2)
+        # a corner of the cell is on both sides that meet there
         at_turn = on_side[..., [1, 2, 0]] & on_side[..., [2, 0, 1]]
-        turns = (at_turn & edge_turns[self.cell][:, None]).any(axis=2)
-        ends = np.where(is_edge, turns + 2 * np.roll(turns, -1, axis=1), NOT_ON_EDGE)
+        turns_at_corner = (at_turn & edge_turns[self.cell][:, None]).any(axis=2)
+        ends = np.where(
+            is_edge, turns_at_corner + 2 * np.roll(turns_at_corner, -1, axis=1), NOT_ON_EDGE
+        )
         is_whole = (has_side.sum(axis=1) == 3) & (is_edge.sum(axis=1) <= 1)
-        centre = np.zeros((len(c), 2))
-        centre[~is_whole] = centroid(c[~is_whole])
-        n, k = np.nonzero(has_side & ~is_whole[:, None])
-        sides = c[n, k] - centre[n], next_corners[n, k] - centre[n]
-        fans = Triangles(self.cell[n], self.faces[n], centre[n], *sides, ends[n, k])
+        centre = np.zeros((len(corners), 2))
+        centre[~is_whole] = centroid(corners[~is_whole])
+        polygon, side = np.nonzero(has_side & ~is_whole[:, None])
+        sides = (
+            corners[polygon, side] - centre[polygon],
+            next_corners[polygon, side] - centre[polygon],
+        )
+        fans = Triangles(
+            self.cell[polygon], self.faces[polygon], centre[polygon], *sides, ends[polygon, side]
+        )
         single = self.select(is_whole)._single_triangles(has_side[is_whole], ends[is_whole])
         arrays = [
-            [getattr(part, attribute.name) for part in (single, fans)] for attribute in fields(fans)
+            [getattr(triangle_set, attribute.name) for triangle_set in (single, fans)]
+            for attribute in fields(fans)
         ]
         return Triangles(*(np.concatenate(attribute) for attribute in arrays))
 
     def _single_triangles(self, has_side: Flags, ends: Longs) -> Triangles:
-        """Return these polygons of three sides as triangles, an edge of the surface the third side.
+        """Return these polygons of three sides as triangles; a side on an edge becomes the third.
 
         Parameters
         ----------
         has_side, ends
-            (n, m) whether a side begins at a corner, and the `ends` of that side.
+            (n, m) whether a side of finite length begins at a corner, and the `ends` of that side,
+            see `Triangles`.
         """
         side_numbers = np.argsort(~has_side, axis=1, kind="stable")[:, :3]
         corners = np.take_along_axis(self.corners, side_numbers[..., None], axis=1)
         side_ends = np.take_along_axis(ends, side_numbers, axis=1)
         has_edge = (side_ends != NOT_ON_EDGE).any(axis=1)
         apex = np.where(has_edge, (side_ends.argmax(axis=1) + 2) % 3, 0)[:, None]
-        first, a, b = (
+        first, second, third = (
             np.take_along_axis(corners, ((apex + i) % 3)[..., None], axis=1)[:, 0] for i in range(3)
         )
-        return Triangles(self.cell, self.faces, first, a - first, b - first, side_ends.max(axis=1))
+        return Triangles(
+            self.cell, self.faces, first, second - first, third - first, side_ends.max(axis=1)
+        )
 
     def clip(self, a: Array, b: Array) -> "Polygons":
-        """Return the parts of the polygons to the left of lines from a (n, 2) to b."""
+        """Return the parts of the polygons to the left of lines from a (n, 2) to b (n, 2)."""
+        # heights of corners above the line, times its length, whose sign changes at crossings
         normal = np.stack([a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]], axis=1)
         height = np.einsum("nki,ni->nk", self.corners - a[:, None], normal)
         height[np.abs(height) < AREA_TOLERANCE] = 0.0
         next_height, next_corner = np.roll(height, -1, axis=1), np.roll(self.corners, -1, axis=1)
         is_crossed = height * next_height < 0
-        part = height / np.where(is_crossed, height - next_height, 1.0)
+        crossing_share = height / np.where(is_crossed, height - next_height, 1.0)
         count, m = height.shape
-        crossing = self.corners + part[..., None] * (next_corner - self.corners)
+        crossing = self.corners + crossing_share[..., None] * (next_corner - self.corners)
         candidates = np.stack([self.corners, crossing], axis=2).reshape(count, 2 * m, 2)
         has_side = (next_corner != self.corners).any(axis=2)
         is_kept = np.stack([(height >= 0) & has_side, is_crossed], axis=2).reshape(count, 2 * m)
+        # kept corners and crossings move to the front; the rest repeats the first of them
         corner_count = max(3, int(is_kept.sum(axis=1).max(initial=0)))
-        first = np.argsort(~is_kept, axis=1, kind="stable")[:, :corner_count]
-        corners = np.take_along_axis(candidates, first[..., None], axis=1)
-        is_corner = np.take_along_axis(is_kept, first, axis=1)
+        kept_first = np.argsort(~is_kept, axis=1, kind="stable")[:, :corner_count]
+        corners = np.take_along_axis(candidates, kept_first[..., None], axis=1)
+        is_corner = np.take_along_axis(is_kept, kept_first, axis=1)
         corners = np.where(is_corner[..., None], corners, corners[:, :1])
         return Polygons(self.cell, self.faces, corners)
 
@@ -293,34 +311,40 @@ def area(corners: Array) -> Array:
 
 
 def centroid(corners: Array) -> Array:
-    """Return the centroids (n, 2) of polygons that have an area."""
+    """Return the centroids (n, 2) of polygons (n, m, 2) that have an area."""
     off = corners - corners[:, :1]
     next_off = np.roll(off, -1, 1)
-    twice = off[..., 0] * next_off[..., 1] - next_off[..., 0] * off[..., 1]
-    inner = np.einsum("nk,nki->ni", twice, off + next_off) / (3 * twice.sum(axis=1))[:, None]
-    return np.asarray(corners[:, 0] + inner)
+    # the mean of the centroids of triangles at the first corner, weighted by their areas
+    doubled_areas = off[..., 0] * next_off[..., 1] - next_off[..., 0] * off[..., 1]
+    from_first_corner = (
+        np.einsum("nk,nki->ni", doubled_areas, off + next_off)
+        / (3 * doubled_areas.sum(axis=1))[:, None]
+    )
+    return np.asarray(corners[:, 0] + from_first_corner)
 
 
 class Segments:
-    """The quadrature points on cells that are cut along each other.
+    """The quadrature points on the cells of this rank, where these are cut along facing cells.
 
     Parameters
     ----------
-    own
-        The cells of this rank.
+    cells
+        All cells of all ranks.
+    own_cells
+        Numbers of the cells of this rank.
     r0
-        (nodes, 3) undeformed.
+        (nodes, 3) undeformed places over R.
     degrees
-        Of the rule on whole cells and on large parts, and on small parts.
+        Degrees of the rules on whole cells and large parts, and on small parts.
     h
         Thickness over R.
     planes
-        Of symmetry: an edge goes on in its image, and does not turn there.
+        Planes of symmetry: an edge goes on in its image, and does not turn there.
 
     Attributes
     ----------
     rule
-        The points of these cells, uncut.
+        The points of this rank's cells, uncut.
     cover_distance
         (cells,) over R: no place of a cell is farther from all points of the rule.
     """
@@ -334,6 +358,7 @@ class Segments:
         h: float,
         planes: Sequence[Mirror] = (),
     ) -> None:
+        """Find turning edges, the cover distances and the uncut points."""
         self._cells, self._r0, self._degrees, self._corner_offset = (
             cells,
             r0,
@@ -348,8 +373,8 @@ class Segments:
         inner_cover = cover_distance(triangle_rule(degrees[0])[0])
         at_edge = cover_distance(edge_rule(degrees[0])[0])
         has_edge = (cells.neighbours < 0).any(axis=1)
-        cover = np.where(has_edge, max(inner_cover, at_edge), inner_cover)
-        self.cover_distance: Array = CELL_RADIUS_FACTOR * sides * cover
+        relative_cover = np.where(has_edge, max(inner_cover, at_edge), inner_cover)
+        self.cover_distance: Array = CELL_RADIUS_FACTOR * sides * relative_cover
         self.rule = ContactPoints.concatenate(
             self._points_on(self._triangles(Polygons.cells(own_cells)))
         )
@@ -361,28 +386,30 @@ class Segments:
         divisions: int,
         gaps: Callable[[ContactPoints], Array],
     ) -> ContactPoints:
-        """Return all points of this rank.
+        """Return all contact points of this rank, with cells cut along the cells that they face.
 
         Parameters
         ----------
-        near
+        near_places
             Places in all cells that are near the rule's points.
         r
-            (nodes, 3) where the cuts are made.
+            (nodes, 3) places of nodes where the cuts are made.
         divisions
             How often triangles in which the gap may be closed are divided into four.
         gaps
-            Returns the gaps (n,) of points (n) there, over R.
+            Returns the gaps (n,) over R of n points at r.
         """
-        number, rule = len(self._cells.nodes), self.rule
+        cell_count, rule = len(self._cells.nodes), self.rule
         if not len(near_places.point):
             return rule
-        keys = np.unique(rule.cell[near_places.point] * number + near_places.cell)
-        cell, other = keys // number, keys % number
-        centres = self._corners(self._r0, other).mean(axis=1)
+        keys = np.unique(rule.cell[near_places.point] * cell_count + near_places.cell)
+        cell, faced_cell = keys // cell_count, keys % cell_count
+        centres = self._corners(self._r0, faced_cell).mean(axis=1)
         order = np.argsort(centres @ ORDERING_DIRECTION, kind="stable")
-        cell, other = cell[order], other[order]
-        segments = cut_by_triangles(Polygons(cell, other, self._projected_corners(cell, other, r)))
+        cell, faced_cell = cell[order], faced_cell[order]
+        segments = cut_by_triangles(
+            Polygons(cell, faced_cell, self._projected_corners(cell, faced_cell, r))
+        )
         points, triangles = [rule.select(~np.isin(rule.cell, cell))], self._triangles(segments)
         for level in range(divisions):
             is_closing = self._may_close(triangles, gaps)
@@ -391,29 +418,38 @@ class Segments:
         return ContactPoints.concatenate([*points, *self._points_on(triangles, divisions)])
 
     def _may_close(self, triangles: Triangles, gaps: Callable[[ContactPoints], Array]) -> Flags:
-        """Return whether the gap in triangles (n,) may be closed.
+        """Return flags (n,): whether the gap in each triangle may be closed somewhere.
 
-        It changes there by as much again as between the corners and the centroid.
+        From its values at the corners and the centroid the gap is taken to fall by at most their
+        range.
         """
         X = CORNERS_AND_CENTROID
         gap = gaps(self._points_by_rule(triangles, X, np.ones(len(X)), 0)).reshape(-1, len(X))
         return np.asarray(gap.min(axis=1) < np.ptp(gap, axis=1))
 
     def _triangles(self, polygons: Polygons) -> Triangles:
-        """Return the triangles of polygons."""
+        """Return the triangles of polygons, without those that have no area."""
         triangles = polygons.triangles(self._cells.neighbours < 0, self._edge_turns)
         return triangles.select(triangles.size > AREA_TOLERANCE)
 
     def _points_on(self, triangles: Triangles, divisions: int = 0) -> list[ContactPoints]:
-        """Return the points on triangles that have been divided so often."""
-        c, third_side = self._corners(self._r0, triangles.cell), triangles.e2 - triangles.e1
-        side = np.linalg.norm(np.einsum("na,nai->ni", third_side, c[:, 1:] - c[:, :1]), axis=1)
-        # of few values, so of few rules
-        corner = np.minimum(np.exp2(np.round(np.log2(self._corner_offset / side))), 1 / 64)
+        """Return the contact points on triangles that have been divided a number of times.
+
+        Triangles of one kind have one rule: kinds differ in size, in whether the third side is on
+        an edge, and in where that edge turns.
+        """
+        corners, third_side = self._corners(self._r0, triangles.cell), triangles.e2 - triangles.e1
+        side_length = np.linalg.norm(
+            np.einsum("na,nai->ni", third_side, corners[:, 1:] - corners[:, :1]), axis=1
+        )
+        # rounded to few values, so that there are few rules
+        corner_share = np.minimum(
+            np.exp2(np.round(np.log2(self._corner_offset / side_length))), 1 / 64
+        )
         is_small = triangles.size * 4**divisions <= 2 * LARGE_AREA
         has_turn = triangles.ends > 0
-        keys = np.stack([is_small, triangles.ends, np.where(has_turn, corner, 0)], axis=1)
-        kinds, number = np.unique(keys, axis=0, return_inverse=True)
+        keys = np.stack([is_small, triangles.ends, np.where(has_turn, corner_share, 0)], axis=1)
+        kinds, kind_of_triangle = np.unique(keys, axis=0, return_inverse=True)
         points = list[ContactPoints]()
         for k, (is_small_kind, ends, offset) in enumerate(kinds):
             degree = self._degrees[int(is_small_kind)]
@@ -422,18 +458,26 @@ class Segments:
                 if ends == NOT_ON_EDGE
                 else edge_rule(degree, int(ends), float(offset))
             )
-            same_kind = triangles.select(number.ravel() == k)
+            same_kind = triangles.select(kind_of_triangle.ravel() == k)
             points.append(self._points_by_rule(same_kind, *rule, divisions))
         return points
 
     def _points_by_rule(
         self, triangles: Triangles, X: Array, weights: Array, divisions: int
     ) -> ContactPoints:
-        """Return the points of a rule on each triangle."""
-        places = triangles.first[:, None] + X[:, :1] * triangles.e1[:, None]
-        places = places + X[:, 1:] * triangles.e2[:, None]
+        """Return the contact points of a rule on each triangle.
+
+        Parameters
+        ----------
+        X, weights
+            (m, 2) points in the reference triangle, and (m,) weights.
+        divisions
+            How often the triangles have been divided.
+        """
+        X_in_cells = triangles.first[:, None] + X[:, :1] * triangles.e1[:, None]
+        X_in_cells = X_in_cells + X[:, 1:] * triangles.e2[:, None]
         cell, faces = (np.repeat(numbers, len(X)) for numbers in (triangles.cell, triangles.faces))
-        table = self._cells.element.tabulate(1, places.reshape(-1, 2))[..., 0]
+        table = self._cells.element.tabulate(1, X_in_cells.reshape(-1, 2))[..., 0]
         a1, a2 = np.einsum("dnk,nki->dni", table[1:], self._r0[self._cells.nodes[cell]])
         area_ratio = np.linalg.norm(np.cross(a1, a2), axis=1)
         weight = np.outer(triangles.size, weights).ravel() * area_ratio
@@ -444,41 +488,63 @@ class Segments:
         )
 
     def normals(self, r: Array) -> Array:
-        """Return the unit normals (cells, 3) of the planes through the corners."""
-        c = self._corners(r, np.arange(len(self._cells.nodes)))
-        n = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
+        """Return the unit normals (cells, 3) of the planes through the corners of each cell.
+
+        Parameters
+        ----------
+        r
+            (nodes, 3) places of nodes.
+        """
+        corners = self._corners(r, np.arange(len(self._cells.nodes)))
+        n = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         return np.asarray(n / np.linalg.norm(n, axis=1)[:, None])
 
     def _corners(self, r: Array, cell: Longs) -> Array:
+        """Return the corners (n, 3, 3) of cells at places r (nodes, 3)."""
         return np.asarray(self._cells.at_corners @ r[self._cells.nodes[cell]])
 
     def _projected_corners(self, cell: Longs, other: Longs, r: Array) -> Array:
-        """Return the corners (n, 3, 2) of cells in the reference cells of others, along their
-        normals.
+        """Return the corners (n, 3, 2) of other cells, projected on the planes of cells.
+
+        They are in the coordinates of the reference cells, along the cells' normals. Their order
+        does not depend on the ranks.
+
+        Parameters
+        ----------
+        cell, other
+            (n,) cells, and the cells whose corners are projected on them.
+        r
+            (nodes, 3) places of nodes.
         """
-        c, y = self._corners(r, cell), self._corners(r, other)
-        sides = np.stack([c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]], axis=1)
-        X = (y - c[:, :1]) @ np.linalg.pinv(sides)
+        corners, other_corners = self._corners(r, cell), self._corners(r, other)
+        sides = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=1)
+        X = (other_corners - corners[:, :1]) @ np.linalg.pinv(sides)
         coordinates = np.concatenate([1 - X.sum(axis=2, keepdims=True), X], axis=2)
         coordinates[np.abs(coordinates) < SNAP_TOLERANCE] = 0.0
         X = np.asarray((coordinates / coordinates.sum(axis=2, keepdims=True))[..., 1:])
-        level = np.argsort(self._corners(self._r0, other) @ ORDERING_DIRECTION, axis=1)
-        return np.take_along_axis(X, level[..., None], axis=1)
+        # a fixed order of the corners, so that rounding is the same on any ranks
+        order = np.argsort(self._corners(self._r0, other) @ ORDERING_DIRECTION, axis=1)
+        return np.take_along_axis(X, order[..., None], axis=1)
 
 
 class Cuts:
-    """The points with the cuts of displacements, which have numbers.
+    """The contact points with cells cut at given displacements, which are known by numbers.
 
-    The number 0 is that of the undeformed surfaces, without divisions. Else it is `DIVISION_LEVELS`
-    times a hash of the displacement, plus how often triangles in a zone of contact are divided.
+    The number 0 stands for the undeformed surfaces, without divisions. Any other number is
+    `DIVISION_LEVELS` times a hash of the displacement, plus how often triangles in a zone of
+    contact are divided.
 
     Parameters
     ----------
-    near
+    segments
+        Gives the points for places near each other.
+    near_places
         Returns the places in all cells that are near the rule's points at a displacement (nodes,
         3).
     gaps
         Returns the gaps (n,) over R of points at a displacement.
+    r0
+        (nodes, 3) undeformed places over R.
     """
 
     def __init__(
@@ -493,22 +559,22 @@ class Cuts:
         self._latest_points = dict[float, tuple[ContactPoints, Array]]()
 
     def points(self, number: float, u: Array) -> tuple[ContactPoints, Array]:
-        """Return the points of a number, and the normals (cells, 3) where the cuts are made.
+        """Return the points with the cuts of a number, and the cells' normals (cells, 3) there.
 
-        A number that is not known, as in a state from elsewhere, becomes that of the displacement
-        u.
+        The points of the last two numbers are kept. A number that is unknown, as in a state from
+        elsewhere, then stands for the displacement u (nodes, 3).
         """
         if number not in self._latest_points:
             cut_u = self._displacements.setdefault(number, np.array(u))
-            latest = [*self._latest_points.items()][-1:]
+            last_item = [*self._latest_points.items()][-1:]
             self._latest_points = {
-                **dict(latest),
+                **dict(last_item),
                 number: self.points_at(cut_u, divisions_of(number)),
             }
         return self._latest_points[number]
 
     def displacement(self, number: float) -> Array:
-        """Return the displacement of a number of which there are points."""
+        """Return the displacement (nodes, 3) at which the cuts of a known number are made."""
         return self._displacements[number]
 
     def points_at(self, u: Array, divisions: int) -> tuple[ContactPoints, Array]:
@@ -520,82 +586,105 @@ class Cuts:
         return points, self._segments.normals(r)
 
     def number_of_displacement(self, u: Array, divisions: int) -> float:
-        """Return the number of a displacement and its divisions, the same for the same ones."""
+        """Return the number of the cuts at a displacement, with a number of divisions.
+
+        The number is remembered. It is the same whenever displacement and divisions are.
+        """
         digest = hashlib.blake2b(np.array(u).tobytes(), digest_size=HASH_BYTES).digest()
         number = float(DIVISION_LEVELS * int.from_bytes(digest) + divisions)
         self.recall(number, u)
         return number
 
     def recall(self, number: float, u: Array) -> None:
-        """Let a number stand for a displacement."""
+        """Let a number stand for the cuts at a displacement u (nodes, 3)."""
         self._displacements[number] = np.array(u)
 
 
 def divisions_of(number: float) -> int:
-    """Return how often triangles are divided with cuts of this number."""
+    """Return how often triangles in a zone of contact are divided for a number of cuts."""
     return int(number) % DIVISION_LEVELS
 
 
 def oriented_sides(triangles: Array) -> tuple[Array, Array]:
-    """Return the ends of the sides (n, 3, 2) of triangles, which have these on their left."""
+    """Return begins and ends (n, 3, 2) of the sides of triangles (n, 3, 2).
+
+    Sides are directed so that the triangle is on their left.
+    """
     a, b = triangles, np.roll(triangles, -1, axis=1)
-    right = (area(triangles) < 0)[:, None, None]
-    return np.where(right, b, a), np.where(right, a, b)
+    is_clockwise = (area(triangles) < 0)[:, None, None]
+    return np.where(is_clockwise, b, a), np.where(is_clockwise, a, b)
 
 
 def cut_by_triangles(triangles: Polygons) -> Polygons:
-    """Return reference cells cut along the sides of triangles that they face.
+    """Return reference cells cut along the sides of the triangles that they face.
 
-    Where these neither overlap nor leave a part of the cell, the polygons are what the cell has in
-    common with each.
+    Each polygon is the common part of a cell and a triangle, or faces nothing (`NO_CELL`). Where
+    triangles overlap, a later one has only the part outside the earlier ones.
+
+    Parameters
+    ----------
+    triangles
+        For each pair of a cell and a cell that it faces, the latter's corners in the reference
+        cell.
     """
-    cells, number = np.unique(triangles.cell, return_inverse=True)
+    cells, row_of_cell = np.unique(triangles.cell, return_inverse=True)
     a, b = oriented_sides(triangles.corners)
     common = Polygons.cells(triangles.cell).with_faces(triangles.faces)
     for k in range(3):
         common = common.clip(a[:, k], b[:, k])
     overlaps = np.abs(area(triangles.corners)) > AREA_TOLERANCE
     overlaps &= area(common.corners) > AREA_TOLERANCE
-    common, number = common.select(overlaps), number[overlaps]
-    covered = np.bincount(number, area(common.corners), len(cells))
+    common, row_of_cell = common.select(overlaps), row_of_cell[overlaps]
+    covered = np.bincount(row_of_cell, area(common.corners), len(cells))
     is_partial = np.abs(covered - REFERENCE_AREA) > AREA_TOLERANCE
     if not is_partial.any():
         return common
-    partial_triangles = triangles.select(overlaps).select(is_partial[number])
-    common_once, rest = _cut_one_by_one(partial_triangles, cells[is_partial])
-    uncovered = np.bincount(np.searchsorted(cells, rest.cell), area(rest.corners), len(cells))
+    partial_triangles = triangles.select(overlaps).select(is_partial[row_of_cell])
+    common_once, remainder = _cut_one_by_one(partial_triangles, cells[is_partial])
+    uncovered = np.bincount(
+        np.searchsorted(cells, remainder.cell), area(remainder.corners), len(cells)
+    )
     is_complete = np.abs(covered + uncovered - REFERENCE_AREA) <= AREA_TOLERANCE
     # where triangles overlap, the later ones count without the earlier ones
     overlapped = cells[is_partial & ~is_complete]
-    single = common.select(~np.isin(common.cell, overlapped))
+    without_overlap = common.select(~np.isin(common.cell, overlapped))
     overlapping = common_once.select(np.isin(common_once.cell, overlapped))
-    return single.concatenate_with(overlapping).concatenate_with(rest)
+    return without_overlap.concatenate_with(overlapping).concatenate_with(remainder)
 
 
 def _cut_one_by_one(triangles: Polygons, cells: Longs) -> tuple[Polygons, Polygons]:
-    """Return what cells have in common with triangles, and what is left of the cells.
+    """Return the common parts of cells and triangles, and the rest of the cells, facing nothing.
 
-    Later triangles count without the earlier ones.
+    Each triangle is cut out of what the earlier triangles have left of its cell.
+
+    Parameters
+    ----------
+    triangles
+        For each pair of a cell and a cell that it faces, the latter's corners in the reference
+        cell.
+    cells
+        Numbers of the cells, ascending.
     """
     triangles = triangles.select(np.argsort(triangles.cell, kind="stable"))
     first = np.searchsorted(triangles.cell, cells)
-    number = np.searchsorted(triangles.cell, cells, "right") - first
-    rest = Polygons.cells(cells)
-    common_parts = rest.select(np.zeros(0, dtype=np.int64))
-    for turn in range(int(number.max(initial=0))):
-        row = np.searchsorted(cells, rest.cell)
-        has_triangle = number[row] > turn
-        cutting = triangles.select(first[row[has_triangle]] + turn)
-        cut_cells, (a, b) = rest.select(has_triangle), oriented_sides(cutting.corners)
+    triangle_count = np.searchsorted(triangles.cell, cells, "right") - first
+    remainder = Polygons.cells(cells)
+    common_parts = remainder.select(np.zeros(0, dtype=np.int64))
+    for triangle_number in range(int(triangle_count.max(initial=0))):
+        cell_row = np.searchsorted(cells, remainder.cell)
+        has_triangle = triangle_count[cell_row] > triangle_number
+        cutting = triangles.select(first[cell_row[has_triangle]] + triangle_number)
+        cut_cells, (a, b) = remainder.select(has_triangle), oriented_sides(cutting.corners)
         common = cut_cells.with_faces(cutting.faces)
         for k in range(3):
             common = common.clip(a[:, k], b[:, k])
         overlaps = area(common.corners) > AREA_TOLERANCE
         common_parts = common_parts.concatenate_with(common.select(overlaps))
-        rest = rest.select(~has_triangle).concatenate_with(cut_cells.select(~overlaps))
+        remainder = remainder.select(~has_triangle).concatenate_with(cut_cells.select(~overlaps))
         remaining = cut_cells.select(overlaps)
+        # what is left of the cell lies outside one side after the other
         for k in range(3):
             outer_part = remaining.clip(b[overlaps, k], a[overlaps, k])
-            rest = rest.concatenate_with(outer_part.with_area())
+            remainder = remainder.concatenate_with(outer_part.with_area())
             remaining = remaining.clip(a[overlaps, k], b[overlaps, k])
-    return common_parts, rest
+    return common_parts, remainder

@@ -77,7 +77,7 @@ CROSSING_DISTANCE = 0.5  # thicknesses: mid-surfaces nearer than that pass throu
 
 @dataclass(frozen=True)
 class ContactGeometry:
-    """The cells of a model between which contact is sought, and where they are.
+    """The cells of a model between which contact is sought, and their places.
 
     Attributes
     ----------
@@ -99,6 +99,8 @@ class ContactGeometry:
         Number of the first degree of freedom of this rank, and how many it has.
     local_cells
         Number of the first cell of this rank, and how many it has, ghosts included.
+    comm
+        Communicator of the mesh.
     """
 
     cells: Cells
@@ -118,11 +120,16 @@ class SurfaceContact(ContactTerm):
 
     Parameters
     ----------
+    pair
+        The two members, with the stiffness of their penalty.
+    geometry
+        The cells of the model.
     sides
-        (cells,) whether each cell belongs to the first member of the pair, and to the second.
+        (cells,) flags of the cells of the first member of the pair, and of the second.
     """
 
     def __init__(self, pair: Pair, geometry: ContactGeometry, sides: tuple[Flags, Flags]) -> None:
+        """Prepare the search and the cuts; places are looked for at the first evaluation."""
         super().__init__(pair, geometry.fields, geometry.offsets)
         self.cuts = StateNumber(0.0)
         self._cells, self._segments, self._h = geometry.cells, geometry.segments, geometry.h
@@ -150,7 +157,7 @@ class SurfaceContact(ContactTerm):
         self._cached_entries: tuple[Projections | None, float, Entries] = None, 0.0, no_entries()
 
     def _may_touch(self, cell: Longs, other: Longs) -> Flags:
-        """Return whether points of cells (n,) may touch the other cells (n,)."""
+        """Return flags (n,): whether points of cells (n,) may touch the other cells (n,)."""
         first, second = self._sides
         return np.asarray((first[cell] & second[other]) | (second[cell] & first[other]))
 
@@ -158,9 +165,10 @@ class SurfaceContact(ContactTerm):
 
     @property
     def history(self) -> dict[str, tuple[StateNumber, float]]:
-        """The penalty's stiffness and the number of the cuts, see `FiniteElementSystem`.
+        """The numbers that a state sets, with defaults: penalty stiffness and number of the cuts.
 
-        A state without a number of its own has the cuts of the undeformed surfaces.
+        See `FiniteElementSystem`. A state without a number of its own has the cuts of the
+        undeformed surfaces.
         """
         return super().history | {self.pair.cuts: (self.cuts, 0.0)}
 
@@ -170,7 +178,10 @@ class SurfaceContact(ContactTerm):
         return float(self._points.weight[places.point[joined_places.first]] @ value) / 2
 
     def _entries(self) -> Entries:
-        """Return the tangent's entries: cached at the present state, computed at a sample."""
+        """Return this rank's entries of the tangent by the displacement; collective.
+
+        They are cached at the present state. At a sample of a step in time they are computed.
+        """
         places, *_ = self._active_set()
         cached_places, cached_stiffness, cached = self._cached_entries
         if cached_places is places and cached_stiffness == self.stiffness.value and not self.sample:
@@ -188,9 +199,10 @@ class SurfaceContact(ContactTerm):
         return self.cuts.value
 
     def coupled_pairs(self) -> tuple[Longs, Longs]:
-        """Return pairs of nodes of cells that touched, or nearly did, where the cuts were made.
+        """Return pairs of nodes between which the tangent may have entries; collective.
 
-        See `NonlocalTerm`.
+        They are the nodes of cells that touched, or nearly did, where the cuts were made. See
+        `NonlocalTerm`.
         """
         self._active_set()
         u = self._cuts.displacement(self.cuts.value)
@@ -199,16 +211,29 @@ class SurfaceContact(ContactTerm):
             self._points, u, self._search.places_of_nodes(u), reach
         )
         keys = np.unique(self._pair_keys(places))
-        cell, other = np.divmod(keys, len(self._cells.nodes))
-        nodes = np.concatenate([self._cells.nodes[cell], self._cells.nodes[other]], axis=1)
+        cell, faced_cell = np.divmod(keys, len(self._cells.nodes))
+        nodes = np.concatenate([self._cells.nodes[cell], self._cells.nodes[faced_cell]], axis=1)
         return self._offsets.coupled_pairs(*pairs_of(nodes)) if self._offsets else pairs_of(nodes)
 
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
     ) -> tuple[fem.Function, Array] | None:
-        """Return the derivative by the thickness or the placement; collective.
+        """Return derivatives of energy Pi + force w . dPi/du by a field; collective.
 
-        See `FieldDifferentiable` of `assembly.nonlocal_terms`.
+        Parameters
+        ----------
+        name
+            Name of the field: "thickness" or "r0".
+        direction
+            The displacement w.
+        energy, force
+            The two weights.
+
+        Returns
+        -------
+        field, values
+            The field and derivatives (own cells, functions, components) by its values; None for any
+            other name. See `FieldDifferentiable` of `assembly.nonlocal_terms`.
         """
         field = {"thickness": self._fields.thickness, "r0": self._fields.r0}.get(name)
         if field is None:
@@ -216,12 +241,13 @@ class SurfaceContact(ContactTerm):
         state = self._state()
         weights = EnergyWeights(self._of_copies(global_values(direction)), energy, force)
         if name == "thickness":
-            of_cells = self._comm.allreduce(self._in_modelled(by_factor(state, weights)))
-            return field, of_cells[self._fields.own, :, None]
+            by_thickness = self._comm.allreduce(self._in_modelled(by_factor(state, weights)))
+            return field, by_thickness[self._fields.own, :, None]
         forces = self._comm.allreduce(self._on_modelled(by_place(state, weights)))
         return field, self._fields.shared_by_cells(forces)
 
     def _state(self) -> ContactState:
+        """Return the contact at the present state, for derivatives by fields; collective."""
         places, joined_places, penalties = self._active_set()
         geometry = self._cells, self._r0, self._at, self._offsets, self._points
         derivatives = self._entries_by_place_and_offset, self._entries, self._geometry
@@ -230,18 +256,19 @@ class SurfaceContact(ContactTerm):
         )
 
     def _add(self, b: Array, forces: Array) -> None:
-        """Add forces (nodes, 3) of this rank's points to the owners' vectors; collective."""
+        """Add forces (nodes, 3) of this rank's points to the vectors of all ranks; collective."""
         add_to_owners(b, forces, self._owned_dofs, self._comm)
 
     def _entries_by_place_and_offset(self) -> Entries:
-        """Return entries of the second derivative by the places of nodes and the offsets H there.
+        """Return this rank's entries of the second derivative by places and offsets H of nodes.
 
-        Blocks of places in the same pair of cells are summed.
+        Blocks of places in the same pair of cells are summed. Collective.
         """
         active_set = self._active_set()
         places, joined_places, (_, slope, curvature) = active_set
         if not len(places.point):
             return no_entries()
+        # of a place that is joined with others the second derivative is that of the smooth minimum
         is_blurred = joined_places.several[joined_places.group]
         first = slope[joined_places.group]
         second = np.where(
@@ -250,20 +277,24 @@ class SurfaceContact(ContactTerm):
         weight = joined_places.weight * self._points.weight[places.point] / 2
         order = np.argsort(self._pair_keys(places), kind="stable")
         blocks = self._blocks(places.select(order), weight[order], first[order], second[order])
-        rows, columns, values = (list(parts) for parts in zip(*blocks, strict=True))
+        rows, columns, values = (
+            list(entries_of_blocks) for entries_of_blocks in zip(*blocks, strict=True)
+        )
         if joined_places.several.any():
-            of_joints = self._entries_of_joints(*active_set)
-            for parts, added in zip((rows, columns, values), of_joints, strict=True):
-                parts.append(added)
+            joint_blocks = self._entries_of_joints(*active_set)
+            for entries_of_blocks, added in zip((rows, columns, values), joint_blocks, strict=True):
+                entries_of_blocks.append(added)
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
 
     def _blocks(
         self, places: Projections, weight: Array, first: Array, second: Array
     ) -> list[Entries]:
-        """Return the entries of places that are ordered by pairs of cells, in chunks.
+        """Return the entries of places by places and offsets of nodes, in chunks of limited memory.
 
         Parameters
         ----------
+        places
+            Places ordered by pairs of cells, see `_pair_keys`.
         weight, first, second
             (n,) weights, and derivatives of the penalty by the penetration.
         """
@@ -281,6 +312,7 @@ class SurfaceContact(ContactTerm):
             penalties = weight[chunk], first[chunk], second[chunk]
             H = gap_hessians(self._cells, chunk_places, geometry, positions, penalties)
             begins = starts_of_chunk - starts_of_chunk[0]
+            # one block for each pair of cells
             sums = np.add.reduceat(H, begins, axis=0)
             dofs = unknown_numbers(geometry[3][begins], len(self._r0), self._components)
             i, j = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
@@ -290,9 +322,9 @@ class SurfaceContact(ContactTerm):
     def _entries_of_joints(
         self, places: Projections, joined_places: JoinedPlaces, penalties: Penalty
     ) -> Entries:
-        """Return what places that are joined as one have besides the entries of each.
+        """Return the entries of joined places, besides those of each place alone.
 
-        The active set is an argument: to find it is collective, and joined places may lie on one
+        The active set is an argument, since to find it is collective. Joined places may lie on one
         rank only.
         """
         _, slope, curvature = penalties
@@ -302,19 +334,19 @@ class SurfaceContact(ContactTerm):
             n, beta, self._components
         )
         weight = self._points.weight[places.point[joined_places.first]] / 2
-        of_joints = weight * (curvature - slope / (BLUR_DISTANCE * self._h))
+        joint_weight = weight * (curvature - slope / (BLUR_DISTANCE * self._h))
         return joint_entries(
-            slopes, nodes, joined_places.group[is_blurred], of_joints, len(self._r0)
+            slopes, nodes, joined_places.group[is_blurred], joint_weight, len(self._r0)
         )
 
     def _pair_keys(self, places: Projections) -> Longs:
-        """Return a number (n,) of the point's cell and the cell that each place is in."""
+        """Return a number (n,) that identifies the cells of each place and its point."""
         return np.asarray(self._points.cell[places.point] * len(self._cells.nodes) + places.cell)
 
     # what is observed
 
     def force(self) -> float:
-        """Return the integral of the pressure over the contact, over E h R; collective."""
+        """Return the integral of the contact pressure, over E h R; collective."""
         places, joined_places, (_, slope, _) = self._active_set()
         weight = self._points.weight[places.point[joined_places.first]]
         return float(self._comm.allreduce(float(weight @ slope / 2)))
@@ -334,7 +366,10 @@ class SurfaceContact(ContactTerm):
         return float(self._comm.allreduce(own_largest, MPI.MAX))
 
     def relative_penetration(self) -> float:
-        """Return the largest penetration over the undeformed thickness there; collective."""
+        """Return the largest penetration over the undeformed thickness there; collective.
+
+        It is 0 without contact. The thickness is the mean of those at the point and at its place.
+        """
         places, *_ = self._active_set()
         own_largest = 0.0
         if len(places.point):
@@ -343,7 +378,10 @@ class SurfaceContact(ContactTerm):
         return float(self._comm.allreduce(own_largest, MPI.MAX))
 
     def deepest_penetration(self) -> tuple[float, Array]:
-        """Return the largest penetration over R, and its place (3,) over R; collective."""
+        """Return the largest penetration over R, and the place (3,) of its point; collective.
+
+        Without contact they are 0 and the origin.
+        """
         places, *_ = self._active_set()
         own_deepest = (0.0, np.zeros(3))
         if len(places.point):
@@ -356,14 +394,16 @@ class SurfaceContact(ContactTerm):
         return float(penetration), np.asarray(x)
 
     def cell_pressures_and_gaps(self) -> tuple[Array, Array, Flags]:
-        """Return what each local cell has, computed once for a state; collective.
+        """Return pressure, gap and full contact of each local cell; collective.
+
+        They are computed once for a state.
 
         Returns
         -------
         pressure
             (cells,) the mean over E h/R; 0 of ghosts.
         gap
-            (cells,) the least over R, up to the reach; the reach of ghosts.
+            (cells,) the least over R; the reach less h where nothing is nearer, and of ghosts.
         is_full
             (cells,) whether all of the cell is pressed.
 
@@ -379,19 +419,24 @@ class SurfaceContact(ContactTerm):
         return self._cell_values.get(state, self._compute_pressures_and_gaps)
 
     def _compute_pressures_and_gaps(self) -> tuple[Array, Array, Flags]:
+        """Compute `cell_pressures_and_gaps` at the present state; collective."""
         places, joined_places, (_, slope, _) = self._active_set()
         points, (first_cell, count) = self._points, self._local_cells
         nearest = places.select(joined_places.first)
         normals = self._cuts.points(self.cuts.value, self._displacement())[1]
+        # half of the force of an edge acts on the cell that it faces, maybe on another rank
         is_edge_alone = self._search.are_edges_alone(points, nearest, normals)
         force = points.weight[nearest.point] * slope
-        of_edges = np.bincount(nearest.cell, force / 2 * is_edge_alone, len(self._cells.nodes))
-        in_modelled = self._in_modelled(of_edges.astype(np.float64)[:, None])[:, 0]
-        on_faced = self._comm.allreduce(in_modelled)[self._fields.own]
+        force_of_edges = np.bincount(
+            nearest.cell, force / 2 * is_edge_alone, len(self._cells.nodes)
+        )
+        force_on_modelled = self._in_modelled(force_of_edges.astype(np.float64)[:, None])[:, 0]
+        force_on_faced = self._comm.allreduce(force_on_modelled)[self._fields.own]
+        # an area of one for cells without points, which are ghosts
         area, pressure = np.ones(count), np.zeros(count)
         np.add.at(area, points.cell - first_cell, points.weight)
         area[: len(np.unique(points.cell))] -= 1.0
-        pressure[: len(on_faced)] = on_faced
+        pressure[: len(force_on_faced)] = force_on_faced
         own_share = force * (1 - is_edge_alone / 2)
         np.add.at(pressure, points.cell[nearest.point] - first_cell, own_share)
         gap = np.full(count, self._reach - self._h)
@@ -414,25 +459,31 @@ class SurfaceContact(ContactTerm):
         return undeformed, self._offsets.half_thickness(self._displacement())
 
     def least_thickness(self, *displacements: Array) -> float:
-        """Return the least thickness of the pair over R, undeformed and at displacements."""
+        """Return the least thickness of the pair over R, undeformed and at some displacements.
+
+        These are (nodes, 3), of all cells.
+        """
         halves = [self._search.half_thickness]
         if self._offsets:
             halves += [self._offsets.half_thickness(u) for u in displacements]
         return 2 * min(float(half[self._nodes_of_pair].min()) for half in halves)
 
     def come_near(self, u: Array, v: Array) -> bool:
-        """Return whether any cells come near each other between two displacements; collective."""
+        """Return whether cells that may touch come near each other from u to v; collective.
+
+        Displacements (nodes, 3) are those of the modelled nodes.
+        """
         return self._search.come_near(self._of_copies(u), self._of_copies(v))
 
     def gap(self, u: Array) -> float:
-        """Return the least gap over R at a displacement, of uncut cells, up to the reach.
+        """Return the least gap over R of the uncut cells at a displacement; collective.
 
-        Collective.
+        It is at most the reach of the search, less h.
         """
         return self._search.least_distance(self._of_copies(u), self._reach) - self._h
 
     def gap_at_supports(self, supported_nodes: Longs, u: Array) -> float:
-        """Return the least gap over R at nodes that supports hold.
+        """Return the least gap over R at nodes that supports hold, at a displacement u (nodes, 3).
 
         See `ClosestPointSearch.gap_at_supports`.
         """
@@ -441,14 +492,23 @@ class SurfaceContact(ContactTerm):
     def passes_through(self, u: Array, v: Array) -> bool:
         """Return whether points pass through a surface on the straight way from u to v; collective.
 
-        Between two samples no point moves, relative to another, by more than a part of the least
-        thickness.
+        Mid-surfaces are looked at in samples of the way. Between two samples no point moves,
+        relative to another, by more than a part of the least thickness.
+
+        Parameters
+        ----------
+        u, v
+            (nodes, 3) displacements of the modelled nodes.
         """
         return self.images_pass_through(self._of_copies(u), self._of_copies(v))
 
     def images_pass_through(self, u: Array, v: Array) -> bool:
-        """Return `passes_through` of displacements (nodes, 3) of all cells; collective."""
+        """Return whether points pass through a surface on the straight way from u to v; collective.
+
+        Displacements (nodes, 3) are those of all cells, images included; see `passes_through`.
+        """
         least_thickness = self.least_thickness(u, v)
+        # motions that are the same for all points do not count
         motion = (v - u) - (v - u).mean(axis=0)
         farthest = 2 * np.linalg.norm(motion, axis=1).max()
         count = int(np.ceil(farthest / (MAX_MOTION_PER_SAMPLE * least_thickness)))
@@ -470,7 +530,13 @@ class SurfaceContact(ContactTerm):
         return np.array(self._displacement())
 
     def sample_rates(self, motion: Array) -> SampleRates:
-        """Return the penalty of the points with its rates along a motion (nodes, 3)."""
+        """Return the penalty of the points at the present sample, with its rates along a motion.
+
+        Parameters
+        ----------
+        motion
+            (nodes, 3) displacement of the whole step, of all nodes.
+        """
         places, joined_places, _ = self._active_set()
         if self._offsets:
             motion = np.column_stack([motion, self._offsets.change(self._at, motion)])
@@ -492,20 +558,20 @@ class SurfaceContact(ContactTerm):
     # the cuts of cells
 
     def improved_cuts(self) -> float | None:
-        """Return the number of the present displacement if cuts there are better; collective.
+        """Return the number of cuts at the present displacement if these are better; else None.
 
-        None if they are not. The measure is the share of the force on points that do not face the
-        cell they faced where the cuts were made, or face an edge that was steep there and is not
-        now, or the other way round.
+        The measure is the share of the force on points that have gone astray. Such points do not
+        face the cell that they faced where the cuts were made. Or they face an edge that was steep
+        there and is not now, or the other way round. Collective.
         """
         u = self._displacement()
         places, *_ = self._active_set()
         normals, left_places = self._segments.normals(self._r0 + u), self._places_left_to_edges
         is_left = self._search.are_left_to_edges(self._points, places, normals)
         stays_left = self._search.are_left_to_edges(self._points, left_places, normals)
-        changed = self._force(self._points, places.select(is_left))
-        changed += self._force(self._points, left_places.select(~stays_left))
-        astray = self._astray_share(self._points, places, changed)
+        changed_force = self._force(self._points, places.select(is_left))
+        changed_force += self._force(self._points, left_places.select(~stays_left))
+        astray = self._astray_share(self._points, places, changed_force)
         if astray <= MAX_ASTRAY_FORCE:
             return None
         points, counted = self._with_cuts_at(u, self._divisions)
@@ -515,7 +581,7 @@ class SurfaceContact(ContactTerm):
     def finer_cuts(self) -> float | None:
         """Return the number of cuts here whose triangles in contact are divided once more.
 
-        None without contact, or after `MAX_DIVISIONS`. Collective.
+        It is None without contact, and after `MAX_DIVISIONS`. Collective.
         """
         u, divisions = self._displacement(), self._divisions
         places, *_ = self._active_set()
@@ -524,7 +590,7 @@ class SurfaceContact(ContactTerm):
         return self._cuts.number_of_displacement(u, divisions + 1)
 
     def present_cuts(self) -> float:
-        """Return the number of the present displacement, for cuts there; collective."""
+        """Return the number of cuts at the present displacement; collective."""
         return self._cuts.number_of_displacement(self._displacement(), self._divisions)
 
     @property
@@ -532,14 +598,22 @@ class SurfaceContact(ContactTerm):
         return divisions_of(self.cuts.value)
 
     def _with_cuts_at(self, u: Array, divisions: int) -> tuple[ContactPoints, Projections]:
-        """Return the points with cuts at a displacement, and their places that count there."""
+        """Return the points with cuts at a displacement, and their places that count; collective.
+
+        Parameters
+        ----------
+        u
+            (nodes, 3) displacement over R.
+        divisions
+            How often triangles in a zone of contact are divided.
+        """
         points, normals = self._cuts.points_at(u, divisions)
         places = self._search.projections(u, self._h, points)
         is_left = self._search.are_left_to_edges(points, places, normals)
         return points, places.select(~is_left)
 
     def recall_cuts(self, number: float) -> None:
-        """Let a number stand for the present displacement; collective.
+        """Let a number stand for cuts at the present displacement; collective.
 
         It may be the number of a run on other ranks.
         """
@@ -548,30 +622,36 @@ class SurfaceContact(ContactTerm):
     def _astray_share(
         self, points: ContactPoints, places: Projections, changed: float = 0.0
     ) -> float:
-        """Return the share of the force on points that do not face the cell that they faced.
+        """Return the share of the force, from 0 to 1, on points that went astray; collective.
 
-        Also on those in triangles that are divided less often than in the zone of contact.
+        They face another cell than where the cuts were made, or their triangle is divided less
+        often than those in the zone of contact.
 
         Parameters
         ----------
         changed
-            Further force of this rank that counts.
+            Further force of this rank that counts as astray, see `_force`.
         """
         faces_another = points.faces[places.point] != places.cell
         is_coarse = points.divisions[places.point] < self._divisions
-        astray = self._force(points, places.select(faces_another | is_coarse)) + changed
-        total, astray = self._comm.allreduce(np.array([self._force(points, places), astray]))
-        return float(astray / total) if total else float(astray > 0)
+        astray_force = self._force(points, places.select(faces_another | is_coarse)) + changed
+        total_force, astray_force = self._comm.allreduce(
+            np.array([self._force(points, places), astray_force])
+        )
+        return float(astray_force / total_force) if total_force else float(astray_force > 0)
 
     def _force(self, points: ContactPoints, places: Projections) -> float:
-        """Return twice the force of this rank's points on their nearest of some places."""
+        """Return twice the force of this rank's points on their nearest places, over E h R."""
         nearest = places.select(places.firsts)
         soft_penetration = SOFT_PENETRATION * self._h
         pressures = penalty(self._h - nearest.distance, self.stiffness.value, soft_penetration)[1]
         return float(points.weight[nearest.point] @ pressures)
 
     def _near(self, u: Array) -> Projections:
-        """Return the places in all cells that may press on this rank's cells at a displacement."""
+        """Return the places in all cells that may press on this rank's cells, at a displacement.
+
+        Cells that are near within the surface are left out, as they are not cut.
+        """
         reach = self._h + self._segments.cover_distance
         near_places = self._search.projections_in_cells(
             self._rule, u, self._search.places_of_nodes(u), float(reach.max())
@@ -580,7 +660,7 @@ class SurfaceContact(ContactTerm):
         return self._search.select_distant_cells(self._rule, near_places.select(is_near))
 
     def _gaps(self, points: ContactPoints, u: Array) -> Array:
-        """Return the gaps (n,) over R of points at a displacement, up to the reach."""
+        """Return the gaps (n,) over R of points at a displacement, at most the reach less h."""
         places = self._search.projections(u, self._reach, points)
         distance = np.full(len(points.cell), self._reach)
         np.minimum.at(distance, places.point, places.distance)
@@ -589,24 +669,26 @@ class SurfaceContact(ContactTerm):
     # geometry
 
     def _displacement(self) -> Array:
+        """Return the displacement (nodes, 3), at present or at the sample; collective."""
         return self.sample.u if self.sample else self._find_displacement()
 
     def _of_copies(self, u: Array) -> Array:
-        """Return the displacement of all cells, of that of the nodes that are modelled."""
+        """Return the displacement of all cells for that of the modelled nodes."""
         return u
 
     def _in_modelled(self, values: Array) -> Array:
-        """Return derivatives by values in modelled cells, of those by values in all cells."""
+        """Return derivatives by values in modelled cells, from those by values in all cells."""
         return values
 
     def _on_modelled(self, forces: Array) -> Array:
-        """Return the forces (nodes, 3) on modelled nodes, of those on all nodes."""
+        """Return the forces on modelled nodes (nodes, 3), from those on all nodes."""
         return forces
 
     def _forces(self) -> Array:
-        """Return the derivative (nodes, 3) of this rank's energy by the places of all nodes.
+        """Return derivatives (nodes, 3 or 4) of this rank's energy by the places of all nodes.
 
-        (nodes, 4) with the derivative by the offset H where that varies.
+        Where the thickness varies, the fourth component is the derivative by the offset H.
+        Collective.
         """
         places, joined_places, (_, slope, _) = self._active_set()
         forces = np.zeros((len(self._r0), self._components))
@@ -619,9 +701,10 @@ class SurfaceContact(ContactTerm):
         return forces
 
     def _active_set(self) -> tuple[Projections, JoinedPlaces, Penalty]:
-        """Return the places in contact, how they are joined, and the penalty of each joined one.
+        """Return the places in contact, how they are joined, and the penalty of each joined place.
 
-        The penalty has its two derivatives by the penetration. At the present state, or sample.
+        The penalty (m,) comes with its two derivatives by the penetration. All are at the present
+        state, or at the sample of a step. They are cached while the state stays. Collective.
         """
         soft_penetration = SOFT_PENETRATION * self._h
         if self._frozen:
@@ -649,7 +732,17 @@ class SurfaceContact(ContactTerm):
     def _find_places(
         self, points: ContactPoints, normals: Array, u: Array
     ) -> tuple[Projections, Projections, JoinedPlaces]:
-        """Return the places that count, those left to edges, and how the former are joined."""
+        """Return the places that count, those left to edges, and the joined places of the former.
+
+        Parameters
+        ----------
+        points
+            Points with the present cuts.
+        normals
+            (cells, 3) where the cuts were made.
+        u
+            (nodes, 3) displacement over R.
+        """
         places = self._search.projections(u, (1 + DISTANCE_TOLERANCE) * self._h, points)
         is_left = self._search.are_left_to_edges(points, places, normals)
         counted = places.select(~is_left)
@@ -657,19 +750,22 @@ class SurfaceContact(ContactTerm):
         return counted, places.select(is_left), joined_places
 
     def freeze(self) -> FrozenContact:
-        """Return the contact of the present state, with its active set fixed; collective."""
+        """Return this contact with the active set of the present state fixed; collective."""
         self._active_set()
         return FrozenContact.at_state(
             self._cells, self._r0, self._h, self._points, self._places, self._joined
         )
 
     def expand_about(self, frozen: FrozenContact) -> None:
-        """Take the frozen contact of another scene on the same mesh for good."""
+        """Use the frozen contact of another scene on the same mesh for all later states.
+
+        Its weights become those of this scene's undeformed surface.
+        """
         self._cached_entries = None, 0.0, self._cached_entries[2]
         self._frozen = frozen.on_surface(self._r0)
 
     def _geometry(self, places: Projections) -> tuple[Array, Array, Array, Longs]:
-        """Return distances, normals, and beta with its nodes; see `gap_geometry`."""
+        """Return distances, normals, and beta with its nodes for places, see `gap_geometry`."""
         return gap_geometry(self._cells, self._points, self._r0 + self._at, places)
 
 

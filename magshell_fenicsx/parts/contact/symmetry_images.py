@@ -29,10 +29,14 @@ SAME_PLACE_TOLERANCE = 1e-9  # over the extent: images of a vertex nearer than t
 
 @dataclass(frozen=True)
 class Images:
-    """The copies that make the whole, numbered one after the other; the first is the model.
+    """The copies of a half or a sector that make the whole; the first is the model.
+
+    Nodes and cells of the copies are numbered one copy after the other.
 
     Attributes
     ----------
+    images
+        The copies, each with its matrix Q (3, 3) and a sign that is negative if it is mirrored.
     count
         Number of nodes of the model.
     parity
@@ -45,49 +49,53 @@ class Images:
 
     @cached_property
     def matrix(self) -> scipy.sparse.csr_array:
-        """P (3 copies count, 3 count)."""
+        """The sparse matrix P (3 copies count, 3 count): displacements of all copies are P u."""
         matrices = [image.Q * (self.parity if image.sign < 0 else 1.0) for image in self.images]
         identity = scipy.sparse.eye_array(self.count)
         return scipy.sparse.vstack([scipy.sparse.kron(identity, Q) for Q in matrices]).tocsr()
 
     def displacements(self, u: Array) -> Array:
-        """Return the displacements (copies count, 3) of all copies, of that (count, 3) of one."""
+        """Return the displacements (copies count, 3) of all copies for u (count, 3)."""
         return np.asarray((self.matrix @ u.ravel()).reshape(-1, 3))
 
     def places(self, r0: Array) -> Array:
-        """Return the places (copies count, 3) of the nodes of all copies."""
+        """Return the undeformed places (copies count, 3) of all copies for r0 (count, 3)."""
         return np.concatenate([image.apply(r0) for image in self.images])
 
     def repeat(self, values: NDArray[Any]) -> NDArray[Any]:
-        """Return the values of the cells of all copies, of those of one."""
+        """Return values of the model's cells, repeated for all copies."""
         return np.concatenate([values] * len(self.images))
 
     def cells(self, cells: Cells, r0: Array, vertices_on_planes: Longs) -> Cells:
-        """Return the cells of all copies, which share the vertices on their planes.
+        """Return the cells of all copies, which share the vertices on planes of symmetry.
+
+        Nodes are not shared.
 
         Parameters
         ----------
+        cells
+            Cells of the model.
         r0
-            (count, 3) undeformed.
+            (count, 3) undeformed places of its nodes.
         vertices_on_planes
-            Numbers of these vertices.
+            Numbers of the vertices on planes of symmetry.
         """
         x = np.zeros((int(cells.corners.max()) + 1, 3))
         x[cells.corners] = cells.at_corners @ r0[cells.nodes]
-        numbers = self.shared_numbers(x, vertices_on_planes)
+        vertex_numbers = self.shared_numbers(x, vertices_on_planes)
         return Cells(
             cells.element,
             np.concatenate([cells.nodes + k * self.count for k in range(len(self.images))]),
-            np.concatenate([number[cells.corners] for number in numbers]),
+            np.concatenate([numbers_of_copy[cells.corners] for numbers_of_copy in vertex_numbers]),
         )
 
     def shared_numbers(self, x: Array, on_planes: Longs) -> Longs:
-        """Return numbers (copies, n) of places (n, 3), one for images at the same place.
+        """Return numbers (copies, n) of all images of places x (n, 3), one where images coincide.
 
         Parameters
         ----------
         on_planes
-            Rows of the places that are on planes of symmetry.
+            Rows of the places that are on planes of symmetry; only these may coincide.
         """
         images = [image.apply(x[on_planes]) for image in self.images]
         tolerance = SAME_PLACE_TOLERANCE * np.ptp(x, axis=0).max()
@@ -99,11 +107,11 @@ class Images:
         return numbers
 
     def sum_forces(self, forces: Array) -> Array:
-        """Return the forces (3 count,) on the model, of those on all copies."""
+        """Return the forces P^T f (3 count,) on the model for forces f on all copies."""
         return np.asarray(self.matrix.T @ forces)
 
     def sum_entries(self, entries: Entries) -> Entries:
-        """Return the entries of the model's tangent, of those of all copies' tangent."""
+        """Return the entries of P^T K P, the model's tangent, for those of K of all copies."""
         rows, columns, values = entries
         size = self.matrix.shape[0]
         K = scipy.sparse.coo_array((values, (rows, columns)), (size, size)).tocsr()
@@ -116,10 +124,14 @@ class ContactWithImages(SurfaceContact):
 
     Parameters
     ----------
+    images
+        The copies that make the whole.
     modelled_dofs
-        Number of the first degree of freedom of this rank, and how many it has.
+        Number of the first degree of freedom of this rank in the model, and how many it has.
+    pair
+        The two members, with the stiffness of their penalty.
     geometry
-        With the cells and nodes of all copies; its own degrees of freedom are all of theirs.
+        The cells and nodes of all copies; its own degrees of freedom are all of theirs.
     sides
         See `SurfaceContact`.
     """
@@ -136,15 +148,16 @@ class ContactWithImages(SurfaceContact):
         self._images, self._modelled_dofs = images, modelled_dofs
 
     def antisymmetric(self) -> "ContactWithImages":
-        """Return this term for additions to u that are antisymmetric to the plane.
+        """Return this term for changes of u that are antisymmetric to the plane.
 
-        The state stays symmetric.
+        The state itself stays symmetric.
         """
-        other = copy(self)
-        other._images = replace(self._images, parity=-1.0)
-        return other
+        antisymmetric_term = copy(self)
+        antisymmetric_term._images = replace(self._images, parity=-1.0)
+        return antisymmetric_term
 
     def _add(self, b: Array, forces: Array) -> None:
+        """Add P^T f, for forces f on all copies, to the vector b of this rank; collective."""
         of_copies = np.zeros(self._images.matrix.shape[0])
         super()._add(of_copies, forces)
         start, size = self._modelled_dofs
@@ -154,6 +167,7 @@ class ContactWithImages(SurfaceContact):
         return self._images.sum_entries(super().entries())
 
     def coupled_pairs(self) -> tuple[Longs, Longs]:
+        """Return the pairs of the model's nodes that copies couple, see `SurfaceContact`."""
         rows, columns = super().coupled_pairs()
         return rows % self._images.count, columns % self._images.count
 
@@ -161,6 +175,7 @@ class ContactWithImages(SurfaceContact):
         return self._images.displacements(u)
 
     def _in_modelled(self, values: Array) -> Array:
+        """Return derivatives by values in modelled cells: the sum over all copies of each cell."""
         copies = len(self._images.images)
         return np.asarray(values.reshape(copies, -1, values.shape[1]).sum(axis=0))
 

@@ -37,16 +37,16 @@ MAX_FACTOR = 4.0  # of a point's force; for one place in a straight motion it is
 
 @dataclass(frozen=True)
 class StepSample:
-    """A displacement on the way of a step, and how the penalty of each point counts there.
+    """A displacement on the way of a step in time, with weights of the penalty there.
 
     Attributes
     ----------
     u
-        (nodes, 2 or 3) of all nodes.
+        (nodes, 2 or 3) displacement of all nodes.
     first, second
-        (points,) factors of the derivatives of the penalty; None for 1.
+        (points,) factors of the first and second derivative of the penalty; None for 1.
     slope
-        (points,) in place of `first` in the tangent.
+        (points,) factor in place of `first` in the tangent.
     """
 
     u: Array
@@ -57,7 +57,15 @@ class StepSample:
     def weigh(
         self, point: NDArray[np.int64], penalties: tuple[Array, Array, Array]
     ) -> tuple[Array, Array, Array]:
-        """Return the penalty of places of points with its derivatives, as they count here."""
+        """Return the penalty of places with its two derivatives, times this sample's factors.
+
+        Parameters
+        ----------
+        point
+            (n,) number of each place's point.
+        penalties
+            (n,) the penalty and its first and second derivatives by the penetration.
+        """
         if self.first is None or self.second is None:
             return penalties
         value, first, second = penalties
@@ -66,13 +74,14 @@ class StepSample:
 
 @dataclass(frozen=True)
 class SampleRates:
-    """The penalty of a contact's points at a sample of a step; (points,) each.
+    """The penalty of each contact point at a sample of a step; (points,) each.
 
     Attributes
     ----------
-    value, rate, curvature
-        The penalty, and its derivatives along the whole way; the second is that of a straight
-        motion.
+    value
+        The penalty.
+    rate, curvature
+        Its first and second derivative along the whole way, as if the motion were straight.
     segment
         A number that changes where the penalty passes a kink.
     """
@@ -92,33 +101,43 @@ class SampleRates:
         k: float,
         soft_penetration: float,
     ) -> "SampleRates":
-        """Sum the penalties of places over their points.
+        """Return the penalties of places summed over each point's places.
 
         Parameters
         ----------
         count
             Number of points.
         point, penetration, closing
-            (n,) of each place: its point, its penetration, and by how much this grows along the
-            whole way.
-        k, soft
+            (n,) for each place: number of its point, penetration, and increase of the penetration
+            along the whole way.
+        k, soft_penetration
             See `penalty`.
         """
         value, first, second = penalty(penetration, k, soft_penetration)
         closing = np.where(np.abs(closing) > PENETRATION_ROUNDING * soft_penetration, closing, 0.0)
         segment = np.digitize(penetration, (0.0, soft_penetration)).astype(float)
-        of_places = value, first * closing, second * closing**2, segment
-        return cls(*(np.bincount(point, values, count).astype(float) for values in of_places))
+        values_of_places = value, first * closing, second * closing**2, segment
+        return cls(
+            *(np.bincount(point, values, count).astype(float) for values in values_of_places)
+        )
 
 
 class SampleCache(Generic[Value]):
-    """Values at the samples of the last step."""
+    """A cache of values at the samples of the last step, as many as Simpson's rule has points."""
 
     def __init__(self) -> None:
         self._samples = list[tuple[Sequence[Any], Value]]()
 
     def get(self, state: Sequence[Any], compute: Callable[[], Value]) -> Value:
-        """Return the value at a state, a sequence of arrays and numbers, computed if it is new."""
+        """Return the value at a state, computed if the state is not among the cached ones.
+
+        Parameters
+        ----------
+        state
+            Arrays and numbers that identify the state.
+        compute
+            Returns the value at this state.
+        """
         for i, (cached_state, value) in enumerate(self._samples):
             if all(map(np.array_equal, cached_state, state)):
                 # the begin of a step is asked for at each iteration: it stays longest
@@ -131,14 +150,16 @@ class SampleCache(Generic[Value]):
 
 
 class TimeAveragedContact(Protocol):
-    """A contact whose force may be that of a step.
+    """A contact whose force may be the mean force of a step in time.
 
     Attributes
     ----------
+    pair
+        The two members of the contact.
     samples
-        Those of the step; empty while the contact has the force of the present state.
+        The samples of the step; empty while the contact has the force of the present state.
     sample
-        The one at which it is evaluated now.
+        The sample at which the contact is evaluated now; None for the present state.
     """
 
     pair: Pair
@@ -156,23 +177,26 @@ class TimeAveragedContact(Protocol):
         """Return whether points pass through a surface on the way from u to v; collective."""
 
     def sample_rates(self, motion: Array) -> SampleRates:
-        """Return the penalty of the points at this sample, with its rates along a motion."""
+        """Return the penalty of the points at this sample, with its rates along a motion.
+
+        The motion (nodes, 2 or 3) is the displacement of the whole step.
+        """
 
 
 def samples_of_step(
     contact: TimeAveragedContact, begin: Array, end: Array, part: float
 ) -> list[StepSample]:
-    """Return the samples whose sum is the force of a contact in a step.
+    """Return the samples whose weighted sum is the force of a contact in a step; collective.
 
-    That is the mean force, and what generalised alpha dissipates. The tangent is by the
-    displacement at a part of the step.
+    That is the mean force, plus what generalised alpha dissipates. The tangent is the derivative by
+    the displacement at a part of the step. See docs/theory.md, Motion.
 
     Parameters
     ----------
     begin, end
-        Displacements at both ends of the step.
+        (nodes, 2 or 3) displacements at both ends of the step.
     part
-        Of the step at which the system has its forces.
+        Position within the step, from 0 to 1, at which the system takes its forces.
     """
     ends = [begin + position * (end - begin) for position, _ in SIMPSON_RULE]
     rates = list[SampleRates]()
@@ -184,25 +208,28 @@ def samples_of_step(
     work = weights @ [sample_rates.rate for sample_rates in rates]
     curvature = (positions * weights) @ [sample_rates.curvature for sample_rates in rates]
     is_kink = np.any(
-        [earlier.segment != other.segment for earlier, other in pairwise(rates)], axis=0
+        [earlier.segment != later.segment for earlier, later in pairwise(rates)], axis=0
     )
     energy_change = rates[-1].value - rates[0].value
+    # factors give Simpson's sums the change of energy, and its derivative by the end
     end_slope, off_middle = rates[-1].rate - energy_change, part - 0.5
-    of_force = _factor(energy_change, work, is_kink)
-    of_slope = _factor(end_slope, curvature, is_kink)
+    force_factor = _factor(energy_change, work, is_kink)
+    slope_factor = _factor(end_slope, curvature, is_kink)
     # of a point that opens the force depends on the end of the way by the length of the way alone
     is_opening = is_kink & (curvature == 0)
-    of_opening = np.where(is_opening, _factor(end_slope, rates[0].curvature, is_kink), 0.0) / part
+    opening_factor = (
+        np.where(is_opening, _factor(end_slope, rates[0].curvature, is_kink), 0.0) / part
+    )
     samples = list[StepSample]()
     for u, (position, weight) in zip(ends, SIMPSON_RULE, strict=True):
         dissipative = {0.0: -off_middle, 1.0: off_middle}.get(position, 0.0)
-        slope = position * (weight * of_force + dissipative) / part
-        second = position * (weight * of_slope + dissipative) / part
+        slope = position * (weight * force_factor + dissipative) / part
+        second = position * (weight * slope_factor + dissipative) / part
         samples.append(
             StepSample(
                 u,
-                np.asarray(weight * of_force + dissipative),
-                np.asarray(second if position else of_opening),
+                np.asarray(weight * force_factor + dissipative),
+                np.asarray(second if position else opening_factor),
                 np.asarray(slope),
             )
         )
@@ -210,7 +237,10 @@ def samples_of_step(
 
 
 def _factor(target: Array, computed: Array, is_kink: Flags) -> Array:
-    """Return the factors that make computed numbers the target at kinks; 1 elsewhere."""
+    """Return factors (points,) of computed numbers that make them the target, at kinks.
+
+    They are 1 elsewhere, and between 0 and `MAX_FACTOR`.
+    """
     is_changed = is_kink & (computed != 0)
     ratio = np.divide(target, computed, out=np.ones_like(computed), where=is_changed)
     return np.clip(ratio, 0.0, MAX_FACTOR)
@@ -219,7 +249,15 @@ def _factor(target: Array, computed: Array, is_kink: Flags) -> Array:
 def at_each_sample(
     contact: TimeAveragedContact, compute: Callable[[], Value], *, tangent: bool = False
 ) -> list[Value]:
-    """Return a value at each sample of the step; without a step, at the present state."""
+    """Return a value at each sample of the step; without a step, one at the present state.
+
+    Parameters
+    ----------
+    compute
+        Returns the value of the contact at its `sample`.
+    tangent
+        Whether the value belongs to the tangent, where `slope` counts in place of `first`.
+    """
     if not contact.samples:
         return [compute()]
     values = list[Value]()
@@ -245,11 +283,11 @@ class ContactTerm:
     Attributes
     ----------
     stiffness
-        k of the penalty, over E h/R^2.
+        Stiffness k of the penalty, over E h/R^2.
     samples, sample
         See `TimeAveragedContact`.
     held
-        The frozen contact that stands for all states; None without, see `hold`.
+        The frozen contact that stands for all states, see `hold`; None without.
     """
 
     amplitude = None
@@ -267,14 +305,20 @@ class ContactTerm:
         self._frozen: Any = None
 
     def hold(self, frozen: Any) -> None:
-        """Take what `freeze` gave at one state for all states, or release it with None."""
+        """Fix the active set for all states by a frozen contact, or release it with None.
+
+        Parameters
+        ----------
+        frozen
+            The result of `freeze` at one state.
+        """
         self.held = self._frozen = None
         if frozen is not None:
             self.expand_about(frozen)
             self.held = frozen
 
     def expand_about(self, frozen: Any) -> None:
-        """Take the frozen contact of another scene on the same mesh, see `frozen_contact`."""
+        """Use the frozen contact of another scene on the same mesh, see `frozen_contact`."""
         raise NotImplementedError
 
     @property
@@ -283,7 +327,7 @@ class ContactTerm:
         return {self.pair.setting: (self.stiffness, self.pair.stiffness)}
 
     def add_residual(self, b: Array, factor: float) -> None:
-        """Add factor dPi/du; collective."""
+        """Add factor dPi/du to the vector b; collective."""
         forces = at_each_sample(self, lambda: self._on_nodes(self._forces()))  # type: ignore[arg-type]
         self._add(b, factor * np.sum(forces, axis=0))
 
@@ -293,16 +337,25 @@ class ContactTerm:
     compile_tangent = compile_residual
 
     def add_tangent(self, K: object, factor: float, clamped: object) -> None:
-        """Add nothing: what assembles the other terms adds `entries`."""
+        """Add nothing: the tangent's assembly takes `entries`."""
 
     def entries(self) -> Entries:
-        """Return the entries of the tangent, see `NonlocalTerm`."""
+        """Return this rank's entries of the tangent, summed over the samples of a step; collective.
+
+        See `NonlocalTerm`.
+        """
         samples = at_each_sample(self, self._entries, tangent=True)  # type: ignore[arg-type]
         rows, columns, values = zip(*samples, strict=True)
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
 
     def entered(self, parameters: Mapping[str, FreeParameter]) -> dict[str, FreeParameter]:
-        """Return the parameters on which the offsets of faces depend, with their derivatives."""
+        """Return the free parameters on which the faces depend, with this term's derivatives.
+
+        Parameters
+        ----------
+        parameters
+            Name -> number that varies in the energies. The result has those that move faces.
+        """
         amplitude = self._offsets.amplitude if self._offsets else None
         return {
             name: with_growth(p, self._state, self._add)
@@ -311,6 +364,7 @@ class ContactTerm:
         }
 
     def _on_nodes(self, forces: Array) -> Array:
+        """Return the forces by the displacement (nodes, dim), of those by places and H."""
         # `_at` has been the displacement of the forces since they were computed
         return forces_on_nodes(self._offsets, self._at, forces)
 
@@ -322,11 +376,13 @@ class ContactTerm:
         raise NotImplementedError
 
     def _entries(self) -> Entries:
+        """Return the entries of the tangent at the present state or sample; collective."""
         raise NotImplementedError
 
     def _state(self) -> ContactState:
+        """Return the contact at the present state, for derivatives by fields; collective."""
         raise NotImplementedError
 
     def _add(self, b: Array, forces: Array) -> None:
-        """Add forces (nodes, 2 or 3) of this rank's points; collective."""
+        """Add forces (nodes, 2 or 3) of this rank's points to the vector b; collective."""
         raise NotImplementedError

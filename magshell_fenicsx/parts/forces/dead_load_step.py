@@ -51,9 +51,16 @@ MAX_COMPONENT = 1e30
 
 
 def _or_formula(unit: str) -> Any:
-    """Return a validator of a number, text with a unit, or a formula of x, y, z."""
+    """Return a pydantic validator of a component: a number, text with a unit, or a formula.
+
+    Parameters
+    ----------
+    unit
+        Unit of the component, such as "pascal". Formulas are of x, y, z and stay text.
+    """
 
     def read(value: Any) -> Any:
+        """Return a formula as it is, else the number of a component."""
         if isinstance(value, str) and is_formula(value):
             return value
         number = in_units(unit)(value)
@@ -113,21 +120,24 @@ class DeadLoadSection(Section):
 
     @model_validator(mode="after")
     def _one_load_in_one_place(self) -> Self:
-        fitting = {
+        """Check that the load has one place and one quantity that goes with it, not zero."""
+        quantities_of_place = {
             "at": ("force",),
             "edge": ("force", "per_length", "moment"),
             "over": ("per_area", "pressure", "potential"),
         }
-        places = [place for place in fitting if getattr(self, place) is not None]
+        places = [place for place in quantities_of_place if getattr(self, place) is not None]
         if len(places) != 1:
             raise ValueError(
                 "a load is at a point, on an edge, or on a part of the surface: give one of at, "
                 "edge, over"
             )
-        quantities = {key for keys in fitting.values() for key in keys}
+        quantities = {key for keys in quantities_of_place.values() for key in keys}
         given_keys = sorted(key for key in quantities if getattr(self, key) is not None)
-        if len(given_keys) != 1 or given_keys[0] not in fitting[places[0]]:
-            raise ValueError(f"with {places[0]} goes one of {', '.join(fitting[places[0]])}")
+        if len(given_keys) != 1 or given_keys[0] not in quantities_of_place[places[0]]:
+            raise ValueError(
+                f"with {places[0]} goes one of {', '.join(quantities_of_place[places[0]])}"
+            )
         value = getattr(self, given_keys[0])
         if not (any(value) if isinstance(value, list) else value):
             raise ValueError(f"{given_keys[0]}: is zero")
@@ -137,14 +147,14 @@ class DeadLoadSection(Section):
 
     @property
     def vector(self) -> list[Varying] | None:
-        """The components of a load with a direction in space; None of others."""
+        """The three components of a load with a direction in space; None of other loads."""
         return next(
             (list(v) for v in (self.force, self.per_length, self.per_area) if v is not None), None
         )
 
     @property
     def varies(self) -> bool:
-        """Whether it has a formula of the undeformed place."""
+        """Whether the load has a formula of the undeformed place."""
         return isinstance(self.pressure, str) or any(isinstance(v, str) for v in self.vector or [])
 
 
@@ -178,11 +188,12 @@ class DeadSection(PathStep):
 
     @model_validator(mode="after")
     def _moments_have_no_displacement(self) -> Self:
+        """Refuse targets and branches that loads with a moment or a potential cannot have."""
         if self.control == "displacement" or self.displacement is not None:
-            for has, what in ((self.turns, "moment"), (self.by_place, "potential")):
-                if has:
+            for is_loaded, kind in ((self.turns, "moment"), (self.by_place, "potential")):
+                if is_loaded:
                     raise ValueError(
-                        f"displacement: a {what} has none; take control: arc or load with factor"
+                        f"displacement: a {kind} has none; take control: arc or load with factor"
                     )
         if self.branches and self.turns:
             raise ValueError(
@@ -209,14 +220,22 @@ class DeadSection(PathStep):
         return not (self.turns or self.by_place)
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        """Refuse a case without a modulus, or without a point that a load names."""
         context.has_modulus("loads of kind: dead")
         for i, load in enumerate(self.loads):
             context.has_point(f"{step.key}.loads.{i}.at", load.at)
 
     def warning(self, step: ProgrammeStep, outline: "Outline", length: float) -> str | None:
-        """Return that a pressure by formula keeps its direction, unlike that of a fluid.
+        """Return a warning that a pressure by formula keeps its direction, unlike that of a fluid.
 
-        Components along the normals of a curved surface are such a pressure.
+        Components along the normals of a curved surface are such a pressure. None without.
+
+        Parameters
+        ----------
+        outline
+            The undeformed shell.
+        length
+            Length R in the unit of the formulas.
         """
         for i, load in enumerate(self.loads):
             if isinstance(load.pressure, str):
@@ -233,9 +252,14 @@ class DeadSection(PathStep):
         return None
 
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
+        """Return the first change of the factor: an equal part of the way to a target factor.
+
+        Towards a target displacement it is 1e-3.
+        """
         return change / self.points if by_load else copysign(1e-3, change)
 
     def step(self, change: float | None, load_start: LoadStart) -> float | None:
+        """Return the first step of the displacement if it is prescribed; else None."""
         return abs(change) / self.points if self.control == "displacement" and change else None
 
     def scale(self, load_start: LoadStart) -> float:
@@ -244,7 +268,12 @@ class DeadSection(PathStep):
     def symmetry_constraints(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
-        R, meridian = context.shell.reference, outline.meridian
+        """Return the symmetry that the loads preserve: of all together, and of each potential.
+
+        Loads along e3, on the axis or all around it, preserve rotations about e3. A mirror plane
+        must map the loads to each other.
+        """
+        length, meridian = context.shell.reference, outline.meridian
         constant_loads = [load for load in self.loads if not load.varies]
         forces = [
             np.array(v)
@@ -252,10 +281,10 @@ class DeadSection(PathStep):
             for v in (load.force, load.per_length, load.per_area)
             if v
         ]
-        places = [np.array(context.points[load.at]) / R for load in self.loads if load.at]
+        places = [np.array(context.points[load.at]) / length for load in self.loads if load.at]
         vectors = [unit(v) for v in (*forces, *places)]
         potentials = [load.potential for load in self.loads if load.potential]
-        x = (
+        sampled_places = (
             outline.sample()
             if potentials or len(constant_loads) < len(self.loads)
             else np.zeros((0, 3))
@@ -271,25 +300,27 @@ class DeadSection(PathStep):
         has_patches = any(load.over not in all_patches for load in self.loads)
 
         def mirrors(mirror: Mirror) -> bool:
+            """Return whether a mirror plane maps the loads to each other."""
             on_plane = all(abs(float(mirror.signed_distance(place))) < ROUNDING for place in places)
             in_potentials = on_plane and all(
-                mirrors_formula(text, mirror, x, R) for text in potentials
+                mirrors_formula(text, mirror, sampled_places, length) for text in potentials
             )
             return in_potentials and all(
-                any(is_image(a, b, mirror, x, R) for b in self.loads) for a in self.loads
+                any(is_image(a, b, mirror, sampled_places, length) for b in self.loads)
+                for a in self.loads
             )
 
         reason = "a patch is loaded" if has_patches else None
         if any(tilted(v) for v in vectors):
             reason = "a load is not along e3, or off the axis"
         is_axisymmetric = (
-            all(load_turns(load, meridian, R) for load in self.loads if load.varies)
+            all(load_turns(load, meridian, length) for load in self.loads if load.varies)
             if meridian
             else True
         )
         if meridian and not (
             is_axisymmetric
-            and all(scalar_is_axisymmetric(text, meridian, R) for text in potentials)
+            and all(scalar_is_axisymmetric(text, meridian, length) for text in potentials)
         ):
             reason = reason or "a load differs around e3"
         energies = [
@@ -308,14 +339,23 @@ class DeadSection(PathStep):
     def mesh_features(
         cls, loads: Sequence[Self], place: Array, sizing: SizingContext
     ) -> list[Feature]:
+        """Return the disc of small elements around a loaded point in the chart."""
         x, y = map(float, place)
         return [DiscFeature((x, y), 0.0, sizing.h, loads[0].growth(sizing))]
 
     def largest(self, sizing: SizingContext) -> float | None:
+        """Return the largest size of elements over R, 2 sqrt(h/R) for thin shells; else None."""
         size = 2 * sqrt(sizing.h)
         return size if size < 0.35 else None
 
     def formulas(self, key: str, context: Context) -> Iterable[Formulas]:
+        """Yield the keys of all loads that may be formulas, with bounds and unit of places.
+
+        Parameters
+        ----------
+        key
+            Key of the step in the case file.
+        """
         from magshell_fenicsx.models.shell.spatial_fields import (
             MAX_COMPONENT,
         )  # the solver takes long to import
@@ -343,6 +383,10 @@ class DeadSection(PathStep):
                 )
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
+        """Return `dead` of the model's `Loads`: the step's amplitude -> its loads, dimensionless.
+
+        Loads on edges that the mirror removes from the model are left out.
+        """
         from magshell_fenicsx.parts.forces.load_vectors import (
             dead_load,
         )  # the solver takes long to import
@@ -357,28 +401,52 @@ class DeadSection(PathStep):
 
 
 def load_turns(load: DeadLoadSection, meridian: MeridianChart, R: float) -> bool:
-    """Return whether a load by formula is the same all around e3."""
+    """Return whether a load by formula is the same all around e3.
+
+    Parameters
+    ----------
+    R
+        Length of the shell in the unit of the formula's places.
+    """
     if load.vector is None:
         return scalar_is_axisymmetric(str(load.pressure), meridian, R)
     return vector_is_axisymmetric([str(v) for v in load.vector], meridian, R)
 
 
 def is_normal(components: Sequence[Varying], outline: "Outline", length: float) -> bool:
-    """Return whether a load by formulas is along the undeformed normals of a curved surface."""
+    """Return whether a load by formulas is along the undeformed normals of a curved surface.
+
+    Parameters
+    ----------
+    components
+        Three numbers or formulas.
+    length
+        Length R in the unit of the formulas' places.
+    """
     sampled = outline.samples_with_normals()
     if sampled is None:
         return False
     places, normals = sampled
     load = np.stack([formula_function(v)(*(length * places).T) for v in components], axis=-1)
-    across = np.linalg.norm(np.cross(load, normals), axis=1).max()
+    largest_tangential = np.linalg.norm(np.cross(load, normals), axis=1).max()
     is_curved = np.linalg.norm(np.ptp(normals, axis=0)) > ROUNDING
-    return bool(is_curved and across < NORMAL_TOLERANCE * np.linalg.norm(load, axis=1).max())
+    return bool(
+        is_curved and largest_tangential < NORMAL_TOLERANCE * np.linalg.norm(load, axis=1).max()
+    )
 
 
 def is_image(
     load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: Array, R: float
 ) -> bool:
-    """Return whether the plane mirrors one load to the other; x are places (n, 3) for formulas."""
+    """Return whether a plane mirrors one load to another.
+
+    Parameters
+    ----------
+    x
+        (n, 3) places over R at which formulas are compared.
+    R
+        Length of the shell in the unit of formulas' places.
+    """
     if load.varies or other.varies:
         return _mirrored_formula(load, other, mirror, R * x, R * mirror.image(x))
     edge = load.edge and mirror.image_of_edge(load.edge)
@@ -406,10 +474,17 @@ def is_image(
 def _mirrored_formula(
     load: DeadLoadSection, other: DeadLoadSection, mirror: Mirror, x: Array, image: Array
 ) -> bool:
+    """Return whether a plane mirrors one load by formula to another, at sampled places.
+
+    Parameters
+    ----------
+    x, image
+        (n, 3) places and their mirror images, in the unit of formulas.
+    """
     edge = load.edge and mirror.image_of_edge(load.edge)
     if (edge, load.over, load.vector is None) != (other.edge, other.over, other.vector is None):
         return False
-    values, images = (
+    values_at_places, values_at_images = (
         np.stack(
             [
                 formula_function(v)(*places.T)
@@ -419,11 +494,28 @@ def _mirrored_formula(
         )
         for one_load, places in ((load, x), (other, image))
     )
-    return equal_to_rounding(values if load.vector is None else values @ mirror.reflection, images)
+    return equal_to_rounding(
+        values_at_places if load.vector is None else values_at_places @ mirror.reflection,
+        values_at_images,
+    )
 
 
 def potential(name: str, text: str, Q: Array, scales: Scales) -> OwnTerm:
-    """Return the energy of a load by the deformed place, zero where nothing has moved."""
+    """Return the energy of a load that is a formula of the deformed place.
+
+    It is zero where nothing has moved.
+
+    Parameters
+    ----------
+    name
+        Name of the energy and its amplitude.
+    text
+        Formula of x, y, z: energy per undeformed area, in the case's units.
+    Q
+        (3, 3) rotation from the case's frame to the model's frame.
+    scales
+        Length, thickness and modulus in the case's units.
+    """
 
     def energy_at(r: "Expr", scale: "Expr", energy_scale: "Expr") -> "Expr":
         x = [scale * sum(float(Q[j, i]) * r[j] for j in range(3) if Q[j, i]) for i in range(3)]
@@ -436,7 +528,10 @@ def potential(name: str, text: str, Q: Array, scales: Scales) -> OwnTerm:
 
 
 def also_displaced(loads: "Loads") -> tuple[str, ...]:
-    """Return amplitudes with a displacement besides the one of the column w_over_h."""
+    """Return the force and dead-load amplitudes that have a column of displacement of their own.
+
+    The amplitude whose displacement is the column w_over_h is left out.
+    """
     return tuple(name for name in (*loads.forces, *loads.dead) if name != loads.displaced)
 
 
@@ -452,10 +547,15 @@ class ForcesObservables(Observables):
         return (*loads.forces, *loads.dead)
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
+        """Return the columns of factors, and of displacements along further loads."""
         factors = (amplitude(name).column for name in self.amplitudes(loads) if name != "force")
         return (*factors, *(f"w_{name}_over_h" for name in also_displaced(loads)))
 
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
+        """Return column -> value at a state: factors of loads, and displacements along them over h.
+
+        Collective.
+        """
         model, loads = view.model, view.loads
         factors = {amplitude(name).column: state.mu[name] for name in self.amplitudes(loads)}
         displaced = also_displaced(loads)
@@ -465,6 +565,7 @@ class ForcesObservables(Observables):
         }
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
+        """Check that the surface has the patches on which dead loads are."""
         from magshell_fenicsx.models.shell.parameters import (
             AreaForce,
         )  # the solver takes long to import
@@ -475,7 +576,10 @@ class ForcesObservables(Observables):
                 patch_of(surface.patches, load.patch)
 
     def conjugate_unit(self, view: ModelView, name: str) -> float | None:
-        """Return w/h of a force, the shell's length of dead loads."""
+        """Return -dPi/dmu of one unit of displacement along a load; None for other amplitudes.
+
+        The unit is w = h of a force, and the shell's length of dead loads.
+        """
         if name in view.loads.forces:
             return view.model.force_unit * view.h
         return (

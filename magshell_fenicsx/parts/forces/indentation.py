@@ -37,6 +37,7 @@ class Place(Direction):
 
     @model_validator(mode="after")
     def _one_way(self) -> Self:
+        """Check that the place is either a point or a direction."""
         if self.point is not None and {"polar", "azimuth"} & self.model_fields_set:
             raise ValueError("give a point, or polar and azimuth")
         return self
@@ -75,6 +76,13 @@ class IndentationSection(PathStep):
         return self.at, self.patch
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        """Refuse a force at the edge, at an unknown point, or concentrated on a solid.
+
+        Raises
+        ------
+        ValueError
+            With the key and what is allowed.
+        """
         context.on_shell(step.key, self.at.polar)
         context.has_point(f"{step.key}.at.point", self.at.point)
         if context.solid and not self.patch:
@@ -87,6 +95,7 @@ class IndentationSection(PathStep):
     def symmetry_constraints(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
+        """Return the symmetry that the force preserves: mirrors through its place."""
         place = self.place_on(step, context, outline)
         reason = "the force is not at the pole" if tilted(place) else None
         return [
@@ -96,6 +105,13 @@ class IndentationSection(PathStep):
         ]
 
     def place_on(self, step: ProgrammeStep, context: Context, outline: "Outline") -> Array:
+        """Return the place (3,) of the force over R, in the case's frame.
+
+        Raises
+        ------
+        CaseError
+            If the section does not say where the force is on this geometry.
+        """
         at, geometry, key = self.at, context.shell.geometry, step.key
         if at.point is not None:
             return np.asarray(np.array(context.points[at.point]) / context.shell.reference)
@@ -117,6 +133,11 @@ class IndentationSection(PathStep):
         return np.asarray(outline.embedding(chart[None])[0])
 
     def chart_of(self, place: Array, outline: "Outline", turn: float, *, half: bool) -> Array:
+        """Return the place of the force in the chart of a frame turned about e3 by `turn` radians.
+
+        On a sphere it follows from the angles, which are exact; `half` puts it on the plane of a
+        half model.
+        """
         if self.at.point is not None or not outline.sphere:
             return super().chart_of(place, outline, turn, half=half)
         polar, theta = radians(self.at.polar), radians(self.at.azimuth) - turn
@@ -129,6 +150,13 @@ class IndentationSection(PathStep):
     def refuse_unfit_place(
         self, step: ProgrammeStep, context: Context, outline: "Outline", chart_place: Array
     ) -> None:
+        """Check that the patch of the force fits between its place and the shell's edge.
+
+        Raises
+        ------
+        CaseError
+            With the radii that are allowed, over h.
+        """
         width = getattr(context.shell, "width", None) if context.shell.geometry == "strip" else None
         distance_to_edge = (
             outline.edge - float(np.hypot(*chart_place[:2]))
@@ -146,9 +174,16 @@ class IndentationSection(PathStep):
     def mesh_features(
         cls, loads: Sequence[Self], place: Array, sizing: SizingContext
     ) -> list[Feature]:
-        """Return small elements in the dent too.
+        """Return the discs of small elements for the dent and for the patch of the force.
 
-        By mirror buckling the radius of its ridge is about sqrt(2 R w).
+        By mirror buckling the radius of the dent's ridge is about sqrt(2 R w) at a depth w.
+
+        Parameters
+        ----------
+        loads
+            The sections of forces at this place.
+        place
+            Coordinates of the place in the chart.
         """
         h, (x, y) = sizing.h, map(float, place)
         patch = min(load.patch for load in loads)
@@ -165,12 +200,14 @@ class IndentationSection(PathStep):
         return 0.5 if sizing.solid else 0.6  # far from the ridge degree 2 needs more than degree 4
 
     def rim(self, sizing: SizingContext) -> float:
-        """Return larger elements for a shell than a solid: the edge of a hemisphere is far from a
-        dent.
+        """Return the size of elements along the edge over sqrt(Rh); larger for a shell.
+
+        The edge of a hemisphere is far from a dent.
         """
         return 2.0 if sizing.solid else 2.8
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
+        """Return `forces` of the model's `Loads`: the step's amplitude -> the force."""
         from magshell_fenicsx.models.shell.parameters import (
             Force,
         )  # the solver takes long to import
@@ -182,6 +219,11 @@ class IndentationSection(PathStep):
         }
 
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
+        """Return the first change of the force, in its unit 2 pi D/R.
+
+        Towards the top of an energy barrier it is small. Under a prescribed force it is an equal
+        part of the way, otherwise one.
+        """
         if self.until == "zero":
             return LEAST_HUMP
         return change / self.points if self.control == "load" else copysign(1.0, change)

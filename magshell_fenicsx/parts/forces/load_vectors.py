@@ -51,7 +51,15 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Weighted:
-    """A measure with its density."""
+    """A measure with a density: integrand * Weighted is the form of the weighted integral.
+
+    Attributes
+    ----------
+    weight
+        Density of the measure, such as undeformed area per reference area.
+    measure
+        A ufl measure.
+    """
 
     weight: Expr
     measure: ufl.Measure
@@ -60,7 +68,13 @@ class Weighted:
         return integrand * self.weight * self.measure
 
     def total(self, V: fem.FunctionSpace, log: KernelLog, name: str = "load measure") -> float:
-        """Return the length, area or whatever it measures; collective."""
+        """Return the integral of one, such as a length or an area; collective.
+
+        Parameters
+        ----------
+        name
+            Name of the kernel in the log.
+        """
         form = log.compile(name, fem.Constant(V.mesh, 1.0) * self)
         return float(V.mesh.comm.allreduce(fem.assemble_scalar(form)))
 
@@ -72,7 +86,19 @@ def load_entries(
     log: KernelLog,
     name: str = "load vector",
 ) -> Entries:
-    """Return the owned entries of l with l . u = integral of direction . u."""
+    """Return the owned entries of l with l . u = integral of direction . u; collective.
+
+    They are local numbers of degrees of freedom, and values.
+
+    Parameters
+    ----------
+    direction
+        Vector (3,) density of the load.
+    measure
+        Weighted measure of the integral.
+    log, name
+        Compiles the form, which has this name there.
+    """
     load = fem.assemble_vector(log.compile(name, ufl.dot(direction, ufl.TestFunction(V)) * measure))
     load.scatter_reverse(InsertMode.add)
     dofs = np.flatnonzero(load.array[: 3 * V.dofmap.index_map.size_local]).astype(np.int32)
@@ -80,7 +106,7 @@ def load_entries(
 
 
 def smooth(x: Expr, radius: Expr) -> Expr:
-    """Return (1 - x.x/radius^2)^2 within the radius: 1 in the middle of a patch, 0 at its rim."""
+    """Return the weight (1 - x.x/radius^2)^2 within a radius of x = 0, and 0 outside."""
     depth = 1 - ufl.dot(x, x) / radius**2
     return ufl.conditional(ufl.gt(depth, 0), depth**2, 0)
 
@@ -92,29 +118,34 @@ def averaged(
     log: KernelLog,
     radius: float | None = None,
 ) -> Entries:
-    """Return l with l . u = average of direction . u; the total is exact on any mesh.
+    """Return the entries of l with l . u = average of direction . u; collective.
+
+    The average is by the same quadrature as its weight, so that the total force is exact on any
+    mesh.
 
     Parameters
     ----------
+    direction
+        The force (3,).
     radius
-        Of the `smooth` patch on a surface whose area must be known to the mesh.
+        Radius over R of a `smooth` patch, whose integral the mesh must resolve; None: no check.
 
     Raises
     ------
     MeshError
-        On every rank, if the mesh is too coarse to know the patch.
+        On every rank, if the mesh is too coarse for the patch.
     """
-    total = measure.total(V, log, "patch weight")
+    weight_integral = measure.total(V, log, "patch weight")
     if (
         radius is not None
-        and not MIN_PATCH_SHARE <= total / (np.pi * radius**2 / 3) <= 1 / MIN_PATCH_SHARE
+        and not MIN_PATCH_SHARE <= weight_integral / (np.pi * radius**2 / 3) <= 1 / MIN_PATCH_SHARE
     ):
         raise MeshError(
             f"loading.patch: its radius is {radius:.3g} R, which the mesh is too coarse for: "
             "choose a smaller mesh.size, or 0 for a force at a point"
         )
     dofs, values = load_entries(V, fem.Constant(V.mesh, direction), measure, log, "patch load")
-    return dofs, np.asarray(values / total)
+    return dofs, np.asarray(values / weight_integral)
 
 
 def point_entries(
@@ -123,12 +154,18 @@ def point_entries(
     direction: NDArray[np.float64],
     cells: Inside | None = None,
 ) -> Entries:
-    """Return l with l . u = direction . u(x) for a vertex x: owned degrees of freedom and values.
+    """Return the owned entries of l with l . u = direction . u(x) for a vertex x (3,).
+
+    They are local numbers of degrees of freedom, and values; empty on other ranks.
 
     Parameters
     ----------
+    x
+        Undeformed place of the vertex over R.
+    direction
+        The force (3,).
     cells
-        The cells that may have the vertex; None for all.
+        Flags of the local cells that may have the vertex; None for all.
     """
     dofs_at_x = fem.locate_dofs_geometrical(
         V, lambda points: np.linalg.norm(points.T - x, axis=1) < 1e-9
@@ -149,26 +186,34 @@ def patch_entries(
     log: KernelLog,
     cells: Inside | None = None,
 ) -> Entries:
-    """Return l with l . u = average of direction . u around x, with weight (1 - d^2/radius^2)^2.
+    """Return the entries of l with l . u = average of direction . u around x; collective.
 
-    d is the distance from x in space. The weight's integral is taken with the same quadrature, so
-    that the total force is exact on any mesh.
+    The weight is (1 - d^2/radius^2)^2, with d the distance from x in space. Its integral is taken
+    with the same quadrature, so that the total force is exact on any mesh.
 
     Parameters
     ----------
+    r0
+        Undeformed placement over R.
+    x, radius
+        Centre (3,) and radius of the patch over R.
+    direction
+        The force (3,).
+    degree
+        Degree of the placement; the quadrature has twice as much.
     cells
-        The cells that the patch may be on; None for all.
+        Flags of the local cells that the patch may be on; None for all.
 
     Raises
     ------
     MeshError
-        On every rank, if the mesh is too coarse to know the patch.
+        On every rank, if the mesh is too coarse for the patch.
     """
     V = r0.function_space
     domain = V.mesh
-    centre, a = (fem.Constant(domain, v) for v in (x, radius))
+    centre, patch_radius = (fem.Constant(domain, v) for v in (x, radius))
     dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree})
-    weight = smooth(r0 - centre, a) * kin.area_ratio(kin.jet(r0, domain))
+    weight = smooth(r0 - centre, patch_radius) * kin.area_ratio(kin.jet(r0, domain))
     weight = weight if cells is None else weight * patch_indicator(domain, cells)
     return averaged(V, direction, Weighted(weight, dx), log, radius)
 
@@ -176,40 +221,58 @@ def patch_entries(
 def vertex_normal(
     r0: fem.Function, x: NDArray[np.float64], cells: Inside | None = None
 ) -> NDArray[np.float64]:
-    """Return the unit normal (3,) of the undeformed mid-surface at a vertex.
+    """Return the unit normal (3,) of the undeformed mid-surface at a vertex; collective.
 
-    It is averaged over its triangles, or over some of them.
+    It is the mean of its triangles' normals, weighted by areas.
 
     Parameters
     ----------
+    x
+        Place (3,) of the vertex in the mesh's geometry.
     cells
-        Flags of the cells that count; None for all.
+        Flags of the local cells that count; None for all.
     """
     _, is_at_vertex, (a1, a2) = _corners(r0, x, cells)
-    total = r0.function_space.mesh.comm.allreduce(
+    area_vector = r0.function_space.mesh.comm.allreduce(
         np.cross(a1[is_at_vertex], a2[is_at_vertex]).sum(axis=0)
     )
-    return np.asarray(total / np.linalg.norm(total))
+    return np.asarray(area_vector / np.linalg.norm(area_vector))
 
 
 def by_vertex_normal(r0: fem.Function, x: Array, v: Array, cells: Inside | None = None) -> Array:
-    """Return derivatives (own cells, nodes, 3) of the normal's component along v by nodes;
-    collective.
+    """Return derivatives (own cells, nodes, 3) of v . n by the nodes; collective.
+
+    n is the `vertex_normal` at x.
+
+    Parameters
+    ----------
+    x, v
+        Place (3,) of the vertex, and a vector (3,).
+    cells
+        Flags of the local cells that count; None for all.
     """
     table, is_at_vertex, (a1, a2) = _corners(r0, x, cells)
-    total = r0.function_space.mesh.comm.allreduce(
+    area_vector = r0.function_space.mesh.comm.allreduce(
         np.cross(a1[is_at_vertex], a2[is_at_vertex]).sum(axis=0)
     )
-    size = np.linalg.norm(total)
-    p = (v - total * (total @ v) / size**2) / size
+    area = np.linalg.norm(area_vector)
+    # n = t/|t| of the sum t of area vectors: its component along v has the gradient p by t
+    p = (v - area_vector * (area_vector @ v) / area**2) / area
     by_tangents = np.stack([np.cross(a2, p), np.cross(p, a1)]) * is_at_vertex[..., None]
     return np.asarray(np.einsum("dvk,dcvi->cki", table, by_tangents))
 
 
 def _corners(r0: fem.Function, x: Array, cells: Inside | None) -> tuple[Array, Inside, Array]:
-    """Return derivatives of shape functions, corners at a vertex, and tangents at corners.
+    """Return shape function gradients, flags of corners at a vertex, and tangents at corners.
 
-    They are (2, corners, nodes), flags (own cells, corners) and (2, own cells, corners, 3).
+    Returns
+    -------
+    gradients
+        (2, corners, nodes) derivatives of shape functions at corners.
+    is_at_vertex
+        (own cells, corners) whether the corner is at the vertex x, in cells that count.
+    tangents
+        (2, own cells, corners, 3) undeformed tangents.
     """
     V = r0.function_space
     corners = basix.geometry(basix.CellType.triangle)
@@ -224,18 +287,30 @@ def _corners(r0: fem.Function, x: Array, cells: Inside | None) -> tuple[Array, I
 
 
 def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Modelled) -> DeadLoad:
-    """Return a load as the model takes it; `name` is for its energy, if it has one."""
+    """Return a load of the case as the model takes it: dimensionless and in the model's frame.
+
+    A force that the mirror planes share is divided by the number of copies.
+
+    Parameters
+    ----------
+    load
+        Section of the case.
+    name
+        Name of its energy, if the load is a potential.
+    context, modelled
+        The case around the load, and the part of the shell that is modelled.
+    """
     mirror = modelled.mirror
     is_shared = mirror is not None and (
         load.edge is None or mirror.image_of_edge(load.edge) == load.edge
     )
     Q, scales = rotation(modelled.turn), context.scales
-    E, t, R = scales.E, scales.h, scales.R
+    E, thickness, R = scales.E, scales.h, scales.R
     if load.potential is not None:
         return Potential(potential(name, load.potential, Q, scales))
     if load.varies:
-        unit = E * t if load.edge else E * t / R
-        pattern = _pattern(load, Q, R, 1 / unit)
+        load_unit = E * thickness if load.edge else E * thickness / R
+        pattern = _pattern(load, Q, R, 1 / load_unit)
         return (
             EdgeForce(load.edge, pattern, total=False)
             if load.edge
@@ -244,25 +319,28 @@ def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Mode
     force = np.asarray(
         (1 / mirror.copies if mirror and is_shared else 1.0)
         * (Q @ (load.force or np.zeros(3)))
-        / (E * t * R)
+        / (E * thickness * R)
     )
     if load.at is not None:
         return PointForce(load.at, force)
     if load.edge is not None and load.moment is not None:
-        return EdgeMoment(load.edge, load.moment / (E * t * R))
+        return EdgeMoment(load.edge, load.moment / (E * thickness * R))
     if load.edge is not None and load.force is not None:
         return EdgeForce(load.edge, force, total=True)
     if load.edge is not None:
         assert load.per_length is not None
         return EdgeForce(
-            load.edge, np.asarray(Q @ np.array(load.per_length, dtype=float) / (E * t)), total=False
+            load.edge,
+            np.asarray(Q @ np.array(load.per_length, dtype=float) / (E * thickness)),
+            total=False,
         )
     if load.pressure is not None:
         assert isinstance(load.pressure, float | int)
-        return AreaForce(_patch_of_load(load), load.pressure * R / (E * t))
+        return AreaForce(_patch_of_load(load), load.pressure * R / (E * thickness))
     assert load.per_area is not None
     return AreaForce(
-        _patch_of_load(load), np.asarray(Q @ np.array(load.per_area, dtype=float) * R / (E * t))
+        _patch_of_load(load),
+        np.asarray(Q @ np.array(load.per_area, dtype=float) * R / (E * thickness)),
     )
 
 
@@ -272,7 +350,19 @@ def _patch_of_load(load: DeadLoadSection) -> str | None:
 
 
 def _pattern(load: DeadLoadSection, Q: Array, length: float, factor: float) -> Pattern:
-    """Return the load of a formula in the model's frame; a pressure is against the normal."""
+    """Return a load by formula as a pattern: a function of places and normals in the model's frame.
+
+    A pressure is against the normal.
+
+    Parameters
+    ----------
+    Q
+        (3, 3) rotation from the case's frame to the model's frame.
+    length
+        Length R in the unit of the formula's places.
+    factor
+        Factor of the formula's values.
+    """
     if load.vector is not None:
         return FormulaVectors(
             [formula_function(v) for v in load.vector], Q, length, factor, vectors=True
@@ -282,7 +372,7 @@ def _pattern(load: DeadLoadSection, Q: Array, length: float, factor: float) -> P
 
 
 def account(context: Context, loads: Loads) -> Account:
-    """Return the forces and dead loads."""
+    """Return the lines of `magshell check` on forces and dead loads."""
     patches = [force.patch * context.shell.R_over_h for force in loads.forces.values()]
     lines = [
         f"force on a patch of radius {patch:g} h" if patch else "force at a point"
@@ -294,46 +384,48 @@ def account(context: Context, loads: Loads) -> Account:
 
 
 class Measures(Protocol):
-    """The measures of the points, edges and surfaces of a model, for loads.
+    """The measures of the points, edges and surfaces of a model, on which loads act.
 
     Attributes
     ----------
     normal
-        The undeformed outward normal.
+        The undeformed outward unit normal, as a UFL expression.
     """
 
     normal: Expr
 
     def edge(self, name: str) -> Weighted:
-        """Return the undeformed length of a named edge."""
+        """Return the measure of undeformed length on a named edge."""
 
     def area(self, patch: str | None) -> Weighted:
-        """Return the undeformed area of a named patch, or of all."""
+        """Return the measure of undeformed area on a named patch; None for all."""
 
     def field(self, pattern: Pattern, edge: str | None) -> tuple[Expr, float | None]:
-        """Return a pattern on the undeformed surface or an edge, and its integral
-        (`pattern_field`).
+        """Return a pattern as a field on the surface or a named edge, and the integral of its size.
+
+        The integral is None where it is not known; see `pattern_field`. Collective.
         """
 
     def at_point(self, name: str, force: NDArray[np.float64]) -> Entries:
-        """The load vector of a force at a named vertex."""
+        """Return the owned entries of the load vector of a force (3,) at a named vertex."""
 
 
 @dataclass(frozen=True)
 class DeadLoads:
-    """The sum of dead loads.
+    """The sum of the dead loads of one amplitude.
 
     Attributes
     ----------
     entries
-        l with l . u = their work at u, in E h R^2.
+        Owned entries of the load vector l, where l . u is the work of the loads at u, over E h R^2.
     size
-        The sum of their sizes over E h R: of a force its length, of a distributed one that of its
-        integral's density.
+        The sum of the loads' sizes over E h R. The size of a force is its length. That of a
+        distributed load is the integral of its density's length.
     spread
-        Of distributed loads: the density, its measure, and whether it has been divided by that.
+        For each distributed load its density, its measure, and whether the density is a total force
+        divided by the measure.
     sizes
-        `size` as forms, where it depends on the placement.
+        Parts of `size` as forms, where it depends on the placement.
     """
 
     entries: Entries
@@ -343,14 +435,14 @@ class DeadLoads:
 
 
 class _DeadLoadSum:
-    """The sum of dead loads while it is made; collective.
+    """The sum of dead loads while it is made; all methods are collective.
 
     Attributes
     ----------
     parts
-        The entries of each load.
+        Entries of the load vector of each load.
     size, densities, sizes
-        See `DeadLoads`.
+        See `DeadLoads`; `densities` is `spread` there.
     """
 
     def __init__(self, V: fem.FunctionSpace, measures: Measures, log: KernelLog) -> None:
@@ -360,7 +452,7 @@ class _DeadLoadSum:
         self.sizes = list[ufl.Form]()
 
     def add(self, load: DeadLoad) -> None:
-        """Add a load; moments and potentials have no load vectors."""
+        """Add a load to the sum; moments and potentials have no load vectors."""
         if isinstance(load, PointForce):
             self.parts.append(self._measures.at_point(load.point, load.force))
             self.size += float(np.linalg.norm(load.force))
@@ -372,6 +464,7 @@ class _DeadLoadSum:
             assert isinstance(load, EdgeMoment | Potential)
 
     def _add_edge_force(self, load: EdgeForce) -> None:
+        """Add a force on an edge: a total, a density, or a pattern."""
         ds = self._measures.edge(load.edge)
         if callable(load.force):
             self._add_pattern(load.force, ds, load.edge)
@@ -383,6 +476,7 @@ class _DeadLoadSum:
         self.size += strength * length
 
     def _add_area_force(self, load: AreaForce) -> None:
+        """Add a force per area: a pressure against the normal, a vector, or a pattern."""
         dx = self._measures.area(load.patch)
         if callable(load.force):
             self._add_pattern(load.force, dx, is_part=load.patch is not None)
@@ -399,7 +493,15 @@ class _DeadLoadSum:
     def _add_pattern(
         self, pattern: Pattern, measure: Weighted, edge: str | None = None, *, is_part: bool = False
     ) -> None:
-        """Add a pattern and the integral of its size, which is known for all of a surface."""
+        """Add a pattern, and the integral of its length.
+
+        Parameters
+        ----------
+        edge
+            Name of its edge; None for a surface.
+        is_part
+            Whether it is on a patch, where the integral is not known from the pattern.
+        """
         density, known_size = self._measures.field(pattern, edge)
         strength = ufl.sqrt(ufl.dot(density, density))
         self._add_density(density, measure, strength)
@@ -412,12 +514,21 @@ class _DeadLoadSum:
     def _add_density(
         self, density: Expr, measure: Weighted, strength: Expr | float, *, is_total: bool = False
     ) -> None:
-        """Add a density on a measure; of a total force it has been divided by the length."""
+        """Add a load density (3,) on a measure.
+
+        Parameters
+        ----------
+        strength
+            Length of the density.
+        is_total
+            Whether the density is a total force over the length of its edge: then the load's size
+            does not depend on the placement.
+        """
         self.parts.append(load_entries(self._V, density, measure, self._log))
         self.densities.append((density, measure, is_total))
         if not is_total:
-            size = self._constant(strength) if isinstance(strength, float) else strength
-            self.sizes.append(size * measure)
+            strength_form = self._constant(strength) if isinstance(strength, float) else strength
+            self.sizes.append(strength_form * measure)
 
     def _constant(self, value: float | Array) -> fem.Constant:
         return fem.Constant(self._V.mesh, value)
@@ -426,7 +537,7 @@ class _DeadLoadSum:
 def assemble_dead_loads(
     loads: Sequence[DeadLoad], V: fem.FunctionSpace, measures: Measures, log: KernelLog
 ) -> DeadLoads:
-    """Return the load vector of all dead loads but the moments; collective."""
+    """Return the load vector of all dead loads except moments and potentials; collective."""
     load_sum = _DeadLoadSum(V, measures, log)
     for load in loads:
         load_sum.add(load)
@@ -439,16 +550,31 @@ def assemble_dead_loads(
 
 
 def patch_indicator(domain: mesh.Mesh, patch: NDArray[np.bool_]) -> fem.Function:
-    """Return one in the cells of a patch, zero in the others."""
+    """Return a field that is one in the cells of a patch, zero in the others.
+
+    Parameters
+    ----------
+    patch
+        (cells,) flags of local cells, ghosts included.
+    """
     indicator = fem.Function(fem.functionspace(domain, ("DG", 0)))
     indicator.x.array[indicator.function_space.dofmap.list[:, 0]] = patch
     return indicator
 
 
 class SurfaceMeasures:
-    """The `Measures` of a mid-surface."""
+    """The `Measures` of a mid-surface.
+
+    Parameters
+    ----------
+    r0
+        Undeformed placement over R.
+    degree
+        Degree of the placement.
+    """
 
     def __init__(self, r0: fem.Function, midsurface: Midsurface, degree: int) -> None:
+        """Take the undeformed placement, whose jet gives normals and areas."""
         self._V, self._midsurface, self._degree, self._r0 = (
             r0.function_space,
             midsurface,
@@ -459,6 +585,7 @@ class SurfaceMeasures:
         self.normal = kin.normal(self._j0)
 
     def edge(self, name: str) -> Weighted:
+        """Return the measure of undeformed length on a named edge."""
         domain, facets = self._midsurface.mesh, self._midsurface.edges[name]
         tags = mesh.meshtags(domain, 1, facets, np.ones_like(facets))
         rule = {"quadrature_degree": edge_quadrature(self._degree) + 2}
@@ -466,6 +593,7 @@ class SurfaceMeasures:
         return Weighted(kin.conormal(self._j0, kin.facet_covector(domain))[2], ds)
 
     def area(self, patch: str | None) -> Weighted:
+        """Return the measure of undeformed area on a named patch; None for all."""
         domain = self._midsurface.mesh
         dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * self._degree})
         weight = kin.area_ratio(self._j0)
@@ -474,6 +602,7 @@ class SurfaceMeasures:
         return Weighted(weight, dx)
 
     def field(self, pattern: Pattern, edge: str | None) -> tuple[Expr, float | None]:
+        """Return a pattern as a field, and the integral of its size, see `Measures`."""
         if edge is None:
             return pattern_field(pattern, self._r0, ADDED_LOAD_DEGREE)
         return pattern_on_edge(pattern, self._r0, self._midsurface.edges[edge], ADDED_LOAD_DEGREE)

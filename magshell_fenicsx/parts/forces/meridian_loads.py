@@ -30,7 +30,18 @@ Integral = Callable[[Expr], ufl.Form]
 
 @dataclass(frozen=True)
 class RevolutionIntegrals:
-    """Integrals over parts of a surface of revolution, per radian as those of its domain."""
+    """Integrals over parts of a surface of revolution, per radian.
+
+    The methods `end`, `pole`, `area` and `patch` return an integral as a function: from an
+    integrand to its form.
+
+    Attributes
+    ----------
+    meridian, domain
+        The meridian, and the integrals of its forms.
+    parts, measures
+        Facets of ends and points, and the measure of each within one measure of the boundary.
+    """
 
     meridian: Meridian
     domain: IntegrationDomain
@@ -38,7 +49,10 @@ class RevolutionIntegrals:
     measures: Sequence[ufl.Measure] = ()
 
     def with_parts(self, loads: Sequence[DeadLoad]) -> "RevolutionIntegrals":
-        """Return these integrals, with one measure for all ends and points of a form."""
+        """Return these integrals with one boundary measure for all ends and points of some loads.
+
+        A form may have only one measure of the boundary.
+        """
         parts = list[Facets]()
         for load in forces(loads):
             if isinstance(load, AreaForce):
@@ -53,23 +67,27 @@ class RevolutionIntegrals:
         return replace(self, parts=parts, measures=self.domain.measures_on(parts) if parts else [])
 
     def _ds(self, facets: Facets) -> ufl.Measure:
+        """Return the measure of facets: of the part that has them, else one of their own."""
         pairs = zip(self.parts, self.measures, strict=True)
         return next(
             (ds for part, ds in pairs if np.array_equal(part, facets)), None
         ) or self.domain.ds(facets)
 
     def end(self, name: str, *, mean: bool = False) -> Integral:
-        """Return the integral along the undeformed circle of an end, or the mean over that."""
+        """Return the integral along the undeformed circle of a named end.
+
+        With `mean` it is the mean there, over 2 pi, as integrals are per radian.
+        """
         ds = self._ds(self.meridian.ends[name])
         return lambda f: f / (2 * np.pi) * ds if mean else f * self.domain.r0[0] * ds
 
     def pole(self, point: str) -> Integral:
-        """Return the value at a point on the axis, over 2 pi."""
+        """Return the value at a named point on the axis, over 2 pi."""
         ds = self._ds(self.meridian.facets_at(point))
         return lambda f: f / (2 * np.pi) * ds
 
     def area(self, load: AreaForce) -> Integral:
-        """Return the integral over the undeformed area, or that of one of several shells."""
+        """Return the integral over the undeformed area, or over the patch of a load."""
         integral = self.domain.over_area()
         if load.patch is None:
             return integral
@@ -77,8 +95,9 @@ class RevolutionIntegrals:
         return lambda f: integral(indicator * f)
 
     def patch(self, radius: float, point: str) -> Integral:
-        """Return the integral of f (1 - d^2/radius^2)^2, with d the distance from a point on the
-        axis.
+        """Return the integral weighted by (1 - d^2/radius^2)^2 within a radius, over R.
+
+        d is the distance from a named point on the axis.
         """
         parameter = np.array([self.meridian.points[point][0]])
         a, pole = (
@@ -95,12 +114,14 @@ def dead_loads(
 ) -> tuple[Energy, float, Sequence[ufl.Form]]:
     """Return the energy of dead loads without moments, the sum of their sizes, and its forms.
 
-    Vectors are along e3, and points are on the axis. Sizes are over E h R.
+    Vectors are along e3, and points are on the axis. Sizes are over E h R, see `DeadLoads`.
 
     Parameters
     ----------
     name
-        Of the amplitude.
+        Name of the amplitude.
+    loads
+        The dead loads, of which moments and potentials are passed over.
     """
     terms, size, sizes, integrals = (
         list[tuple[Expr, Integral]](),
@@ -148,25 +169,38 @@ def dead_loads(
 def pole_force(
     name: str, force: Force, unit: float, integrals: RevolutionIntegrals, log: KernelLog
 ) -> Energy:
-    """Return a force against the outward normal at a point on the axis, or over a patch there."""
+    """Return the energy of a force on the axis, against the outward normal.
+
+    The force is at a point, or on a patch around it.
+
+    Parameters
+    ----------
+    name
+        Name of the amplitude, the force over `unit`.
+    force
+        Point and patch of the force.
+    unit
+        Unit of the force over E h R.
+    """
     integral = (
         integrals.patch(force.patch, force.point) if force.patch else integrals.pole(force.point)
     )
     is_begin = np.isclose(
         integrals.meridian.cells[:, 0], integrals.meridian.points[force.point][0]
     ).any()  # the normal is e3 there
-    share = integrals.domain.constant(
+    density = integrals.domain.constant(
         (1.0 if is_begin else -1.0) * unit / _circumferential_integral(integral, integrals, log)
     )
-    return Energy(name, lambda u: integral(share * u.r[2]), name, linear=True)
+    return Energy(name, lambda u: integral(density * u.r[2]), name, linear=True)
 
 
 def _circumferential_integral(
     integral: Integral, integrals: RevolutionIntegrals, log: KernelLog
 ) -> float:
-    """Return the integral of 1, all around."""
+    """Return the integral of 1, all around the axis."""
     return _integral(integrals.domain.constant(1.0), integral, log)
 
 
 def _integral(f: Expr, integral: Integral, log: KernelLog) -> float:
+    """Return the integral of f all around the axis: 2 pi times that per radian."""
     return float(2 * np.pi * fem.assemble_scalar(log.compile("load measure", integral(f))))

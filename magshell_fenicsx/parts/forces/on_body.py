@@ -33,26 +33,39 @@ WEIGHT_DEGREE = 8  # quadrature degree of a patch's weight
 
 
 class BodyMeasures:
-    """The `Measures` of a body: a load of the mid-surface is spread evenly through the thickness.
+    """The `Measures` of a body in three dimensions, for loads of its mid-surface.
 
-    Resultants are the shell's where the mid-surface is flat, else to the order of (h/R)^2.
+    Loads are spread evenly through the thickness. Their resultants are the shell's where the
+    mid-surface is flat, else to the order of (h/R)^2.
+
+    Parameters
+    ----------
+    body
+        Mesh of the body.
+    V
+        Space of the displacement.
+    log
+        Compiles forms.
     """
 
     def __init__(self, body: BodyMesh, V: fem.FunctionSpace, log: KernelLog) -> None:
+        """Take the body's mesh, with its normals and the thickness as fields."""
         self._body, self._V, self._log = body, V, log
         J = ufl.Jacobian(body.mesh)
-        m = ufl.cross(J[:, 0], J[:, 1])
-        self.normal = m / ufl.sqrt(ufl.dot(m, m))
-        Q = fem.functionspace(body.mesh, ("Lagrange", 2))
-        self._thickness = fem.Function(Q)
-        self._thickness.x.array[:] = body.at_nodes(Q, body.thickness)
+        area_vector = ufl.cross(J[:, 0], J[:, 1])
+        self.normal = area_vector / ufl.sqrt(ufl.dot(area_vector, area_vector))
+        thickness_space = fem.functionspace(body.mesh, ("Lagrange", 2))
+        self._thickness = fem.Function(thickness_space)
+        self._thickness.x.array[:] = body.at_nodes(thickness_space, body.thickness)
 
     def edge(self, name: str) -> Weighted:
+        """Return the measure of undeformed length: the edge's face over the thickness."""
         return Weighted(
             1 / self._thickness, face_measure(self._body.mesh, [self._body.faces[name]])(1)
         )
 
     def area(self, patch: str | None) -> Weighted:
+        """Return the measure of undeformed area on a named patch: volume over the thickness."""
         body, weight = self._body, 1 / self._thickness
         if patch is not None:
             weight = weight * patch_indicator(body.mesh, patch_of(body.patches, patch))
@@ -61,29 +74,40 @@ class BodyMeasures:
         )
 
     def field(self, pattern: Pattern, edge: str | None) -> tuple[Expr, float | None]:
+        """Return the field of a pattern in the body, constant through the thickness; collective.
+
+        The pattern is taken on the mid-surface under each node. The integral of its size is not
+        known, hence None.
+        """
         nodes, normals = body_positions_and_normals(self._V)
-        z = self._body.at_nodes(
+        height = self._body.at_nodes(
             self._V, (self._body.heights - MIDSURFACE_HEIGHT) * self._body.thickness
         )[self._V.dofmap.list]
         field = fem.Function(
             fem.functionspace(self._V.mesh, ("DG", self._V.element.basix_element.degree, (3,)))
         )
-        vectors = pattern(nodes - z[..., None] * normals, normals)
+        vectors = pattern(nodes - height[..., None] * normals, normals)
         refuse_unbounded(vectors, nodes, self._V.mesh.comm, "loading.loads")
         if edge is None:
-            middle = replace(body_cell_geometry(self._V), nodal=nodes - z[..., None] * normals)
+            midsurface_cells = replace(
+                body_cell_geometry(self._V), nodal=nodes - height[..., None] * normals
+            )
             vectors = project_pattern(
-                pattern, middle, vectors, field.function_space.element.basix_element
+                pattern, midsurface_cells, vectors, field.function_space.element.basix_element
             ).nodal
         field.x.array.reshape(-1, 3)[field.function_space.dofmap.list] = vectors
         return field, None
 
     def at_point(self, name: str, force: Array) -> Entries:
-        """Return a force over a patch of the radius h, or of larger elements around the point."""
+        """Return the entries of a force (3,) over a patch around a named point; collective.
+
+        The patch has the radius h, or is as large as the elements around the point. It reaches
+        through the thickness.
+        """
         domain, x, n = self._body.mesh, self._body.points[name], self._body.normals[name]
         centre, normal = (fem.Constant(domain, v) for v in (x, n))
-        d = ufl.SpatialCoordinate(domain) - centre
-        height, h = ufl.dot(d, normal), thickness_at(self._body, x)
+        from_point = ufl.SpatialCoordinate(domain) - centre
+        height, h = ufl.dot(from_point, normal), thickness_at(self._body, x)
         radius = fem.Constant(domain, max(h, self._reach(x, n)))
         is_in_shell = ufl.conditional(
             ufl.lt(abs(height), fem.Constant(domain, h)), 1.0, 0.0
@@ -92,16 +116,22 @@ class BodyMeasures:
         return averaged(
             self._V,
             force,
-            Weighted(is_in_shell * smooth(d - height * normal, radius), dx),
+            Weighted(is_in_shell * smooth(from_point - height * normal, radius), dx),
             self._log,
         )
 
     def _reach(self, x: Array, n: Array) -> float:
-        """Return the distance from the normal line at x of the farthest node of the cells around
-        it.
+        """Return the largest distance over R of nodes around a point from the normal line there.
+
+        The nodes are those of the cells at the point; collective.
+
+        Parameters
+        ----------
+        x, n
+            (3,) place of the point, and unit normal.
         """
-        X = self._body.mesh.geometry.x[compat.geometry_dofs(self._body.mesh)] - x
-        cells_at_x = X[(np.linalg.norm(X, axis=2) < 1e-9).any(axis=1)]
+        from_x = self._body.mesh.geometry.x[compat.geometry_dofs(self._body.mesh)] - x
+        cells_at_x = from_x[(np.linalg.norm(from_x, axis=2) < 1e-9).any(axis=1)]
         from_normal = cells_at_x - (cells_at_x @ n)[..., None] * n
         return float(
             self._V.mesh.comm.allreduce(
@@ -111,7 +141,7 @@ class BodyMeasures:
 
 
 def thickness_at(body: BodyMesh, x: Array) -> float:
-    """Return h over R at a vertex of the mid-surface; collective."""
+    """Return the thickness over R at a vertex x (3,) of the mid-surface; collective."""
     is_at_x = np.linalg.norm(body.mesh.geometry.x - x, axis=1) < 1e-9
     return float(body.mesh.comm.allreduce(body.thickness[is_at_x].max(initial=0.0), MPI.MAX))
 
@@ -119,7 +149,15 @@ def thickness_at(body: BodyMesh, x: Array) -> float:
 def outer_patch(
     body: BodyMesh, V: fem.FunctionSpace, point: str, radius: float, log: KernelLog
 ) -> Entries:
-    """Return an inward force averaged over the outer face around a point, weighted by `smooth`."""
+    """Return the entries of an inward force averaged over a patch of the outer face; collective.
+
+    The weight is `smooth` around a named point.
+
+    Parameters
+    ----------
+    radius
+        Radius of the patch over R.
+    """
     x, normal = body.points[point], body.normals[point]
     values = x + thickness_at(body, x) / 2 * normal, radius
     centre, a = (fem.Constant(body.mesh, value) for value in values)

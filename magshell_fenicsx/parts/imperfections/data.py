@@ -1,4 +1,7 @@
-"""A measured imperfection: a smooth function through heights over the perfect surface."""
+"""A measured imperfection: a smooth function through heights over the perfect surface.
+
+w0 is the deviation along the outward normal. Places, lengths and w0 are over R from `Scan` on.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -96,7 +99,7 @@ class DataSection(FileKeys, ImperfectionSection):
 
 @dataclass(frozen=True)
 class Factored:
-    """A function of place times a factor; both over R."""
+    """A deviation: a fitted function of places (n, 3), times a factor; all over R."""
 
     function: "ScatteredSpline"
     factor: float
@@ -107,7 +110,7 @@ class Factored:
 
 @dataclass(frozen=True)
 class Lengths:
-    """The units of a case.
+    """The units of lengths of a case, to convert columns of a file.
 
     Attributes
     ----------
@@ -116,7 +119,7 @@ class Lengths:
     R
         Reference length in the case's length.
     si
-        Whether that is a metre.
+        Whether lengths of the case are in metres.
     """
 
     h: float
@@ -124,8 +127,14 @@ class Lengths:
     si: bool
 
     def over_R(self, unit: str | None, name: str) -> float:
-        """The size of a column's unit over R; without one, w0 is over h and a place in the case's
-        length.
+        """Return the size over R of the unit of the column `name`.
+
+        Without a unit (None), w0 is over h, and a place is in the case's length.
+
+        Raises
+        ------
+        TableError
+            If the column has a unit of length, and the case has none.
         """
         if unit in ("h", "R"):
             return self.h if unit == "h" else 1.0
@@ -141,23 +150,32 @@ class Lengths:
 
 @dataclass(frozen=True)
 class Scan:
-    """Columns of finite numbers, lengths over R and angles in rad; `lost` rows had others."""
+    """Measured places and perhaps deviations, in rows of finite numbers.
+
+    Attributes
+    ----------
+    columns
+        Name -> values (n,): lengths over R, angles in rad.
+    lost
+        Number of rows that had other values, and are left out.
+    """
 
     columns: dict[str, Array]
     lost: int
 
     @property
     def w0(self) -> Array | None:
+        """The measured deviations (n,); None if the places lie on the real surface themselves."""
         return self.columns.get("w0")
 
 
 def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
-    """Measured places and deviations of a file: CSV with a header, or .npz.
+    """Return the measured places and deviations of a file: CSV with a header, or .npz.
 
     Raises
     ------
     TableError
-        If it cannot be read, or has not the columns.
+        If the file cannot be read, or lacks the columns.
     """
     columns, units = read_table(file, files or Files())
     place_columns = next(
@@ -190,6 +208,7 @@ def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
 
 
 def _factor(unit: str | None, name: str, lengths: Lengths) -> float:
+    """Return the size of the unit of a column: over R, or of an angle in rad."""
     if name not in ANGLES:
         return lengths.over_R(unit, name)
     if unit not in (None, "deg", "degree", "degrees", "°", "rad"):
@@ -198,6 +217,18 @@ def _factor(unit: str | None, name: str, lengths: Lengths) -> float:
 
 
 def _finite_rows(names: Sequence[str], columns: Sequence[Array]) -> Scan:
+    """Return the rows of columns in which all numbers are finite.
+
+    Parameters
+    ----------
+    names, columns
+        Names, and values of each, which broadcast to one shape.
+
+    Raises
+    ------
+    TableError
+        If shapes differ, there are too many rows, or too few of finite numbers.
+    """
     try:
         rows = np.column_stack([np.ravel(column) for column in np.broadcast_arrays(*columns)])
     except ValueError:
@@ -218,14 +249,27 @@ def _finite_rows(names: Sequence[str], columns: Sequence[Array]) -> Scan:
 
 @dataclass(frozen=True)
 class _Fit:
+    """A fitted deviation over R, the element size over R that resolves it, and words about it."""
+
     function: "ScatteredSpline"
     size: float
     account: str
 
 
 def _fit_of_scan(standard: float | None, scan: Scan, reference: ReferenceShell) -> _Fit:
-    """The smooth function; `standard` is the standard deviation of the noise over h, None to
-    estimate it.
+    """Return the smooth function through the deviations of a scan.
+
+    Parameters
+    ----------
+    standard
+        Standard deviation of the noise over h; None to estimate it.
+    reference
+        The shell without the imperfection.
+
+    Raises
+    ------
+    TableError
+        If deviations are too large, or the values leave a hole that is too large to guess.
     """
     import scipy
 
@@ -245,6 +289,7 @@ def _fit_of_scan(standard: float | None, scan: Scan, reference: ReferenceShell) 
         )
     count = len(w0)
     tree = scipy.spatial.cKDTree(places)
+    # the eighth neighbour of a place is taken to be 1.7 spacings away
     spacing = float(np.median(tree.query(places, [9])[0])) / 1.7
     distances = tree.query(surface)[0]
     if distances.max() > max(MAX_HOLE * sqrt(h), MAX_HOLE_OVER_SPACING * spacing):
@@ -273,7 +318,21 @@ def _fit_of_scan(standard: float | None, scan: Scan, reference: ReferenceShell) 
 
 
 def _on_surface(scan: Scan, reference: ReferenceShell, surface: Array) -> tuple[Array, Array]:
-    """Places (n, 3) of the perfect surface and w0 (n,), over R."""
+    """Return places (n, 3) on the perfect surface and deviations w0 (n,) of a scan, both over R.
+
+    Columns of angles give places on a sphere or a cylinder. Other places are moved to the feet of
+    their normals; without measured deviations, w0 is their height above the surface.
+
+    Parameters
+    ----------
+    surface
+        Places (m, 3) all over the perfect surface.
+
+    Raises
+    ------
+    TableError
+        If places are not of this shell, or do not agree with w0.
+    """
     import scipy
 
     columns, w0 = scan.columns, scan.w0
@@ -313,31 +372,40 @@ def _on_surface(scan: Scan, reference: ReferenceShell, surface: Array) -> tuple[
 
 
 def _averaged_in_cubes(places: Array, w0: Array, distance: float) -> tuple[Array, Array]:
-    """Means over cubes of this size, so that no two places are the same."""
-    _, cell = np.unique(np.floor(places / distance).astype(np.int64), axis=0, return_inverse=True)
-    cell = cell.ravel()
-    count = np.bincount(cell)
-    return np.column_stack([np.bincount(cell, c) / count for c in places.T]), np.bincount(
-        cell, w0
+    """Return the means of places (n, 3) and of w0 (n,) over cubes, so that no two places are equal.
+
+    `distance` is the side of the cubes over R.
+    """
+    _, cube = np.unique(np.floor(places / distance).astype(np.int64), axis=0, return_inverse=True)
+    cube = cube.ravel()
+    count = np.bincount(cube)
+    return np.column_stack([np.bincount(cube, c) / count for c in places.T]), np.bincount(
+        cube, w0
     ) / count
 
 
 def _sharpest_bend(function: "ScatteredSpline", x: Array, length: float) -> float:
-    """1/k of the shortest wave sin(k x) that a function resembles, from its second differences over
-    a length over R.
+    """Return 1/k of the shortest wave sin(k x) that a function resembles.
+
+    It is infinite for a constant function.
+
+    The second differences at places `x` (n, 3) show the sharpest bend. They are over 0.7 times
+    `length`, which is over R.
     """
     x = x[:: max(1, len(x) // 2000)]
     w, d = function(x), 0.7 * length
-    bent = sum(np.abs(function(x + d * e) - 2 * w + function(x - d * e)) for e in np.eye(3)) / d**2
-    largest = float(np.nanmax(bent))
+    second_differences = (
+        sum(np.abs(function(x + d * e) - 2 * w + function(x - d * e)) for e in np.eye(3)) / d**2
+    )
+    largest = float(np.nanmax(second_differences))
     return float(np.sqrt(np.ptp(w) / 2 / largest)) if largest > 0 else inf
 
 
 def feet(perfect: "Outline", x: Array) -> tuple[Array, Array]:
-    """Feet (n, 3) of the normals through places x (n, 3), all over R, and the heights (n,) of these
-    above the surface.
+    """Return feet (n, 3) of normals through places x (n, 3), and heights (n,) of the places.
 
-    Of a mesh file, on quadrics through its nodes.
+    All are over R; heights are above the perfect surface, along its outward normal. On a mesh file
+    the surface is made of quadrics through its nodes.
     """
     import scipy
 
@@ -347,8 +415,10 @@ def feet(perfect: "Outline", x: Array) -> tuple[Array, Array]:
         r = np.linalg.norm(x, axis=1)
         return x / r[:, None], r - 1
     sample = perfect.sample()
-    nearest, of_nearest = np.unique(scipy.spatial.cKDTree(sample).query(x)[1], return_inverse=True)
-    chart = np.array([perfect.inverse(place) for place in sample[nearest]])[of_nearest]
+    nearest, row_of_place = np.unique(
+        scipy.spatial.cKDTree(sample).query(x)[1], return_inverse=True
+    )
+    chart = np.array([perfect.inverse(place) for place in sample[nearest]])[row_of_place]
     for _ in range(
         NEWTON_STEPS
     ):  # Gauss and Newton's, which converges as fast as w0 is small against the radius of curvature
@@ -356,9 +426,11 @@ def feet(perfect: "Outline", x: Array) -> tuple[Array, Array]:
             (perfect.perfect(chart + e) - perfect.perfect(chart - e)) / (2 * CHART_STEP)
             for e in CHART_STEP * np.eye(2)
         ]
-        J = np.stack(tangents, axis=-1)
-        residual = np.einsum("nij,ni->nj", J, x - perfect.perfect(chart))
-        step = np.linalg.solve(np.einsum("nij,nik->njk", J, J), residual[..., None])[..., 0]
+        tangents_matrix = np.stack(tangents, axis=-1)
+        residual = np.einsum("nij,ni->nj", tangents_matrix, x - perfect.perfect(chart))
+        step = np.linalg.solve(
+            np.einsum("nij,nik->njk", tangents_matrix, tangents_matrix), residual[..., None]
+        )[..., 0]
         chart = chart + np.clip(step, -0.2, 0.2)
         if np.abs(step).max() < 1e-12:
             break
@@ -367,7 +439,16 @@ def feet(perfect: "Outline", x: Array) -> tuple[Array, Array]:
 
 
 def _on_quadrics(nodes: Array, x: Array) -> tuple[Array, Array]:
-    """The same from nodes (m, 6): places and normals."""
+    """Return feet (n, 3) and heights (n,) of places x (n, 3) on quadrics through nodes.
+
+    Each place has the quadric z(s, t) through the nodes nearest to it, in the frame of the tangents
+    and the normal at the nearest node.
+
+    Parameters
+    ----------
+    nodes
+        (m, 6) places and normals.
+    """
     import scipy
 
     nodes = np.unique(nodes.round(14), axis=0)
@@ -375,9 +456,10 @@ def _on_quadrics(nodes: Array, x: Array) -> tuple[Array, Array]:
     nearest = tree.query(x, NODES_PER_QUADRIC)[1]
     centre, normal = nodes[nearest[:, 0], :3], nodes[nearest[:, 0], 3:]
     normal = normal / np.linalg.norm(normal, axis=1)[:, None]
-    first = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal), axis=1)])
-    first /= np.linalg.norm(first, axis=1)[:, None]
-    frame = np.stack([first, np.cross(normal, first), normal], axis=1)
+    first_tangent = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal), axis=1)])
+    first_tangent /= np.linalg.norm(first_tangent, axis=1)[:, None]
+    frame = np.stack([first_tangent, np.cross(normal, first_tangent), normal], axis=1)
+    # coordinates of the neighbours in the frames, and the coefficients of z(s, t) by least squares
     s, t, z = np.moveaxis(
         np.einsum("nkj,nij->nki", nodes[nearest, :3] - centre[:, None], frame), -1, 0
     )

@@ -37,12 +37,13 @@ class FormulaSection(ImperfectionSection):
     def geometry(self, reference: ReferenceShell, key: str) -> ImperfectionGeometry:
         """Return the geometry of the formula, see `ImperfectionSection`.
 
-        The element size is 2.5/k of the shortest wave sin(k x) that it resembles.
+        The element size is 2.5/k of the shortest wave sin(k x) that the formula resembles. It
+        varies from place to place if only a small part of the surface needs small elements.
 
         Raises
         ------
         CaseError
-            If it is not finite somewhere, or too deep.
+            If the formula is not finite somewhere, or too deep.
         """
         x = reference.perfect.sample()
         deviation = ByFormula(self.w0, self.amplitude / reference.R_over_h)
@@ -53,21 +54,25 @@ class FormulaSection(ImperfectionSection):
                 f"{key}.w0: {shown_value(self.w0)}: has no finite value, or one above half a "
                 f"radius, at (x, y, z)/R = ({place})"
             )
-        largest, with_derivatives = (
+        range_of_formula, formula_derivatives = (
             np.ptp(deviation(x)) / abs(deviation.factor or 1.0),
             formula_with_derivatives(self.w0),
         )
 
         def sizes(places: Array) -> Array:
-            """2.5/k of the wave with the depth of the whole and the curvature of each place."""
-            taylor = with_derivatives(places)
-            curved = np.nan_to_num(np.linalg.norm(taylor.hessian, axis=(0, 1)))
-            depth = max(largest, float(np.ptp(np.nan_to_num(taylor.value))))
-            return np.asarray(2.5 * np.sqrt(depth / 2 / np.maximum(curved, 1e-300 + 1e-12 * depth)))
+            """Return 2.5/k (n,) of a wave with the whole depth and the curvature at each place."""
+            taylor = formula_derivatives(places)
+            curvature = np.nan_to_num(np.linalg.norm(taylor.hessian, axis=(0, 1)))
+            depth = max(range_of_formula, float(np.ptp(np.nan_to_num(taylor.value))))
+            return np.asarray(
+                2.5 * np.sqrt(depth / 2 / np.maximum(curvature, 1e-300 + 1e-12 * depth))
+            )
 
         at_sample = sizes(x)
         size = (
-            float(at_sample.min()) if largest > 0 and at_sample.min() < MAX_ELEMENT_SIZE else np.inf
+            float(at_sample.min())
+            if range_of_formula > 0 and at_sample.min() < MAX_ELEMENT_SIZE
+            else np.inf
         )
         is_local = not (at_sample < 2 * size).mean() > MAX_LOCAL_SHARE
         return ImperfectionGeometry(deviation, size, sizes=sizes if is_local else None)
@@ -75,10 +80,11 @@ class FormulaSection(ImperfectionSection):
 
 @dataclass(frozen=True)
 class ByFormula:
-    """A deviation."""
+    """The deviation w0 over R: a formula of places over R, times a factor."""
 
     w0: str
     factor: float
 
     def __call__(self, places: Array) -> Array:
+        """Return w0 (n,) at places (n, 3)."""
         return np.asarray(self.factor * formula(self.w0)(*places.T))

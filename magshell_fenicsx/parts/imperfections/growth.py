@@ -47,6 +47,7 @@ class ImperfectionStep(LoadStep):
         return f"{step.name} grows: {', '.join(self.multiplies(step, context))}"
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
+        """Return the step's amplitude -> the deviations that its factor multiplies, for `Loads`."""
         return {
             "growing_imperfections": {
                 step.name: tuple(modelled.deviations[key] for key in self.multiplies(step, context))
@@ -54,19 +55,26 @@ class ImperfectionStep(LoadStep):
         }
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
-        keys: Mapping[str, object] = context.sections["imperfections"]
-        names = context.loads(ImperfectionStep)
+        """Check that the case has the imperfection of the step, which no other step may share.
+
+        Raises
+        ------
+        ValueError
+            With the key and what is allowed.
+        """
+        imperfections: Mapping[str, object] = context.sections["imperfections"]
+        load_of_amplitude = context.loads(ImperfectionStep)
         context.needs(f"{step.key}.kind: imperfection", "a mid-surface")
-        if not keys:
+        if not imperfections:
             raise ValueError(
                 f"{step.key}.kind: imperfection: the case has none; give shell.imperfections"
             )
-        if not grown_by([step], keys)[step.name]:
+        if not grown_by([step], imperfections)[step.name]:
             raise ValueError(
                 f"{step.key}.item: {self.item}: shell.imperfections has no such item, counted "
                 "from 0"
             )
-        if names[step.name].item is None and len(names) > 1:
+        if load_of_amplitude[step.name].item is None and len(load_of_amplitude) > 1:
             raise ValueError(
                 f"{step.key}.item: give it: another step grows another item of shell.imperfections"
             )
@@ -89,8 +97,14 @@ class GrowingObservables(Observables):
 
 
 def grown_by(steps: Iterable[ProgrammeStep], keys: Collection[str]) -> dict[str, list[str]]:
-    """Amplitude of a step -> the keys below `shell`, among those given, of the imperfections that
-    it multiplies.
+    """Return amplitude of a step -> keys of the imperfections that its factor multiplies.
+
+    Parameters
+    ----------
+    steps
+        Steps of the programme, of which those of `kind: imperfection` count.
+    keys
+        Keys below `shell` of the imperfections, such as "imperfections.0".
     """
     items = {step.name: step.load.item for step in steps if isinstance(step.load, ImperfectionStep)}
 

@@ -38,22 +38,22 @@ class ImperfectionGeometry:
     Attributes
     ----------
     deviation
-        Places (n, 3) of the perfect surface -> w0 (n,).
+        Function of places (n, 3) of the perfect surface -> w0 (n,).
     size
-        Largest element size that resolves it, within `reach` of its centre.
+        Largest element size that resolves the imperfection, within `reach` of its centre.
     centre
-        Its centre (3,) on the perfect surface; None if it is everywhere.
+        Centre (3,) on the perfect surface; None if the imperfection is everywhere.
     distance
-        From its centre.
+        Function of places -> distance from the centre; None without a centre.
     reach
-        How far it reaches from its centre, in the measure of `distance`.
+        Largest extent from the centre, in the measure of `distance`.
     rim
-        Whether the curvature jumps there.
+        Whether the curvature jumps at the reach.
     account
-        What it was made from, for people.
+        Words about its origin, for people.
     sizes
-        Places (n, 3) -> element sizes (n,) that show it there, of one without a centre that varies
-        more in some places; None where they are alike.
+        Places (n, 3) -> element sizes (n,) that resolve it there, for an imperfection without a
+        centre that varies more in some places; None where they are alike.
     """
 
     deviation: Deviation
@@ -66,7 +66,7 @@ class ImperfectionGeometry:
     sizes: Callable[[Array], Array] | None = None
 
     def is_within_rim(self, places: Array) -> NDArray[np.bool_]:
-        """Return whether places (n, 3) are within the rim."""
+        """Return whether places (n, 3) are within the rim of a local imperfection."""
         assert self.distance
         return np.asarray(self.distance(places) < self.reach)
 
@@ -99,17 +99,21 @@ class Local:
 
     @staticmethod
     def profile(squared: Array) -> Array:
-        """f."""
+        """Return the profile f (n,) at squares (n,) of distances over the width."""
         raise NotImplementedError
 
     def __call__(self, places: Array) -> Array:
+        """Return w0 (n,) over R at places (n, 3) over R."""
         squared = np.asarray((self.distance(places) / self.width) ** 2, dtype=np.float64)
         return np.asarray(-self.depth * self.profile(squared))
 
 
 @dataclass(frozen=True)
 class RotatedFunction(Generic[Values]):
-    """A function of places (n, 3) in a frame whose axes are the rows of `axes`."""
+    """A function of places (n, 3) in a frame whose axes are the rows of `axes`.
+
+    `of_place` is the function in the frame of the case.
+    """
 
     of_place: Callable[[Array], Values]
     axes: Array
@@ -119,25 +123,27 @@ class RotatedFunction(Generic[Values]):
 
 
 def in_frame(of_place: Callable[[Array], Values], turn: float) -> Callable[[Array], Values]:
-    """A function of places in a frame turned about e3 (rad)."""
+    """Return a function of places (n, 3) in a frame that is turned about e3 by `turn` (rad)."""
     return RotatedFunction(of_place, rotation(turn)) if turn else of_place
 
 
 def half_width(width: float, R_over_h: float, nu: float) -> float:
-    """Width of an imperfection over R (rad), from the width over (h R)^(1/2)/(12 (1 -
-    nu^2))^(1/4)."""
+    """Return a width over R (rad) from a dimple's width over (h R)^(1/2)/(12 (1 - nu^2))^(1/4)."""
     return width / sqrt(sqrt(12 * (1 - nu**2)) * R_over_h)
 
 
 def number_over(scale: Literal["h", "width"]) -> BeforeValidator:
-    """A validator: a length with a unit -> a number over h, or in the unit of a dimple's width; or
-    a number.
+    """Return a pydantic validator that keeps a number, or makes one of a length with a unit.
+
+    The result is over h, or in the unit of a dimple's width, see `half_width`. The sizes are in the
+    context of the validation, see `note_sizes`.
     """
 
     def convert(value: Any, info: ValidationInfo) -> Any:
+        """Return a length with a unit over the size in the context, and a number unchanged."""
         if not isinstance(value, str):
             return value
-        exact = in_units("metre")(value)
+        metres = in_units("metre")(value)
         if info.context and CONTEXT not in info.context:
             return 1.0  # the shell is wrong: any number will do
         sizes = (info.context or {}).get(CONTEXT)
@@ -146,7 +152,7 @@ def number_over(scale: Literal["h", "width"]) -> BeforeValidator:
                 "has a unit: that needs lengths of the shell with units; a number is in "
                 f"{UNITS[scale]}"
             )
-        return exact / sizes[scale]
+        return metres / sizes[scale]
 
     return BeforeValidator(convert, json_schema_input_type=float | with_unit("millimetre"))
 
@@ -154,10 +160,19 @@ def number_over(scale: Literal["h", "width"]) -> BeforeValidator:
 def note_sizes(
     data: Any, handler: ModelWrapValidatorHandler[Any], info: ValidationInfo, *, with_units: bool
 ) -> None:
-    """Note what the imperfections in plain data of a shell are over: the shell without them has
-    these sizes.
+    """Note in the context of a validation by which sizes lengths of imperfections are divided.
 
-    A wrong shell has none: its own message says what is wrong.
+    The shell without its imperfections has these sizes. Nothing is noted for a wrong shell, whose
+    own message says what is wrong, or if no imperfection has a text.
+
+    Parameters
+    ----------
+    data
+        Plain data of the shell.
+    handler
+        Validates the data of a shell.
+    with_units
+        Whether lengths of the case have units.
     """
     if (
         not isinstance(info.context, dict)
@@ -176,19 +191,18 @@ def note_sizes(
 
 
 def sizes_noted(info: ValidationInfo) -> Mapping[str, Any]:
-    """The part of the context of a validation with the sizes, for what is validated later."""
+    """Return the part of the context of a validation with the sizes, for later validations."""
     return {CONTEXT: (info.context or {}).get(CONTEXT, {})}
 
 
 def _imperfections(data: dict[str, Any]) -> list[Any]:
+    """Return the plain data of all imperfections of a shell."""
     listed = data.get("imperfections")
     return [*(listed if isinstance(listed, list) else []), data.get("defect")]
 
 
 def _has_text(part: Any) -> bool:
-    """Whether a part of plain data has text that begins with a number, or the unit of random
-    numbers.
-    """
+    """Return whether plain data has text that begins with a number, or the key `unit`."""
     if isinstance(part, dict):
         return any(key == "unit" or _has_text(value) for key, value in part.items())
     if isinstance(part, list):
@@ -210,42 +224,48 @@ class ImperfectionSection(Section):
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Numbers that a knockdown factor is differentiated by, as paths of keys below the
-        section."""
+        """Keys below the section of the numbers by which a knockdown factor is differentiated."""
         return ("amplitude",)
 
     def account(self) -> str:
-        """Describe the imperfection in the account of what is built."""
+        """Return a description of the imperfection for `magshell check`."""
         return self.kind
 
     @property
     def pending_modes(self) -> int:
-        """Number of modes of the perfect shell that it needs and that are not yet computed."""
+        """Number of modes of the perfect shell that are needed and not yet computed."""
         return 0
 
     @property
     def of_perfect_shell(self) -> bool:
-        """Whether it is computed from the perfect shell, with whose numbers it changes."""
+        """Whether the imperfection is computed from the perfect shell, and changes with it."""
         return False
 
     def listed(self) -> "Mapping[str, ImperfectionSection]":
-        """Return the imperfections that are built of it, by their keys below its own.
+        """Return the imperfections that the section stands for, by their keys below its own.
 
-        They are itself, with the key "", or others, whose keys begin with a dot.
+        Usually this is the section itself, with the key "". Others have keys that begin with a dot.
         """
         return {"": self}
 
     def refuse_unfit(self, R_over_h: float, nu: float, edge: float | None) -> None:
-        """Raise ValueError if a shell cannot have it.
+        """Refuse the imperfection of a shell with these numbers.
 
         Parameters
         ----------
         edge
             Polar angle of the edge of a sphere (rad); None of other shells.
+
+        Raises
+        ------
+        ValueError
+            If the shell cannot have it.
         """
 
     def geometry(self, reference: ReferenceShell, key: str) -> ImperfectionGeometry:
-        """Return its geometry on the perfect shell; `key` is its key, with dots.
+        """Return the imperfection's geometry on the perfect shell.
+
+        `key` is the key of the section in the case, with dots, for messages.
 
         Raises
         ------
@@ -272,7 +292,7 @@ class LocalSection(ImperfectionSection):
         return ("amplitude", "width", "at.polar", "at.azimuth")
 
     def half_width(self, R_over_h: float, nu: float) -> float:
-        """Over R (rad)."""
+        """Return the half-width over R (rad) on a shell with these numbers."""
         return half_width(self.width, R_over_h, nu)
 
     def refuse_unfit(self, R_over_h: float, nu: float, edge: float | None) -> None:
@@ -280,15 +300,26 @@ class LocalSection(ImperfectionSection):
         _refuse_steep(depth, self.deviation.steepest * depth / self.half_width(R_over_h, nu))
 
     def geometry(self, reference: ReferenceShell, key: str) -> ImperfectionGeometry:
-        of, width = self.deviation, self.half_width(reference.R_over_h, reference.nu)
+        """Return the geometry of the profile around the section's place on the perfect shell.
+
+        Raises
+        ------
+        CaseError
+            If the place is not on the surface.
+        """
+        profile_class, width = self.deviation, self.half_width(reference.R_over_h, reference.nu)
         place, distance = locate(self.at, reference, key)
-        size = min(DIMPLE_ELEMENT_SIZE / sqrt(reference.R_over_h), of.element_widths * width)
-        deviation = of(self.amplitude / reference.R_over_h, width, distance)
-        return ImperfectionGeometry(deviation, size, place, distance, of.reach * width, of.rim)
+        size = min(
+            DIMPLE_ELEMENT_SIZE / sqrt(reference.R_over_h), profile_class.element_widths * width
+        )
+        deviation = profile_class(self.amplitude / reference.R_over_h, width, distance)
+        return ImperfectionGeometry(
+            deviation, size, place, distance, profile_class.reach * width, profile_class.rim
+        )
 
 
 def _refuse_steep(depth: float, slope: float) -> None:
-    """Refuse a local imperfection by its depth over R and its steepest slope."""
+    """Refuse a local imperfection that is too deep (over R) or too steep, by a ValueError."""
     if depth > 0.5:
         raise ValueError(f"the dimple is {depth:.2g} radii deep; it must stay below half a radius")
     if slope > 2:
@@ -304,7 +335,13 @@ class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
     key = "imperfections"
 
     def refuse_unfit(self, context: Context) -> None:
-        """Refuse imperfections that the shell cannot have."""
+        """Refuse imperfections that the shell cannot have, as they are too deep, steep or wide.
+
+        Raises
+        ------
+        ValueError
+            With the key of the imperfection.
+        """
         shell = context.shell
         if getattr(shell, "defect", None) and shell.imperfections:
             raise ValueError(
@@ -322,7 +359,7 @@ class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
 def imperfection_geometries(
     imperfections: Mapping[str, ImperfectionSection], reference: ReferenceShell
 ) -> dict[str, ImperfectionGeometry]:
-    """Key of each imperfection below `shell` -> what it brings."""
+    """Return key of each imperfection below `shell` -> its geometry on the perfect shell."""
     return {
         key: section.geometry(reference, f"shell.{key}") for key, section in imperfections.items()
     }

@@ -59,6 +59,7 @@ class ModesSection(FileKeys, ImperfectionSection):
 
     @model_validator(mode="after")
     def _one_mode_in_a_file(self) -> Self:
+        """Refuse several amplitudes beside a file, which has one mode."""
         if self.file is not None and len(self.amplitudes) > 1:
             raise ValueError(
                 "amplitudes: a file has one mode: give one amplitude, and an item of the list for "
@@ -75,9 +76,7 @@ class ModesSection(FileKeys, ImperfectionSection):
 
     @property
     def shapes(self) -> tuple[Shape, ...] | None:
-        """The modes as functions of places over R, 1 where inwards largest; None until they are
-        computed.
-        """
+        """The modes as functions of places over R, 1 where inwards largest; None until computed."""
         return self._shapes
 
     @property
@@ -91,8 +90,16 @@ class ModesSection(FileKeys, ImperfectionSection):
     def become(
         self, modes: "Sequence[Mode]", name: str = "", place: ShellPose | None = None
     ) -> None:
-        """Take the modes of the perfect shell, or the parts of the shell `name` in those of
-        several.
+        """Take modes of the perfect shell as the shapes of this imperfection.
+
+        Parameters
+        ----------
+        modes
+            The modes, the lowest first.
+        name
+            Name of the shell, if the modes are those of several shells together.
+        place
+            Pose of that shell among the others; None without.
 
         Raises
         ------
@@ -143,7 +150,7 @@ class ModesSection(FileKeys, ImperfectionSection):
 
 @dataclass(frozen=True)
 class Modes:
-    """w0 = -sum of amplitudes times modes, over R."""
+    """The deviation w0 = -sum of amplitudes times modes, over R, as a function of places (n, 3)."""
 
     shapes: tuple[Shape, ...]
     amplitudes: tuple[float, ...]
@@ -155,7 +162,15 @@ class Modes:
 
 @dataclass(frozen=True)
 class Round:
-    """f(rho, z) cos(m theta), f through its values at places (rho, 0, z) of the meridian."""
+    """A wave f(rho, z) cos(m theta) around e3, as a function of places (n, 3) over R.
+
+    Attributes
+    ----------
+    f
+        Smooth function through values at places (rho, 0, z) of the meridian.
+    m
+        Number of waves.
+    """
 
     f: "ScatteredSpline"
     m: int
@@ -168,8 +183,14 @@ class Round:
 
 @dataclass(frozen=True)
 class MirroredMode:
-    """A mode on one side of a plane, and its image with a sign on the other: symmetric to the last
-    digit.
+    """A mode on one side of a plane, and its image on the other: symmetric to the last digit.
+
+    Attributes
+    ----------
+    shape
+        The mode, which is evaluated where the signed distance from the plane is not negative.
+    sign
+        1 for a symmetric, -1 for an antisymmetric mode.
     """
 
     shape: Shape
@@ -183,12 +204,21 @@ class MirroredMode:
 
 
 def _zero_mode(places: Array) -> Array:
+    """Return zero displacements (n,) at places (n, 3)."""
     return np.zeros(len(places))
 
 
 @dataclass(frozen=True)
 class PlacedMode:
-    """A mode in the frame of a shell that has its place among others."""
+    """A mode in the frame of one shell, which has its pose among other shells.
+
+    Attributes
+    ----------
+    shape
+        The mode, as a function of places in the frame of all shells.
+    place
+        The pose: places in the shell's frame -> places in the frame of all shells.
+    """
 
     shape: Shape
     place: ShellPose
@@ -204,7 +234,13 @@ class PlacedMode:
 
 @dataclass(frozen=True)
 class OfShells:
-    """A mode of several shells together: of each that it moves its part, by name."""
+    """A mode of several shells together.
+
+    Attributes
+    ----------
+    parts
+        Name of each shell that the mode moves -> the mode on this shell.
+    """
 
     parts: Mapping[str, Shape]
 
@@ -213,18 +249,33 @@ Mode = Shape | OfShells
 
 
 def on_surface(places: Array, w: Array, cover: Array) -> "ScatteredSpline":
-    """A mode from its inward displacements (n,), over the largest, at places (n, 3)."""
+    """Return a mode as a smooth function through inward displacements.
+
+    Parameters
+    ----------
+    places, w
+        Places (n, 3) over R, and displacements (n,) over the largest one.
+    cover
+        Places (m, 3) that the function must cover.
+    """
     from magshell_fenicsx.mesh.scattered_data import fit_scattered
 
     return fit_scattered(places, w, cover, noise=0)
 
 
 def on_meridian(places: Array, f: Array, m: int) -> Round:
-    """A wave around e3 from these displacements (n,) at places (n, 3) of the meridian, with its
-    parity across e3.
+    """Return a wave around e3 from inward displacements on a meridian.
+
+    Parameters
+    ----------
+    places, f
+        Places (n, 3) of the meridian over R, and displacements (n,) over the largest one.
+    m
+        Number of waves.
     """
     from magshell_fenicsx.mesh.scattered_data import fit_scattered
 
+    # a meridian that begins on the axis is continued beyond it, with the parity of the wave
     if places[:, 0].min() < ON_AXIS:
         places, f = (
             np.vstack([places, places * [-1.0, 1.0, 1.0]]),
@@ -234,6 +285,20 @@ def on_meridian(places: Array, f: Array, m: int) -> Round:
 
 
 def _read(section: ModesSection, sample: Array, key: str) -> "ScatteredSpline":
+    """Return the mode in the file of a section as a function of places over R.
+
+    Parameters
+    ----------
+    sample
+        Places (n, 3) all over the perfect shell, which the mode must reach.
+    key
+        Key and name of the file, for messages.
+
+    Raises
+    ------
+    CaseError
+        If the file has no mode, or that of another shell.
+    """
     import scipy
 
     try:
@@ -256,10 +321,11 @@ def _read(section: ModesSection, sample: Array, key: str) -> "ScatteredSpline":
 
 
 def over_largest(places: Array, w: Array) -> Array:
-    """Values over the largest one with its sign; of equally large ones that of the highest place,
-    in any order.
+    """Return values (n,) over the largest of them, with its sign.
+
+    Of equally large values that at the highest place (n, 3) counts, whatever their order.
     """
     size = np.abs(w)
     largest_places = np.flatnonzero(size > (1 - CREST_TOLERANCE) * size.max())
-    first = largest_places[np.lexsort(places[largest_places].round(6).T)[-1]]
-    return np.asarray(w / np.copysign(size.max(), w[first]))
+    chosen_row = largest_places[np.lexsort(places[largest_places].round(6).T)[-1]]
+    return np.asarray(w / np.copysign(size.max(), w[chosen_row]))

@@ -48,6 +48,7 @@ class RandomSection(ImperfectionSection):
 
     @model_validator(mode="after")
     def _one_way(self, info: ValidationInfo) -> Self:
+        """Check that either a random field or dimples are given, and that dimples have room."""
         if (self.amplitude is None) != (self.length is None) or (self.amplitude is None) == (
             self.dimples is None
         ):
@@ -61,6 +62,7 @@ class RandomSection(ImperfectionSection):
         return f"random field of {self.amplitude:g} h, seed {self.seed}"
 
     def listed(self) -> Mapping[str, ImperfectionSection]:
+        """Return the random dimples by their keys below the section's, or the section itself."""
         return (
             {f".{key}": dimple for key, dimple in self.random_dimples.items()}
             if self.dimples
@@ -69,17 +71,22 @@ class RandomSection(ImperfectionSection):
 
     @cached_property
     def random_dimples(self) -> Mapping[str, DimpleSection | GaussianSection]:
-        """The random dimples by their keys below the section."""
+        """The random dimples by keys below the section, such as "dimples.0"; empty for a field.
+
+        They are drawn from the seed, once, and validated as sections of the case.
+        """
         if self.dimples is None:
             return {}
         items = self.dimples.draw(generator(self.seed, 0, "shell.imperfections"))
-        kind = DimpleSection if self.dimples.kind == "dimple" else GaussianSection
+        section_class = DimpleSection if self.dimples.kind == "dimple" else GaussianSection
         try:
-            sections = [kind.model_validate(item, context=dict(self._sizes)) for item in items]
+            sections = [
+                section_class.model_validate(item, context=dict(self._sizes)) for item in items
+            ]
         except ValidationError as e:
-            first = e.errors()[0]
+            error = e.errors()[0]
             raise ValueError(
-                f"dimples: {first['loc'][-1]}: {first['msg'].removeprefix('Value error, ')}"
+                f"dimples: {error['loc'][-1]}: {error['msg'].removeprefix('Value error, ')}"
             ) from None
         return {f"dimples.{i}": dimple for i, dimple in enumerate(sections)}
 
@@ -99,6 +106,13 @@ class RandomWaves:
 
     The mean over seeds is zero, the covariance is delta^2 exp(-d^2/(2 length^2)) (Shinozuka and
     Deodatis 1996). The bits of PCG64 are the same on every machine and in every version of NumPy.
+
+    Attributes
+    ----------
+    delta, length
+        Standard deviation and length of correlation, over R.
+    seed
+        Chooses one of the random fields.
     """
 
     delta: float
@@ -107,7 +121,7 @@ class RandomWaves:
 
     @cached_property
     def _waves(self) -> Array:
-        """(4, N): the components of k and the phase."""
+        """Array (4, N): three components of k over the length, and the phase (rad)."""
         import scipy
 
         bits = np.random.PCG64(self.seed).random_raw(4 * WAVE_COUNT).reshape(4, WAVE_COUNT)
@@ -115,6 +129,7 @@ class RandomWaves:
         return np.vstack([scipy.special.ndtri(uniform[:3]) / self.length, 2 * np.pi * uniform[3:]])
 
     def __call__(self, places: Array) -> Array:
+        """Return w0 (n,) over R at places (n, 3) over R."""
         w0 = np.empty(len(places))
         for i in range(0, len(places), PLACES_AT_ONCE):
             x = places[i : i + PLACES_AT_ONCE]

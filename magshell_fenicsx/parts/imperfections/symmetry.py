@@ -1,5 +1,6 @@
-"""The symmetry that imperfections leave, by their values; and where they are in the chart, for its
-mesh.
+"""The symmetry that imperfections leave, by their values, and their places in the chart.
+
+w0 is the deviation along the outward normal. Places, widths and depths are over R.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -40,18 +41,18 @@ AXIS_TOLERANCE = 1e-9  # over R
 
 @dataclass(frozen=True)
 class _Numbers:
-    """Local deviations, those that differ in their depth alone added up.
+    """Local deviations as numbers; the depths of those that are alike otherwise are added up.
 
     Attributes
     ----------
     rows
-        Centres, widths, and the numbers of the profiles, (n, 5).
+        (n, 5): centre (3), width, and number of the profile.
     depths
-        (n,).
+        (n,) depths, inwards positive.
     angles
-        Whether distances are angles.
+        Whether distances from a centre are angles.
     profiles
-        See `Local`.
+        Functions f of (distance/width)², see `Local`; `rows` has their numbers.
     """
 
     rows: Array
@@ -61,10 +62,14 @@ class _Numbers:
 
     @cached_property
     def tree(self) -> "scipy.spatial.cKDTree":
+        """Tree of the rows, to find the image of each under a mirror."""
         return scipy.spatial.cKDTree(self.rows)
 
     def __call__(self, x: Array) -> Array:
-        """Return the sum (m,) of the deviations at a few places (m, 3)."""
+        """Return the sum w0 (m,) over R of the deviations at a few places (m, 3).
+
+        Each is -depth f((distance/width)²), with the profile f of its row.
+        """
         centres, widths = self.rows[:, :3], self.rows[:, 3]
         distance = np.linalg.norm(x[:, None] - centres, axis=-1)
         if self.angles:
@@ -72,14 +77,14 @@ class _Numbers:
         squared = (distance / widths) ** 2
         w0 = np.zeros(len(x))
         for number, profile in enumerate(self.profiles):
-            of_it = np.round(self.rows[:, 4]) == number
-            w0 -= profile(squared[:, of_it]) @ self.depths[of_it]
+            has_profile = np.round(self.rows[:, 4]) == number
+            w0 -= profile(squared[:, has_profile]) @ self.depths[has_profile]
         return w0
 
 
 @dataclass(frozen=True)
 class _Sum:
-    """The sum of some deviations."""
+    """The sum of some deviations, as a function of places (n, 3)."""
 
     deviations: Sequence[Deviation]
 
@@ -88,21 +93,28 @@ class _Sum:
 
     @cached_property
     def numbers(self) -> _Numbers | None:
-        """Numbers of the local deviations; None if there are others. There may be thousands."""
-        local = [d for d in self.deviations if isinstance(d, Local)]
-        classes = list(dict.fromkeys(type(d) for d in local))
-        angles = [d.distance.axis for d in local if isinstance(d.distance, AngularDistance)]
+        """The local deviations as numbers; None if there are deviations of other kinds.
+
+        None also for a mixture of angular and straight distances. There may be thousands of
+        deviations.
+        """
+        local_deviations = [d for d in self.deviations if isinstance(d, Local)]
+        classes = list(dict.fromkeys(type(d) for d in local_deviations))
+        angles = [
+            d.distance.axis for d in local_deviations if isinstance(d.distance, AngularDistance)
+        ]
         places = angles or [
-            d.distance.place for d in local if isinstance(d.distance, StraightDistance)
+            d.distance.place for d in local_deviations if isinstance(d.distance, StraightDistance)
         ]
         if not places or len(places) < len(self.deviations):
             return None
-        shapes = [(d.width, classes.index(type(d))) for d in local]
+        shapes = [(d.width, classes.index(type(d))) for d in local_deviations]
         rows = np.round(np.column_stack([places, shapes]) / IMAGE_TOLERANCE) * IMAGE_TOLERANCE
-        rows, number = np.unique(rows, axis=0, return_inverse=True)
-        depths = np.bincount(number.ravel(), [d.depth for d in local])
+        # deviations with equal rows, but rounding, become one with the sum of their depths
+        rows, row_of_deviation = np.unique(rows, axis=0, return_inverse=True)
+        depths = np.bincount(row_of_deviation.ravel(), [d.depth for d in local_deviations])
         is_kept = np.abs(depths) > IMAGE_TOLERANCE * np.abs(depths).max()
-        profiles = [kind.profile for kind in classes]
+        profiles = [profile_class.profile for profile_class in classes]
         return (
             _Numbers(rows[is_kept], depths[is_kept], bool(angles), profiles)
             if is_kept.any()
@@ -110,7 +122,10 @@ class _Sum:
         )
 
     def mirrored(self, mirror: Mirror) -> bool | None:
-        """Return whether the sum is its own image, by its numbers; None if they do not decide."""
+        """Return whether a plane mirrors the sum onto itself; None if the numbers do not decide it.
+
+        None means that the deviations must be compared by their values at many places.
+        """
         numbers = self.numbers
         if numbers is None or (numbers.angles and mirror.offset):
             return None
@@ -131,10 +146,12 @@ class _Sum:
 def imperfection_constraints(
     imperfections: Mapping[str, ImperfectionGeometry], perfect: Outline, *, one_by_one: bool
 ) -> list[SymmetryConstraint]:
-    """Return the symmetry that imperfections preserve.
+    """Return the symmetry that imperfections preserve; empty without imperfections.
 
     Parameters
     ----------
+    imperfections
+        Key below `shell` -> geometry.
     perfect
         The perfect shell.
     one_by_one
@@ -152,6 +169,7 @@ def imperfection_constraints(
     sample = cache(lambda: _sample(imperfections, perfect))
 
     def mirrors(mirror: Mirror) -> bool:
+        """Return whether a plane is a plane of symmetry of all groups of imperfections."""
         undecided = []
         for group in groups:
             if (answer := group.mirrored(mirror)) is False:
@@ -167,43 +185,51 @@ def imperfection_constraints(
         for imperfection in imperfections.values()
         if imperfection.centre is not None
     ]
-    off = [centre for centre in centres if np.hypot(*centre[:2]) > AXIS_TOLERANCE]
+    centres_off_axis = [centre for centre in centres if np.hypot(*centre[:2]) > AXIS_TOLERANCE]
     reason = None
-    if off and perfect.round:
+    if centres_off_axis and perfect.round:
         reason = "an imperfection is off the axis"
     elif perfect.meridian:
         places = perfect.meridian.interior_sample()
-        rotated = [
+        w0_at_angles = [
             np.concatenate([group(places @ rotation(a)) for group in groups]) for a in ANGLES[:24]
         ]
-        if not all(_are_equal(rotated[0], w0) for w0 in rotated):
+        if not all(_are_equal(w0_at_angles[0], w0) for w0 in w0_at_angles):
             reason = "an imperfection differs around e3"
     if not perfect.round:
         return [SymmetryConstraint(reason, (), mirrors)]
-    if common_azimuth(off) is None:
-        return [SymmetryConstraint(reason, (), mirrors, azimuths=_azimuths_of_planes(off))]
-    return [SymmetryConstraint(reason, off, mirrors)]
+    if common_azimuth(centres_off_axis) is None:
+        return [
+            SymmetryConstraint(reason, (), mirrors, azimuths=_azimuths_of_planes(centres_off_axis))
+        ]
+    return [SymmetryConstraint(reason, centres_off_axis, mirrors)]
 
 
 def _azimuths_of_planes(centres: Sequence[Array]) -> tuple[float, ...]:
     """Return azimuths (rad) of planes through e3 that may be planes of symmetry of places.
 
-    They map the first place to itself or to one at the same distance.
+    Each plane maps the first place to itself, or to a place at the same height and distance from
+    e3.
     """
-    first, *others = centres
+    first_place, *other_places = centres
     at_same_distance = [
         x
-        for x in others
-        if abs(np.hypot(*x[:2]) - np.hypot(*first[:2])) < AXIS_TOLERANCE
-        and abs(x[2] - first[2]) < AXIS_TOLERANCE
+        for x in other_places
+        if abs(np.hypot(*x[:2]) - np.hypot(*first_place[:2])) < AXIS_TOLERANCE
+        and abs(x[2] - first_place[2]) < AXIS_TOLERANCE
     ]
     return tuple(
-        (atan2(x[1], x[0]) + atan2(first[1], first[0])) / 2 for x in (first, *at_same_distance)
+        (atan2(x[1], x[0]) + atan2(first_place[1], first_place[0])) / 2
+        for x in (first_place, *at_same_distance)
     )
 
 
 def _sample(imperfections: Mapping[str, ImperfectionGeometry], perfect: Outline) -> Array:
-    """Return places (n, 3) all over the shell, and around each local imperfection."""
+    """Return places (n, 3) at which deviations are compared with their images.
+
+    They lie all over the shell, and around each local imperfection: at its centre, and on contours
+    within its reach.
+    """
     places = [perfect.sample()]
     for key, imperfection in imperfections.items():
         if imperfection.centre is None:
@@ -219,6 +245,7 @@ def _sample(imperfections: Mapping[str, ImperfectionGeometry], perfect: Outline)
 
 
 def _are_equal(w0: Array, image: Array) -> bool:
+    """Return whether deviations and those at the images of their places are equal but rounding."""
     return bool(
         (
             np.abs(w0 - image) <= EQUALITY_TOLERANCE * max(np.abs(w0).max(), np.abs(image).max())
@@ -233,11 +260,13 @@ class LocalImperfection:
     Attributes
     ----------
     centre, radius
-        The disc that it needs small elements in.
+        The disc that needs small elements.
     size
-        See `ImperfectionGeometry`.
+        Element size over R, see `ImperfectionGeometry`.
     circle
         Whether its outline is a circle around the chart's origin.
+    jumps
+        Whether the curvature jumps on that circle.
     rim
         Points (n, 2) of the closed curve on which the curvature jumps; None where it does not, and
         of a circle.
@@ -251,7 +280,10 @@ class LocalImperfection:
     rim: Array | None = None
 
     def features(self, outline: Outline, sizing: SizingContext, growth: float) -> list[Feature]:
-        """Return mesh sizes: small elements on it and a little around, which grow away from it."""
+        """Return mesh sizes: small elements on the imperfection and a little around, then growing.
+
+        `growth` is the growth of the size per distance.
+        """
         radius, size = self.radius + 0.7 * sqrt(sizing.h), self.size / sizing.refinement
         return [
             DiscFeature((float(x), float(y)), radius, size, growth)
@@ -262,17 +294,21 @@ class LocalImperfection:
 def local_imperfections(
     imperfections: Iterable[tuple[str, ImperfectionGeometry]], perfect: Outline, turn: float
 ) -> list[LocalImperfection]:
-    """The local imperfections of a case in the chart of a frame that is turned about e3 (rad).
+    """Return the local imperfections of a case in the chart of a frame turned about e3.
 
     Parameters
     ----------
+    imperfections
+        Keys below `shell` and geometries.
     perfect
         The perfect shell.
+    turn
+        Angle of the frame (rad).
 
     Raises
     ------
     CaseError
-        If one reaches around the shell.
+        If an imperfection reaches around the shell.
     """
     local_imperfections = []
     for key, imperfection in imperfections:
@@ -306,12 +342,13 @@ def local_imperfections(
 
 
 def distinct_rims(local: Iterable[LocalImperfection]) -> tuple[Array, ...]:
-    """Return the rims that need edges of elements; of nearly equal ones, the first."""
+    """Return the rims that need edges of elements; of nearly equal rims only the first."""
     rims: list[Array] = []
     for local_imperfection in local:
         rim = local_imperfection.rim
         if rim is not None and all(
-            np.abs(rim - other).max() > RIM_TOLERANCE * local_imperfection.size for other in rims
+            np.abs(rim - kept_rim).max() > RIM_TOLERANCE * local_imperfection.size
+            for kept_rim in rims
         ):
             rims.append(rim)
     return tuple(rims)
@@ -325,8 +362,24 @@ def contour(
     centre: Array,
     part: float,
 ) -> Array:
-    """Points (n, 2) of the chart at a part of the reach of an imperfection: the first on each ray
-    from its centre.
+    """Return points (n, 2) of the chart at which an imperfection reaches a part of its reach.
+
+    There is one point on each ray from the centre: the first at the distance `part` times the
+    reach, by the rule of false position.
+
+    Parameters
+    ----------
+    key
+        Key of the imperfection below `shell`, for the message.
+    turn
+        Angle about e3 of the frame of the chart (rad).
+    centre
+        Centre (2,) of the imperfection in the chart.
+
+    Raises
+    ------
+    CaseError
+        If the imperfection reaches around the shell.
     """
     assert imperfection.distance
     distance, Q, reach = imperfection.distance, rotation(turn), part * imperfection.reach
@@ -334,7 +387,7 @@ def contour(
     rays = np.column_stack([np.cos(angles), np.sin(angles)])
 
     def distance_beyond(t: Array) -> Array:
-        """Return on each ray the distance at t (..., corners), less the wanted one."""
+        """Return distances (..., corners) from the centre at t along rays, less the wanted one."""
         chart = centre + t[..., None] * rays
         return distance(perfect.perfect(chart.reshape(-1, 2)) @ Q).reshape(t.shape) - reach
 
@@ -366,7 +419,10 @@ def contour(
 
 
 def images(local_imperfection: LocalImperfection, perfect: Outline) -> list[Array]:
-    """Return its centre (2,), and the images of this across glued sides of a grid."""
+    """Return the centre (2,) of a local imperfection, and its images across glued sides.
+
+    Glued are opposite sides of a grid, as of a closed cylinder.
+    """
     if not (grid := perfect.grid):
         return [local_imperfection.centre]
     steps = product(*((-1, 0, 1) if glued else (0,) for glued in grid.glued))

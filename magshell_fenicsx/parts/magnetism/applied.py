@@ -33,10 +33,19 @@ MAX_HALVINGS = 16  # of a segment, whose parts are then shorter than rounding in
 
 
 def crossed_place(distance: Callable[[Array], Array], starts: Array, ends: Array) -> Array | None:
-    """Return a place (3,) inside a body on the segments between places (n, 3); None without one.
+    """Return a place (3,) inside a body on straight segments between places; None without one.
 
-    A distance changes by at most the length of a segment. So no place of a segment is inside if
-    the distances at both ends add up to more than its length; the other segments are halved.
+    Parameters
+    ----------
+    distance
+        Places (n, 3) -> their distances (n,) from the body, negative inside it.
+    starts, ends
+        (n, 3) ends of the segments.
+
+    Notes
+    -----
+    A distance changes by at most the length of a segment. So no place of a segment is inside if the
+    distances at both ends add up to more than its length; the other segments are halved.
     """
     distance_before, distance_after = distance(starts), distance(ends)
     for _ in range(MAX_HALVINGS):
@@ -47,13 +56,13 @@ def crossed_place(distance: Callable[[Array], Array], starts: Array, ends: Array
             values[may_cross] for values in (starts, ends, distance_before, distance_after)
         )
         middle = (starts + ends) / 2
-        between = distance(middle)
-        if (between < 0).any():
-            return np.asarray(middle[between.argmin()])
+        distance_of_middle = distance(middle)
+        if (distance_of_middle < 0).any():
+            return np.asarray(middle[distance_of_middle.argmin()])
         starts, ends = np.concatenate([starts, middle]), np.concatenate([middle, ends])
         distance_before, distance_after = (
-            np.concatenate([distance_before, between]),
-            np.concatenate([between, distance_after]),
+            np.concatenate([distance_before, distance_of_middle]),
+            np.concatenate([distance_of_middle, distance_after]),
         )
     return None
 
@@ -61,15 +70,17 @@ def crossed_place(distance: Callable[[Array], Array], starts: Array, ends: Array
 class AppliedField:
     """Taylor polynomials of a field at the quadrature points of a shell, a meridian or a solid.
 
+    The constructor is collective.
+
     Parameters
     ----------
-    of
-        The field that no amplitude drives.
+    field_at_rest
+        The field that no amplitude drives: places (n, 3) over R -> B, first and second derivatives.
     r0, u
         Placement and displacement in one space; on a meridian along e_rho and e_z.
     degree
-        Of the quadrature.
-    driven
+        Degree of the quadrature.
+    moving_fields
         The fields that amplitudes drive, which are added.
 
     Raises
@@ -80,9 +91,10 @@ class AppliedField:
     Attributes
     ----------
     polynomial
-        The coefficient of the densities.
+        The coefficient of the densities: at each point u, B at the undeformed place, then B, its
+        gradient and its halved second derivatives at the present place.
     mu
-        The amplitudes of the driven fields.
+        Name -> value of the amplitudes of the driven fields.
     lost
         Where the field was not finite since the path began; empty if it was finite everywhere.
     """
@@ -111,6 +123,7 @@ class AppliedField:
         places = self._r0.renew()
         B, G, H = self._total_field(field_at_rest(places.reshape(-1, 3)), places.reshape(-1, 3))
         differentiable = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3))
+        # nan where the field is not differentiable, which `refuse_unbounded` reports
         self._B0 = np.where(np.reshape(differentiable, (-1, 1)), B, np.nan).reshape(places.shape)
         refuse_unbounded(self._B0, places, V.mesh.comm, "magnetic.applied")
         self.polynomial.compute_by(
@@ -123,24 +136,35 @@ class AppliedField:
         return tuple(self.mu)
 
     def _polynomials(self) -> Array:
-        u, x = self._displacement.renew(), self.places
-        B, G, H = self._total_field(self._values_at_rest.renew(), x)
+        """Return the values of `polynomial` at the present state: (cells, points, size).
+
+        If the field is not finite at a present place, `lost` describes this place.
+        """
+        displacement, places = self._displacement.renew(), self.places
+        B, G, H = self._total_field(self._values_at_rest.renew(), places)
         is_lost = ~np.isfinite(B).all(axis=1)
-        self.lost = self._lost_description(x[is_lost][0]) if is_lost.any() else self.lost
-        second = H[:, :, *COMPONENT_PAIRS] * np.where(
+        self.lost = self._lost_description(places[is_lost][0]) if is_lost.any() else self.lost
+        # the terms of second order, B,jk dx_j dx_k/2: those with j and k different count twice
+        second_order = H[:, :, *COMPONENT_PAIRS] * np.where(
             COMPONENT_PAIRS[0] == COMPONENT_PAIRS[1], 0.5, 1.0
         )
-        columns = [array.reshape(*u.shape[:2], -1) for array in (u, self._B0, B, G, second)]
+        columns = [
+            array.reshape(*displacement.shape[:2], -1)
+            for array in (displacement, self._B0, B, G, second_order)
+        ]
         return np.concatenate(columns, axis=-1)
 
     def slope(self, name: str, other: str = "", *, at_present_places: bool = True) -> PointField:
-        """Return the polynomials of dB/dmu, or the values of d2B/dmu_i dmu_j, of moving fields.
+        """Return a point field of the derivative of the Taylor polynomial by one or two amplitudes.
+
+        With `name` alone this is dB/dmu and its gradient; with `other` too, d2B/dmu_i dmu_j without
+        a gradient. Fields that no amplitude drives do not contribute. The values follow the state.
 
         Parameters
         ----------
         at_present_places
-            Whether they are about the present places; else they are changes of the polynomials
-            there.
+            True for a polynomial about the present places, to take the place of `polynomial`. False
+            for a change of the entries of `polynomial`, whose displacement then does not change.
         """
         field = PointField(self._u.function_space.mesh, self._degree, FIELD_POLYNOMIAL_SIZE)
         field.compute_by(
@@ -150,6 +174,7 @@ class AppliedField:
         return field
 
     def _slopes(self, name: str, other: str, *, at_present_places: bool) -> Array:
+        """Return the values (cells, points, size) of the point field `slope`."""
         values = np.zeros_like(self.polynomial.values)
         values[..., :3] = self.polynomial.values[..., :3] if at_present_places else 0.0
         shape = values.shape[:2]
@@ -162,6 +187,8 @@ class AppliedField:
                     if other
                     else at_places.derivative(name)
                 )
+                # columns as in `polynomial`: 0:3 u, 3:6 B at the undeformed place, 6:9 B, 9:18
+                # gradient
                 values[..., 6:9] += B.reshape(*shape, 3)
                 if G is not None:
                     values[..., 9:18] += G.reshape(*shape, 9)
@@ -177,16 +204,19 @@ class AppliedField:
     ) -> str:
         """Describe the body through which a point has moved between two states; "" without one.
 
-        Each state is given by places (n, 3) and amplitudes.
+        Each state is given by the places (n, 3) of all quadrature points and the amplitudes by
+        name. Only fields of bodies, which have a `distance`, are looked at.
         """
-        at_rest: list[tuple[FieldInSpace, MovingField]] = [
-            (part, MovingField(part)) for part in getattr(self._field_at_rest, "parts", [])
+        parts_at_rest: list[tuple[FieldInSpace, MovingField]] = [
+            (field_part, MovingField(field_part))
+            for field_part in getattr(self._field_at_rest, "parts", [])
         ]
         for field, moving_field in [
-            *at_rest,
+            *parts_at_rest,
             *((moving.at_rest, moving) for moving in self._moving_fields),
         ]:
             if distance := getattr(field, "distance", None):
+                # the places as seen from the body, which moves by x -> Q x + t
                 relative_places = [
                     (x - t) @ Q
                     for x, (Q, t) in (
@@ -201,20 +231,24 @@ class AppliedField:
     def _total_field(
         self, at_rest: tuple[Array, Array, Array], x: Array
     ) -> tuple[Array, Array, Array]:
-        """Return B, G and H of the field at rest and the moving ones together, at places x."""
+        """Return B, its gradient and its second derivatives of the whole field at places x (n, 3).
+
+        The shapes are (n, 3), (n, 3, 3) and (n, 3, 3, 3). They are those of the field at rest,
+        `at_rest`, plus those of the moving fields. The moving fields at x are kept for `_slopes`.
+        """
         self._fields_at_places = [moving.field_at(x, self.mu) for moving in self._moving_fields]
         fields = [at_rest, *(at_places.value for at_places in self._fields_at_places)]
-        B, G, H = (np.sum(part, axis=0) for part in zip(*fields, strict=True))
+        B, G, H = (np.sum(contributions, axis=0) for contributions in zip(*fields, strict=True))
         return B, G, H
 
     def _lost_description(self, x: Array) -> str:
-        """Describe why the field is not finite at a place (3,)."""
-        at_rest = [
-            (part, part(x[None])[0])
-            for part in getattr(self._field_at_rest, "parts", [self._field_at_rest])
+        """Describe for the user why the field is not finite at a place (3,); "" if it is finite."""
+        values_at_rest = [
+            (field_part, field_part(x[None])[0])
+            for field_part in getattr(self._field_at_rest, "parts", [self._field_at_rest])
         ]
         for field, B in [
-            *at_rest,
+            *values_at_rest,
             *(
                 (moving.at_rest, moving.field_at(x[None], self.mu).B)
                 for moving in self._moving_fields
@@ -235,9 +269,17 @@ class FieldAmplitude:
 
     Attributes
     ----------
+    applied
+        The field, which holds the value of the amplitude.
+    name
+        Name of the amplitude.
     terms
-        The energies of the field. Those with an amplitude are linear in it, as in the field; what
-        is soft is quadratic.
+        The energies of the field. Terms with an amplitude of their own are linear in the field;
+        terms without one, of soft magnets, are quadratic in it.
+    u
+        The displacement.
+    log
+        Log of compiled kernels.
     """
 
     applied: AppliedField
@@ -255,7 +297,11 @@ class FieldAmplitude:
         self.applied.mu[self.name] = float(value)
 
     def slopes(self) -> list[FormTerm]:
-        """Return dPi/dmu: of energies linear in the field, the energy in dB/dmu."""
+        """Return dPi/dmu as terms, one for each energy.
+
+        An energy linear in the field is taken in the field dB/dmu; a quadratic one is
+        differentiated along the change of the Taylor polynomial.
+        """
         linear = [self._with_polynomial(t, self.applied.slope(self.name)) for t in self._linear]
         return linear + [
             self._derivative_along(t, self.applied.slope(self.name, at_present_places=False))
@@ -263,7 +309,11 @@ class FieldAmplitude:
         ]
 
     def second_derivatives(self, q: Any) -> Sequence[Derivative]:
-        """Return d2Pi/dmu dq by another amplitude, a constant, or a `q` with this method."""
+        """Return d2Pi/dmu dq as terms.
+
+        `q` is another amplitude of a field, a UFL constant, or a parameter with this method. The
+        list is empty for an amplitude of another field.
+        """
         if not isinstance(q, FieldAmplitude):
             if hasattr(q, "second_derivatives"):
                 derivatives: Sequence[Derivative] = q.second_derivatives(self)
@@ -275,6 +325,7 @@ class FieldAmplitude:
         linear = [
             self._with_polynomial(t, self.applied.slope(self.name, q.name)) for t in self._linear
         ]
+        # quadratic energies: Pi' along d2B/dmu dq, and Pi'' along dB/dmu and dB/dq
         by_both_change, by_first, by_second = (
             self.applied.slope(*names, at_present_places=False)
             for names in ((self.name, q.name), (self.name,), (q.name,))
@@ -291,10 +342,12 @@ class FieldAmplitude:
 
     @property
     def _linear(self) -> list[FormTerm]:
+        """The energies that are linear in the field."""
         return [t for t in self.terms if t.amplitude is not None]
 
     @property
     def _quadratic(self) -> list[FormTerm]:
+        """The energies that are quadratic in the field."""
         return [t for t in self.terms if t.amplitude is None]
 
     def _with_polynomial(self, t: FormTerm, polynomial: PointField) -> FormTerm:
@@ -306,13 +359,18 @@ class FieldAmplitude:
         return self._term(t, ufl.derivative(t.form, self.applied.polynomial, change))
 
     def _term(self, t: FormTerm, form: ufl.Form) -> FormTerm:
+        """Return a form as a term with the name and the amplitude of another term."""
         return FormTerm(t.name, form, self.u, self.log, t.amplitude)
 
 
 def field_parameters(
     fields: Sequence[AppliedField], terms: Sequence[Term], u: fem.Function, log: KernelLog
 ) -> dict[str, FreeParameter]:
-    """Return the amplitudes of moving fields as free parameters, by name; collective."""
+    """Return the amplitudes of moving fields as free parameters, by name; collective.
+
+    Only the `terms` whose forms have a field's polynomial are differentiated. The residuals of the
+    derivatives are compiled.
+    """
     parameters = {}
     for field in fields:
         terms_of_field = [

@@ -1,8 +1,9 @@
 """Derivatives of the energy and the forces of charges by the charges and by their heights.
 
-The energy W = sum of q_i q_j/|x_i - x_j| has dW/dq_i = sum of q_j/|x_i - x_j|, and of v . dW/du the
-rate of that along v. Places are found with rates of nodes as imaginary parts, times a step so small
-that their own are exact to rounding (W. Squire, G. Trapp, SIAM Review 40, 1998, 110).
+The energy W = sum of q_i q_j/|x_i - x_j| has dW/dq_i = sum of q_j/|x_i - x_j|. The derivative of
+the force term v . dW/du is the rate of this sum along v. The rates v of nodes are the imaginary
+parts of complex nodes, times a step so small that derivatives are exact to rounding (W. Squire, G.
+Trapp, SIAM Review 40, 1998, 110).
 """
 
 from dataclasses import dataclass
@@ -31,17 +32,27 @@ class Weights:
 
 
 def places(points: Points, rows: Ints, nodes: Complex) -> tuple[Complex, Complex, Complex]:
-    """Return mid-surface places r, normals n and places x of the charges of elements `rows`.
+    """Return mid-surface places r, normals n and places x of the charges of elements.
 
-    They are (n, P, .., 3), and x (n, P, .., layers, 3), on cells with nodes (n, k, 3).
+    Places are over R. Shapes are (n, P, .., 3) for r and n, and (n, P, .., layers, 3) for x.
+
+    Parameters
+    ----------
+    points
+        Tables of shape functions, thickness and heights at P points of an element.
+    rows
+        (n,) rows of the elements in `points.t`.
+    nodes
+        (n, k, 3) nodes of their cells, with rates as imaginary parts.
     """
     T = np.moveaxis(points.tables, -2, 0)
-    flat = (
+    # real and imaginary parts side by side, so that a real matrix product interpolates both
+    flat_nodes = (
         np.ascontiguousarray(nodes.transpose(1, 0, 2)).view(np.float64).reshape(nodes.shape[1], -1)
     )
     r, a1, a2 = (
         np.moveaxis(
-            (table.reshape(-1, table.shape[-1]) @ flat)
+            (table.reshape(-1, table.shape[-1]) @ flat_nodes)
             .view(np.complex128)
             .reshape(-1, *nodes.shape[::2]),
             1,
@@ -49,8 +60,8 @@ def places(points: Points, rows: Ints, nodes: Complex) -> tuple[Complex, Complex
         ).reshape(len(nodes), *table.shape[:-1], 3)
         for table in T
     )
-    m = np.cross(a1, a2)
-    n = m / np.sqrt(np.sum(m * m, axis=-1, keepdims=True))
+    area_vector = np.cross(a1, a2)
+    n = area_vector / np.sqrt(np.sum(area_vector * area_vector, axis=-1, keepdims=True))
     heights = points.t[rows][..., None] * points.heights
     return r, n, r[..., None, :] + heights[..., None] * n[..., None, :]
 
@@ -64,10 +75,11 @@ def pair_derivatives(
     *,
     heights: bool = False,
 ) -> tuple[Array, Array]:
-    """Return derivatives by the charges of left and right points, of sums over pairs (n, 2).
+    """Return derivatives of sums over pairs of cells, by the charges of left and right points.
 
-    Both are like `Points.q`. With `heights`, derivatives by the heights of the charges over the
-    mid-surface are returned instead.
+    Both arrays have the shape of `Points.q`. With `heights`, they are derivatives by the heights of
+    the charges over the mid-surface. What is differentiated is `weights.energy` W + `weights.force`
+    v . dW/du, with the rates v of the nodes.
 
     Parameters
     ----------
@@ -79,6 +91,7 @@ def pair_derivatives(
         Points on each pair's first and second cell, and their rows (n,).
     """
     by_left, by_right = (np.zeros_like(points.q) for points, _ in (left, right))
+    # either all pairs of points count, or each left point has right points of its own
     is_shared = right[0].tables.ndim == 3
     size = left[0].q[0].size * (right[0].q[0].size if is_shared else right[0].q[0, 0].size)
     batch_size, derivatives = (
@@ -105,7 +118,12 @@ def pair_derivatives(
 def _by_charges(
     x: Components, y: Components, q: Array, p: Array, weights: Weights
 ) -> tuple[Array, Array]:
-    parts = [
+    """Return derivatives (n, 1 or P, charges) by left charges q and right charges p.
+
+    `x` and `y` are components of places and normals of left and right charges. With d = x - y the
+    kernel is 1/|d|, and its rate -d . d'/|d|³.
+    """
+    places_and_rates = [
         [
             (np.ascontiguousarray(values.real), values.imag / COMPLEX_STEP)
             for values in components[0]
@@ -113,7 +131,7 @@ def _by_charges(
         for components in (x, y)
     ]
     separation, rate = (
-        [a[i][..., :, None] - b[i][..., None, :] for a, b in zip(*parts, strict=True)]
+        [a[i][..., :, None] - b[i][..., None, :] for a, b in zip(*places_and_rates, strict=True)]
         for i in range(2)
     )  # (n, 1 or P, left, right)
     inverse = 1 / np.sqrt(separation[0] ** 2 + separation[1] ** 2 + separation[2] ** 2)
@@ -125,6 +143,12 @@ def _by_charges(
 def _by_heights(
     x: Components, y: Components, q: Array, p: Array, weights: Weights
 ) -> tuple[Array, Array]:
+    """Return derivatives (n, 1 or P, charges) by the heights of left charges q and right charges p.
+
+    A charge moves along its normal n with its height, so that q p/|d|, d = x - y, has the
+    derivative -q p n . d/|d|³. `x` and `y` are components of places and normals of left and right
+    charges.
+    """
     d = [a[..., :, None] - b[..., None, :] for a, b in zip(x[0], y[0], strict=True)]
     square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
     inverse_cube = 1 / (square * np.sqrt(square))
@@ -141,6 +165,11 @@ def _by_heights(
 
 
 def _components(points: Points, rows: Ints, nodes: Complex, is_shared: bool) -> Components:
+    """Return the components x, y, z of the charges' places, and those of their normals.
+
+    Each is (n, 1, charges) if the points are `is_shared` by all points of the other element, else
+    (n, P, charges): one set for each of its P points.
+    """
     _, n, x = places(points, rows, nodes)
     shape = len(x), 1 if is_shared else x.shape[1], -1, 3
     places_and_normals = x.reshape(shape), np.broadcast_to(n[..., None, :], x.shape).reshape(shape)

@@ -101,7 +101,7 @@ class Boxes:
     Attributes
     ----------
     elements
-        (n,) the elements.
+        (n,) numbers of the elements.
     low, size
         (n, 2 or 3) lowest corners and sides.
     """
@@ -120,7 +120,10 @@ class Boxes:
         return Boxes(self.elements[which], self.low[which], self.size[which])
 
     def halves(self, sides: Ints) -> "Boxes":
-        """Return both halves of each box, divided along side number `sides` (n,): (2 n) boxes."""
+        """Return both halves of each box, divided along side number `sides` (n,).
+
+        The 2 n boxes are all lower halves, then all upper halves.
+        """
         size = self.size.copy()
         rows = np.arange(len(size))
         size[rows, sides] /= 2
@@ -156,7 +159,7 @@ class PointCharges:
 
 
 class ChargedElements:
-    """Charged elements with coordinates (a, b), or (a, b, c) where they are solid.
+    """Base of charged elements with coordinates (a, b), or (a, b, c) where they are solid.
 
     Attributes
     ----------
@@ -170,7 +173,10 @@ class ChargedElements:
     dimension: ClassVar[int] = 2
 
     def box_places(self, boxes: Boxes, x: Array) -> Array:
-        """Return places (n, m, k, 3) of points x (m, 2 or 3) of boxes, k through the thickness."""
+        """Return deformed places (n, m, k, 3) over R of points x (m, 2 or 3) of n boxes.
+
+        There are k places at each point, through the thickness.
+        """
         raise NotImplementedError
 
     def charges_at(
@@ -180,17 +186,18 @@ class ChargedElements:
         weights: Array,
         nodal_derivatives: NodalDerivatives | None = None,
     ) -> PointCharges:
-        """Return the charges at points x (m, 2 or 3) of boxes, times weights (m,).
+        """Return the charges at points x (m, 2 or 3) of the unit square or cube, in each box.
 
-        With `nodal_derivatives`, the charges can add their derivatives to it.
+        They are multiplied by the weights (m,) of the points. With `nodal_derivatives`, the
+        returned charges have an `add_derivatives`, which adds to it.
         """
         raise NotImplementedError
 
     def separated_boxes(self, places: Array) -> Iterator[tuple[Boxes, Ints, Ints]]:
-        """Yield boxes, and pairs (box number, place number) that are far enough apart.
+        """Yield boxes with pairs (box number, place number) that are far enough apart.
 
-        The boxes of all pairs together cover all elements once for each place. A box belongs to
-        one of the yielded sets only.
+        The numbers are two arrays (pairs,). The boxes of all pairs together cover all elements once
+        for each of the places (n, 3) over R. A box belongs to one of the yielded sets only.
 
         Raises
         ------
@@ -213,6 +220,7 @@ class ChargedElements:
             is_separated = distance > SEPARATION_IN_RADII * radius[box_of_pair]
             if is_separated.any():
                 yield boxes, box_of_pair[is_separated], place_of_pair[is_separated]
+            # boxes too near to a place are halved along their longest side, for this place alone
             halved, box_of_pair = np.unique(box_of_pair[~is_separated], return_inverse=True)
             place_of_pair, x = place_of_pair[~is_separated], x[halved]
             ends = x[:, 1 : 1 + 2 * self.dimension]
@@ -229,7 +237,7 @@ class ChargedElements:
 class ShellFaces(ChargedElements):
     """Charges of both faces of a shell, and of its interior where the remanence varies there.
 
-    With `include_uncharged`, interiors without a charge are there too.
+    With `include_uncharged`, layers of the interior are kept even if they have no charge.
     """
 
     def __init__(
@@ -243,6 +251,7 @@ class ShellFaces(ChargedElements):
         )
         self._sectors, self.count = sectors, sectors * len(cells)
         spread = np.abs(shape.remanence - shape.remanence[:, :1]).max(initial=0.0)
+        # a uniform remanence has no charge inside; around an axis only an axial one is uniform
         is_uniform = spread <= 1e-12 * np.abs(shape.remanence).max(initial=0.0)
         is_axial = not shape.swept or not np.abs(shape.remanence[..., :2]).any()
         self._inside = (
@@ -252,9 +261,14 @@ class ShellFaces(ChargedElements):
         )
 
     def _jets(self, boxes: Boxes, x: Array) -> SurfaceJets:
+        """Return the surface's jets at points x (m, 2) of the unit square, mapped into each box."""
         return self._jets_at(boxes, boxes.points(x))
 
     def _jets_at(self, boxes: Boxes, ab: Array) -> SurfaceJets:
+        """Return the surface's jets at coordinates ab (n, m, 2) of the elements of n boxes.
+
+        An element of a meridian is one sector of a ring, so that b counts within the sector.
+        """
         ab = ab.copy()
         if self.shape.swept:
             ab[..., 1] = (self._sector[boxes.elements][:, None] + ab[..., 1]) / self._sectors
@@ -265,9 +279,9 @@ class ShellFaces(ChargedElements):
         return np.stack([jets.place(0.5), jets.place(-0.5)], axis=2)
 
     def contains(self, places: Array) -> NDArray[np.bool_]:
-        """Return which of places (n, 3) are in the shell.
+        """Return which of the places (n, 3) over R are in the deformed shell.
 
-        These have a foot on the mid-surface within half of the thickness.
+        Such a place has a foot on the mid-surface, at a distance below half of the thickness.
         """
         from scipy.spatial import cKDTree  # takes long to import
 
@@ -284,20 +298,22 @@ class ShellFaces(ChargedElements):
             grid_places[:, 1:, 1:] - grid_places[:, :-1, :-1],
             grid_places[:, 1:, :-1] - grid_places[:, :-1, 1:],
         ]
+        # a place in the shell is within `reach` of a grid point of its box
         reach = np.max(
-            [np.linalg.norm(diagonal, axis=-1).max(axis=(1, 2)) for diagonal in diagonals], axis=0
+            [np.linalg.norm(array, axis=-1).max(axis=(1, 2)) for array in diagonals], axis=0
         )
         reach = reach + grid.thickness.max(axis=1)
         candidates = cKDTree(grid.r[0].reshape(-1, 3)).query_ball_point(places, reach.max())
-        place = np.repeat(np.arange(len(places)), [len(diagonal) for diagonal in candidates])
+        place = np.repeat(np.arange(len(places)), [len(array) for array in candidates])
         box, point = np.divmod(np.concatenate([*candidates, []]).astype(np.intp), len(start))
         distance_to_point = np.linalg.norm(places[place] - grid.r[0][box, point], axis=-1)
+        # of each pair (place, box) the nearest grid point, where Newton's method starts
         order = np.lexsort((distance_to_point, box, place))
         order = order[distance_to_point[order] <= reach[box[order]]]
         _, nearest = np.unique(
             place[order] * self.count + box[order], return_index=True
         )  # the nearest in each box
-        place, box, point = (diagonal[order][nearest] for diagonal in (place, box, point))
+        place, box, point = (array[order][nearest] for array in (place, box, point))
         if len(place):
             is_inside[
                 place[self._feet_within(boxes[box], start[point][:, None], places[place][:, None])]
@@ -307,12 +323,13 @@ class ShellFaces(ChargedElements):
     def _feet_within(self, boxes: Boxes, ab: Array, x: Array) -> NDArray[np.bool_]:
         """Return whether places x (n, 1, 3) have a foot in their box within half of the thickness.
 
-        Newton's method starts from coordinates `ab` (n, 1, 2).
+        Newton's method for the foot starts from coordinates `ab` (n, 1, 2). The result is (n,).
         """
         for _ in range(NEWTON_STEPS):
             foot = self._jets_at(boxes, ab)
             J = np.stack([foot.r[1], foot.r[2]], axis=-1)
             step = np.einsum("nmdi,nmi->nmd", np.linalg.pinv(J), x - foot.r[0])
+            # b of an element is a part of the ring's azimuth
             step[..., 1] *= self._sectors
             ab = np.clip(ab + step, BOUNDARY_INSET**3, 1 - BOUNDARY_INSET**3)
         foot = self._jets_at(boxes, ab)
@@ -330,9 +347,15 @@ class ShellFaces(ChargedElements):
         weights: Array,
         nodal_derivatives: NodalDerivatives | None = None,
     ) -> PointCharges:
+        """Return the charges of both faces and of the layers inside, like `ChargedElements`.
+
+        By Nanson the area vector is dX/da x dX/db of the undeformed layer. The divergence has the
+        cofactors dX/db x dX/deta and dX/deta x dX/da, with the derivatives of Br by a and b.
+        """
         area = np.prod(boxes.size, axis=1)[:, None] * weights / self._sectors
 
         def layers(at: SurfaceJets) -> list[Layer]:
+            """Return the layers of jets at the points: both faces, then those inside."""
             layers_of_jets = list[Layer]()
             for eta, sign in ((0.5, 1.0), (-0.5, -1.0)):
                 G1, G2, _ = at.layer(eta)
@@ -351,7 +374,10 @@ class ShellFaces(ChargedElements):
 
 
 class EdgeStrips(ChargedElements):
-    """Edges of cells as strips: coordinates along the edge and through the thickness."""
+    """Edges of cells as charged strips: coordinates along the edge and through the thickness.
+
+    `cells` and `edges` (n,) are the cell and the local number of each edge.
+    """
 
     def __init__(self, shape: MagnetisedShell, cells: Ints, edges: Ints) -> None:
         self.shape = shape
@@ -361,9 +387,10 @@ class EdgeStrips(ChargedElements):
         self.count = len(self._cells)
 
     def _coordinates(self, boxes: Boxes, x: Array) -> tuple[Array, Array, Array]:
-        """Return coordinates (n, m, 2) of the surface at points of boxes, tangents and heights.
+        """Return surface coordinates (n, m, 2), tangents (n, 2) and heights (n, m) in boxes.
 
-        The tangents (n, 2) are their derivatives along the edge; heights (n, m) are over the
+        The points x (m, 2) of the unit square run along the edge and through the thickness. A
+        tangent is the derivative of the surface coordinates along the edge; heights are over the
         thickness.
         """
         s, eta = np.moveaxis(boxes.points(x), -1, 0)
@@ -383,6 +410,7 @@ class EdgeStrips(ChargedElements):
         return np.stack([a, b], axis=-1), tangents, eta - 0.5
 
     def _jets(self, boxes: Boxes, x: Array) -> tuple[SurfaceJets, Array, Array]:
+        """Return the surface's jets at points x (m, 2) of boxes, tangents and heights."""
         ab, tangents, eta = self._coordinates(boxes, x)
         return SurfaceJets.at_points(self.shape, self._cells[boxes.elements], ab), tangents, eta
 
@@ -398,6 +426,10 @@ class EdgeStrips(ChargedElements):
         weights: Array,
         nodal_derivatives: NodalDerivatives | None = None,
     ) -> PointCharges:
+        """Return the charges Br . N dA0 of the strips; see `ChargedElements.charges_at`.
+
+        The outward area vector is the tangent of the undeformed edge times dX/deta.
+        """
         jets, tangents, eta = self._jets(boxes, x)
         area = (
             np.prod(boxes.size, axis=1)[:, None]
@@ -406,6 +438,7 @@ class EdgeStrips(ChargedElements):
         )
 
         def layers(jets: SurfaceJets) -> list[Layer]:
+            """Return the points of the strip as a single layer, each with its own height."""
             G1, G2, G3 = jets.layer(eta[..., None])  # type: ignore[arg-type]  # heights of points
             tangent = tangents[:, None, :1] * G1 + tangents[:, None, 1:] * G2
             outward = area[..., None] * np.cross(tangent, G3)
@@ -430,12 +463,23 @@ def _point_charges(
     layers_of: Callable[[SurfaceJets], list[Layer]],
     nodal_derivatives: NodalDerivatives | None,
 ) -> PointCharges:
-    """Return the charges of some layers of a surface with jets."""
+    """Return the charges of some layers of a surface.
+
+    Parameters
+    ----------
+    jets
+        Jets of the surface at the points, with the remanence and its derivatives B (3, n, m, 3).
+    layers_of
+        Jets -> the layers, each with its height and the factors of B in its charges.
+    nodal_derivatives
+        Derivatives to which `PointCharges.add_derivatives` adds; None without.
+    """
     n, layers = unit(np.cross(jets.r[1], jets.r[2])), layers_of(jets)
     thickness = jets.thickness[..., None]
     x = np.stack([jets.r[0] + eta * thickness * n for eta, _ in layers], axis=2)
 
     def charges(layers: list[Layer]) -> Array:
+        """Return the charges (n, m, layers): factors of layers times B and its derivatives."""
         return np.stack(
             [
                 sum(np.sum(c * b, axis=-1) for c, b in zip(C, jets.B, strict=True))
@@ -449,6 +493,7 @@ def _point_charges(
         return PointCharges(x, q)
 
     def add_derivatives(on_x: Array, on_q: Array) -> None:
+        """Add derivatives of a number, from those by places and sizes of the charges."""
         heights = np.stack([eta * thickness + 0 * jets.r[0][..., :1] for eta, _ in layers], axis=2)
         by_B = [
             sum(on_q[:, :, i, None] * C[j] for i, (_, C) in enumerate(layers)) for j in range(3)
@@ -456,6 +501,7 @@ def _point_charges(
         jets.add_derivatives(
             nodal_derivatives, on_x.sum(axis=2), (heights * on_x).sum(axis=2), np.stack(by_B)
         )
+        # heights and factors depend on the undeformed shell, too
         jets.add_reference_derivatives(
             nodal_derivatives, lambda other: charges(layers_of(other)), on_q
         )
@@ -464,7 +510,11 @@ def _point_charges(
 
 
 def field(families: Sequence[ChargedElements], places: Array) -> Array:
-    """Return the flux density (n, 3) of charges at places (n, 3); nan in the shell's surface."""
+    """Return the flux density (n, 3) of charges at places (n, 3); nan in the shell's surface.
+
+    Places are over R; the flux density is over the remanence's magnitude. Not collective: these are
+    the charges of this rank's elements.
+    """
     B = np.zeros_like(places)
     for family in families:
         rule, weights = cube(GAUSS_POINTS_PER_SIDE, family.dimension)
@@ -473,6 +523,8 @@ def field(families: Sequence[ChargedElements], places: Array) -> Array:
                 for boxes, box_of_pair, place_of_pair in family.separated_boxes(
                     places[part_of_places]
                 ):
+                    # charges are computed once for each box that is used, then summed over its
+                    # pairs
                     used_boxes, box_of_pair = np.unique(box_of_pair, return_inverse=True)
                     parts_of_charges = [
                         family.charges_at(part_of_boxes, rule, weights)
@@ -495,9 +547,14 @@ def field(families: Sequence[ChargedElements], places: Array) -> Array:
 def _add_field(
     B: Array, place_of_pair: Ints, places: Array, x: Array, q: Array, box_of_pair: Ints
 ) -> None:
-    """Add to B (n, 3) at places the field of charges q (boxes, points) at x (boxes, points, 3).
+    """Add to B (n, 3) at places (n, 3) the field of the charges of boxes.
 
-    Place and box of each pair are `place_of_pair` and `box_of_pair`.
+    Parameters
+    ----------
+    place_of_pair, box_of_pair
+        (pairs,) numbers of the place and of the box of each pair that is counted.
+    x, q
+        (boxes, points, 3) places and (boxes, points) sizes of the charges.
     """
     components = np.ascontiguousarray(np.moveaxis(x, -1, 0))
     for pairs in _slices(len(place_of_pair), q.shape[1]):
@@ -506,17 +563,21 @@ def _add_field(
             for i in range(3)
         ]
         square_of_distance = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
-        share = q[box_of_pair[pairs]] / (
+        q_over_cube = q[box_of_pair[pairs]] / (
             4 * np.pi * square_of_distance * np.sqrt(square_of_distance)
         )
         for i in range(3):
-            B[:, i] += np.bincount(place_of_pair[pairs], np.einsum("nm,nm->n", share, d[i]), len(B))
+            B[:, i] += np.bincount(
+                place_of_pair[pairs], np.einsum("nm,nm->n", q_over_cube, d[i]), len(B)
+            )
 
 
 def gradient(
     families: Sequence[ChargedElements], place: Array, e: Array, nodal_derivatives: NodalDerivatives
 ) -> float:
-    """Return e . B at one place (3,), and add to its derivatives by nodal values.
+    """Return e . B at one place (3,), and add its derivatives to `nodal_derivatives`.
+
+    B is over the remanence's magnitude, e a vector (3,). Only this rank's elements are counted.
 
     Raises
     ------
@@ -524,32 +585,38 @@ def gradient(
         If the place is in the shell's surface.
     """
     value = 0.0
-    parts = (
-        (family, part)
+    chunks = (
+        (family, chunk)
         for family in families
         for boxes, box, _ in family.separated_boxes(place[None])
-        for part in _chunks_of_boxes(boxes[box], GAUSS_POINTS_PER_SIDE**family.dimension)
+        for chunk in _chunks_of_boxes(boxes[box], GAUSS_POINTS_PER_SIDE**family.dimension)
     )
-    for family, part in parts:
+    for family, chunk in chunks:
         rule, weights = cube(GAUSS_POINTS_PER_SIDE, family.dimension)
-        charges = family.charges_at(part, rule, weights, nodal_derivatives)
+        charges = family.charges_at(chunk, rule, weights, nodal_derivatives)
         d = place - charges.x
         r = np.linalg.norm(d, axis=-1)
         kernel = d @ e / (4 * np.pi * r**3)
         value += float(np.sum(charges.q * kernel))
-        slope = e / r[..., None] ** 3 - 3 * (d @ e / r**5)[..., None] * d
+        # 4 pi times the derivative of the kernel by the place; by a charge's place it is opposite
+        kernel_slope = e / r[..., None] ** 3 - 3 * (d @ e / r**5)[..., None] * d
         assert charges.add_derivatives
-        charges.add_derivatives(-charges.q[..., None] * slope / (4 * np.pi), kernel)
+        charges.add_derivatives(-charges.q[..., None] * kernel_slope / (4 * np.pi), kernel)
     return value
 
 
 def moment(families: Sequence[ChargedElements]) -> Array:
-    """Return the sum of q x, (3,): the integral of the remanence as the shell carries it."""
+    """Return the moment (3,) of all charges, the sum of q x, over R³ and the remanence's size.
+
+    It is the integral of the remanence as the shell carries it.
+    """
     total = np.zeros(3)
     for family in families:
         rule, weights = cube(GAUSS_POINTS_PER_SIDE, family.dimension)
-        for part in _chunks_of_boxes(Boxes.undivided(family.count, family.dimension), len(weights)):
-            charges = family.charges_at(part, rule, weights)
+        for chunk in _chunks_of_boxes(
+            Boxes.undivided(family.count, family.dimension), len(weights)
+        ):
+            charges = family.charges_at(chunk, rule, weights)
             total += np.einsum("nml,nmli->i", charges.q, charges.x)
     return total
 
@@ -566,6 +633,7 @@ def cube(n: int, dimension: int = 3) -> tuple[Array, Array]:
 
 
 def _chunks_of_boxes(boxes: Boxes, points_per_box: int) -> Iterator[Boxes]:
+    """Divide boxes into chunks of at most `MAX_POINTS_AT_ONCE` points together."""
     boxes_at_once = max(1, MAX_POINTS_AT_ONCE // points_per_box)
     for first in range(0, len(boxes.elements), boxes_at_once):
         yield boxes[first : first + boxes_at_once]
@@ -578,9 +646,10 @@ def _slices(count: int, points_per_item: int) -> Iterator[slice]:
 
 
 def triangles(family: ChargedElements, parts: int) -> list[tuple[Array, Array]]:
-    """Return flat triangles, corners (n, 3, 3), with their charges (n,).
+    """Return flat triangles, corners (n, 3, 3) over R, with their charges (n,), chunk by chunk.
 
-    Each element is divided into parts² quadrangles of two triangles each.
+    Each element is divided into parts² quadrangles of two triangles each. A quadrangle's charge is
+    shared by area; triangles almost without area are left out.
     """
     low = np.stack(np.meshgrid(*[np.arange(parts) / parts] * 2, indexing="ij"), axis=-1).reshape(
         -1, 2
@@ -596,9 +665,9 @@ def triangles(family: ChargedElements, parts: int) -> list[tuple[Array, Array]]:
         cube(3, 2),
     )
     triangles_and_charges = []
-    for part_of_boxes in _chunks_of_boxes(boxes, len(weights)):
-        x = family.charges_at(part_of_boxes, corners, np.zeros(len(corners))).x
-        q = family.charges_at(part_of_boxes, rule, weights).q.sum(axis=1).ravel()
+    for chunk in _chunks_of_boxes(boxes, len(weights)):
+        x = family.charges_at(chunk, corners, np.zeros(len(corners))).x
+        q = family.charges_at(chunk, rule, weights).q.sum(axis=1).ravel()
         quads = np.moveaxis(x, 1, 2).reshape(-1, 4, 3)
         halves = quads[:, [[0, 1, 2], [0, 2, 3]]]
         area = np.linalg.norm(

@@ -70,7 +70,10 @@ class MagnetisedSolid:
     remanence: Array
 
     def contains(self, places: Array) -> NDArray[np.bool_]:
-        """Return which of places (n, 3) are in the deformed cells."""
+        """Return which of the places (n, 3) over R are in the deformed cells of this rank.
+
+        Candidates are cells whose nodes' ball, slightly enlarged, contains the place.
+        """
         from scipy.spatial import cKDTree  # takes long to import
 
         is_inside = np.zeros(len(places), dtype=bool)
@@ -84,6 +87,7 @@ class MagnetisedSolid:
             np.arange(len(places)), [len(cells_of_place) for cells_of_place in candidates]
         )
         cell = np.concatenate([*candidates, []]).astype(np.intp)
+        # pairs (place, cell) whose ball contains the place
         is_near = np.linalg.norm(places[place] - middle[cell], axis=-1) <= radius[cell]
         place, cell = place[is_near], cell[is_near]
         for first in range(0, len(place), MAX_POINTS_AT_ONCE):
@@ -92,9 +96,9 @@ class MagnetisedSolid:
         return is_inside
 
     def _are_in_cells(self, nodes: Array, x: Array) -> NDArray[np.bool_]:
-        """Return whether each of places x (n, 3) is in its cell with nodes (n, k, 3).
+        """Return whether each of places x (n, 3) is in its deformed cell, of nodes (n, k, 3).
 
-        Newton's method starts from the nearest node.
+        Newton's method for the reference coordinates starts from the nearest node.
         """
         nearest = np.linalg.norm(nodes - x[:, None], axis=-1).argmin(axis=1)
         reference = self.element.points[nearest]
@@ -102,6 +106,7 @@ class MagnetisedSolid:
             value, *gradients = np.einsum(
                 "dnk,nki->dni", tables(self.element, reference[:, None], 1)[:, :, 0], nodes
             )
+            # clipped, so that an iterate does not leave the range where the map is regular
             step = np.linalg.pinv(np.stack(gradients, axis=-1)) @ (x - value)[..., None]
             reference = np.clip(reference + step[..., 0], -NEWTON_OVERSHOOT, 1 + NEWTON_OVERSHOOT)
         value = np.einsum("nk,nki->ni", tables(self.element, reference[:, None], 0)[0, :, 0], nodes)
@@ -112,25 +117,39 @@ class MagnetisedSolid:
 
 
 class SolidCharges(ChargedElements):
-    """Base of the charges of a solid's cells.
+    """Base of the charges of some cells of a solid.
 
     Attributes
     ----------
     shape
         The solid with all its cells.
+    cells
+        (count,) the number of each element's cell; a cell may occur once for each face.
     """
 
     def __init__(self, shape: MagnetisedSolid, cells: Ints) -> None:
         self.shape, self.cells, self.count = shape, cells, len(cells)
 
     def reference(self, boxes: Boxes, x: Array) -> Array:
-        """Return places (n, m, 3) on the reference cube of points x (m, 2 or 3) of boxes."""
+        """Return places (n, m, 3) on the reference cube of points x of boxes.
+
+        The points (m, 2) of a face or (m, 3) of a cell are in the unit square or cube of each box.
+        """
         raise NotImplementedError
 
     def remanence_factors(self, boxes: Boxes, X: Array, weights: Array) -> Array:
-        """Return the factors (4, n, m, 3) of the remanence and its derivatives in the charges.
+        """Return factors C (4, n, m, 3) of the remanence and its derivatives in the charges.
 
-        X (3, n, m, 3) are the derivatives of undeformed places by reference coordinates.
+        The charges are q = C . (Br, Br_a, Br_b, Br_c), summed over components.
+
+        Parameters
+        ----------
+        boxes
+            The n boxes.
+        X
+            (3, n, m, 3) derivatives of undeformed places by reference coordinates.
+        weights
+            (n, m) weights of the points, with the size of the box.
         """
         raise NotImplementedError
 
@@ -157,27 +176,38 @@ class SolidCharges(ChargedElements):
         weights: Array,
         nodal_derivatives: NodalDerivatives | None = None,
     ) -> PointCharges:
+        """Return the charges at points of boxes, in one layer; see `ChargedElements.charges_at`."""
         reference, cells, solid = self.reference(boxes, x), self.cells[boxes.elements], self.shape
-        T, TB = tables(solid.element, reference, 1), tables(solid.remanence_element, reference, 1)
-        X = np.einsum("dnmk,nki->dnmi", T[1:], solid.X[cells])
-        B = np.einsum("dnmk,nki->dnmi", TB, solid.remanence[cells])
-        C = self.remanence_factors(boxes, X, np.prod(boxes.size, axis=1)[:, None] * weights)
-        place = np.einsum("nmk,nki->nmi", T[0], self._nodes[cells])
-        q = np.sum(C * B, axis=(0, -1))
+        shape_tables, remanence_tables = (
+            tables(solid.element, reference, 1),
+            tables(solid.remanence_element, reference, 1),
+        )
+        X = np.einsum("dnmk,nki->dnmi", shape_tables[1:], solid.X[cells])
+        remanence = np.einsum("dnmk,nki->dnmi", remanence_tables, solid.remanence[cells])
+        factors = self.remanence_factors(boxes, X, np.prod(boxes.size, axis=1)[:, None] * weights)
+        place = np.einsum("nmk,nki->nmi", shape_tables[0], self._nodes[cells])
+        q = np.sum(factors * remanence, axis=(0, -1))
         if nodal_derivatives is None:
             return PointCharges(place[:, :, None], q[..., None])
 
         def add_derivatives(on_x: Array, on_q: Array) -> None:
-            np.add.at(nodal_derivatives.by_u, cells, np.einsum("nmk,nmi->nki", T[0], on_x[:, :, 0]))
+            """Add derivatives of a number, from those by places and sizes of the charges."""
             np.add.at(
-                nodal_derivatives.by_remanence, cells, np.einsum("dnmk,dnmi->nki", TB, C * on_q)
+                nodal_derivatives.by_u,
+                cells,
+                np.einsum("nmk,nmi->nki", shape_tables[0], on_x[:, :, 0]),
+            )
+            np.add.at(
+                nodal_derivatives.by_remanence,
+                cells,
+                np.einsum("dnmk,dnmi->nki", remanence_tables, factors * on_q),
             )
 
         return PointCharges(place[:, :, None], q[..., None], add_derivatives)
 
 
 class CellFaces(SolidCharges):
-    """Charges Br.N dA0 of faces of cells, with outward normals; faces by local numbers."""
+    """Charges Br . N dA0 of cells' faces with outward normals N; `faces` are local numbers."""
 
     def __init__(self, shape: MagnetisedSolid, cells: Ints, faces: Ints) -> None:
         super().__init__(shape, cells)
@@ -187,12 +217,15 @@ class CellFaces(SolidCharges):
         return places_on_faces(self._faces[boxes.elements], boxes.points(x))
 
     def remanence_factors(self, boxes: Boxes, X: Array, weights: Array) -> Array:
-        faces, C = self._faces[boxes.elements], np.zeros((4, *X.shape[1:]))
-        first, second = (
+        """Return outward area vectors times weights for Br, zero for its derivatives."""
+        faces, factors = self._faces[boxes.elements], np.zeros((4, *X.shape[1:]))
+        tangent_a, tangent_b = (
             np.einsum("nd,dnmi->nmi", FACE_TANGENTS[faces, side], X) for side in range(2)
         )
-        C[0] = (OUTWARD_SIGNS[faces][:, None] * weights)[..., None] * np.cross(first, second)
-        return C
+        factors[0] = (OUTWARD_SIGNS[faces][:, None] * weights)[..., None] * np.cross(
+            tangent_a, tangent_b
+        )
+        return factors
 
 
 class CellInteriors(SolidCharges):
@@ -204,10 +237,11 @@ class CellInteriors(SolidCharges):
         return boxes.points(x)
 
     def remanence_factors(self, boxes: Boxes, X: Array, weights: Array) -> Array:
-        C, density = np.zeros((4, *X.shape[1:])), -weights[..., None]
+        """Return minus cofactors times weights for Br's derivatives: -Div Br dV0."""
+        factors, density = np.zeros((4, *X.shape[1:])), -weights[..., None]
         for d in range(3):
-            C[1 + d] = density * np.cross(X[(d + 1) % 3], X[(d + 2) % 3])
-        return C
+            factors[1 + d] = density * np.cross(X[(d + 1) % 3], X[(d + 2) % 3])
+        return factors
 
 
 class ChargeLayers(ChargedElements):
@@ -226,6 +260,11 @@ class ChargeLayers(ChargedElements):
         weights: Array,
         nodal_derivatives: NodalDerivatives | None = None,
     ) -> PointCharges:
+        """Return the charges of cells' interiors, in `GAUSS_LAYERS` layers, without derivatives.
+
+        The points x (m, 2) of boxes are repeated at the height of each layer; `nodal_derivatives`
+        is not used.
+        """
         heights, weights_through = gauss(GAUSS_LAYERS)
         zero, one = np.zeros((len(boxes.elements), 1)), np.ones((len(boxes.elements), 1))
         boxes_in_solid = Boxes(
@@ -254,6 +293,6 @@ def places_on_faces(faces: Ints, ab: Array) -> Array:
 
 
 def cells_with_varying_remanence(shape: MagnetisedSolid) -> Ints:
-    """Return the numbers of the cells in which the remanence varies."""
+    """Return the numbers of the cells in which the remanence varies by more than rounding."""
     spread = np.abs(shape.remanence - shape.remanence[:, :1]).max(axis=(1, 2), initial=0.0)
     return np.flatnonzero(spread > UNIFORMITY_TOLERANCE * np.abs(shape.remanence).max(initial=0.0))

@@ -1,7 +1,7 @@
-"""Second derivatives of charges by nodes, rotated with the nodes: near nodes, in single precision.
+"""Second derivatives of charges by near nodes, rotated with the nodes, in single precision.
 
-In go the blocks of a `Stiffness` and the rotations of nodes, out come rotated blocks. In C; see
-docs/theory.md.
+The blocks of a `Stiffness` and the rotations of nodes go in, rotated blocks come out. The loop is
+in C; see docs/theory.md.
 """
 
 from dataclasses import dataclass
@@ -33,11 +33,11 @@ class StoredBlocks:
     Attributes
     ----------
     starts, numbers
-        Of each row of blocks, where it starts, and the numbers of its blocks.
+        Start of each row of blocks in `numbers`, and the numbers of the selected blocks.
     first
-        Which of these is the first one of its row that is stored.
+        For each row, the position in `numbers` of the first block that is stored.
     row_starts, columns
-        Starts of rows, and columns, of what is stored.
+        Compressed rows of the stored blocks: start of each row, column of each block.
     """
 
     starts: Indices
@@ -50,12 +50,12 @@ class StoredBlocks:
     def select(
         cls, stiffness: Stiffness, is_selected: NDArray[np.bool_], *, upper: bool
     ) -> "StoredBlocks":
-        """Return the selected of all blocks (blocks,).
+        """Return the blocks of a stiffness where `is_selected` (blocks,).
 
         Parameters
         ----------
         upper
-            Whether blocks below the diagonal are not stored.
+            Whether selected blocks below the diagonal are not stored.
         """
         numbers = np.flatnonzero(is_selected).astype(np.int32)
         counts = np.append(0, np.cumsum(is_selected, dtype=np.int32))
@@ -65,6 +65,7 @@ class StoredBlocks:
         is_stored = columns >= (rows if upper else 0)
         stored_counts = np.append(0, np.cumsum(is_stored, dtype=np.int32))
         row_starts = stored_counts[starts].astype(np.int32)
+        # columns ascend, so the stored blocks are the last ones of a row
         first = (starts[1:] - np.diff(row_starts)).astype(np.int32)
         return cls(starts, numbers, first, row_starts, columns[is_stored])
 
@@ -78,22 +79,29 @@ class BlockRotation:
         self._upper = comm.size == 1
 
     def stored_blocks(self, stiffness: Stiffness, is_selected: NDArray[np.bool_]) -> StoredBlocks:
-        """Return the selected blocks (blocks,); on one rank those of one half of the matrix."""
+        """Return the selected blocks of a stiffness, where `is_selected` (blocks,).
+
+        On a single rank only the upper half of the matrix is stored.
+        """
         return StoredBlocks.select(stiffness, is_selected, upper=self._upper)
 
     def rotated_blocks(
         self, stiffness: Stiffness, sign: float, number: Ints, q: Array, stored: StoredBlocks
     ) -> SinglePrecisionBlocks | None:
-        """Return blocks of `Stiffness.matrix` where nodes are rotated.
+        """Return the stored blocks of `Stiffness.matrix(sign)` after a rotation of the nodes.
 
-        None where there are several images, whose blocks are not stored apart.
+        None if there are several images, whose blocks are not stored apart.
 
         Parameters
         ----------
+        sign
+            Factor of the blocks of images: 1 if they move as the modelled part, -1 if opposite.
         number
             (rows,) global numbers of the nodes of rows.
         q
             (all nodes, 4) quaternions, scalar last.
+        stored
+            The blocks to rotate.
         """
         count = len(stiffness.columns)
         if len(stiffness.turn) > 2:
@@ -116,5 +124,6 @@ class BlockRotation:
         return SinglePrecisionBlocks(stored.row_starts, stored.columns, values, self._upper)
 
     def _pointer(self, array: NDArray[Any]) -> Any:
+        """Return an array as a C pointer; it must be C contiguous."""
         assert array.flags.c_contiguous
         return self._ffi.from_buffer(C_TYPES[array.dtype], array)

@@ -74,7 +74,30 @@ class PartsTooNear(ValueError):
 
 
 class ElementKind:
-    """Charges of the faces of all cells, or of edges with one local number, by quadrature rule."""
+    """Charges of the faces of all cells, or of edges with one local number, by quadrature rule.
+
+    Parameters
+    ----------
+    shape
+        All modelled cells.
+    cells
+        (n,) numbers of the cells whose faces, or edges, are meant.
+    copies
+        The modelled cells and their images.
+    edge
+        Local number of the edges; None for faces.
+    include_uncharged
+        Whether interior layers without a charge are kept.
+
+    Attributes
+    ----------
+    faces
+        Whether the charges are those of faces.
+    cells
+        (copies * n,) numbers of the cells, with images.
+    number
+        (copies * all cells,) row of each cell in `cells`, or -1.
+    """
 
     def __init__(
         self,
@@ -99,7 +122,10 @@ class ElementKind:
         self._rules: dict[int, Points] = {}
 
     def rule(self, which: int) -> Points:
-        """Return the charged points of the rule with a number in `DEGREES`."""
+        """Return the charged points of a rule, on the elements of all copies.
+
+        `which` is the position of the rule's degree in `DEGREES`. Points are computed once.
+        """
         if which not in self._rules:
             self._rules[which] = (
                 self._face_rule(which) if self._edge is None else self._strip_rule(which)
@@ -111,18 +137,23 @@ class ElementKind:
         return float(np.abs(self.rule(which).q).max(initial=0.0))
 
     def _face_rule(self, which: int) -> Points:
+        """Return the charged points of a rule on faces, and on layers inside."""
         X, ab, weights = self._face_points(which)
         q = self.family.charges_at(Boxes.undivided(self.family.count), ab, weights).q
         assert isinstance(self.family, ShellFaces)
         return self._charged_points(X, heights(self.family), q)
 
     def _face_points(self, which: int) -> tuple[Array, Array, Array]:
-        """Return points of the reference triangle, their coordinates (a, b), and weights."""
+        """Return a rule's points (P, 2) of the reference triangle, coordinates (a, b), weights.
+
+        Here X = a, Y = (1 - a) b; weights are those of an integral over the square of (a, b).
+        """
         X, w = basix.make_quadrature(basix.CellType.triangle, DEGREES[which])
         ab = np.stack([X[:, 0], X[:, 1] / (1 - X[:, 0])], axis=-1)
         return X, ab, np.array(w / (1 - X[:, 0]), dtype=np.float64)
 
     def _strip_rule(self, which: int) -> Points:
+        """Return the charged points of a rule on edges, as many layers as points across."""
         s, eta, points, weights = self._strip_points(which)
         q = self.family.charges_at(Boxes.undivided(self.family.count), points, weights).q.reshape(
             -1, len(s), len(eta)
@@ -136,7 +167,15 @@ class ElementKind:
         ]
 
     def _strip_points(self, which: int) -> tuple[Array, Array, Array, Array]:
-        """Return coordinates along the edge and across it, all pairs of these, and weights."""
+        """Return a rule on an edge strip.
+
+        Returns
+        -------
+        s, eta
+            Coordinates in [0, 1] along the edge (P,) and through the thickness (L,).
+        points, weights
+            (P L, 2) all pairs of these, and their weights (P L,).
+        """
         s, ws = gauss((DEGREES[which] + 2) // 2)
         eta, we = gauss(2 + which)
         points = np.stack(np.meshgrid(s, eta, indexing="ij"), axis=-1).reshape(-1, 2)
@@ -145,7 +184,11 @@ class ElementKind:
     def add_derivatives(
         self, which: int, by_charges: Array, nodal_derivatives: NodalDerivatives
     ) -> None:
-        """Add derivatives by nodal values, from those by the charges of a rule."""
+        """Add derivatives by nodal values, from derivatives by the charges of a rule.
+
+        They are added to `nodal_derivatives`. `by_charges` has the shape of `Points.q` for the rule
+        `which`, with the images' charges.
+        """
         count, boxes = len(self._copies.images), Boxes.undivided(self.family.count)
         by_modelled_charges = np.einsum(
             "c,c...->...",
@@ -164,7 +207,11 @@ class ElementKind:
     def add_height_derivatives(
         self, which: int, by_heights: Array, nodal_derivatives: NodalDerivatives
     ) -> None:
-        """Add derivatives by the thickness, from those by the heights of a rule."""
+        """Add derivatives by the thickness, from derivatives by the heights of charges.
+
+        They are added to `nodal_derivatives`. `by_heights` has the shape of `Points.q` for the rule
+        `which`. An image whose normals are turned over has opposite heights.
+        """
         X = (
             self._face_points(which)[0]
             if self._edge is None
@@ -181,6 +228,10 @@ class ElementKind:
         )
 
     def _charged_points(self, X: Array, eta: Array, q: Array) -> Points:
+        """Return charges q (cells, P, L) at points X (P, 2) in layers eta (L,), and their images.
+
+        Heights `eta` are over the thickness.
+        """
         T = self._shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2)
         t = self._shape.thickness(
             self._modelled, np.broadcast_to(X, (len(self._modelled), *X.shape))
@@ -191,20 +242,24 @@ class ElementKind:
 
 
 class InteractingCharges:
-    """All charges of a shell; those of different parts act on each other, or all do.
+    """All charges of a shell; either charges of different parts act on each other, or all do.
+
+    The constructor is collective.
 
     Parameters
     ----------
     shape
         All modelled cells.
     parts
-        (copies * cells,) part of each cell.
+        (copies * cells,) number of the part that each cell belongs to.
     cells, edges
-        Edges that may be charged, by cell and local number.
-    near
-        The pairs of adjacent cells, where each part acts on itself too; None where it does not.
+        Cell and local number of each edge that may be charged.
+    singular_pairs
+        The pairs of adjacent cells, if each part acts on itself too; None if it does not.
+    copies
+        The modelled cells and their images.
     include_uncharged
-        Whether elements without a charge are there too.
+        Whether elements without a charge are kept.
     """
 
     def __init__(
@@ -235,22 +290,23 @@ class InteractingCharges:
             for edge in range(3)
             if (edges == edge).any()
         ]
-        sizes = [kind.largest_charge(0) for kind in kinds]
+        sizes = [element_kind.largest_charge(0) for element_kind in kinds]
         self._kinds = [
-            kind
-            for kind, size in zip(kinds, sizes, strict=True)
+            element_kind
+            for element_kind, size in zip(kinds, sizes, strict=True)
             if include_uncharged or size > CHARGE_TOLERANCE * max(sizes)
         ]
         self._of_different_parts = np.asarray(parts[:, None] != parts)  # pairs of different parts
-        self._apart = self._of_different_parts.astype(np.uint8)
-        for cell, others in enumerate(singular_pairs.neighbours if singular_pairs else ()):
-            self._apart[cell] = 1
-            self._apart[cell, others] = 0
+        self._acts_by_rule = self._of_different_parts.astype(np.uint8)
+        for cell, adjacent_cells in enumerate(singular_pairs.neighbours if singular_pairs else ()):
+            self._acts_by_rule[cell] = 1
+            self._acts_by_rule[cell, adjacent_cells] = 0
         self._parts = parts
         assert isinstance(kinds[0].family, ShellFaces)
         sizes_of_parts = np.bincount(parts, weights=np.tile(_areas(shape.r0), len(copies.images)))
         number = np.tile(np.arange(len(shape.r0)), len(copies.images))
         order = np.empty(len(parts), dtype=np.intp)
+        # cells ordered by the area of their part, then by the numbers of part and cell
         order[np.lexsort([number, parts[number], sizes_of_parts[parts].round(AREA_DIGITS)])] = (
             np.arange(len(parts))
         )
@@ -264,18 +320,28 @@ class InteractingCharges:
     def rules(self, nodes: Array, own_cells: range) -> tuple[NDArray[np.int8], NDArray[np.bool_]]:
         """Return the number in `DEGREES` of the rule of each pair, and which faces are stacked.
 
-        Both are (own cells, copies * cells). The number is -1 for a pair that has no rule here.
+        Both arrays are (own cells, copies * cells). The number is -1 for a pair without a rule: it
+        acts by multipoles, is adjacent, or does not act.
+
+        Parameters
+        ----------
+        nodes
+            (copies * cells, k, 3) deformed nodes.
+        own_cells
+            Cells of this rank.
 
         Raises
         ------
-        Touching
-            If two parts are closer than their thickness.
+        PartsTooNear
+            If two parts overlap, or are too near for the size of their cells.
         """
         least_distances, too_near = (
             np.array([least_distance(degree) for degree in DEGREES]),
             least_distance(DEGREE_OF_TOO_NEAR),
         )
-        has_rule = self._apart[own_cells.start : own_cells.stop] & self.boxes(nodes, own_cells)[1]
+        has_rule = (
+            self._acts_by_rule[own_cells.start : own_cells.stop] & self.boxes(nodes, own_cells)[1]
+        )
         is_stacked = self._stacked_faces.find_stacked(
             nodes, own_cells, has_rule & self._of_different_parts[own_cells.start : own_cells.stop]
         )
@@ -288,20 +354,22 @@ class InteractingCharges:
         return rules, is_stacked
 
     def boxes(self, nodes: Array, own_cells: range) -> tuple[MultipoleExpansion, NDArray[np.bool_]]:
-        """Return the multipole expansion, and the pairs that are too near each other for it.
+        """Return the multipole expansion, and the pairs of cells too near each other for it.
 
-        The pairs are (own cells, copies * cells). Both follow from where the cells are, not from
-        where they have been.
+        The pairs are flags (own cells, copies * cells). Both depend on the present nodes alone, not
+        on earlier ones. They are computed again only if a cell has moved to another box or has
+        grown.
         """
         acts_on_itself = self._singular_pairs is not None
         self._octree = self._octree or Octree(
             self._places, self._parts, self._groups, own_cells, acts_on_itself=acts_on_itself
         )
         places, radii = _balls(nodes)
-        grown = np.maximum(
+        # growth of each cell's radius, rounded to a power of `RADIUS_RATIO`
+        growth_steps = np.maximum(
             0, np.ceil(np.log(radii / self._radii) / np.log(RADIUS_RATIO) - 0.5)
         ).astype(np.int64)
-        key = np.column_stack([self._octree.steps_moved(places), grown])
+        key = np.column_stack([self._octree.steps_moved(places), growth_steps])
         if self._boxes is None or not np.array_equal(key, self._boxes[0]):
             tree = self._octree.tree(
                 key[:, :3], self._radii * RADIUS_RATIO ** key[:, 3] + self._h / 2
@@ -313,21 +381,25 @@ class InteractingCharges:
     def evaluate(
         self, nodes: Array, own_cells: range, stiffness: Stiffness | None = None
     ) -> tuple[float, Array]:
-        """Return the energy of pairs with own cells, half of each, and its gradient.
+        """Return this rank's part of the energy, and its gradient (own cells, k, 3) by nodes.
 
-        The gradient (own cells, k, 3) is by their nodes.
+        The energy is that of pairs with own cells. A pair with a cell of another rank or an image
+        counts half here.
 
         Parameters
         ----------
         nodes
             (copies * cells, k, 3) deformed nodes; own cells are among the first copy.
+        own_cells
+            Cells of this rank.
         stiffness
-            The second derivatives by nodes of own cells and nodes of all cells are added to it.
+            Matrix to which second derivatives by nodes of own cells and nodes of all cells are
+            added.
 
         Raises
         ------
-        Touching
-            See `rules`.
+        PartsTooNear
+            If two parts overlap, or are too near for the size of their cells.
         """
         (rules, is_stacked), gradient = self.rules(nodes, own_cells), np.zeros_like(nodes)
         multipoles = self.boxes(nodes, own_cells)[0]
@@ -335,13 +407,14 @@ class InteractingCharges:
             multipoles.place_charges(nodes), with_second_derivatives=stiffness is not None
         )
         first, second = np.nonzero(rules >= 0)
-        which, first = rules[first, second], first + own_cells.start
+        rule_of_pair, first = rules[first, second], first + own_cells.start
         is_own_pair = (second >= own_cells.start) & (
             second < own_cells.stop
         )  # such a pair stands in both orders
         shares = (is_own_pair & (first < second), 1.0), (~is_own_pair, 0.5)
-        for number, (counted, share) in product(np.unique(which), shares):
-            is_counted = counted & (which == number)
+        # pairs by rule, then by kind of elements (faces or edges) on the first and second cell
+        for number, (counted, share) in product(np.unique(rule_of_pair), shares):
+            is_counted = counted & (rule_of_pair == number)
             cells = np.column_stack([first[is_counted], second[is_counted]])
             for first_kind, second_kind in product(self._kinds, self._kinds):
                 one_row, other_row = first_kind.number[cells[:, 0]], second_kind.number[cells[:, 1]]
@@ -356,7 +429,7 @@ class InteractingCharges:
                 energy += share * self._pairs.add(
                     nodes, cells[is_charged], count, left, right, gradient, stiffness
                 )
-        for number, kind in product({MULTIPOLE_RULE, *np.unique(which)}, self._kinds):
+        for number, kind in product({MULTIPOLE_RULE, *np.unique(rule_of_pair)}, self._kinds):
             self._pairs.finish(nodes, kind.cells, kind.rule(int(number)), gradient, stiffness)
         if self._singular_pairs:
             energy += self._singular_pairs.add(nodes, gradient, stiffness)
@@ -379,14 +452,21 @@ class InteractingCharges:
     ) -> NodalDerivatives:
         """Return derivatives of energy and forces by the remanence, at fixed deformed nodes.
 
-        What is differentiated is the energy and its rate along `rates`, times `weights`; if
-        `of_shape`, also by the undeformed place and the thickness. The energy is the one of
-        `evaluate`, of this rank; `rates` (copies * cells, k, 3) are those of the nodes.
+        What is differentiated is `weights.energy` W + `weights.force` v . dW/du, with this rank's
+        part W of the energy and the rates v of nodes. With `of_shape`, there are also derivatives
+        by the undeformed place and by the thickness.
+
+        Parameters
+        ----------
+        nodes, rates
+            (copies * cells, k, 3) deformed nodes and their rates.
+        own_cells
+            Cells of this rank.
 
         Raises
         ------
-        Touching
-            See `rules`.
+        PartsTooNear
+            If two parts overlap, or are too near for the size of their cells.
         """
         (rules, is_stacked), moved_nodes = (
             self.rules(nodes, own_cells),
@@ -405,9 +485,9 @@ class InteractingCharges:
             for by_heights in by_all_heights:
                 kind.add_height_derivatives(MULTIPOLE_RULE, by_heights, nodal_derivatives)
         first, second = np.nonzero(rules >= 0)
-        which, first = rules[first, second], first + own_cells.start
-        for number in map(int, np.unique(which)):
-            cells = np.column_stack([first, second])[which == number]
+        rule_of_pair, first = rules[first, second], first + own_cells.start
+        for number in map(int, np.unique(rule_of_pair)):
+            cells = np.column_stack([first, second])[rule_of_pair == number]
             for first_kind, second_kind in product(self._kinds, self._kinds):
                 one_row, other_row = first_kind.number[cells[:, 0]], second_kind.number[cells[:, 1]]
                 is_charged = (one_row >= 0) & (other_row >= 0)

@@ -19,9 +19,10 @@ FIELD = ("lambda_m", *TRANSVERSE_AMPLITUDES)  # amplitudes of the field's compon
 def directions(
     programme: Sequence[ProgrammeStep], field: Magnetisation | None, turn: float
 ) -> Array:
-    """Return unit vectors (steps + 1, 3) of the field before each step and after the last.
+    """Return unit vectors (steps + 1, 3) of the field before each step and after the last one.
 
-    They are in a frame turned by `turn` about e3 (rad).
+    They are in a frame turned by `turn` about e3 (rad). Only steps of kind `rotation` change the
+    direction. Without a field the first direction is e3.
     """
     vectors = [field.axes[0] if field else np.eye(3)[2]]
     for step in programme:
@@ -32,20 +33,24 @@ def directions(
 
 
 def components(direction: Array, field: Magnetisation | None) -> Array:
-    """Return a direction's components for the amplitudes of `FIELD`.
+    """Return the components of a direction (3,), for the amplitudes of `FIELD` that exist.
 
-    A field in space has one amplitude for all directions.
+    A field in space has one amplitude for all directions: the result is then [1].
     """
     return np.ones(1) if field is None or field.in_space else np.array(field.axes) @ direction
 
 
 def field_at(mu: Mapping[str, float]) -> Array:
-    """Return the components of the field, from all amplitudes."""
+    """Return the components of the field that exist, from all amplitudes by name."""
     return np.array([mu[name] for name in FIELD if name in mu])
 
 
 def straight(direction: Array) -> dict[str, Curve]:
-    """Return curves of the components of a field of strength t along a direction."""
+    """Return curves of the components of a field of strength t along a direction.
+
+    A curve returns the value of an amplitude at t and its first and second derivatives. The curves
+    are by name of the amplitude.
+    """
 
     def curve(c: float) -> Curve:
         return lambda t: (c * t, c, 0.0)
@@ -54,9 +59,14 @@ def straight(direction: Array) -> dict[str, Curve]:
 
 
 def circle(size: float, start: Array, end: Array) -> dict[str, Curve]:
-    """Return curves of the components of a field turned by t (rad) from `start` towards `end`."""
+    """Return curves of the components of a field turned by t (rad) from `start` towards `end`.
+
+    `start` and `end` are unit vectors of components, `size` is the field's signed magnitude. A
+    curve returns the value of an amplitude at t and its first and second derivatives.
+    """
     normal_part = end - (start @ end) * start
-    towards = normal_part / np.linalg.norm(normal_part)
+    # the direction after a turn by 90 degrees
+    quarter_turn = normal_part / np.linalg.norm(normal_part)
 
     def curve(b: float, a: float) -> Curve:
         return lambda t: (
@@ -65,8 +75,8 @@ def circle(size: float, start: Array, end: Array) -> dict[str, Curve]:
             -b * cos(t) - a * sin(t),
         )
 
-    parts = zip(FIELD, size * start, size * towards, strict=False)
-    return {name: curve(float(b), float(a)) for name, b, a in parts}
+    names_and_sizes = zip(FIELD, size * start, size * quarter_turn, strict=False)
+    return {name: curve(float(b), float(a)) for name, b, a in names_and_sizes}
 
 
 def as_a_whole(name: str, total: float) -> dict[str, Curve]:
@@ -75,22 +85,26 @@ def as_a_whole(name: str, total: float) -> dict[str, Curve]:
 
 
 def field_size(mu: Mapping[str, float], sense: float) -> float:
-    """Return the magnitude of the field with the sign `sense`, or its own if it has not turned."""
+    """Return the magnitude of the field with the sign `sense`.
+
+    A field that has not turned has the sign of its amplitude lambda_m.
+    """
     first, second, third = (mu.get(name, 0.0) for name in FIELD)
     return copysign(hypot(first, second, third), sense) if second or third else first
 
 
 def field_angle(mu: Mapping[str, float], field: Magnetisation | None, sense: float = 1.0) -> float:
-    """Return the angle between the field and its first direction (degrees).
+    """Return the angle between the field and its first direction (degrees), from amplitudes `mu`.
 
-    `sense` is the sign of the case's field.
+    `sense` is the sign of the field of the case. The angle is signed if the field turns in one
+    plane.
     """
     if field and field.turns:
         first, axis = field.axes[0], field.turns[0].turn / np.linalg.norm(field.turns[0].turn)
         direction = combined_motion(field.turns, mu)[0] @ first
         normal = np.cross(first, direction)
-        planar = all(np.abs(np.cross(axis, motion.turn)).max() < 1e-9 for motion in field.turns)
-        second = float(normal @ axis) if planar else float(np.linalg.norm(normal))
+        is_planar = all(np.abs(np.cross(axis, motion.turn)).max() < 1e-9 for motion in field.turns)
+        second = float(normal @ axis) if is_planar else float(np.linalg.norm(normal))
         return degrees(atan2(second, float(first @ direction)))
     along, second, third = (mu.get(name, 0.0) for name in FIELD)
     if not (second or third):

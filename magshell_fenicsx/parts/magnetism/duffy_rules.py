@@ -1,9 +1,9 @@
 """Quadrature of 1/distance over two adjacent cells, or one cell twice, where it is nearly singular.
 
 Each point of the first cell sees the second along rays from its own place, or from where it would
-be in the plane of the second. With polar coordinates and r = s sinh v a rule is exact for
-charges in one surface, where the area r dr dangle takes the pole away, and for those in two at a
-distance s: both faces, with the same points.
+be in the plane of the second. In polar coordinates with r = s sinh v, a rule is exact for charges
+in one surface: the area r dr dangle cancels the pole. It is also exact for charges in two surfaces
+at a distance s: both faces, with the same points.
 """
 
 from itertools import pairwise
@@ -28,7 +28,10 @@ STRIP_SCALE = 0.15  # scale of rules from an edge strip to the faces, over the t
 
 
 def graded(n: int, s: float, end: float = 1.0) -> tuple[Array, Array]:
-    """Return n points in [0, end] and weights, dense at 0 on the scale s."""
+    """Return n points in [0, end] and their weights, dense at 0 on the scale s.
+
+    The map t = s sinh v removes the near pole of 1/sqrt(t² + s²).
+    """
     x, w = gauss(n)
     top = np.arcsinh(end / s)
     return s * np.sinh(top * x), w * top * s * np.cosh(top * x)
@@ -45,41 +48,46 @@ def barycentric(X: Array) -> Array:
 
 
 def polar(apex: Array, s: float) -> tuple[Array, Array]:
-    """Return a rule of the reference triangle, points (n, 2) and weights, in polar coordinates.
+    """Return a rule of the reference triangle in polar coordinates: points (n, 2), weights (n,).
 
-    The pole is a place `apex` (2,) in its plane; points are dense there on the scale s.
+    The pole is a place `apex` (2,) in the triangle's plane, inside or outside it. Points are dense
+    there on the scale s.
     """
-    V = CORNERS - apex
-    is_inside = min(_spanned_area(V[i], V[j]) for i, j in ENDS) > -AREA_TOLERANCE
-    lines = np.array([V[j] - V[i] for i, j in ENDS])
+    corners = CORNERS - apex
+    is_inside = min(_spanned_area(corners[i], corners[j]) for i, j in ENDS) > -AREA_TOLERANCE
+    lines = np.array([corners[j] - corners[i] for i, j in ENDS])
     points, weights = list[Array](), list[Array]()
     v, wv = gauss(RAY_POINTS)
-    for A, B in _sectors(V, is_inside):
+    for A, B in _sectors(corners, is_inside):
         bisector = A / np.linalg.norm(A) + B / np.linalg.norm(B)
-        entry = int(np.argmin(_ray_lengths(lines, V, bisector[None])[0]))
-        direction = lines[entry] / np.linalg.norm(lines[entry])
-        start = V[ENDS[entry][0]]
+        # the side that the sector's middle ray meets first
+        nearest_side = int(np.argmin(_ray_lengths(lines, corners, bisector[None])[0]))
+        direction = lines[nearest_side] / np.linalg.norm(lines[nearest_side])
+        start = corners[ENDS[nearest_side][0]]
         normal = start - (start @ direction) * direction
         normal = normal / np.linalg.norm(normal)
-        ends = [np.arcsinh((C @ direction) / (C @ normal)) for C in (A, B)]
-        x, w = gauss(SECTOR_POINTS + int(abs(ends[1] - ends[0])))
-        mu = ends[0] + (ends[1] - ends[0]) * x
+        sector_ends = [np.arcsinh((C @ direction) / (C @ normal)) for C in (A, B)]
+        x, w = gauss(SECTOR_POINTS + int(abs(sector_ends[1] - sector_ends[0])))
+        mu = sector_ends[0] + (sector_ends[1] - sector_ends[0]) * x
+        # rays at the angle atan(sinh(mu)) from the side's normal: dangle = dmu/cosh(mu)
         rays = (normal[None] + np.sinh(mu)[:, None] * direction) / np.cosh(mu)[:, None]
-        cuts = _ray_lengths(lines, V, rays)
-        low = np.zeros(len(x)) if is_inside else cuts.min(axis=1)
-        high = np.where(np.isfinite(cuts), cuts, 0.0).max(axis=1)
+        side_distances = _ray_lengths(lines, corners, rays)
+        low = np.zeros(len(x)) if is_inside else side_distances.min(axis=1)
+        high = np.where(np.isfinite(side_distances), side_distances, 0.0).max(axis=1)
         bottom, top = (np.arcsinh(length / s)[:, None] for length in (low, high))
         r = s * np.sinh(bottom + (top - bottom) * v)
-        turn = (abs(ends[1] - ends[0]) * w / np.cosh(mu))[:, None]
+        angle_weights = (abs(sector_ends[1] - sector_ends[0]) * w / np.cosh(mu))[:, None]
         points.append((apex + r[..., None] * rays[:, None]).reshape(-1, 2))
-        weights.append((turn * wv * (top - bottom) * np.sqrt(r**2 + s**2) * r).ravel())
+        # r dr dangle, with dr = sqrt(r² + s²) dv
+        weights.append((angle_weights * wv * (top - bottom) * np.sqrt(r**2 + s**2) * r).ravel())
     return np.concatenate(points), np.concatenate(weights)
 
 
 def _sectors(V: Array, is_inside: bool) -> list[tuple[Array, Array]]:
-    """Return pairs of rays through corners V (3, 2) of a triangle with no corner between them.
+    """Return sectors, pairs of rays through corners V (3, 2) of a triangle, in order of angle.
 
-    The rays start in the origin, which is inside the triangle or beside it.
+    The rays start in the origin, which is inside the triangle or beside it. No corner lies between
+    the rays of a sector; sectors almost without an angle are left out.
     """
     if is_inside:
         return [(V[i], V[j]) for i, j in ENDS if _spanned_area(V[i], V[j]) > AREA_TOLERANCE]
@@ -92,7 +100,8 @@ def _sectors(V: Array, is_inside: bool) -> list[tuple[Array, Array]]:
 def _ray_lengths(lines: Array, starts: Array, rays: Array) -> Array:
     """Return the lengths (n, 3) of rays (n, 2) from the origin to the sides of a triangle.
 
-    They are infinite where a ray does not meet a side.
+    `lines` (3, 2) are vectors along the sides, `starts` (3, 2) the corners. A length is infinite
+    where a ray does not meet a side.
     """
     starts = starts[[i for i, _ in ENDS]]
     det = rays[:, :1] * lines[:, 1] - rays[:, 1:] * lines[:, 0]
@@ -109,7 +118,11 @@ def _ray_lengths(lines: Array, starts: Array, rays: Array) -> Array:
 
 
 def rule_along_sides(dense_sides: tuple[bool, bool, bool], s: float) -> tuple[Array, Array]:
-    """Return a rule of the reference triangle that is dense at some of its sides."""
+    """Return a rule of the reference triangle, dense at some of its sides: points, weights.
+
+    Points are (n, 2). They are dense on the scale 3 s where `dense_sides` is true, in the order of
+    local edges.
+    """
     if not any(dense_sides):
         X, w = basix.make_quadrature(basix.CellType.triangle, INNER_DEGREE)
         return np.asarray(X), np.asarray(w)
@@ -124,7 +137,10 @@ def rule_along_sides(dense_sides: tuple[bool, bool, bool], s: float) -> tuple[Ar
 
 
 def at_corner(corner: int) -> tuple[Array, Array]:
-    """Return a rule of the reference triangle for integrands nearly singular at a corner."""
+    """Return a rule of the reference triangle for integrands nearly singular at a corner.
+
+    It has points (n, 2) and weights (n,), by the Duffy transform: X = V + a (A - V + b (B - A)).
+    """
     (a, wa), (b, wb) = gauss(6), gauss(5)
     V, A, B = CORNERS[corner], CORNERS[(corner + 1) % 3], CORNERS[(corner + 2) % 3]
     side = A - V + b[:, None] * (B - A)
@@ -140,13 +156,16 @@ def on_edge(edge: int, t: Array) -> Array:
 
 
 def continued_across_side(X: Array, sides: tuple[int, int], flip: bool) -> Array:
-    """Return points X (n, 2) of a triangle in coordinates of its neighbour, continued there.
+    """Return points X (n, 2) of a triangle in the reference coordinates of its neighbour.
 
-    Both share a side, with local numbers `sides`; `flip` if it runs the other way in the second.
+    The coordinates are continued linearly beyond the shared side, so that they are outside the
+    neighbour. The side has the local numbers `sides` in both triangles; `flip` if it runs the other
+    way in the second one.
     """
     bary, (i, j), (m, n) = barycentric(X), ENDS[sides[0]], ENDS[sides[1]]
     m, n = (n, m) if flip else (m, n)
     continued = np.zeros_like(bary)
+    # the corner off the shared side is mirrored: weight t there becomes t, t, -t
     opposite = bary[:, 3 - i - j]
     continued[:, m], continued[:, n], continued[:, 3 - m - n] = (
         bary[:, i] + opposite,
@@ -157,7 +176,10 @@ def continued_across_side(X: Array, sides: tuple[int, int], flip: bool) -> Array
 
 
 def strip() -> tuple[Array, Array, Array]:
-    """Return a rule of an edge strip: coordinates along and across it, in [0, 1], and weights."""
+    """Return a rule of an edge strip: coordinates along and across it, in [0, 1], and weights.
+
+    All three are (n,). Points are dense at both ends of the edge.
+    """
     (x, wt), (eta, we) = (gauss(n) for n in STRIP_POINTS)
     t, wt = x**2 * (3 - 2 * x), 6 * x * (1 - x) * wt  # dense at both ends
     a, b = (coordinate.ravel() for coordinate in np.meshgrid(t, eta, indexing="ij"))
@@ -167,22 +189,34 @@ def strip() -> tuple[Array, Array, Array]:
 def strip_rule_seen_from(t: float, eta: float, s: float) -> tuple[Array, Array, Array]:
     """Return a rule of an edge strip, dense at a place (t, eta) on it or beyond one of its ends.
 
-    `s` is the scale: the thickness over the length of the edge.
+    Parameters
+    ----------
+    t, eta
+        Coordinates along the edge and through the thickness; t is outside [0, 1] beyond an end.
+    s
+        The scale: the thickness over the length of the edge.
+
+    Returns
+    -------
+    tuple
+        Coordinates along and across the strip, and weights, each (n,).
     """
     x, w = gauss(STRIP_POINTS[1])
     v, wv = gauss(RAY_POINTS)
     # beyond an end normals may differ, so that no points come too near each other
     is_beyond = not 0 <= t <= 1
     power, min_scale = (1, 0.1) if is_beyond else (3, 0.02)
+    # (start, end, sign) of distances from t along the edge
     segments = (
         [(0.0, t, -1.0), (0.0, 1 - t, 1.0)]
         if not is_beyond
         else [(-t, 1 - t, 1.0) if t < 0 else (t - 1, t, -1.0)]
     )
     rules_of_segments = list[tuple[Array, Array, Array]]()
-    for high in (-eta, 1 - eta):
+    # below and above the height eta, with points dense at it
+    for reach in (-eta, 1 - eta):
         for height, weight in zip(
-            eta + high * x**power, abs(high) * power * x ** (power - 1) * w, strict=True
+            eta + reach * x**power, abs(reach) * power * x ** (power - 1) * w, strict=True
         ):
             scale = s * max(abs(height - eta), min_scale)
             for start, end, sign in segments:
@@ -196,4 +230,4 @@ def strip_rule_seen_from(t: float, eta: float, s: float) -> tuple[Array, Array, 
                         weight * wv * (top - bottom) * scale * np.cosh(r),
                     )
                 )
-    return tuple(np.concatenate(part) for part in zip(*rules_of_segments, strict=True))
+    return tuple(np.concatenate(arrays) for arrays in zip(*rules_of_segments, strict=True))

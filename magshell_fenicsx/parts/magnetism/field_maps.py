@@ -54,6 +54,7 @@ class FieldMapSection(Section):
 
     @model_validator(mode="after")
     def _is_a_grid(self) -> "FieldMapSection":
+        """Refuse sides without length or not perpendicular, and unfit numbers of points."""
         if len(self.points) != len(self.sides):
             raise ValueError(
                 f"points: {len(self.points)} numbers for {len(self.sides)} sides: give one for "
@@ -77,18 +78,18 @@ FieldMaps = Annotated[dict[str, FieldMapSection], Field(max_length=100)]
 
 @dataclass(frozen=True)
 class FieldMap:
-    """A map in the model's frame.
+    """A map of the magnetic field, in the frame of the model.
 
     Attributes
     ----------
     grid
-        In the frame of the case, without values.
+        The grid in the frame of the case, without values.
     places
-        (n, 3) over R, of the grid in the model's frame.
+        (n, 3) places of the grid over R, in the frame of the model.
     total
         Whether the applied field is added.
     own, applied
-        See `sensors.Sensor`.
+        Flux densities of a remanence of length one and of lambda_m = 1, in T or over |Br|.
     """
 
     grid: MapGrid
@@ -99,7 +100,10 @@ class FieldMap:
 
 
 def field_maps(context: Context, turn: float) -> tuple[FieldMap, ...]:
-    """Return the maps of a case, in a frame turned by `turn` about e3 (rad)."""
+    """Return the maps of a case, in the frame of the model.
+
+    That frame is turned by `turn` about e3 (rad) from the one of the case.
+    """
     sections: dict[str, FieldMapSection] = context.sections.get("field_maps") or {}
     field_units, R = units(context), context.shell.reference
     unit = unit_of_readings(context)
@@ -124,7 +128,7 @@ def field_maps(context: Context, turn: float) -> tuple[FieldMap, ...]:
 
 
 def unit_of_readings(context: Context) -> str:
-    """Return the unit of readings: T, or what they are over."""
+    """Return the unit of flux densities that are read: "T", "sqrt(mu0 E)" or "|Br|"."""
     magnetic, E = context.section_of(MagneticSection), context.shell.youngs_modulus
     if magnetic and magnetic.remanent is None:
         return "T" if E and magnetic.lambda_m is None else "sqrt(mu0 E)"
@@ -152,7 +156,7 @@ class FieldMapping(KeyAbility[Mapping[str, FieldMapSection]]):
             refuse_unknown_field(f"field_maps.{name}", section.field, context)
 
     def numbers(self, context: Context) -> list[str]:
-        """How many places there are."""
+        """Return a line of `magshell check` for each map: its numbers of places and its field."""
         return [
             f"field map {name}: {' x '.join(map(str, section.points))} places, {section.field} "
             "field"
@@ -167,6 +171,11 @@ class FieldMapsObservables(Observables):
         return [field_map.grid.name for field_map in loads.field_maps]
 
     def on_grids(self, view: ModelView, state: "State") -> list[MapGrid]:
+        """Return the grids of all maps with the flux density at a state; collective.
+
+        Each has values (n, 3) in the unit of its `MapGrid`. `view` is the model with the frame and
+        units in which it is reported.
+        """
         from magshell_fenicsx.parts.magnetism.readings import (
             field_at,
         )  # the solver takes long to import

@@ -55,12 +55,23 @@ class FieldSection(FactorStep):
 
     @classmethod
     def level(cls, text: str, context: Context) -> float:
+        """Return a flux density with a unit, as of a history, over that of `magnetic.applied`.
+
+        Raises
+        ------
+        ValueError
+            If the case has no `magnetic.applied.flux_density`.
+        """
         magnetic = context.section_of(MagneticSection)
         if magnetic is None or not magnetic.applied.flux_density:
             raise ValueError("needs magnetic.applied.flux_density")
         return float(in_units("tesla")(text)) / magnetic.applied.flux_density
 
     def curves(self, step_start: StepStart) -> tuple[Curves, float] | None:
+        """Return curves of the field's components, and the present strength along the direction.
+
+        None if the field has its first direction, which the amplitude lambda_m alone drives.
+        """
         from magshell_fenicsx.parts.magnetism.direction import (
             straight,
         )  # the solver takes long to import
@@ -69,7 +80,10 @@ class FieldSection(FactorStep):
         return (straight(direction), value) if direction[1:].any() else None
 
     def _direction_and_value(self, step_start: StepStart) -> tuple[Array, float]:
-        """The direction by the amplitudes of the field's components, and the field along it."""
+        """Return the field's direction at the begin of the step, and the strength along it.
+
+        The direction has a component for each amplitude of `direction.FIELD` that exists.
+        """
         from magshell_fenicsx.parts.magnetism.direction import components, directions, field_at
 
         field = step_start.loads.magnetic
@@ -82,7 +96,10 @@ class FieldSection(FactorStep):
         return direction, float(direction @ field_at(step_start.mu))
 
     def load_start(self, step_start: StepStart) -> LoadStart:
-        """The field has no conjugate."""
+        """Return the amplitude where the step begins: the strength along its direction.
+
+        The field has no conjugate, so both of its entries are zero.
+        """
         return LoadStart(
             self._direction_and_value(step_start)[1],
             0.0,
@@ -94,9 +111,11 @@ class FieldSection(FactorStep):
 
     @classmethod
     def asked_for(cls, context: Context) -> bool:
+        """Return whether the case has a field."""
         return bool(strength(context))
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        """Refuse a step without a field."""
         if not strength(context):
             raise ValueError(
                 f"{step.key}.kind: field needs magnetic.lambda_m, not zero, for its target or "
@@ -104,6 +123,7 @@ class FieldSection(FactorStep):
             )
 
     def unstable_alone(self, value: float, course: StepCourse, what: str) -> str:
+        """Tell the user that the field alone makes the shell unstable, at lambda_m = `value`."""
         return (
             f"the field alone makes the shell unstable: critical field lambda_m = {value:.9g} of "
             f"{course.drive.end or 0.0:g} ({what})"
@@ -127,6 +147,13 @@ class RotationSection(Step):
     """Equal angles to it"""
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        """Check that there is a field before the step, which it can turn to its direction.
+
+        Raises
+        ------
+        ValueError
+            If there is none, or if the direction is parallel or opposite to it.
+        """
         start = direction_before(step.number, context)
         if start is None or not strength(context):
             raise ValueError(
@@ -148,22 +175,29 @@ class RotationSection(Step):
     def symmetry_constraints(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
+        """Return the constraint that a plane contains the last direction of the field."""
         return [SymmetryConstraint("the field turns", [self.to.vector()])]
 
     def changes(self, name: str, mu: Iterable[str]) -> set[str]:
-        return {name} | {other for other in mu if other.startswith("lambda_")}
+        """Return the amplitudes that the step changes: its own, `name`, and all of the field."""
+        return {name} | {amplitude for amplitude in mu if amplitude.startswith("lambda_")}
 
     def course(self, step_start: StepStart) -> StepCourse:
+        """Return how the field turns: by arc length along curves of its components.
+
+        The parameter of the curves is the angle (rad) from the begin of the step. The course is
+        impossible if the field is zero.
+        """
         from magshell_fenicsx.parts.magnetism import direction  # the solver takes long to import
 
         field, number = step_start.loads.magnetic, step_start.step.number
-        ends = direction.directions(step_start.context.steps, field, step_start.turn)[
+        end_directions = direction.directions(step_start.context.steps, field, step_start.turn)[
             number - 1 : number + 1
         ]
-        start, end = (direction.components(end, field) for end in ends)
+        start, end = (direction.components(end, field) for end in end_directions)
         size, total = (
             float(start @ direction.field_at(step_start.mu)),
-            acos(float(ends[0] @ ends[1])),
+            acos(float(end_directions[0] @ end_directions[1])),
         )
         targets = [float(t) for t in np.linspace(0.0, total, self.points + 1)[1:]]
         drive = Drive("arc", "load", total, targets, total / self.points, total / self.points)
@@ -185,6 +219,10 @@ class RotationSection(Step):
     def expected_end(
         self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float
     ) -> ExpectedEnd:
+        """Return the end of the step: its angle from the first direction of the field (degrees).
+
+        The angle is None if the step does not begin at the first direction.
+        """
         from magshell_fenicsx.parts.magnetism.direction import (
             directions,
         )  # the solver takes long to import
@@ -198,14 +236,15 @@ class RotationSection(Step):
 
 
 def turn_name(step: ProgrammeStep) -> str:
-    """The amplitude by which a step of kind: rotation turns a field in space; no user's name has a
-    space.
+    """Return the name of the amplitude by which a step of kind `rotation` turns a field in space.
+
+    It contains a space, which no name of a user has.
     """
     return f"{step.name} {step.number}"
 
 
 def direction_before(number: int, context: Context) -> NDArray[np.float64] | None:
-    """The unit vector (3,) of the field where a step begins; None without a field."""
+    """Return the unit vector (3,) of the field where step `number` begins; None without a field."""
     rotated_to = [
         step.load.to
         for step in context.steps_before(number)

@@ -65,6 +65,7 @@ class AppliedSection(Direction):
 
     @model_validator(mode="after")
     def _beside_sources(self) -> Self:
+        """Refuse a field beside sources without a strength, and sources of the same name."""
         other_keys = {
             "polar",
             "azimuth",
@@ -84,6 +85,7 @@ class AppliedSection(Direction):
 
     @model_validator(mode="after")
     def _square(self) -> Self:
+        """Refuse keys beside `components`, a gradient of a wrong shape, and a zero field."""
         if self.components and (
             other_keys := {"polar", "azimuth", "uniform", "gradient"} & self.model_fields_set
         ):
@@ -98,12 +100,12 @@ class AppliedSection(Direction):
 
     @property
     def is_uniform(self) -> bool:
-        """Whether it is the same everywhere."""
+        """Whether the applied field is the same everywhere."""
         return not (self.gradient or self.components or self.sources)
 
     @property
     def reference(self) -> float | None:
-        """|B^a| in T, with its sign; 1 T where sources are the whole field."""
+        """|B^a| in T, with its sign; 1 T where sources are the whole field, None if not given."""
         return (self.flux_density or 1.0) if self.sources else self.flux_density
 
     @property
@@ -113,7 +115,15 @@ class AppliedSection(Direction):
 
 
 def _of_places(value: Any) -> Any:
-    """A susceptibility: a number, a formula, or numbers of patches."""
+    """Return the value of the key `susceptibility` after checking it.
+
+    Allowed are a number, a formula, or a mapping of patches to numbers.
+
+    Raises
+    ------
+    ValueError
+        With what is allowed.
+    """
     if isinstance(value, str):
         formula(value)
     elif isinstance(value, dict) and not value:
@@ -174,7 +184,10 @@ class MagneticSection(Section, Ability):
     @model_validator(mode="before")
     @classmethod
     def _soft_alone(cls, data: Any) -> Any:
-        """Without the key a soft shell has no remanence, and another one that along e3."""
+        """Set `remanent` to none if a susceptibility is given and this key is not.
+
+        So a soft shell has no remanence by default, and any other shell has one along e3.
+        """
         if (
             isinstance(data, dict)
             and data.get("susceptibility") is not None
@@ -185,6 +198,7 @@ class MagneticSection(Section, Ability):
 
     @model_validator(mode="after")
     def _what_is_soft(self) -> Self:
+        """Refuse combinations of keys that a soft-magnetic material does not allow."""
         if self.remanent is None and self.susceptibility is None:
             raise ValueError(
                 "remanent: none is of a shell with a susceptibility: give that, or leave remanent "
@@ -211,7 +225,10 @@ class MagneticSection(Section, Ability):
 
     @model_validator(mode="after")
     def _what_acts(self) -> Self:
-        """Parts with a remanence that moves with the material, see `coulomb`."""
+        """Refuse an interaction with keys that it does not allow.
+
+        Only parts with a remanence that moves with F act on each other, in the full energy.
+        """
         if self.interaction == "none":
             return self
         excluded = {
@@ -220,7 +237,7 @@ class MagneticSection(Section, Ability):
             "remanence: rotation": self.remanence == "rotation",
             f"energy: {self.energy}": self.energy != "full",
         }
-        if reason := next((key for key, given in excluded.items() if given), None):
+        if reason := next((key for key, is_given in excluded.items() if is_given), None):
             raise ValueError(
                 f"interaction: {self.interaction}: not with {reason}: it is that of parts with a "
                 "remanence alone, with remanence: deformation and energy: full"
@@ -229,6 +246,7 @@ class MagneticSection(Section, Ability):
 
     @model_validator(mode="after")
     def _one_amplitude(self) -> Self:
+        """Refuse keys that give the strength of the field twice, not at all, or as zero."""
         if self.remanent is None:
             self._one_field()
             return self
@@ -261,7 +279,7 @@ class MagneticSection(Section, Ability):
 
     @property
     def without_field(self) -> bool:
-        """Whether the remanence is alone: nothing says how strong a field is."""
+        """Whether the remanence is alone: no key says how strong a field is."""
         keys_given = self.model_fields_set
         return (
             self.remanent is not None
@@ -282,7 +300,13 @@ class MagneticSection(Section, Ability):
             raise ValueError("remanence: is a law of remanent, which this shell has not")
 
     def amplitude(self, youngs_modulus: float | None) -> float:
-        """lambda_m = |Br||Ba|/(mu_0 E); of a shell that is soft alone |Ba|/sqrt(mu_0 E)."""
+        """Return lambda_m = |Br||Ba|/(mu_0 E); of a shell that is soft alone |Ba|/sqrt(mu_0 E).
+
+        Raises
+        ------
+        ValueError
+            If it follows from flux densities, and there is no modulus (Pa).
+        """
         if self.lambda_m is not None:
             return self.lambda_m
         if self.without_field:
@@ -293,14 +317,20 @@ class MagneticSection(Section, Ability):
         return self.applied.reference / self.tesla(youngs_modulus)
 
     def tesla(self, youngs_modulus: float) -> float:
-        """The applied flux density of lambda_m = 1."""
+        """Return the applied flux density (T) of lambda_m = 1; the modulus is in Pa."""
         if self.remanent is None:
             return sqrt(MU_0 * youngs_modulus)
         assert self.remanent.flux_density is not None
         return MU_0 * youngs_modulus / self.remanent.flux_density
 
     def refuse_unfit(self, context: Context) -> None:
-        """Refuse a field of unknown strength, and shells that its energies do not allow."""
+        """Refuse a field of unknown strength, and shells that its energies do not allow.
+
+        Raises
+        ------
+        ValueError
+            With the key and what is allowed.
+        """
         from magshell_fenicsx.parts.magnetism.sensors import is_read  # it needs this section
 
         shell = context.shell
@@ -348,12 +378,14 @@ class MagneticSection(Section, Ability):
             raise ValueError("magnetic.remanent: patches needs the patch rest")
 
     def in_time(self, context: Context, driven: Collection[str]) -> InTime:
-        why = "not after kind: rotation" if ANGLE in driven else ""
+        """Return the field as a load in time, with the reason if it may not be one."""
+        refused_because = "not after kind: rotation" if ANGLE in driven else ""
         if not strength(context):
-            why = "needs magnetic.lambda_m, not zero"
-        return InTime("field", why)
+            refused_because = "needs magnetic.lambda_m, not zero"
+        return InTime("field", refused_because)
 
     def patches(self) -> dict[str, Iterable[str]]:
+        """Return the keys that have values by patch -> names of the patches."""
         values = {
             "magnetic.remanent.patches": self.remanent and self.remanent.patches,
             "magnetic.susceptibility": self.susceptibility,
@@ -363,6 +395,10 @@ class MagneticSection(Section, Ability):
     def symmetry_constraints(
         self, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
+        """Return the symmetry that magnetism preserves of a shell.
+
+        There is no constraint if nothing magnetic acts on the shell or is read.
+        """
         from magshell_fenicsx.parts.magnetism.magnetisation import (
             remanence_constraints,
         )  # the solver takes long to import
@@ -375,6 +411,7 @@ class MagneticSection(Section, Ability):
         return interacting + (remanence_constraints(context, outline) if is_visible else [])
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
+        """Yield the formulas of the undeformed place, with the values that they may have."""
         from magshell_fenicsx.models.shell.spatial_fields import (
             MAX_COMPONENT,
         )  # the solver takes long to import
@@ -393,6 +430,7 @@ class MagneticSection(Section, Ability):
             )
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
+        """Return the fields of the model's `Loads` that the section adds, by name."""
         from magshell_fenicsx.parts.magnetism.magnetisation import (
             adds,
         )  # the solver takes long to import
@@ -400,7 +438,13 @@ class MagneticSection(Section, Ability):
         return adds(context, modelled)
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:
-        """Look at lambda_m, and at the sources and formulas of remanence and applied field."""
+        """Check lambda_m, and the values of sources and formulas at places (n, 3) over R.
+
+        Raises
+        ------
+        CaseError
+            With the key and the first place of a value that is not finite or too large.
+        """
         from magshell_fenicsx.parts.magnetism.interaction import refuse_unfit_interaction
         from magshell_fenicsx.parts.magnetism.sources.field import (
             placed_sources,
@@ -454,7 +498,11 @@ class MagneticSection(Section, Ability):
                 )
 
     def warning(self, context: Context, places: Array) -> str | None:
-        """A field of magnets and currents elsewhere has neither a divergence nor a curl."""
+        """Return a warning if the formula of the field has a divergence or a curl; else None.
+
+        A field of magnets and currents elsewhere has neither. It is sampled at places (n, 3) over
+        R.
+        """
         components = self.applied.components if strength(context) else None
         if not components:
             return None
@@ -475,8 +523,10 @@ class MagneticSection(Section, Ability):
         )
 
     def numbers(self, context: Context) -> list[str]:
-        """How strong magnets and coils are on the shell: too weak, and a place was meant in another
-        unit.
+        """Return a line of `magshell check` with the strength (mT) of all sources on the shell.
+
+        If it is too weak, a place was probably meant in another unit. The list is empty without
+        sources.
         """
         from magshell_fenicsx.parts.magnetism.sources.field import (
             placed_sources,
@@ -495,7 +545,11 @@ class MagneticSection(Section, Ability):
         ]
 
     def units(self, context: Context, units: CaseSizes) -> CaseSizes:
-        """The flux density, or the strength of the sources, of lambda_m = 1."""
+        """Return the sizes of units, with the flux density or strength of lambda_m = 1 where known.
+
+        The flux density is in mT; the strength is in percent of that of sources that are the whole
+        field.
+        """
         if (
             isnan(units.E)
             or self.without_field
@@ -508,6 +562,6 @@ class MagneticSection(Section, Ability):
 
 
 def strength(context: Context) -> float:
-    """lambda_m of a case; 0 without a field."""
+    """Return lambda_m of a case; 0 without a field."""
     magnetic = context.section_of(MagneticSection)
     return magnetic.amplitude(context.shell.youngs_modulus) if magnetic else 0.0

@@ -1,7 +1,7 @@
 """Extrapolated forces of all charges on each other, from states on a path and beside it.
 
-In go forces that were computed at states (`ForceExtrapolation.add_state`) and an earlier second
-derivative, out come forces at states near by. docs/theory.md.
+Input: forces that were computed at states (`ForceExtrapolation.add_state`) and an earlier second
+derivative. Output: forces at nearby states. See docs/theory.md.
 """
 
 from collections import deque
@@ -33,7 +33,10 @@ SLOPE_DISTANCE_RATIO = 0.05  # distance of two states that tell a slope, over th
 
 @dataclass(frozen=True)
 class ForceState:
-    """A state u of all nodes with this rank's part of the forces there, and of D u."""
+    """A state u of all nodes, with this rank's part of the forces there and of D u.
+
+    D is the stored part of an earlier second derivative of the energy.
+    """
 
     u: Array
     forces: Array
@@ -46,19 +49,22 @@ class ForceState:
 
 
 class ForceExtrapolation:
-    """Forces near states at which they were computed, by an earlier second derivative D and its
-    errors.
+    """Forces near states at which they were computed, by an earlier second derivative D.
 
-    D is here what is stored between nodes of cells in boxes that touch: what it lacks is smooth
-    along the path, and small beside it. Along the path, the forces without D u are a polynomial
-    through its last points. It has slopes at points where two states near each other are known.
-    Changes of u beside the path correct D and the polynomial by secants, the newest change first
-    (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443: secants of several steps).
+    D is the part that is stored, between nodes of cells in boxes that touch. What it lacks is
+    smooth along the path, and small beside it. Along the path, the forces without D u are a
+    polynomial through the last points. It also has the slope at points where two states near each
+    other are known. Changes of u beside the path correct D and the polynomial by secants, the
+    newest change first (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443: secants of several
+    steps).
 
     Parameters
     ----------
+    blocks
+        Products of stored blocks with vectors.
     rotations
-        Returns quaternions (nodes, 4) of the nodes at a state since another one.
+        Function of a state and an earlier state -> quaternions (nodes, 4), scalar last: the
+        rotations of nodes from the earlier state.
     is_single_rank
         Whether all nodes are on this rank.
     """
@@ -80,12 +86,16 @@ class ForceExtrapolation:
         self._model: tuple[PathPolynomial, list[tuple[Array, Array]]] | None = None
 
     def add_state(self, u: Array, forces: Array) -> None:
-        """Add computed forces at a state."""
+        """Add this rank's part of forces, as computed at a state u of all nodes.
+
+        The state is a new point of the path, or one more state of the last point.
+        """
         state = ForceState(u, forces, self._product(u) if self._D else np.zeros_like(forces))
         if self._points and not self._is_new_point(u):
             self._points[-1] = [*self._points[-1][-MAX_CHANGES:], state]
         else:
             distance = float(np.linalg.norm(u - self._points[-1][-1].u)) if self._points else 0.0
+            # of earlier points a few states are kept, and the new point begins with this one
             earlier_points = [
                 point[-STATES_PER_EARLIER_POINT:] for point in self._points[1 - PATH_POINTS :]
             ]
@@ -96,14 +106,16 @@ class ForceExtrapolation:
         self._model = None
 
     def forces(self, u: Array, D: InteractionHessian, u_of_D: Array) -> Array | None:
-        """Return this rank's part of the forces at u; None if nothing is known.
+        """Return this rank's part of the forces at a state u; None if nothing is known.
 
         Parameters
         ----------
+        u
+            Displacement of all nodes.
         D
             The second derivative.
         u_of_D
-            The state at which it was computed.
+            The state at which D was computed.
         """
         if not (self._points and np.isfinite(u).all()):
             return None
@@ -116,15 +128,15 @@ class ForceExtrapolation:
         return forces
 
     def extrapolation_holds_along(self, u: Array, step: Array) -> bool:
-        """Return whether forces are known at two states near u, along a direction."""
+        """Return whether forces are known at two states near u that differ along `step`."""
         if not self._points or self._is_new_point(u):
             return False
         largest_distance, step_size = (
             SLOPE_DISTANCE_RATIO * self._distances[-1],
             float(np.linalg.norm(step)),
         )
-        for state, other in pairwise(self._points[-1]):
-            change, distance_to_u = state.u - other.u, float(np.linalg.norm(u - state.u))
+        for state, next_state in pairwise(self._points[-1]):
+            change, distance_to_u = state.u - next_state.u, float(np.linalg.norm(u - state.u))
             distance = float(np.linalg.norm(change))
             if (
                 max(distance, distance_to_u) < largest_distance
@@ -134,14 +146,17 @@ class ForceExtrapolation:
         return False
 
     def _is_new_point(self, u: Array) -> bool:
-        """Return whether a state is not of the last point."""
+        """Return whether a state is too far from the last point to belong to it."""
         return (
             float(np.linalg.norm(u - self._points[-1][-1].u))
             > SAME_POINT_RATIO * self._distances[-1]
         )
 
     def _rotate_stiffness(self, u: Array, D: InteractionHessian, u_of_D: Array) -> None:
-        """Take D as it is at another state, if nodes have rotated enough."""
+        """Rotate D with the nodes from `u_of_D` to u, if they have rotated enough since.
+
+        The products D u of all stored states are then computed again.
+        """
         earlier_u = self._rotated_u if D is self._D else None
         if (
             earlier_u is not None
@@ -165,31 +180,34 @@ class ForceExtrapolation:
         ]
 
     def _make_model(self) -> tuple["PathPolynomial", list[tuple[Array, Array]]]:
-        """Return the polynomial along the path, and orthonormal changes with what is lacking along
-        them.
+        """Return the polynomial along the path, and corrections along changes beside it.
+
+        A correction is an orthonormal change q of u, with the change y of forces along q that D and
+        the polynomial lack.
         """
         polynomial, changes = PathPolynomial.from_points(self._points), list[tuple[Array, Array]]()
         pairs = [pair for point in reversed(self._points) for pair in pairwise(reversed(point))]
-        for state, other in pairs[:MAX_CHANGES]:
-            s = state.u - other.u
+        for state, older_state in pairs[:MAX_CHANGES]:
+            s = state.u - older_state.u
             y, size = (
                 state.remainder
-                - other.remainder
+                - older_state.remainder
                 - polynomial.remainder(state.u)
-                + polynomial.remainder(other.u),
+                + polynomial.remainder(older_state.u),
                 float(np.linalg.norm(s)),
             )
+            # Gram-Schmidt, twice because of rounding; y changes along with s
             for _ in range(2):
                 for q, y_of_q in changes:
-                    part = float(q @ s)
-                    s, y = s - part * q, y - part * y_of_q
-            new_size = float(np.linalg.norm(s))
-            if new_size > MIN_NEW_SHARE * size:
-                changes.append((np.asarray(s / new_size), np.asarray(y / new_size)))
+                    projection = float(q @ s)
+                    s, y = s - projection * q, y - projection * y_of_q
+            remaining_size = float(np.linalg.norm(s))
+            if remaining_size > MIN_NEW_SHARE * size:
+                changes.append((np.asarray(s / remaining_size), np.asarray(y / remaining_size)))
         return polynomial, changes
 
     def _product(self, u: Array) -> Array:
-        """Return D u, which is stored for the last states."""
+        """Return this rank's part of D u; products with the last states are kept."""
         for stored_u, product in self._products:
             if np.array_equal(u, stored_u):
                 return product
@@ -209,11 +227,11 @@ class PathPolynomial:
     base
         The newest state, at position 0.
     direction
-        Of size one.
+        Unit vector from the previous point to the newest one.
     distance
-        The unit of positions.
+        The distance of these points, which is the unit of positions.
     coefficients
-        Of the powers from the first on.
+        (n, forces) coefficients of the powers from the first on.
     """
 
     base: ForceState
@@ -223,28 +241,32 @@ class PathPolynomial:
 
     @classmethod
     def from_points(cls, points: list[list[ForceState]]) -> "PathPolynomial":
-        """Return the polynomial through the last state of each point, the newest one last."""
+        """Return the polynomial through the last state of each point, with slopes where known.
+
+        Each point of the path is a list of states near each other; the newest point and state are
+        last. Points beside the direction, or at nearly the same position, are left out.
+        """
         base, previous = points[-1][-1], points[-2][-1] if len(points) > 1 else None
         if previous is None or np.array_equal(previous.u, base.u):
             return cls(base, np.zeros_like(base.u), 1.0, np.zeros((0, len(base.forces))))
         direction, distance = base.u - previous.u, float(np.linalg.norm(base.u - previous.u))
         direction = np.asarray(direction / distance)
-        rows, values, places = list[Array](), list[Array](), [0.0]
+        rows, values, positions = list[Array](), list[Array](), [0.0]
         powers = np.arange(1.0, MAX_COEFFICIENTS + 1)
         for point in reversed(points):
             last = point[-1]
             s = last.u - base.u
             position, size = float(direction @ s) / distance, float(np.linalg.norm(s)) / distance
             if last is not base:
-                separation = min(abs(position - x) for x in places)
+                separation = min(abs(position - x) for x in positions)
                 is_across = abs(position) < MIN_ALONG_SHARE * size
                 if is_across or separation < MIN_SEPARATION * max(1.0, abs(position)):
                     continue
-                places.append(position)
+                positions.append(position)
                 rows.append(np.asarray(position**powers))
                 values.append(last.remainder - base.remainder)
-            for state, other in pairwise(reversed(point)):
-                change = state.u - other.u
+            for state, older_state in pairwise(reversed(point)):
+                change = state.u - older_state.u
                 step, length = (
                     float(direction @ change) / distance,
                     float(np.linalg.norm(change)) / distance,
@@ -255,8 +277,9 @@ class PathPolynomial:
                     and length < SLOPE_DISTANCE_RATIO
                 ):
                     position = float(direction @ (state.u - base.u)) / distance
+                    # the mean slope between two near states as a further equation
                     rows.append(np.asarray((position**powers - (position - step) ** powers) / step))
-                    values.append(np.asarray((state.remainder - other.remainder) / step))
+                    values.append(np.asarray((state.remainder - older_state.remainder) / step))
                     break
             if len(rows) == MAX_COEFFICIENTS:
                 break
@@ -265,7 +288,7 @@ class PathPolynomial:
         return cls(base, direction, distance, np.asarray(coefficients, dtype=np.float64))
 
     def remainder(self, u: Array) -> Array:
-        """Return the forces without D u at a state."""
+        """Return this rank's part of the forces without D u at a state u of all nodes."""
         position = float(self.direction @ (u - self.base.u)) / self.distance
         return np.asarray(
             self.base.remainder

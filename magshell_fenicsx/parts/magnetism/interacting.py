@@ -55,7 +55,7 @@ TOO_NEAR = (
 
 
 def polar(F: Array) -> Array:
-    """Return the rotations (n, 3, 3) nearest to matrices F (n, 3, 3)."""
+    """Return the rotations (n, 3, 3) that are nearest to matrices F (n, 3, 3)."""
     U, _, V = np.linalg.svd(F)
     # a determinant of -1 is a reflection, where an iterate has turned a cell inside out
     U[:, :, 2] *= np.linalg.det(U @ V)[:, None]
@@ -65,7 +65,17 @@ def polar(F: Array) -> Array:
 class InteractionTerm:
     """Energy over E h R² of the parts of a model in each other's field, and in their own.
 
-    It is multiplied by the amplitude `interaction`.
+    It is an `assembly.dense_tangent.DenseTerm`, multiplied by the amplitude `interaction`. Like the
+    constructor, methods that evaluate the energy are collective.
+
+    Parameters
+    ----------
+    model
+        The shells' model, with placement, thickness and magnetisation.
+    u
+        The displacement.
+    interaction
+        Strength, and whether each part acts on itself too.
 
     Raises
     ------
@@ -103,7 +113,7 @@ class InteractionTerm:
 
     @property
     def no_number(self) -> str:
-        """Explanation for the user where the energy is not a number."""
+        """Explanation for the user in case the energy is not a number."""
         if self._model.shell_contacts:
             return (
                 " (parts are in each other, or too near for the size of their cells: take smaller "
@@ -115,18 +125,21 @@ class InteractionTerm:
         )
 
     def antisymmetric(self) -> "InteractionTerm":
-        """Return the same term for additions to u that are opposite in the images."""
+        """Return the same term for changes of u that are opposite in the images.
+
+        The returned term takes its second derivative from this one, which computes both at once.
+        """
         odd_term = copy(self)
         odd_term._even_term = self
         return odd_term
 
     def refuse_near(self) -> None:
-        """Refuse a single part, or undeformed parts that are too near each other; collective.
+        """Check that undeformed parts can act on each other; collective.
 
         Raises
         ------
         CaseError
-            On every rank, for such parts.
+            On every rank, if all is one part that does not act on itself, or if parts are too near.
         """
         if not self._acts_on_itself and self._part_of_cells.max() == 0:
             raise CaseError(
@@ -143,16 +156,21 @@ class InteractionTerm:
             raise CaseError(TOO_NEAR)
 
     def energy(self) -> float:
+        """Return this rank's part of the energy; collective."""
         return self._evaluated()[0]
 
     def compile_residual(self) -> None:
-        """A sum over pairs of charges."""
+        """Compile nothing: the residual is a sum over pairs of charges."""
 
     def add_residual(self, b: Array, factor: float) -> None:
+        """Add factor dPi/du of this rank's cells to b, with ghosts; collective."""
         b += factor * self._evaluated()[1]
 
     def add_extrapolated_residual(self, b: Array, factor: float) -> None:
-        """Add the residual of extrapolated forces, see `assembly.dense_tangent.DenseTerm`."""
+        """Add factor dPi/du to b, extrapolated from forces at earlier states; collective.
+
+        The forces are computed if nothing is known; see `assembly.dense_tangent.DenseTerm`.
+        """
         self._nodes()  # what is known is forgotten if shape or remanence changed
         extrapolated = (
             self._extrapolation.forces(
@@ -166,7 +184,11 @@ class InteractionTerm:
         b += factor * (self._evaluated()[1] if extrapolated is None else extrapolated)
 
     def extrapolation_holds_along(self, step: Array) -> bool:
-        """Return whether forces are known along a step, see `assembly.dense_tangent.DenseTerm`."""
+        """Return whether extrapolated forces are accurate along a step; collective.
+
+        `step` is a change of all local unknowns, with ghosts; see
+        `assembly.dense_tangent.DenseTerm`.
+        """
         self._nodes()
         displacement, index_map = global_values(self._u), self._u.function_space.dofmap.index_map
         step_of_rank = step.reshape(-1, 3)[: index_map.size_local]
@@ -175,13 +197,13 @@ class InteractionTerm:
         )
 
     def compile_tangent(self) -> None:
-        """A sum over pairs of charges."""
+        """Compile nothing: the tangent is a sum over pairs of charges."""
 
     def add_tangent(self, K: PETSc.Mat, factor: float, clamped: list[fem.DirichletBC]) -> None:
-        """Nodes far apart act on each other; see `acting`."""
+        """Add nothing: distant nodes act on each other, and the tangent is dense."""
 
     def hessian(self, *, inexact: bool = False) -> "InteractionHessian":
-        """Return the second derivative, see `assembly.dense_tangent.DenseTerm`; collective."""
+        """Return the second derivative by u; an earlier one may do if `inexact`. Collective."""
         return (
             self._even_term.even_and_odd_hessians(inexact=inexact)[1]
             if self._even_term
@@ -191,9 +213,10 @@ class InteractionTerm:
     def even_and_odd_hessians(
         self, *, inexact: bool
     ) -> tuple["InteractionHessian", "InteractionHessian"]:
-        """Return the second derivative by u, and that by odd additions to u; collective.
+        """Return the second derivatives by even and by odd changes of u; collective.
 
-        Odd additions are opposite in the images.
+        Even changes move the images along as mirror images, odd ones oppositely. Both are those of
+        the present state; if `inexact`, they may be those of an earlier one.
         """
         nodes = self._nodes()
         if self._latest_hessians is None or not (
@@ -206,9 +229,22 @@ class InteractionTerm:
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
     ) -> tuple[fem.Function, Array] | None:
-        """Return derivatives by remanence, thickness or placement; collective.
+        """Return derivatives of energy Pi + force v . dPi/du by a field's values; collective.
 
-        See `assembly.nonlocal_terms.FieldDifferentiable`.
+        Parameters
+        ----------
+        name
+            Name of the remanence, "thickness", or "r0" for the placement.
+        direction
+            The direction v.
+        energy, force
+            The two factors.
+
+        Returns
+        -------
+        tuple or None
+            The field, and derivatives (own cells, nodes, components) by its values. None if the
+            term does not depend on a field of that name.
         """
         field_of_model, of_shape = self_field(self._view), name in ("thickness", "r0")
         nodes, rates = self._nodes(), global_values(direction)[self._cells.nodes]
@@ -217,14 +253,14 @@ class InteractionTerm:
             Weights(self._scale * energy, self._scale * force),
             self._cells.own_range,
         )
-        part = slice(own_cells.start, own_cells.stop)
+        own_rows = slice(own_cells.start, own_cells.stop)
         if of_shape:
-            into = self._charges.field_derivatives(
+            nodal_derivatives = self._charges.field_derivatives(
                 nodes, rates_of_copies, own_cells, weights, of_shape=True
             )
             by_place, by_thickness = (
-                self._comm.allreduce(derivative)[part]
-                for derivative in (into.by_place, into.by_thickness)
+                self._comm.allreduce(derivative)[own_rows]
+                for derivative in (nodal_derivatives.by_place, nodal_derivatives.by_thickness)
             )
             if name == "thickness":
                 assert self._model.thickness
@@ -256,36 +292,45 @@ class InteractionTerm:
         by_remanence = charges.field_derivatives(
             nodes, rates_of_copies, own_cells, weights
         ).by_remanence
-        return field_of_model.Br, np.asarray(self._comm.allreduce(by_remanence))[part]
+        return field_of_model.Br, np.asarray(self._comm.allreduce(by_remanence))[own_rows]
 
     def _at_fixed_charges(self, direction: fem.Function, energy: float, force: float) -> Array:
-        """Return derivatives by the placement of own cells' nodes at fixed charges; collective.
+        """Return derivatives (own cells, nodes, 3) by the placement at fixed charges; collective.
 
-        A placement moves charges as a displacement does.
+        A placement moves charges as a displacement does. So the derivatives of energy Pi + force v
+        . dPi/du are energy dPi/du + force D v, with the direction v. Those by a node are shared
+        equally by its local cells.
         """
         V, count = self._u.function_space, len(self._cells.own_range)
         D, v = self.hessian(), global_values(direction).ravel()
-        of_nodes = energy * self._evaluated()[1] + force * (
+        by_nodes = energy * self._evaluated()[1] + force * (
             D.near_blocks @ v + D.times_far(v[:, None]).ravel()
         )
         nodes = V.dofmap.list[:count]
-        cells_of_node = np.bincount(nodes.ravel(), minlength=len(of_nodes) // 3)
-        return np.asarray((of_nodes.reshape(-1, 3) / np.maximum(cells_of_node, 1)[:, None])[nodes])
+        cells_of_node = np.bincount(nodes.ravel(), minlength=len(by_nodes) // 3)
+        return np.asarray((by_nodes.reshape(-1, 3) / np.maximum(cells_of_node, 1)[:, None])[nodes])
 
     def _hessians_at(self, nodes: Array) -> tuple["InteractionHessian", "InteractionHessian"]:
+        """Return the second derivatives by even and odd changes of u; collective.
+
+        The deformed `nodes` (copies * cells, k, 3) are the same on all ranks. Near pairs of cells
+        fill stored blocks; others act by multipoles.
+        """
         own_cells, images, V = self._cells.own_range, self._copies.images, self._u.function_space
         count, has_images = V.dofmap.index_map.size_global, len(images) > 1
         column_of = np.tile(self._cells.nodes, (len(images), 1)).astype(np.int64)
         column_of[len(self._cells.nodes) :] += count  # those of images are apart
+        # rows are local nodes of own cells; those of other ranks and of images are -1
         row_of = np.full(column_of.shape, -1)
         row_of[own_cells.start : own_cells.stop] = V.dofmap.list[: len(own_cells)]
-        turn = np.stack([image.Q for image in images])
-        local = V.dofmap.index_map.size_local + V.dofmap.index_map.num_ghosts
+        image_transforms = np.stack([image.Q for image in images])
+        local_count = V.dofmap.index_map.size_local + V.dofmap.index_map.num_ghosts
         multipoles, near_cells = self._charges.boxes(nodes, own_cells)
         has_block, adjacent = (
-            np.zeros((local, count), dtype=bool),
+            np.zeros((local_count, count), dtype=bool),
             np.zeros((count, count), dtype=bool),
         )
+        # blocks of nodes of near cells are stored; those of adjacent cells serve extrapolation
         for pattern, row_numbers, pairs in (
             (has_block, row_of, near_cells),
             (adjacent, self._cells.nodes, multipoles.adjacent_cells(own_cells)),
@@ -296,25 +341,29 @@ class InteractionTerm:
         self._comm.Allreduce(
             MPI.IN_PLACE, adjacent, MPI.LOR
         )  # the same blocks on any number of ranks
-        stiffness = Stiffness(has_block, self._scale, row_of, column_of, turn)
+        stiffness = Stiffness(has_block, self._scale, row_of, column_of, image_transforms)
         try:
             self._charges.evaluate(nodes, own_cells, stiffness)
         except PartsTooNear:
             stiffness.blocks[:] = np.nan
-        numbers = V.dofmap.index_map.local_to_global(np.arange(local, dtype=np.int32))
+        node_numbers = V.dofmap.index_map.local_to_global(np.arange(local_count, dtype=np.int32))
         cells = CellNodes(
-            self._cells.nodes, own_cells, row_of[own_cells.start : own_cells.stop], numbers, turn
+            self._cells.nodes,
+            own_cells,
+            row_of[own_cells.start : own_cells.stop],
+            node_numbers,
+            image_transforms,
         )
-        B = multipoles.jacobian(multipoles.place_charges(nodes))
+        multipole_jacobian = multipoles.jacobian(multipoles.place_charges(nodes))
         even_hessian, odd_hessian = (
             InteractionHessian(
                 stiffness,
                 multipoles,
-                B,
+                multipole_jacobian,
                 self._scale,
                 cells,
                 sign,
-                adjacent[numbers][has_block],
+                adjacent[node_numbers][has_block],
                 self._turning,
             )
             for sign in ([1.0, -1.0] if has_images else [1.0, 1.0])
@@ -322,7 +371,10 @@ class InteractionTerm:
         return even_hessian, odd_hessian
 
     def _evaluated(self) -> tuple[float, Array]:
-        """Return the energy of this rank's cells and its gradient by local nodes; collective."""
+        """Return this rank's part of the energy and its gradient by local nodes; collective.
+
+        The gradient includes ghosts. Both are nan if parts overlap. The last states are kept.
+        """
         nodes, V = self._nodes(), self._u.function_space
         for nodes_before, energy, forces in self._evaluations:
             if np.array_equal(nodes, nodes_before):
@@ -344,17 +396,18 @@ class InteractionTerm:
         return self._scale * energy, forces
 
     def _nodes(self) -> Array:
-        """Return the deformed nodes (copies * cells, k, 3) of all cells; collective.
+        """Return the deformed nodes (copies * cells, k, 3) over R of all cells; collective.
 
-        Charges are computed again if placement, remanence or thickness changed.
+        If placement, remanence or thickness have changed, all that follows from them is forgotten:
+        charges, evaluations, second derivatives and extrapolated forces.
         """
         r0, u = (global_values(f) for f in (self._model.r0, self._u))
         field_of_model = self_field(self._view)
-        thickness, of_nodes = (
+        thickness, remanence_of_nodes = (
             self._model.thickness,
             field_of_model.Br.x.array.reshape(-1, 3)[field_of_model.Br.function_space.dofmap.list],
         )
-        inputs: tuple[Array, ...] = (r0, self._cells.gather_values(of_nodes))
+        inputs: tuple[Array, ...] = (r0, self._cells.gather_values(remanence_of_nodes))
         if thickness is not None:
             inputs += (
                 self._cells.gather_values(thickness.x.array[thickness.function_space.dofmap.list]),
@@ -372,24 +425,28 @@ class InteractionTerm:
         return self._copies.nodes_of_all((r0 + u)[self._cells.nodes])
 
     def _rotations(self, u: Array, u_before: Array) -> Array:
-        """Return the rotations of all nodes from one displacement to another.
+        """Return the rotations of all nodes from the displacement `u_before` to u.
 
-        They are quaternions (nodes, 4), scalar last.
+        They are quaternions (nodes, 4), scalar last: the mean change of the cells' frames around a
+        node.
         """
         r0, nodes = global_values(self._model.r0), self._cells.nodes
         element = self._u.function_space.element.basix_element
         T = element.tabulate(1, element.points)[1:, :, :, 0]
 
         def frames(u: Array) -> Array:
+            """Return tangents and normal as columns (cells, nodes, 3, 3), at a displacement."""
             a1, a2 = np.einsum("dpk,cki->dcpi", T, (r0 + u.reshape(-1, 3))[nodes], optimize=True)
             return np.stack([a1, a2, unit(np.cross(a1, a2))], axis=-1)
 
         F = np.zeros((len(r0), 3, 3))
+        # sum of deformation gradients of all cells at a node; its nearest rotation is returned
         np.add.at(F, nodes, frames(u) @ np.linalg.inv(frames(u_before)))
         return np.ascontiguousarray(Rotation.from_matrix(polar(F)).as_quat())
 
     @cached_property
     def _charges(self) -> InteractingCharges:
+        """The charges of all cells, undeformed; collective at the first use."""
         shape, cells, edges = self._cells_and_charged_edges()
         return InteractingCharges(
             shape, self._part_of_cells, cells, edges, self._comm, self._singular_pairs, self._copies
@@ -397,6 +454,7 @@ class InteractionTerm:
 
     @cached_property
     def _singular_pairs(self) -> SingularPairs | None:
+        """Pairs of adjacent cells; None if parts do not act on themselves. Collective."""
         shape, cells, edges = self._cells_and_charged_edges()
         if not self._acts_on_itself:
             return None
@@ -407,9 +465,9 @@ class InteractionTerm:
     def _cells_and_charged_edges(
         self, *, include_uncharged: bool = False
     ) -> tuple[MagnetisedShell, Ints, Ints]:
-        """Return the cells of all ranks, and their charged edges by cell and number; collective.
+        """Return the cells of all ranks, and cell and local number of charged edges; collective.
 
-        With `include_uncharged`, edges that another remanence may charge are there too.
+        With `include_uncharged`, edges that another remanence could charge are included.
         """
         field_of_model = self_field(self._view)
         shape, (cells, edges) = (
@@ -421,11 +479,11 @@ class InteractionTerm:
             self._inputs_of_charges[2],
         )
         r0, remanence = self._inputs_of_charges[0][self._cells.nodes], self._inputs_of_charges[1]
-        everywhere = MagnetisedShell(
+        all_cells = MagnetisedShell(
             shape.element, r0, 0 * r0, shape.remanence_element, remanence, shape.h, factor
         )
         own_cells, comm = np.asarray(cells) + self._cells.own_range.start, self._comm
-        return everywhere, gather_rows(comm, own_cells), gather_rows(comm, np.asarray(edges))
+        return all_cells, gather_rows(comm, own_cells), gather_rows(comm, np.asarray(edges))
 
     @cached_property
     def _copies(self) -> Copies:
@@ -438,9 +496,9 @@ class InteractionTerm:
 
     @cached_property
     def _corners(self) -> Ints:
-        """(copies * cells, 3) numbers of corners; collective.
+        """(copies * cells, 3) numbers of the cells' corners; collective.
 
-        A corner on a mirror plane and its image have one number.
+        A corner on a mirror plane and its image have the same number.
         """
         r0, corners = global_values(self._model.r0), self._cells.nodes[:, :3]
         places = self._copies.nodes_of_all(r0[None])
@@ -449,15 +507,16 @@ class InteractionTerm:
             for earlier in range(later):
                 is_shared = np.abs(x - places[earlier]).max(axis=1) < IMAGE_TOLERANCE
                 numbers[later][is_shared] = numbers[earlier][is_shared]
-        return np.concatenate([of_copy[corners] for of_copy in numbers])
+        return np.concatenate([copy_numbers[corners] for copy_numbers in numbers])
 
     @cached_property
     def _part_of_cells(self) -> Ints:
-        """(copies * cells,) the part of each cell; collective."""
+        """(copies * cells,) number of the connected part of each cell; collective."""
         V, corners = self._u.function_space, self._corners
         if len(self._copies.images) == 1:
             return np.asarray(self._cells.gather_values(component_numbers(V)[V.dofmap.list[:, 0]]))
         ones, size = np.ones(corners.size, dtype=np.int8), int(corners.max()) + 1
+        # parts are the components of a graph whose links join corners of a cell
         graph = coo_array(
             (ones, (corners[:, :1].repeat(3, axis=1).ravel(), corners.ravel())), (size, size)
         )
@@ -466,5 +525,6 @@ class InteractionTerm:
 
     @property
     def _view(self) -> ModelView:
+        """The model as its self-field needs it, in its own units and frame."""
         mirror = self._model.mirror if self._model.multiplicity > 1 else None  # type: ignore[attr-defined]  # of shells
         return ModelView(self._model, 1.0, 1.0, mirror, 0.0, False)

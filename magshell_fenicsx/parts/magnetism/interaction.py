@@ -63,15 +63,18 @@ class InteractionStep(FactorStep):
 
     @classmethod
     def asked_for(cls, context: Context) -> bool:
+        """Return whether the case has an interaction of magnetised parts."""
         return acts(context)
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        """Refuse a step without an interaction of magnetised parts."""
         if not acts(context):
             raise ValueError(
                 f"{step.key}.kind: interaction needs magnetic.interaction: others or all"
             )
 
     def unstable_alone(self, value: float, course: StepCourse, what: str) -> str:
+        """Tell the user that the interaction alone makes the shell unstable, at factor `value`."""
         return (
             f"the interaction alone makes the shell unstable at {value:.9g} of it ({what}): to go "
             "on, take it as a load, kind: interaction"
@@ -85,7 +88,7 @@ def acts(context: Context) -> bool:
 
 
 def interaction(context: Context) -> Interaction | None:
-    """Return the interaction of a case; None without one."""
+    """Return the strength of a case's interaction and what acts on what; None without one."""
     magnetic, E = context.section_of(MagneticSection), context.shell.youngs_modulus
     if magnetic is None or not acts(context):
         return None
@@ -98,7 +101,7 @@ def interaction(context: Context) -> Interaction | None:
 
 
 def refuse_unfit_interaction(context: Context) -> None:
-    """Refuse a case without what the interaction needs.
+    """Check that the case has what its interaction needs: flux density, units, parts and a step.
 
     Raises
     ------

@@ -2,9 +2,9 @@
 
 A remanence moves with F (`densities`), or it turns with the surface and does not stretch: R Br in
 place of F Br. R is the rotation of the polar decomposition of F = a_i (x) a0^i + n (x) n0. In the
-surface, with C = U^2, U = (C + J 1)/T, T^2 = tr C + 2 J and J = sqrt(det C), so that R = F U^-1 =
-(F + J F C^-1)/T, and J F C^-1 = J a^i (x) a0_i: no root but of numbers above zero, at equal
-stretches too. In units and arguments as `densities`.
+surface let C = U², U = (C + J 1)/T, T² = tr C + 2 J and J = sqrt(det C). Then R = F U^-1 = (F + J F
+C^-1)/T, and J F C^-1 = J a^i (x) a0_i. All roots are of positive numbers, at equal stretches too.
+Units and arguments are those of `densities`.
 """
 
 import ufl
@@ -18,7 +18,10 @@ from magshell_fenicsx.parts.magnetism.magnetised import MagneticEnergy, Remanenc
 
 
 def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
-    """Return the full energy density -Ba . (R - R0) Br of a remanence that only rotates."""
+    """Return the full energy density -Ba . (R - R0) Br of a remanence that only rotates.
+
+    r0 and u are the jets of placement and displacement; R is that of the module's docstring.
+    """
     r, n0, up = r0 + u, kin.normal(r0), kin.dual_basis(r0)
     n, area0 = kin.normal(r), kin.area_ratio(r0)
     J = kin.area_ratio(r) / area0
@@ -32,12 +35,18 @@ def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
 
 
 def magnetic_first(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
-    """Return the term U1, linear in u; the surface turns in itself."""
+    """Return the term U1, linear in u, of a remanence that only rotates.
+
+    It is the antisymmetric part of the U1 of `densities`: the surface turns in itself.
+    """
     return (densities.magnetic_first(r0, u, Br, Ba) - densities.magnetic_first(r0, u, Ba, Br)) / 2
 
 
 def magnetic_torque(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
-    """Return Uq, quadratic in the rotations q_i = n0 . u,_i of the normal and w in the surface."""
+    """Return the term Uq of a remanence that only rotates.
+
+    It is quadratic in the rotations q_i = n0 . u,_i of the normal and w in the surface.
+    """
     n0, q = kin.normal(r0), densities.rotation(r0, u)
     up1, up2 = kin.dual_basis(r0)
     w = ufl.dot(n0, ufl.cross(up1, u.r1) + ufl.cross(up2, u.r2)) / 2
@@ -47,7 +56,11 @@ def magnetic_torque(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
 
 
 def magnetic_tau(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
-    """Return Utau: rotations times strains or, of the normal part, times surface gradients of u."""
+    """Return the term Utau of a remanence that only rotates.
+
+    The normal part of the remanence contributes rotations times surface gradients of u, its part in
+    the surface rotations times strains.
+    """
     n0, q = kin.normal(r0), densities.rotation(r0, u)
     up1, up2 = kin.dual_basis(r0)
     in_surface = Br - ufl.dot(n0, Br) * n0
@@ -86,7 +99,7 @@ _TERMS: dict[MagneticEnergy, tuple[str, ...]] = {
 
 
 def full_density(law: RemanenceLaw, *, thins: bool) -> MagneticDensity:
-    """Return the density of the full energy.
+    """Return the density of the full energy under a law of the remanence.
 
     `thins` says whether the thickness of the shell changes with its area.
     """
@@ -98,7 +111,10 @@ def full_density(law: RemanenceLaw, *, thins: bool) -> MagneticDensity:
 def magnetic_densities(
     law: RemanenceLaw, energy: MagneticEnergy, *, thins: bool
 ) -> dict[str, MagneticDensity]:
-    """Return the density of each term by its name, linear in the applied field."""
+    """Return the densities of a magnetic energy under a law of the remanence, by name of the term.
+
+    They are linear in the applied field. `thins` is as in `full_density`.
+    """
     if energy == "full":
         return {"magnetic": full_density(law, thins=thins)}
     return {name: _EXPANDED[law][name] for name in _TERMS[energy]}

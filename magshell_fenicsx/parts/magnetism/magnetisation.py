@@ -59,7 +59,7 @@ EQUALITY_TOLERANCE = 1e-9  # part of a direction outside a plane: rounding
 
 
 def by_points(section: RemanentSection, turn: float = 0.0) -> ControlledPattern:
-    """Return a remanence by vectors at points, in a frame turned by `turn` about e3 (rad).
+    """Return a remanence given by vectors at points, in a frame turned by `turn` about e3 (rad).
 
     Raises
     ------
@@ -84,10 +84,17 @@ def magnetisation(
 
     Parameters
     ----------
+    magnetic
+        The section of the case file.
     patch_rims
-        Of `Problem`.
+        Name of the patch of each dimple -> whether places (n, 3) are within its rim.
     to
-        Directions that the field turns to.
+        Directions that the field turns to, in the order of steps.
+
+    Raises
+    ------
+    CaseError
+        If a file of vectors or of a source cannot be read.
     """
     section, gradient = (
         magnetic.remanent or RemanentSection.model_construct(),
@@ -96,6 +103,7 @@ def magnetisation(
     field, moving_fields = in_space(context, turn)
     tesla_of_remanence = units(context)[0]
     basis = [magnetic.applied.vector(turn)]
+    # Gram-Schmidt: unit vectors that span all directions of a field that is uniform or linear
     for direction in () if field else to:
         normal_part = direction.vector(turn) - np.sum(
             [(direction.vector(turn) @ e) * e for e in basis], axis=0
@@ -140,7 +148,8 @@ def soft_magnet(
 ) -> SoftMagnet | None:
     """Return the soft-magnetic material, in a frame turned by `turn` about e3 (rad).
 
-    None without a susceptibility. `patch_rims` has the rims of patches by name, see `Problem`.
+    None without a susceptibility. `patch_rims` maps the name of each dimple's patch to a function
+    that says whether places (n, 3) are within its rim.
     """
     magnetic = context.section_of(MagneticSection)
     if magnetic is None or magnetic.susceptibility is None:
@@ -153,12 +162,12 @@ def soft_magnet(
     elif isinstance(chi, dict) and isinstance(context.shell, MeshSurface):
         patches = {name: np.array([value]) for name, value in chi.items()}
     elif isinstance(chi, dict):
-        rest = np.array([chi.get("rest", 0.0)])
+        rest_value = np.array([chi.get("rest", 0.0)])
         rims = tuple(
-            (inside, np.array([chi[name]]) if name in chi else rest)
+            (inside, np.array([chi[name]]) if name in chi else rest_value)
             for name, inside in patch_rims.items()
         )
-        pattern = WithinRims(rims, rest) if rims else float(rest[0])
+        pattern = WithinRims(rims, rest_value) if rims else float(rest_value[0])
     scale = (
         sqrt(MU_0 * E) / remanent.flux_density if remanent and remanent.flux_density and E else 1.0
     )
@@ -168,12 +177,19 @@ def soft_magnet(
 
 
 def soft_mirrored(chi: Any, outline: Outline, mirror: Mirror) -> bool:
-    """Return whether a plane mirrors a susceptibility; patches are mapped onto themselves."""
+    """Return whether a plane mirrors the susceptibility `chi`, the value of its key.
+
+    Only a formula can break the symmetry here: patches are mapped onto themselves.
+    """
     return not isinstance(chi, str) or mirrors_formula(chi, mirror, outline.sample())
 
 
 def _on_patch(section: Direction, context: Context, turn: float) -> Array | Pattern:
-    """Return the remanence on a patch, which may be one shell of several."""
+    """Return the remanence on a patch, in a frame turned by `turn` about e3 (rad).
+
+    It is a vector (3,) or a pattern. A patch that is one of several shells has the remanence of
+    that shell's own frame, moved to its place.
+    """
     if not isinstance(section, RemanentSection) or section.of_shell is None:
         return section.vector(turn)
     place, factor = section.of_shell
@@ -188,7 +204,11 @@ def _on_patch(section: Direction, context: Context, turn: float) -> Array | Patt
 def _remanence(
     section: RemanentSection, context: Context, turn: float, patch_rims: Mapping[str, InsideRim]
 ) -> NDArray[np.float64] | Pattern:
-    """Return the remanence over its magnitude, without patches of a mesh."""
+    """Return the remanence over its magnitude, in a frame turned by `turn` about e3 (rad).
+
+    It is a vector (3,) or a pattern: a function of undeformed places and normals. Patches of a mesh
+    are not included. `patch_rims` are as in `magnetisation`.
+    """
     if section.kind == "radial":
         return radial
     if section.kind == "tangential":
@@ -203,14 +223,20 @@ def _remanence(
         return layer_average(section.layers, turn)
     if section.patches and not isinstance(context.shell, MeshSurface):
         vectors = {name: direction.vector(turn) for name, direction in section.patches.items()}
-        rest = vectors.pop("rest")
-        rims = tuple((inside, vectors.get(name, rest)) for name, inside in patch_rims.items())
-        return WithinRims(rims, rest) if vectors else rest
+        rest_vector = vectors.pop("rest")
+        rims = tuple(
+            (inside, vectors.get(name, rest_vector)) for name, inside in patch_rims.items()
+        )
+        return WithinRims(rims, rest_vector) if vectors else rest_vector
     return section.vector(turn)
 
 
 def remanence_constraints(context: Context, outline: Outline) -> list[SymmetryConstraint]:
-    """Remanence and applied field must both be symmetric to a plane, or both antisymmetric."""
+    """Return the symmetry that the magnetisation preserves, as one constraint in a list.
+
+    Remanence and applied field must both be symmetric to a plane, or both antisymmetric. The
+    constraint has the reason, if any, why the problem is not axisymmetric about e3.
+    """
     magnetic = context.section_of(MagneticSection)
     assert magnetic
     formulas = magnetic.applied.components if magnetic.applied.has_field_beside_sources else None
@@ -223,7 +249,9 @@ def remanence_constraints(context: Context, outline: Outline) -> list[SymmetryCo
         [] if without_uniform_field else [magnetic.applied.vector()]
     )
     rotates_as_whole = turns(context)  # then the rotation is a part of the field at each place
-    turning = [] if rotates_as_whole else [step.to.vector() for step in _rotations(context)]
+    turned_directions = (
+        [] if rotates_as_whole else [step.to.vector() for step in _rotations(context)]
+    )
     remanent = magnetic.remanent or RemanentSection.model_construct()
     G = np.array(magnetic.applied.gradient or np.zeros((3, 3)))
     if isinstance(remanent.components, UserField):
@@ -253,24 +281,34 @@ def remanence_constraints(context: Context, outline: Outline) -> list[SymmetryCo
             for meridian in (outline.meridian.shell_meridians if outline.meridian else ())
             if name.startswith(meridian.name)
         )
-        span = outline.meridian and replace(outline.meridian, shell_meridians=meridians)
-        if not (span and field_is_axisymmetric(fields[-1], span, smooth=False)):
+        meridian_of_patch = outline.meridian and replace(
+            outline.meridian, shell_meridians=meridians
+        )
+        if not (
+            meridian_of_patch and field_is_axisymmetric(fields[-1], meridian_of_patch, smooth=False)
+        ):
             reasons.append(f"the remanence of {name} differs around e3")
     sources = values(context) if magnetic.applied.sources or rotates_as_whole else []
     reasons += [
-        f"{what} differs around e3"
-        for what, is_axisymmetric in _axisymmetry_of_formulas(magnetic, outline, sources).items()
+        f"{field_in_words} differs around e3"
+        for field_in_words, is_axisymmetric in _axisymmetry_of_formulas(
+            magnetic, outline, sources
+        ).items()
         if not is_axisymmetric
     ]
     if np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() > PARALLEL:
         reasons.append("the gradient of the applied field is not diag(a, a, b)")
 
     def mirrors(mirror: Mirror) -> bool:
+        """Return whether a plane maps remanence and field to themselves or both to opposites."""
         S, x = mirror.reflection, outline.sample() if fields or sources else np.zeros((0, 3))
         x = with_nearby_places(x) if formulas else x
 
         def images(sign: float) -> bool:
-            uniform = all(np.abs(S @ v - sign * v).max() <= 1e-10 for v in (*vectors, *turning))
+            """Return whether mirror images are `sign` times the remanence and the field."""
+            uniform = all(
+                np.abs(S @ v - sign * v).max() <= 1e-10 for v in (*vectors, *turned_directions)
+            )
             some_places = x[:: len(x) // 50 + 1]  # the field of a source is smooth
             varying = all(
                 equal_to_rounding(
@@ -282,14 +320,14 @@ def remanence_constraints(context: Context, outline: Outline) -> list[SymmetryCo
                 )
             )
             kinds = {"radial": 1.0, "tangential": float(S[2, 2])}
-            of_shells = [
+            shell_patterns = [
                 (pattern_of_shell.pattern, pattern_of_shell.place.Q[:, 2])
                 for pattern_of_shell in patterns.values()
             ]
-            is_symmetric = all(p is not radial or sign == 1.0 for p, _ in of_shells)
+            is_symmetric = all(p is not radial or sign == 1.0 for p, _ in shell_patterns)
             is_symmetric &= all(
                 p is not tangential or np.abs(S @ e3 - sign * e3).max() <= EQUALITY_TOLERANCE
-                for p, e3 in of_shells
+                for p, e3 in shell_patterns
             )
             return uniform and varying and is_symmetric and kinds.get(remanent.kind, sign) == sign
 
@@ -312,7 +350,11 @@ def remanence_constraints(context: Context, outline: Outline) -> list[SymmetryCo
 def _axisymmetry_of_formulas(
     magnetic: MagneticSection, outline: Outline, sources: Sequence[Callable[[Array], Array]]
 ) -> dict[str, bool]:
-    """Return for each formula, and for the sources, whether it is the same around e3."""
+    """Return whether formulas and fields of sources are the same around e3, by description.
+
+    The descriptions, of those that exist, are subjects of a message for the user. Values along the
+    outline's meridian are compared; without a meridian none is axisymmetric.
+    """
     meridian = outline.meridian
     remanence = magnetic.remanent.components if magnetic.remanent else None
     applied = magnetic.applied.components if magnetic.applied.has_field_beside_sources else None
@@ -337,20 +379,25 @@ def _axisymmetry_of_formulas(
 
 
 def _at_places(pattern: Pattern, x: Array) -> Array:
-    """Return the values (n, 3) at places of a pattern that does not depend on the normal."""
+    """Return the values (n, 3) at places x (n, 3) of a pattern that ignores the normal."""
     return np.asarray(pattern(x[None], 0 * x[None])[0])
 
 
 def _vectors_of_sources(sources: Sequence[SourceSection], R: float) -> list[Array]:
-    """Return what a mirror plane through e3 may contain: places of sources, or axes on e3."""
+    """Return a vector (3,) for each source that a mirror plane through e3 must contain.
+
+    It is the place of the source over R or, of a source on e3, its axis.
+    """
     places = [np.array(source.position) / R for source in sources]
     axes = [source.axes[:, 2] for source in sources]
     return [place if tilted(place) else axis for place, axis in zip(places, axes, strict=True)]
 
 
 def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
-    """The field that a step drives; else the remanence alone, where a reduced model shows it as it
-    is.
+    """Return the fields of the model's `Loads` that magnetism adds, by name.
+
+    If a step drives the field, `magnetic` is the magnetisation with it. Otherwise `remanence` is
+    the magnetisation alone; it is left out where a reduced model does not represent it.
     """
     magnetic, turn, patch_rims = (
         context.section_of(MagneticSection),
@@ -377,11 +424,12 @@ def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
 
 
 def _rotations(context: Context) -> list[RotationSection]:
+    """Return the steps of a case that turn the field."""
     return [step.load for step in context.steps if isinstance(step.load, RotationSection)]
 
 
 def account(context: Context, loads: Loads) -> Account:
-    """Describe the energy of the field, and its sources."""
+    """Return the lines of `magshell check` on the energy of the field and on its sources."""
     magnetic, field, words = context.section_of(MagneticSection), loads.magnetic, list[str]()
     if loads.interaction:
         words = [

@@ -89,9 +89,9 @@ class Magnetisation:
         return self.gradient is None and self.in_space is None
 
     def field_at(self, mu: Mapping[str, float], r: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the applied flux density (..., 3) at deformed places r (..., 3).
+        """Return the applied flux density (..., 3) at deformed places r (..., 3) over R.
 
-        A uniform one has the magnitude lambda_m.
+        A uniform one has the magnitude lambda_m. `mu` are all amplitudes by name.
         """
         lambda_m = mu.get("lambda_m", 0.0)
         if self.in_space and not lambda_m:
@@ -110,7 +110,11 @@ class Magnetisation:
         return np.asarray(uniform + lambda_m * r @ self.gradient.T)
 
     def sign_of_images(self, mu: Mapping[str, float], r0: fem.Function, mirror: Mirror) -> float:
-        """Return 1 if mirror images continue the applied field, -1 if opposites do; collective."""
+        """Return 1 if the field's mirror images continue it, -1 if their opposites do; collective.
+
+        The applied field at some nodes of the placement r0 is compared with the reflected field at
+        their images.
+        """
         x = r0.x.array.reshape(-1, 3)
         x = x[:: len(x) // PLACES + 1]
         images = self.field_at(mu, mirror.image(x)) @ mirror.reflection
@@ -123,7 +127,12 @@ class Magnetisation:
     def on_cells(self, patches: Mapping[str, NDArray[np.bool_]], cells: int) -> "Magnetisation":
         """Return the magnetisation with patterns in place of values of named patches.
 
-        `patches` has the cells of each patch, of `cells` on this rank.
+        Parameters
+        ----------
+        patches
+            Name of each patch -> which of this rank's cells are in it.
+        cells
+            Number of this rank's cells, with ghosts.
 
         Raises
         ------

@@ -75,10 +75,15 @@ class MagnetisedShell:
     incompressible: Array | float = 0
 
     def reference(self, ab: Array) -> tuple[Array, Array, Array]:
-        """Map coordinates ab (n, m, 2) to places (n, m, d) on the reference cell.
+        """Map coordinates ab (n, m, 2) to places on the reference cell.
 
-        The derivatives (n, m, 2, d) of these places, and azimuths (n, m) over a full turn, come
-        with them. A triangle is a square whose side a = 1 is a corner; a ring has the azimuth b.
+        A triangle is a square whose side a = 1 is a corner; a ring has the azimuth b.
+
+        Returns
+        -------
+        tuple
+            Places (n, m, d), their derivatives (n, m, 2, d) by a and b, and azimuths (n, m) over a
+            full turn.
         """
         a, b = ab[..., 0], ab[..., 1]
         if self.swept:
@@ -88,9 +93,10 @@ class MagnetisedShell:
         return np.stack([a, (1 - a) * b], -1), slopes, 0 * a
 
     def thickness(self, cells: Ints, X: Array) -> Array:
-        """Return the undeformed thickness over R and its derivatives by X, (1 + d or 3, n, m).
+        """Return the undeformed thickness over R and its derivatives by X: (1 + d or 3, n, m).
 
-        X (n, m, d) are places on the reference cell, of each of the cells (n,).
+        X (n, m, d) are places on the reference cell, m for each of the cells (n,). A constant
+        thickness has three entries, whatever d.
         """
         if self.thickness_factor is None:
             thickness = np.zeros((3, *X.shape[:2]))
@@ -100,9 +106,9 @@ class MagnetisedShell:
         return np.asarray(self.h * np.einsum("dnmk,nk->dnm", tables(element, X, 1), values[cells]))
 
     def zero_derivatives(self, *, of_shape: bool = False) -> NodalDerivatives:
-        """Return zero derivatives, to which others are added.
+        """Return derivatives that are zero, to which others are added.
 
-        With `of_shape`, those by the undeformed place and the thickness are there too.
+        With `of_shape`, those by the undeformed place and the thickness are included.
         """
         zero = NodalDerivatives(np.zeros_like(self.r0), np.zeros_like(self.remanence))
         if not of_shape:
@@ -117,7 +123,8 @@ class MagnetisedShell:
     ) -> None:
         """Add derivatives by nodal factors of the thickness to `nodal_derivatives`.
 
-        They follow from those by thicknesses (n, m) at places X (m, d) of reference cells (n,).
+        They follow from derivatives `by_thickness` (n, m) by the thickness over R, at places X (m,
+        d) of the reference cell in cells (n,).
         """
         if self.thickness_factor and nodal_derivatives.by_thickness is not None:
             T = self.thickness_factor[0].tabulate(0, X)[0, :, :, 0]
@@ -125,13 +132,16 @@ class MagnetisedShell:
 
 
 def tables(element: Any, X: Array, order: int) -> Array:
-    """Return values and derivatives (.., n, m, nodes) of an element's basis at places (n, m, d)."""
+    """Return values and derivatives (.., n, m, nodes) of an element's basis at places (n, m, d).
+
+    The first index counts derivatives up to an order, as in basix.
+    """
     flat = element.tabulate(order, X.reshape(-1, X.shape[-1]))[..., 0]
     return np.asarray(flat.reshape(len(flat), *X.shape[:2], -1))
 
 
 def rotate_about_axis(v: Array, angle: Array, sign: float = 1.0) -> Array:
-    """Rotate vectors (n, m, ..., 3) about e3 by angles (n, m), or back with `sign` -1."""
+    """Rotate vectors (n, m, ..., 3) about e3 by angles (n, m) in rad; back with `sign` -1."""
     c, s = np.cos(angle), sign * np.sin(angle)
     c, s = (component.reshape(*angle.shape, *[1] * (v.ndim - 3)) for component in (c, s))
     return np.stack(
@@ -151,10 +161,12 @@ class SurfaceJets:
         (3, n, m, 3) of the remanence.
     t
         (3, n, m) of the undeformed thickness over R.
+    shape, cells
+        The shell, and the numbers (n,) of the cells.
     shape_tables, remanence_tables
-        Values and derivatives of the bases of both elements there.
+        Values and derivatives of the bases of both elements at the points.
     angle
-        (n, m) azimuths.
+        (n, m) azimuths (rad).
     ab
         (n, m, 2) coordinates.
     """
@@ -172,36 +184,71 @@ class SurfaceJets:
 
     @classmethod
     def at_points(cls, shape: MagnetisedShell, cells: Ints, ab: Array) -> "SurfaceJets":
-        """Return the jets at coordinates ab (n, m, 2) in cells (n,)."""
+        """Return the jets at coordinates ab (n, m, 2) in cells (n,).
+
+        Jets on a meridian are first taken at azimuth zero and then rotated about e3.
+        """
         X, slopes, b = shape.reference(ab)
         angle = 2 * np.pi * b
-        T, TB = tables(shape.element, X, 2), tables(shape.remanence_element, X, 1)
+        shape_tables, remanence_tables = (
+            tables(shape.element, X, 2),
+            tables(shape.remanence_element, X, 1),
+        )
         if shape.swept:
             full_turn = 2 * np.pi
             jets = []
             for nodal in (shape.r0, shape.u):
-                on_meridian = np.einsum("dnmk,nki->dnmi", T, nodal[cells])
+                on_meridian = np.einsum("dnmk,nki->dnmi", shape_tables, nodal[cells])
                 at_azimuth_zero = _ring(on_meridian, full_turn)
                 jets.append(np.stack([rotate_about_axis(d, angle) for d in at_azimuth_zero]))
-            B = np.einsum("dnmk,nki->dnmi", TB, shape.remanence[cells])
+            B = np.einsum("dnmk,nki->dnmi", remanence_tables, shape.remanence[cells])
             by_azimuth = full_turn * np.stack([-B[0, ..., 1], B[0, ..., 0], 0 * B[0, ..., 0]], -1)
             fields = np.stack([rotate_about_axis(d, angle) for d in (B[0], B[1], by_azimuth)])
-            t = shape.thickness(cells, X)
-            t = np.stack([t[0], t[1], 0 * t[0]])
+            thickness = shape.thickness(cells, X)
+            thickness = np.stack([thickness[0], thickness[1], 0 * thickness[0]])
             r0, u = jets
-            return cls(r0, r0[:3] + u[:3], fields, t, shape, cells, T, TB, angle, ab)
-        T, TB = _chain(T, slopes, ab), _chain(TB, slopes, ab)
-        r0, u = (np.einsum("dnmk,nki->dnmi", T, nodal[cells]) for nodal in (shape.r0, shape.u))
-        t = shape.thickness(cells, X)
-        if len(t) > 1:
-            t = np.concatenate([t[:1], np.einsum("nmad,dnm->anm", slopes, t[1:3])])
-        B = np.einsum("dnmk,nki->dnmi", TB, shape.remanence[cells])
-        return cls(r0, r0[:3] + u[:3], B, t, shape, cells, T, TB, angle, ab)
+            return cls(
+                r0,
+                r0[:3] + u[:3],
+                fields,
+                thickness,
+                shape,
+                cells,
+                shape_tables,
+                remanence_tables,
+                angle,
+                ab,
+            )
+        shape_tables, remanence_tables = (
+            _chain(shape_tables, slopes, ab),
+            _chain(remanence_tables, slopes, ab),
+        )
+        r0, u = (
+            np.einsum("dnmk,nki->dnmi", shape_tables, nodal[cells]) for nodal in (shape.r0, shape.u)
+        )
+        thickness = shape.thickness(cells, X)
+        if len(thickness) > 1:
+            thickness = np.concatenate(
+                [thickness[:1], np.einsum("nmad,dnm->anm", slopes, thickness[1:3])]
+            )
+        B = np.einsum("dnmk,nki->dnmi", remanence_tables, shape.remanence[cells])
+        return cls(
+            r0,
+            r0[:3] + u[:3],
+            B,
+            thickness,
+            shape,
+            cells,
+            shape_tables,
+            remanence_tables,
+            angle,
+            ab,
+        )
 
     def layer(self, eta: float) -> tuple[Array, Array, Array]:
-        """Return dX/da, dX/db and dX/deta (n, m, 3) of the undeformed shell.
+        """Return dX/da, dX/db and dX/deta (n, m, 3) of the undeformed shell at the height `eta`.
 
-        `eta` is the height over the thickness.
+        Here X = r0 + eta t n0; heights are over the thickness t.
         """
         _, a1, a2, _a11, _a12, _a22 = self.r0
         n0, (n1, n2) = _normals(self.r0)
@@ -219,11 +266,11 @@ class SurfaceJets:
     @property
     def _incompressible(self) -> Array | float:
         """`MagnetisedShell.incompressible` of these cells."""
-        of_all = self.shape.incompressible
-        return np.asarray(of_all)[self.cells] if np.ndim(of_all) else of_all
+        incompressible = self.shape.incompressible
+        return np.asarray(incompressible)[self.cells] if np.ndim(incompressible) else incompressible
 
     def place(self, eta: float) -> Array:
-        """Return places (n, m, 3) of the deformed shell at a height over the thickness."""
+        """Return places (n, m, 3) over R of the deformed shell at a height over the thickness."""
         return np.asarray(
             self.r[0] + eta * self.thickness[..., None] * unit(np.cross(self.r[1], self.r[2]))
         )
@@ -231,9 +278,14 @@ class SurfaceJets:
     def add_derivatives(
         self, nodal_derivatives: NodalDerivatives, by_place: Array, by_normal: Array, by_B: Array
     ) -> None:
-        """Add dJ/du and dJ/dB at nodes to `nodal_derivatives`, for a number J.
+        """Add the derivatives dJ/du and dJ/dBr of a number J at nodes to `nodal_derivatives`.
 
-        They follow from dJ/dr and dJ/dn (n, m, 3), and from dJ/d(B, B_a, B_b) (3, n, m, 3).
+        Parameters
+        ----------
+        by_place, by_normal
+            (n, m, 3) derivatives dJ/dr and dJ/dn by mid-surface places and normals.
+        by_B
+            (3, n, m, 3) derivatives by the remanence and its derivatives by a and b.
         """
         area_vector = np.cross(self.r[1], self.r[2])
         area = np.linalg.norm(area_vector, axis=-1, keepdims=True)
@@ -253,10 +305,10 @@ class SurfaceJets:
             by_meridian = np.stack([by_jets[0], by_jets[1]])[..., [0, 2]]  # of f and f_s
             by_meridian[0][..., 0] += full_turn * by_jets[2][..., 1]  # f_theta = (0, U, 0)
             by_u = np.einsum("dnmk,dnmi->nki", self.shape_tables[:2], by_meridian)
-            by_fields = np.stack([by_B[0], by_B[1]])
-            by_fields[0][..., 0] += full_turn * by_B[2][..., 1]
-            by_fields[0][..., 1] -= full_turn * by_B[2][..., 0]
-            by_remanence = np.einsum("dnmk,dnmi->nki", self.remanence_tables[:2], by_fields)
+            by_remanence_jets = np.stack([by_B[0], by_B[1]])
+            by_remanence_jets[0][..., 0] += full_turn * by_B[2][..., 1]
+            by_remanence_jets[0][..., 1] -= full_turn * by_B[2][..., 0]
+            by_remanence = np.einsum("dnmk,dnmi->nki", self.remanence_tables[:2], by_remanence_jets)
         else:
             by_u = np.einsum("dnmk,dnmi->nki", self.shape_tables[:3], by_jets)
             by_remanence = np.einsum("dnmk,dnmi->nki", self.remanence_tables, by_B)
@@ -269,16 +321,24 @@ class SurfaceJets:
         charges_of: "Callable[[SurfaceJets], Array]",
         by_charges: Array,
     ) -> None:
-        """Add derivatives by the undeformed place and the thickness; of triangles.
+        """Add a number's derivatives by the undeformed place and the thickness; only of triangles.
 
-        They follow from the derivatives `by_charges` (n, m, l) by numbers that depend on the jets.
-        Those numbers' own derivatives are found along an imaginary change, exact to rounding.
+        They are added to `nodal_derivatives` if it has arrays for them. Derivatives of charges by
+        the jets are found along an imaginary change, exact to rounding.
+
+        Parameters
+        ----------
+        charges_of
+            Jets -> charges (n, m, l), an analytic function.
+        by_charges
+            (n, m, l) derivatives of the number by these charges.
         """
         if nodal_derivatives.by_place is None or nodal_derivatives.by_thickness is None:
             return
         by_r0, by_t = np.zeros((6, *self.r0.shape[1:])), np.zeros((3, *self.t.shape[1:]))
 
         def rate(**jets: Any) -> Array:
+            """Return the number's derivative (n, m) along an imaginary change of jets."""
             change = charges_of(replace(self, **jets)).imag
             total = np.sum(by_charges * change, axis=-1)
             return np.asarray(total / COMPLEX_STEP, dtype=np.float64)
@@ -312,7 +372,10 @@ def unit(m: Array) -> Array:
 
 
 def _normals(jet: Array) -> tuple[Array, tuple[Array, Array]]:
-    """Return the normal (..., 3) of a surface with a jet (6, ..., 3), and its derivatives."""
+    """Return the normal (..., 3) of a surface with a jet (6, ..., 3), and its two derivatives.
+
+    It uses no absolute values, so that it is analytic in the jet.
+    """
     _, a1, a2, a11, a12, a22 = jet
     m = np.cross(a1, a2)
     size = np.sqrt(np.sum(m * m, axis=-1, keepdims=True))  # analytic
@@ -324,21 +387,24 @@ def _normals(jet: Array) -> tuple[Array, tuple[Array, Array]]:
 
 
 def _ring(f: Array, ring: float) -> Array:
-    """Return jets (6, n, m, 3) by (s, b) at azimuth zero of vectors of a meridian.
+    """Return jets (6, n, m, 3) by (s, b) at azimuth zero of an axisymmetric field.
 
-    `f` (3, n, m, 2) are these with their derivatives by s; `ring` is the angle for b = 1.
+    `f` (3, n, m, 2) are its radial and axial components with two derivatives by the meridian's
+    coordinate s; `ring` is the angle (rad) for b = 1.
     """
     (U, W), (Us, Ws), (Uss, Wss) = (np.moveaxis(components, -1, 0) for components in f)
     zero = np.zeros_like(U)
-    parts = [(U, zero, W), (Us, zero, Ws), (zero, ring * U, zero)]
-    parts += [(Uss, zero, Wss), (zero, ring * Us, zero), (-(ring**2) * U, zero, zero)]
-    return np.stack([np.stack(part, axis=-1) for part in parts])
+    jet_components = [(U, zero, W), (Us, zero, Ws), (zero, ring * U, zero)]
+    jet_components += [(Uss, zero, Wss), (zero, ring * Us, zero), (-(ring**2) * U, zero, zero)]
+    return np.stack([np.stack(vector, axis=-1) for vector in jet_components])
 
 
 def _chain(T: Array, slopes: Array, ab: Array) -> Array:
-    """Return derivatives by (a, b) of shape functions, from those by reference coordinates.
+    """Return derivatives by (a, b) of shape functions, from those by reference coordinates X, Y.
 
-    These are X = a, Y = (1 - a) b, of a triangle.
+    A triangle has X = a, Y = (1 - a) b. `T` has the values and first, perhaps also second,
+    derivatives of n, m points and k functions; `slopes` (n, m, 2, 2) are those of X and Y by a and
+    b.
     """
     value, first = T[0], np.einsum("nmad,dnmk->anmk", slopes, T[1:3])
     if len(T) == 3:

@@ -22,16 +22,17 @@ FieldInSpace = Callable[[Array], tuple[Array, Array, Array]]
 
 @dataclass(frozen=True)
 class MovingField:
-    """A field that amplitudes move and multiply.
+    """A field in space that amplitudes move and multiply.
 
     Attributes
     ----------
     at_rest
-        The field where all amplitudes are zero.
+        The field where all amplitudes are zero: places (n, 3) over R to B with two derivatives.
     motions
-        Translations and rotations, carried out one after the other; none is both.
+        Translations and rotations by amplitudes, carried out one after the other. No motion is
+        both.
     factors
-        Amplitude -> change of the factor of the field for an amplitude of one.
+        Amplitude -> change of the field's factor, from one, for an amplitude of one.
     """
 
     at_rest: FieldInSpace
@@ -44,7 +45,11 @@ class MovingField:
         return (*(motion.name for motion in self.motions), *self.factors)
 
     def field_at(self, x: Array, mu: Mapping[str, float]) -> "FieldAtPlaces":
-        """Return the field at places x (n, 3) over R, for amplitudes mu."""
+        """Return the field at places x (n, 3) over R, for amplitudes mu.
+
+        B, its gradient and its second derivatives are taken where the motions carry x back to, and
+        turned with the source.
+        """
         Q, t = combined_motion(self.motions, mu)
         B, G, H = self.at_rest((x - t) @ Q)
         rotated = (
@@ -57,9 +62,19 @@ class MovingField:
 
 @dataclass(frozen=True)
 class FieldAtPlaces:
-    """A moving field at places x (n, 3) for amplitudes mu.
+    """A moving field at places, for given amplitudes, with its derivatives by these.
 
-    B (n, 3), gradient G (n, 3, 3) and second derivatives H (n, 3, 3, 3) are without the factors.
+    Attributes
+    ----------
+    moving_field
+        The field with its motions and factors.
+    x
+        (n, 3) places over R.
+    mu
+        Amplitude -> value.
+    B, G, H
+        (n, 3), (n, 3, 3) and (n, 3, 3, 3): field, gradient dB_i/dx_j and second derivatives,
+        without the factors.
     """
 
     moving_field: MovingField
@@ -84,7 +99,7 @@ class FieldAtPlaces:
         return self._factor() * C, self._factor() * slope
 
     def second_derivative(self, name: str, other: str) -> Array:
-        """Return d2B/dmu_i dmu_j (n, 3) by two amplitudes."""
+        """Return d2B/dmu_i dmu_j (n, 3) by the amplitudes `name` and `other`."""
         factor_names = [
             amplitude for amplitude in (name, other) if amplitude in self.moving_field.factors
         ]
@@ -95,50 +110,60 @@ class FieldAtPlaces:
             return self._factor(*factor_names) * self.B
         if factor_names:
             return self._factor(*factor_names) * self._motion_rate(motion_names[0])[0]
-        C, slope = self._motion_rate(
-            motion_names[0]
-        )  # the motion that is carried out first, or the only one
+        # C: rate by the motion that is carried out first
+        C, slope = self._motion_rate(motion_names[0])
         A, v = self._velocity(motion_names[-1])
+        # dB/dmu = A B - G w, applied to C = dB/dmu_i
         rate: Array = C @ A.T - np.einsum("nij,nj->ni", slope, self.x @ A.T + v)
         return self._factor() * rate
 
     def _factor(self, *differentiated_by: str) -> float:
-        """Return the product of all factors, differentiated by some amplitudes."""
+        """Return the product of all factors, differentiated by some amplitudes.
+
+        A factor is 1 + change mu; its derivative by mu is the change.
+        """
         if len(set(differentiated_by)) < len(differentiated_by):
-            return 0.0  # each is linear
-        changes = self.moving_field.factors.items()
+            return 0.0  # a factor is linear in its amplitude
+        changes_of_factors = self.moving_field.factors.items()
         return float(
             np.prod(
                 [
-                    change if name in differentiated_by else 1 + change * self.mu[name]
-                    for name, change in changes
+                    change_of_factor
+                    if name in differentiated_by
+                    else 1 + change_of_factor * self.mu[name]
+                    for name, change_of_factor in changes_of_factors
                 ]
             )
         )
 
     def _motion_rate(self, name: str) -> tuple[Array, Array]:
-        """Return dB/dmu by a motion, and its gradient, without the factors."""
+        """Return dB/dmu (n, 3) by a motion, and its gradient (n, 3, 3), without the factors."""
         A, v = self._velocity(name)
         w = self.x @ A.T + v
         C = self.B @ A.T - np.einsum("nij,nj->ni", self.G, w)
+        # gradient of A B - G w, with dw/dx = A
         slope = (
             np.einsum("ij,njk->nik", A, self.G) - np.einsum("nijk,nj->nik", self.H, w) - self.G @ A
         )
         return C, slope
 
     def _velocity(self, name: str) -> Velocity:
-        """Return A and v of the velocity of a motion, which later motions carry along."""
+        """Return A (3, 3) and v (3,) of the velocity w(x) = A x + v of a motion.
+
+        Later motions carry the velocity along.
+        """
         motions = self.moving_field.motions
-        number = next(i for i, motion in enumerate(motions) if motion.name == name)
-        motion = motions[number]
+        motion_number = next(i for i, motion in enumerate(motions) if motion.name == name)
+        motion = motions[motion_number]
         A = np.asarray(np.cross(np.eye(3), motion.turn), dtype=np.float64)
         v = motion.shift - A @ motion.centre
-        Q, t = combined_motion(motions[number + 1 :], self.mu)
+        # later motions x -> Q x + t carry it to Q A Q^T x + Q v - Q A Q^T t
+        Q, t = combined_motion(motions[motion_number + 1 :], self.mu)
         A = Q @ A @ Q.T
         return A, np.asarray(Q @ v - A @ t)
 
 
 def combined_motion(motions: Sequence[RigidMotion], mu: Mapping[str, float]) -> tuple[Array, Array]:
-    """Return Q (3, 3) and t (3,) of x -> Q x + t, all motions together."""
+    """Return rotation Q (3, 3) and shift t (3,) of x -> Q x + t, all motions together."""
     origin, *ends = apply_motions(motions, mu, np.vstack([np.zeros(3), np.eye(3)])).x
     return np.column_stack(ends) - origin[:, None], np.asarray(origin)

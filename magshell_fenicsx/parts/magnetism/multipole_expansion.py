@@ -31,7 +31,10 @@ SECOND_DERIVATIVES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # as in p
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Places, normals and dual bases (rows, P, 3) of points on the mid-surface."""
+    """Points on the mid-surface: places r, unit normals n and dual bases, each (rows, P, 3).
+
+    The dual basis is that of the tangents: a^1 . a_1 = 1, a^1 . a_2 = 0.
+    """
 
     r: Array
     n: Array
@@ -39,6 +42,7 @@ class SurfacePoints:
 
     @classmethod
     def from_nodes(cls, nodes: Array, tables: Array) -> "SurfacePoints":
+        """Return the points from nodes (rows, k, 3) and tables (P, 3, k) of shape functions."""
         r, a1, a2 = np.tensordot(nodes, tables, axes=(1, 2)).transpose(3, 0, 2, 1)
         m = np.cross(a1, a2)
         size = np.linalg.norm(m, axis=-1, keepdims=True)
@@ -53,12 +57,12 @@ class PlacedCharges:
     Attributes
     ----------
     Y
-        (COUNT, charges) harmonics about the middles of their boxes, over their width; in the order
-        of boxes.
+        (COUNT, charges) harmonics about the middles of boxes, lengths over the boxes' width;
+        charges are in the order of boxes.
     surfaces
-        Mid-surfaces of each kind of elements.
+        Points of the mid-surface under the charges, for each kind of elements.
     heights
-        (rows, P, L) heights of the charges over the mid-surface, of each kind.
+        (rows, P, L) heights of the charges over the mid-surface, for each kind.
     """
 
     Y: Array
@@ -71,15 +75,20 @@ class MultipoleExpansion:
 
     Parameters
     ----------
+    tree
+        Boxes, and which of them act on each other by multipoles.
     kinds
-        Cells (rows,) and points of each.
-    own
+        Cells (rows,) and charged points of each kind of elements.
+    own_cells
         The cells of this rank.
+    pairs
+        Compiled functions.
     """
 
     def __init__(
         self, tree: Tree, kinds: Sequence[tuple[Ints, Points]], own_cells: range, pairs: Pairs
     ) -> None:
+        """Order the charges by boxes of the finest level; parameters are those of the class."""
         self._tree, self._kinds, self._pairs, self._leaf = tree, kinds, pairs, tree.levels[-1]
         self._own_rows = [
             (cells >= own_cells.start) & (cells < own_cells.stop) for cells, _ in kinds
@@ -87,6 +96,7 @@ class MultipoleExpansion:
         box = np.concatenate(
             [self._leaf.of_cell[cells].repeat(points.q[0].size) for cells, points in kinds]
         )
+        # charges in the order of boxes, so that each box has one slice
         self._order = np.argsort(box, kind="stable")
         self._filled, self._first = np.unique(box[self._order], return_index=True)
         self._middle = self._leaf.middle[box[self._order]]
@@ -94,7 +104,7 @@ class MultipoleExpansion:
         self._octants = [list(_octants(level.keys)) for level in tree.levels]
 
     def place_charges(self, nodes: Array) -> PlacedCharges:
-        """Return the charges on cells with nodes (cells, k, 3)."""
+        """Return the charges at their places on cells with nodes (cells, k, 3)."""
         surfaces = [
             SurfacePoints.from_nodes(nodes[cells], points.tables) for cells, points in self._kinds
         ]
@@ -113,21 +123,28 @@ class MultipoleExpansion:
         )
 
     def add(self, charges: PlacedCharges, *, with_second_derivatives: bool) -> float:
-        """Return the energy of own cells, half of each pair's, and add derivatives to points' sums.
+        """Add derivatives of the energy to points' sums, and return the energy of own cells.
 
-        First derivatives are added, and second ones if `with_second_derivatives`.
+        The energy counts half of each pair. First derivatives are added, and second ones if
+        `with_second_derivatives`. See `Points.sums` for the sums at points.
         """
         N, L = derivatives(), self.local_expansions(self._moments(self._q * charges.Y))[..., 0]
         matrices = (
             [*N, *(N[i] @ N[j] for i, j in SECOND_DERIVATIVES)] if with_second_derivatives else N
         )
+        # values at charges: potential, its gradient, and its second derivatives
         expansion_of_boxes = np.stack([L, *(L @ weighted for weighted in matrices)], axis=-1)
-        values = np.empty((len(self._q), expansion_of_boxes.shape[-1]))
+        values_at_charges = np.empty((len(self._q), expansion_of_boxes.shape[-1]))
         for box, first, last in zip(
             self._filled, self._first, [*self._first[1:], len(self._q)], strict=True
         ):
-            values[self._order[first:last]] = charges.Y[:, first:last].T @ expansion_of_boxes[box]
-        values *= self._leaf.width ** -np.array([1.0] + [2.0] * 3 + [3.0] * 6)[: values.shape[1]]
+            values_at_charges[self._order[first:last]] = (
+                charges.Y[:, first:last].T @ expansion_of_boxes[box]
+            )
+        values_at_charges *= (
+            self._leaf.width
+            ** -np.array([1.0] + [2.0] * 3 + [3.0] * 6)[: values_at_charges.shape[1]]
+        )
         energy, start = 0.0, 0
         for (_, points), heights, own_rows in zip(
             self._kinds, charges.heights, self._own_rows, strict=True
@@ -135,7 +152,7 @@ class MultipoleExpansion:
             stop = start + points.q.size
             weighted = (
                 points.q[own_rows, ..., None]
-                * values[start:stop].reshape(*points.q.shape, -1)[own_rows]
+                * values_at_charges[start:stop].reshape(*points.q.shape, -1)[own_rows]
             )
             heights, start, energy = (
                 heights[own_rows, ..., None],
@@ -143,12 +160,13 @@ class MultipoleExpansion:
                 energy + weighted[..., 0].sum() / 2,
             )
             f, K = weighted[..., 1:4], weighted[..., 4:]
+            # derivatives by places and, times heights, by normals
             columns = [
                 f,
                 heights * f,
                 *([K, heights * K, heights * heights * K] if with_second_derivatives else []),
             ]
-            sums = np.concatenate([part.sum(axis=2) for part in columns], axis=-1)
+            sums = np.concatenate([column.sum(axis=2) for column in columns], axis=-1)
             points.sums[own_rows, :, : sums.shape[-1]] += sums
         return float(energy)
 
@@ -161,15 +179,21 @@ class MultipoleExpansion:
         *,
         heights: bool = False,
     ) -> list[list[Array]]:
-        """Return derivatives of the energy and its rate by the charges of own cells, for each kind.
+        """Return derivatives of the energy and of its rate by the charges of own cells.
 
-        They are like `q`. With `heights`, derivatives by the heights of the charges over the
-        mid-surface follow.
+        The result has one list for each kind, of arrays like `q`: derivatives by charges and, with
+        `heights`, by the heights of the charges over the mid-surface.
 
         Parameters
         ----------
+        nodes
+            (cells, k, 3) nodes.
         moved_nodes
             (cells, k, 3) the nodes, with rates times `COMPLEX_STEP` as imaginary parts.
+        kinds
+            Cells and points of each kind, as in the constructor.
+        weights
+            Factors of the energy and of its rate.
         """
         Y, N, width = self.place_charges(nodes).Y, derivatives(), self._leaf.width
         places_of_kinds = [
@@ -186,8 +210,10 @@ class MultipoleExpansion:
         )
         dY = directional_derivatives(rate, Y)
         L, dL = (
-            self.local_expansions(self._moments(self._q * values))[..., 0] for values in (Y, dY)
+            self.local_expansions(self._moments(self._q * factor_harmonics))[..., 0]
+            for factor_harmonics in (Y, dY)
         )
+        # factor, harmonics and their rates for derivatives by charges, then by heights
         factors_and_rates: list[tuple[Array | float, Array, Array]] = [(1.0, Y, dY)]
         if heights:
             normals = [
@@ -206,12 +232,12 @@ class MultipoleExpansion:
             )
         split = np.cumsum([points.q.size for _, points in kinds])[:-1]
         derivatives_by_kind = list[list[Array]]()
-        for factor, values, rates in factors_and_rates:
+        for factor, factor_harmonics, rates in factors_and_rates:
             by_charges = np.empty(len(self._q))
             for box, first, last in zip(
                 self._filled, self._first, [*self._first[1:], len(self._q)], strict=True
             ):
-                y, dy = values[:, first:last], rates[:, first:last]
+                y, dy = factor_harmonics[:, first:last], rates[:, first:last]
                 by_moments = weights.energy * (L[box] @ y) + weights.force * (
                     L[box] @ dy + dL[box] @ y
                 )
@@ -220,42 +246,49 @@ class MultipoleExpansion:
             split_by_kind = zip(np.split(by_charges, split), kinds, self._own_rows, strict=True)
             derivatives_by_kind.append(
                 [
-                    part.reshape(points.q.shape) * own_rows[:, None, None]
-                    for part, (_, points), own_rows in split_by_kind
+                    derivatives_of_kind.reshape(points.q.shape) * own_rows[:, None, None]
+                    for derivatives_of_kind, (_, points), own_rows in split_by_kind
                 ]
             )
         return [list(split_by_kind) for split_by_kind in zip(*derivatives_by_kind, strict=True)]
 
     def _moments(self, values: Array) -> Array:
-        """Return moments (boxes, COUNT, 1), sums of values (COUNT, charges) in order of boxes."""
+        """Return moments (boxes, COUNT, 1), the sums over each box of values (COUNT, charges).
+
+        Charges are in the order of boxes.
+        """
         M = np.zeros((len(self._leaf.keys), COUNT, 1))
         M[self._filled, :, 0] = np.add.reduceat(values, self._first, axis=1).T
         return M
 
     def local_expansions(self, M: Array) -> Array:
-        """Return L = G M times the width, for moments M (boxes, COUNT, n) of the finest level."""
+        """Return L = G M times the width, for moments M (boxes, COUNT, n) of the finest level.
+
+        L is that of the finest level too.
+        """
         levels, moments = self._tree.levels, [M]
+        # moments go up to larger boxes
         for k, level in reversed(list(enumerate(levels))[1:]):
             moments_of_parents = np.zeros((len(levels[k - 1].keys), *M.shape[1:]))
             for Z, boxes in self._octants[k]:
                 moments_of_parents[level.parent[boxes]] += _matrix_products(Z, moments[0][boxes])
             moments.insert(0, moments_of_parents)
         L = np.zeros_like(moments[0])
-        for k, (level, of_level) in enumerate(zip(levels, moments, strict=True)):
+        # expansions come down, and each level adds its own pairs of boxes
+        for k, (level, level_moments) in enumerate(zip(levels, moments, strict=True)):
             if k:
-                expansions = np.empty_like(of_level)
+                expansions = np.empty_like(level_moments)
                 for Z, boxes in self._octants[k]:
-                    expansions[boxes] = (
-                        _matrix_products(Z.T, L[level.parent[boxes]]) / 2
-                    )  # over half the width
+                    # expansions are over the width, which halves
+                    expansions[boxes] = _matrix_products(Z.T, L[level.parent[boxes]]) / 2
                 L = expansions
             self._pairs.translate(
-                level.one, level.other, level.offset, ends(), self._tree.G, of_level, L
+                level.one, level.other, level.offset, ends(), self._tree.G, level_moments, L
             )
         return L
 
     def adjacent_cells(self, own_cells: range) -> NDArray[np.bool_]:
-        """Return (own cells, cells) whether two cells share a box or have adjacent boxes."""
+        """Return a mask (own cells, cells) of pairs of cells that share a box or a box's border."""
         grid_places = self._leaf.keys[self._leaf.of_cell, 2:]
         return np.asarray(
             np.abs(grid_places[own_cells.start : own_cells.stop, None] - grid_places).max(axis=-1)
@@ -263,7 +296,7 @@ class MultipoleExpansion:
         )
 
     def local_expansions_of_cells(self, moments: Array) -> tuple[Ints, Array]:
-        """Return the box of each cell, and the local expansions of all boxes.
+        """Return the box of each cell (cells,), and the local expansions (boxes, COUNT, n).
 
         `moments` (cells, COUNT, n) are first summed over boxes.
         """
@@ -274,7 +307,10 @@ class MultipoleExpansion:
         )
 
     def jacobian(self, charges: PlacedCharges) -> Array:
-        """Return derivatives (cells, COUNT, 3 k) of the moments of each cell's box by its nodes."""
+        """Return derivatives (cells, COUNT, 3 k) of moments by the nodes of each cell.
+
+        The moments are those of the cell's charges about the middle of the cell's box.
+        """
         N, start, k = derivatives(), 0, self._kinds[0][1].tables.shape[-1]
         B = np.zeros((len(self._leaf.of_cell), COUNT, k, 3))
         slopes = np.empty((3, len(self._q), COUNT))
@@ -290,6 +326,7 @@ class MultipoleExpansion:
             )
             moments_by_normal = np.einsum("rpl,irpla->irpa", heights, slopes_of_kind, optimize=True)
             for d in range(2):
+                # a charge at a height moves with the normal: dn = -(n . da_d) a^d
                 moments_by_tangent = np.einsum(
                     "rpi,irpa->rpa", surface.dual_basis[d], moments_by_normal, optimize=True
                 )
@@ -314,7 +351,7 @@ class CellNodes:
     numbers
         (local nodes,) global numbers of nodes.
     turn
-        (copies, 3, 3) the change of a copy's nodes by that of the modelled ones.
+        (copies, 3, 3) the change of a copy's nodes from a change of the modelled nodes.
     """
 
     nodes: NDArray[np.intp]
@@ -324,23 +361,26 @@ class CellNodes:
     turn: Array
 
     def changes_of_copies(self, v: Array, sign: float) -> Array:
-        """Return changes (copies * cells, 3 k, n) of all copies from those of nodes (3 nodes, n).
+        """Return changes (copies * cells, 3 k, n) of all copies' cells from nodal changes v.
 
-        `sign` is -1 for changes that are opposite in the images.
+        v is (3 nodes, n); `sign` is -1 for changes that are opposite in the images.
         """
         n, moved = v.shape[-1], v.reshape(-1, 3, v.shape[-1])
-        each = [
+        changes = [
             sign ** (i > 0) * np.tensordot(Q, moved, axes=(1, 1)) for i, Q in enumerate(self.turn)
         ]
         return np.concatenate(
-            [x[:, self.nodes].transpose(1, 2, 0, 3).reshape(len(self.nodes), -1, n) for x in each]
+            [
+                change_of_copy[:, self.nodes].transpose(1, 2, 0, 3).reshape(len(self.nodes), -1, n)
+                for change_of_copy in changes
+            ]
         )
 
     def sum_at_nodes(self, f: Array) -> Array:
-        """Sum values of own cells (own cells, 3 k, n) at nodes, (3 local nodes, n)."""
-        summed_up = np.zeros((len(self.numbers), 3, f.shape[-1]))
-        np.add.at(summed_up, self.rows, f.reshape(*self.rows.shape, 3, -1))
-        return summed_up.reshape(3 * len(self.numbers), -1)
+        """Return sums (3 local nodes, n) at nodes of values f (own cells, 3 k, n) in cells."""
+        sums = np.zeros((len(self.numbers), 3, f.shape[-1]))
+        np.add.at(sums, self.rows, f.reshape(*self.rows.shape, 3, -1))
+        return sums.reshape(3 * len(self.numbers), -1)
 
 
 @dataclass(frozen=True)
@@ -349,12 +389,22 @@ class InteractionHessian:
 
     Attributes
     ----------
+    near
+        Blocks between nodes of cells near each other.
+    far
+        Multipole expansion of all others.
     B
         See `MultipoleExpansion.jacobian`.
+    scale
+        Factor of the far part.
+    cells
+        Numbers of nodes.
     sign
         -1 of additions to u that are opposite in the images.
     is_adjacent
         Which of the stored blocks are of nodes of cells in boxes that touch.
+    block_rotation
+        Rotation of blocks with their nodes.
     """
 
     near: Stiffness
@@ -372,9 +422,9 @@ class InteractionHessian:
         return self.near.matrix(self.sign)
 
     def rotated_blocks(self, q: Array) -> SinglePrecisionBlocks | None:
-        """Return the blocks `is_adjacent` where nodes are rotated by q (nodes, 4).
+        """Return the blocks `is_adjacent` where nodes are rotated; None with several images.
 
-        None with several images.
+        q (nodes, 4) are unit quaternions, scalar last.
         """
         return self.block_rotation.rotated_blocks(
             self.near, self.sign, self.cells.numbers, q, self._stored_blocks
@@ -385,8 +435,12 @@ class InteractionHessian:
         return self.block_rotation.stored_blocks(self.near, self.is_adjacent)
 
     def times_far(self, v: Array) -> Array:
-        """Return products with the multipoles' part, see `assembly.dense_tangent.DenseHessian`."""
+        """Return products of the multipoles' part with vectors v (3 nodes, n); collective.
+
+        See `assembly.dense_tangent.DenseHessian`.
+        """
         own_cells = slice(self.cells.own.start, self.cells.own.stop)
+        # dM = B du, then L = G dM, then forces B^T L
         of_cell, local_expansions = self.far.local_expansions_of_cells(
             _cellwise_products(self.B, self.cells.changes_of_copies(v, self.sign))
         )
@@ -405,12 +459,19 @@ def _cellwise_products(B: Array, v: Array) -> Array:
 
 
 def _matrix_products(Z: Array, M: Array) -> Array:
+    """Return products (boxes, m, n) of a matrix Z (m, COUNT) with moments M (boxes, COUNT, n)."""
     return (M[..., 0] @ Z.T)[..., None] if M.shape[-1] == 1 else np.asarray(Z @ M)
 
 
 def _octants(keys: Ints) -> Iterator[tuple[Array, Ints]]:
-    """Yield the shift to the parent, and the boxes with this place in it, for each of the eight."""
+    """Yield, for each of the eight octants, the shift to the parent and the boxes in that octant.
+
+    `keys` (boxes, 5) end with the place in the grid.
+    """
     bits = keys[:, 2:] & 1
-    number = bits @ np.array([4, 2, 1])
-    for k in map(int, np.unique(number)):
-        yield shift((k >> 2, k >> 1 & 1, k & 1)), np.flatnonzero(number == k)
+    octant = bits @ np.array([4, 2, 1])
+    for octant_number in map(int, np.unique(octant)):
+        yield (
+            shift((octant_number >> 2, octant_number >> 1 & 1, octant_number & 1)),
+            np.flatnonzero(octant == octant_number),
+        )

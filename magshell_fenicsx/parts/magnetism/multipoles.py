@@ -26,40 +26,44 @@ def place_of(degree: int, m: int) -> int:
 
 
 def harmonics(x: Array) -> Array:
-    """Y (COUNT, n) at places (n, 3)."""
+    """Return the regular solid harmonics Y (COUNT, n) at places x (n, 3)."""
     (a, b, z), Y = np.ascontiguousarray(x.T), np.empty((COUNT, len(x)))
     square = a * a + b * b + z * z
     Y[0] = 1.0
     for m in range(ORDER + 1):
         if m:
             previous, row = place_of(m - 1, m - 1), place_of(m, m)
+            # R_m^m from R_(m-1)^(m-1)
             if m == 1:
                 Y[row], Y[row + 1] = -a / 2, -b / 2
             else:
                 Y[row] = (b * Y[previous + 1] - a * Y[previous]) / (2 * m)
                 Y[row + 1] = -(a * Y[previous + 1] + b * Y[previous]) / (2 * m)
         for degree in range(m + 1, ORDER + 1):
-            share = 1 / ((degree + m) * (degree - m))
-            for part in range(1 + (m > 0)):
-                row, lower, second_lower = (place_of(degree - k, m) + part for k in range(3))
+            # recurrence in the degree l at fixed m
+            inverse_product = 1 / ((degree + m) * (degree - m))
+            for imaginary in range(1 + (m > 0)):
+                row, lower, second_lower = (place_of(degree - k, m) + imaginary for k in range(3))
                 np.multiply(z, Y[lower], out=Y[row])
-                Y[row] *= (2 * degree - 1) * share
+                Y[row] *= (2 * degree - 1) * inverse_product
                 if degree > m + 1:
-                    Y[row] -= share * square * Y[second_lower]
+                    Y[row] -= inverse_product * square * Y[second_lower]
     return Y
 
 
 @cache
 def derivatives() -> tuple[Array, Array, Array]:
-    """Return the matrices N (COUNT, COUNT) with dY/dx_i = N_i Y."""
+    """Return the matrices N (COUNT, COUNT) with dY/dx_i = N_i Y, for x, y and z."""
     matrices = [np.zeros((COUNT, COUNT)) for _ in range(3)]
-    coefficients, rest = _complex()
+    coefficients, zero_row = _complex()
     for degree, m in product(range(1, ORDER + 1), range(ORDER + 1)):
         if m > degree:
             continue
         # of R_l^m: (d/dx + i d/dy) gives R_(l-1)^(m+1), (d/dx - i d/dy) -R_(l-1)^(m-1), d/dz
         # R_(l-1)^m
-        up, down, unchanged = (coefficients.get((degree - 1, n), rest) for n in (m + 1, m - 1, m))
+        up, down, unchanged = (
+            coefficients.get((degree - 1, n), zero_row) for n in (m + 1, m - 1, m)
+        )
         for i, row in enumerate(((up - down) / 2, (up + down) / 2j, unchanged)):
             position = place_of(degree, m)
             matrices[i][position] = row.real
@@ -69,7 +73,10 @@ def derivatives() -> tuple[Array, Array, Array]:
 
 
 def _complex() -> tuple[dict[tuple[int, int], NDArray[np.complex128]], NDArray[np.complex128]]:
-    """R_l^m as rows of coefficients of Y, for all l and m; and a row of zeros."""
+    """Return R_l^m as rows of coefficients of Y, (l, m) -> row, and a row of zeros.
+
+    All l up to ORDER and all m from -l to l are there.
+    """
     rows = {}
     for degree in range(ORDER + 1):
         for m in range(degree + 1):
@@ -84,21 +91,24 @@ def _complex() -> tuple[dict[tuple[int, int], NDArray[np.complex128]], NDArray[n
 
 @cache
 def shift(octant: tuple[int, int, int]) -> Array:
-    """The matrix Z with Y(y/2 + s) = Z Y(y): from the middle of a box to that of the one of which
-    it is this octant.
+    """Return the matrix Z with Y(y/2 + s) = Z Y(y), from a box to its parent.
+
+    s is the middle of this `octant` of the parent; lengths are over the width of each box.
     """
     y = np.random.default_rng(0).uniform(-1, 1, (4 * COUNT, 3))
     s = (np.array(octant) - 0.5) / 2
+    # Y(y/2 + s) is a polynomial in y, so that random places determine Z
     return np.asarray(np.linalg.lstsq(harmonics(y).T, harmonics(y / 2 + s).T, rcond=None)[0].T)
 
 
 def translations(D: Array) -> Array:
     """Return the matrices G (n, COUNT, COUNT) with 1/|a - b| = Y(b) . G Y(a).
 
-    D (n, 3) are the vectors from b's centre to a's.
+    D (n, 3) are the vectors from b's centre to a's; a and b are relative to their centres.
     """
     x, y, z = D.T
     square, w = x * x + y * y + z * z, x + 1j * y
+    # irregular harmonics I_l^m of D by recurrence
     irregular: dict[tuple[int, int], NDArray[np.complex128]] = {(0, 0): square ** (-0.5) + 0j}
     for m in range(ORDER + 1):
         if m:
@@ -123,7 +133,7 @@ def translations(D: Array) -> Array:
 
 
 def ends() -> Ints:
-    """(COUNT,) how many of the first rows of a column of these matrices are not zero."""
+    """Return how many of the first rows of each column of `translations` are not zero, (COUNT,)."""
     return np.concatenate(
         [np.full(2 * degree + 1, (ORDER - degree + 1) ** 2) for degree in range(ORDER + 1)]
     )

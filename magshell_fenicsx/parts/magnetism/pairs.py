@@ -59,9 +59,9 @@ class Copies:
     Attributes
     ----------
     images
-        The first is what is modelled itself.
+        Images under mirrors and rotations; the first is the modelled part itself.
     charge_sign
-        1 if charges of mirrored images are those of what is modelled, -1 if they are opposite.
+        1 if charges of mirrored images equal the modelled ones, -1 if they are opposite.
     """
 
     images: tuple[Image, ...] = (Image(np.eye(3), np.zeros(3), 1.0),)
@@ -82,18 +82,20 @@ class Copies:
         return np.concatenate([image.apply(nodes) for image in self.images])
 
 
-NO_IMAGES = Copies()  # of a shell that is modelled whole
+NO_IMAGES = Copies()  # the copies of a shell that is modelled whole
 
 
 @dataclass(frozen=True)
 class Points:
     """Charged points on elements of one kind.
 
+    P points of an element have L layers of charges each, through the thickness.
+
     Attributes
     ----------
     tables
-        (P, 3, k) shape functions and their derivatives by the reference coordinates, or (P, M, 3,
-        k): M points for each of the P of another element.
+        (P, 3, k) shape functions and their derivatives by the reference coordinates. Points that
+        depend on P points of another element have (P, M, 3, k).
     heights
         (.., L) heights of layers over the thickness.
     t
@@ -132,7 +134,7 @@ class Stiffness:
         (cells, k) numbers of nodes; rows of other ranks and of images are -1, columns of images
         follow all others.
     turn
-        (copies, 3, 3) the change of a copy's nodes by that of the modelled ones.
+        (copies, 3, 3) the change of a copy's nodes from a change of the modelled nodes.
 
     Attributes
     ----------
@@ -143,14 +145,15 @@ class Stiffness:
     starts, columns
         First block of each row, and the column of each block.
     onto
-        (cells, k (k + 1)/2, 3, 3) sums of each cell.
+        (cells, k (k + 1)/2, 3, 3) sums of each cell, upper triangle of its nodes.
     """
 
     def __init__(
         self, pattern: NDArray[np.bool_], factor: float, row_of: Ints, column_of: Ints, turn: Array
     ) -> None:
+        """Number the blocks and set them to zero; parameters are those of the class."""
         self.factor, self.row_of, self.column_of = factor, row_of, column_of
-        number = np.where(
+        block_numbers = np.where(
             pattern, np.cumsum(pattern, dtype=np.int32).reshape(pattern.shape) - 1, -1
         ).astype(np.int32)
         self._count = int(np.count_nonzero(pattern))
@@ -159,15 +162,15 @@ class Stiffness:
             np.int32
         )
         self.shape = 3 * pattern.shape[0], 3 * pattern.shape[1]
-        of_images = [number + self._count] if len(turn) > 1 else []
-        self.where = np.concatenate([number, *of_images], axis=1)
-        self.blocks = np.zeros((self._count * (1 + len(of_images)), 3, 3))
+        image_block_numbers = [block_numbers + self._count] if len(turn) > 1 else []
+        self.where = np.concatenate([block_numbers, *image_block_numbers], axis=1)
+        self.blocks = np.zeros((self._count * (1 + len(image_block_numbers)), 3, 3))
         self.turn = np.ascontiguousarray(turn)
         cells, k = row_of.shape
         self.onto = np.zeros((cells, k * (k + 1) // 2, 3, 3))
 
     def finish(self) -> None:
-        """Add the sums of each cell to the blocks."""
+        """Add the sums of each cell, `onto`, to the blocks of its nodes."""
         k = self.row_of.shape[1]
         a, b = np.triu_indices(k)
         block = np.zeros((k, k, 3, 3))
@@ -177,7 +180,10 @@ class Stiffness:
             self.blocks[self.where[self.row_of[cell][:, None], self.column_of[cell]]] += block
 
     def matrix(self, sign: float) -> bsr_array:
-        """Return the matrix (3 local nodes, 3 all nodes), columns of images times the sign."""
+        """Return the matrix (3 local nodes, 3 all nodes).
+
+        Blocks of images are added times `sign`.
+        """
         blocks, blocks_of_images = self.blocks[: self._count], self.blocks[self._count :]
         if len(blocks_of_images):
             blocks = blocks + sign * blocks_of_images
@@ -186,7 +192,7 @@ class Stiffness:
 
 @dataclass(frozen=True)
 class PairLimits:
-    """Limits by which a pair of cells has a rule.
+    """Limits that decide which quadrature rule a pair of cells has.
 
     Attributes
     ----------
@@ -195,7 +201,8 @@ class PairLimits:
     space
         Least distance over size that is counted.
     above_tolerance
-        Distance over a cell's radius: what is so near to its middle is above or below the cell.
+        Distance over a cell's radius: a place nearer than this to the middle is above or below the
+        cell.
     flat
         Sine of the angle up to which a cell is beside another, not above it.
     worst
@@ -210,7 +217,10 @@ class PairLimits:
 
 
 class Pairs:
-    """The compiled functions for pairs of cells with nodes (cells, k, 3); collective to make."""
+    """The compiled functions for pairs of cells with nodes (cells, k, 3).
+
+    Construction is collective over the ranks of `comm`, one of which compiles.
+    """
 
     def __init__(self, comm: MPI.Comm) -> None:
         names = "pairs.c", "multipole_expansion.c", "stacked_faces.c"
@@ -227,13 +237,15 @@ class Pairs:
         gradient: Array,
         stiffness: Stiffness | None = None,
     ) -> float:
-        """Return the energy of the first `counted` pairs (n, 2) of cells.
+        """Return the energy of the first `counted` pairs, and add derivatives of all pairs.
 
-        The derivatives of all pairs are added to gradient (cells, k, 3) and stiffness; what they
-        are at points is first added to the sums of these: see `finish`.
+        Derivatives by nodes of pairs are added to `gradient` (cells, k, 3) and `stiffness`. Those
+        at points go first to the sums of `Points`; `finish` brings them to the nodes.
 
         Parameters
         ----------
+        cells
+            (n, 2) first and second cell of each pair.
         left, right
             Points on each pair's first and second cell, and their rows (n,).
         """
@@ -246,12 +258,24 @@ class Pairs:
         is_shared = right[0].tables.ndim == 3
         (P, L), (M, S), p = left[0].q.shape[1:], right[0].q.shape[-2:], self._pointer
         on_left, on_right = (
-            [p(points.tables), p(points.heights), p(points.t), p(points.q)]
-            for points in (left[0], right[0])
+            [
+                p(point_arguments.tables),
+                p(point_arguments.heights),
+                p(point_arguments.t),
+                p(point_arguments.q),
+            ]
+            for point_arguments in (left[0], right[0])
         )
-        sizes = [len(filled_cells), counted, padding, p(filled_cells), nodes.shape[1], p(nodes)]
+        pair_arguments = [
+            len(filled_cells),
+            counted,
+            padding,
+            p(filled_cells),
+            nodes.shape[1],
+            p(nodes),
+        ]
         sums = p(right[0].sums) if is_shared else self._ffi.NULL
-        points = [
+        point_arguments = [
             P,
             L,
             *on_left,
@@ -264,9 +288,14 @@ class Pairs:
             p(right_rows),
             int(is_shared),
         ]
-        return float(self._lib.pairs(*sizes, *points, p(gradient), *self._matrix(nodes, stiffness)))
+        return float(
+            self._lib.pairs(
+                *pair_arguments, *point_arguments, p(gradient), *self._matrix(nodes, stiffness)
+            )
+        )
 
     def _matrix(self, nodes: Array, stiffness: Stiffness | None) -> list[Any]:
+        """Return the arguments of C functions for a stiffness; null pointers for None."""
         if not stiffness:
             return [0.0, *3 * [self._ffi.NULL], 0, *3 * [self._ffi.NULL], 1]
         p, block_numbers = self._pointer, stiffness.where
@@ -285,7 +314,10 @@ class Pairs:
         ]
 
     def cells(self, arrays: dict[str, Array], **numbers: float) -> Any:
-        """Return the struct `Cells` of stacked_faces.c, for `add_stacked` and `visible_points`."""
+        """Return the struct `Cells` of stacked_faces.c, for `add_stacked` and `visible_points`.
+
+        `arrays` and `numbers` are its members; the arrays live as long as the struct.
+        """
         struct = self._ffi.new(
             "Cells *", numbers | {name: self._pointer(array) for name, array in arrays.items()}
         )
@@ -302,7 +334,8 @@ class Pairs:
     ) -> float:
         """Return the energy of pairs (n, 2) of cells with stacked faces, and add derivatives.
 
-        The energy is nan if two cells overlap; see `add`.
+        The energy is nan if two cells overlap. See `add` for `gradient` and `stiffness`, and
+        `cells` for `struct`.
         """
         if not len(cells):
             return 0.0
@@ -314,18 +347,28 @@ class Pairs:
     def visible_points(
         self, struct: Any, nodes: Array, first: int, second: int, max_points: int
     ) -> tuple[Array, Array, Array, Array] | None:
-        """Return the rule of a cell with points on another, for each of P points of the first.
+        """Return the rule on the second cell as seen from each of P points of the first cell.
 
-        It has places (P, M, 2), weights (P, M), and `inward` and `shift` (P,) of stacked_faces.c.
         None if both cells overlap.
+
+        Returns
+        -------
+        places
+            (P, M, 2) in the reference triangle; rules are padded to the longest.
+        weights
+            (P, M), zero for padding.
+        inward
+            (P,) 1 where the first cell's normal leads away from the second one, else -1.
+        shift
+            (P,) how far charges of the first cell are moved inward, to a least distance.
         """
         p, P = self._pointer, struct.P
-        count, (inward, shift) = np.zeros(P, dtype=np.int64), np.zeros((2, P))
+        point_counts, (inward, shift) = np.zeros(P, dtype=np.int64), np.zeros((2, P))
         X, w = np.full((P, max_points, 2), 1 / 3), np.zeros((P, max_points))
-        outputs = p(count), p(X), p(w), p(inward), p(shift)
+        outputs = p(point_counts), p(X), p(w), p(inward), p(shift)
         if self._lib.seen_of(struct, first, second, p(nodes), max_points, *outputs):
             return None
-        longest = count.max()
+        longest = point_counts.max()
         return X[:, :longest], w[:, :longest], inward, shift
 
     def finish(
@@ -336,12 +379,17 @@ class Pairs:
         gradient: Array,
         stiffness: Stiffness | None = None,
     ) -> None:
-        """Add the sums at points on cells (rows,) to gradient and stiffness, and reset them."""
+        """Add the sums at points to `gradient` and `stiffness`, and reset the sums.
+
+        `cells` (rows,) are the cells of the points; `gradient` is (cells, k, 3).
+        """
         padding, p = -len(cells) % LANES, self._pointer
         filled, (P, *_) = _filled(cells, padding), points.tables.shape
         cell_blocks = p(stiffness.onto) if stiffness else self._ffi.NULL
-        sizes = [len(filled), padding, p(filled), nodes.shape[1], p(nodes), P]
-        self._lib.points(*sizes, p(points.tables), p(points.sums), p(gradient), cell_blocks)
+        size_arguments = [len(filled), padding, p(filled), nodes.shape[1], p(nodes), P]
+        self._lib.points(
+            *size_arguments, p(points.tables), p(points.sums), p(gradient), cell_blocks
+        )
         points.sums[:] = 0.0
 
     def rules(
@@ -352,7 +400,7 @@ class Pairs:
         least_distances: Array,
         limits: PairLimits,
     ) -> NDArray[np.int8] | None:
-        """Return (own cells, cells) the number of the rule of each pair, -1 without one.
+        """Return the number of the rule of each pair, (own cells, cells); -1 without a rule.
 
         None if two cells are too near each other.
 
@@ -368,10 +416,10 @@ class Pairs:
         normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
         radius = np.linalg.norm(nodes - centre[:, None], axis=-1).max(axis=1)
         p, rule_numbers = self._pointer, np.empty((len(own_cells), len(nodes)), dtype=np.int8)
-        sizes = [len(nodes), own_cells.start, own_cells.stop, nodes.shape[1]]
+        size_arguments = [len(nodes), own_cells.start, own_cells.stop, nodes.shape[1]]
         arrays = [p(array) for array in (nodes, centre, normal, radius, has_rule)]
         too_near = self._lib.rules(
-            *sizes,
+            *size_arguments,
             *arrays,
             limits.h,
             limits.space,
@@ -396,25 +444,28 @@ class Pairs:
     ) -> None:
         """Add the translated moments M of acting boxes to the expansions L of receiving boxes.
 
-        Both are (boxes, .., n); `acting_boxes` and `receiving_boxes` are (pairs,).
-
         Parameters
         ----------
+        receiving_boxes, acting_boxes
+            (pairs,) numbers of boxes.
         which
             (pairs,) row of G of each pair.
         ends
             Number of entries of each row of a translation matrix that are not zero.
         G
             (matrices, sum of ends) these entries.
+        M, L
+            (boxes, COUNT, n) moments and expansions.
         """
         if not len(receiving_boxes):
             return
         p, G, M = self._pointer, np.ascontiguousarray(G), np.ascontiguousarray(M)
-        numbers = p(receiving_boxes), p(acting_boxes), p(which)
-        sizes = M.shape[1], p(ends), G.shape[1], M.shape[2]
-        self._lib.translate(len(receiving_boxes), *numbers, *sizes, p(G), p(M), p(L))
+        box_numbers = p(receiving_boxes), p(acting_boxes), p(which)
+        size_arguments = M.shape[1], p(ends), G.shape[1], M.shape[2]
+        self._lib.translate(len(receiving_boxes), *box_numbers, *size_arguments, p(G), p(M), p(L))
 
     def _pointer(self, array: NDArray[Any]) -> Any:
+        """Return a C pointer to a contiguous array."""
         assert array.flags.c_contiguous
         return self._ffi.from_buffer(C_TYPES[array.dtype], array)
 

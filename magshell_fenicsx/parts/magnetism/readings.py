@@ -40,12 +40,17 @@ register(
 
 
 class FieldObservables(Observables):
-    """Strength and angle of the field, columns of every run, and the magnetic moment."""
+    """Observables of the applied field and of the magnetic moment.
+
+    Strength and angle of the field are columns of every run; the moment is in summary.json.
+    """
 
     def columns(self, loads: "Loads", supports: Sequence[str]) -> tuple[str, ...]:
+        """Return no columns: `lambda_m` and `field_angle` are columns of every run."""
         return ()
 
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
+        """Return strength and angle of the applied field at a state, column -> value."""
         from magshell_fenicsx.parts.magnetism.direction import (  # the solver takes long to import
             field_angle,
             field_size,
@@ -55,6 +60,10 @@ class FieldObservables(Observables):
         return {"lambda_m": field_size(state.mu, view.sense), "field_angle": angle}
 
     def summary(self, view: ModelView, state: "State") -> dict[str, Any]:
+        """Return the magnetic moment at the end of a path, in the frame of the case; collective.
+
+        It is in A m² with units, else over |Br| R³/μ0, or √(E/μ0) R³ of a shell that is soft alone.
+        """
         from magshell_fenicsx.parts.magnetism.self_field import magnetic_moment, magnetisation_of
 
         magnetisation = magnetisation_of(view.loads)
@@ -62,20 +71,29 @@ class FieldObservables(Observables):
             return {}
         at_state = view.model.system.at_state(state)
         moment = at_state.evaluate(lambda: magnetic_moment(view, state.mu)) @ rotation(view.azimuth)
-        size = magnetisation.tesla * magnetisation.metres**3 / MU_0 if magnetisation.metres else 1.0
+        moment_unit = (
+            magnetisation.tesla * magnetisation.metres**3 / MU_0 if magnetisation.metres else 1.0
+        )
         unit = "√(E/μ0) R³" if magnetisation.soft and magnetisation.soft.alone else "|Br| R³/μ0"
         return {
             "magnetic_moment": {
-                "value": (size * moment).tolist(),
+                "value": (moment_unit * moment).tolist(),
                 "unit": "A m²" if magnetisation.metres else unit,
             }
         }
 
 
 class SoftObservables(Observables):
-    """Mean polarisation that the field induces."""
+    """Observables of a soft material: the mean polarisation that the field induces."""
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
+        """Refuse patches of a susceptibility that the surface does not have.
+
+        Raises
+        ------
+        MeshError
+            With the name of the patch.
+        """
         from magshell_fenicsx.models.shell.spatial_fields import by_patch
 
         soft_magnet = loads.magnetic.soft if loads.magnetic else None
@@ -88,6 +106,10 @@ class SoftObservables(Observables):
         return INDUCED if loads.magnetic and loads.magnetic.soft else ()
 
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
+        """Return the mean induced polarisation along e1, e2 and e3 of the case; collective.
+
+        Empty without a soft material.
+        """
         field = view.loads.magnetic
         if field is None or field.soft is None:
             return {}
@@ -95,7 +117,8 @@ class SoftObservables(Observables):
         J = np.array(
             [at_state.integral(forms[f"induced {axis}"]) for axis in "xyz"]
         ) / at_state.integral(forms["induced volume"])
-        if 1 not in view.model.axes:  # of a meridian, with which they turn
+        # on a meridian, components across e3 turn around it: their mean is zero
+        if 1 not in view.model.axes:
             J[:2] = 0.0
         if view.mirror:
             sign = field.sign_of_images(state.mu, view.model.r0, view.mirror)
@@ -106,14 +129,23 @@ class SoftObservables(Observables):
 
 
 class SensorsObservables(Observables):
-    """Readings of sensors."""
+    """Observables of sensors: three columns of flux density for each."""
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
+        """Refuse sensors within half the thickness of a surface from a mesh file.
+
+        Raises
+        ------
+        CaseError
+            With the sensor.
+        """
         from scipy.spatial import cKDTree
 
-        if not loads.sensors or surface.nodes.shape[1] < 3:  # of a chart `sensors.depth` knows
+        # only mesh files: `sensors.depth` tests charts
+        if not loads.sensors or surface.nodes.shape[1] < 3:
             return
         corners = surface.embedding(surface.nodes)[surface.cells[:, :3]]
+        # 45 places on each flat triangle
         barycentric = np.array([(i, j, 8 - i - j) for i in range(9) for j in range(9 - i)]) / 8.0
         surface_points = cKDTree(np.einsum("mk,nki->nmi", barycentric, corners).reshape(-1, 3))
         for sensor in loads.sensors:
@@ -127,9 +159,11 @@ class SensorsObservables(Observables):
         return tuple(column for sensor in loads.sensors for column in sensor.columns)
 
     def differentiable(self, loads: "Loads") -> Sequence[str]:
+        """Return the columns of all sensors: each has a `slope`."""
         return self.columns(loads, ())
 
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
+        """Return the readings of all sensors, column -> value; collective."""
         if not view.loads.sensors:
             return {}
         readings = self._readings(view, state, view.loads.sensors)
@@ -137,6 +171,11 @@ class SensorsObservables(Observables):
         return dict(zip(columns, map(float, readings.ravel()), strict=True))
 
     def slope(self, view: ModelView, state: "State", column: str) -> Slope | None:
+        """Return a sensor's column with its derivatives; None for other columns. Collective.
+
+        Derivatives by displacement and remanence are those of the shell's own field. Derivatives by
+        amplitudes, of the applied field, are differences of fourth order.
+        """
         from magshell_fenicsx.continuation.system import State
         from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES
         from magshell_fenicsx.parts.magnetism.self_field import (
@@ -154,13 +193,13 @@ class SensorsObservables(Observables):
         if not matching:
             return None
         (sensor, i), self_field_of_model = matching[0], self_field(view)
-        e = sensor.own * rotation(view.azimuth)[:, i]
+        direction = sensor.own * rotation(view.azimuth)[:, i]
         system = view.model.system
         at_state, nodes = system.at_state(state), view.model.r0.function_space.dofmap.list
 
         def nodal_derivatives() -> tuple[Array, Array]:
             derivatives, by_u = (
-                self_field_of_model.derivatives(state.mu, sensor.place, e),
+                self_field_of_model.derivatives(state.mu, sensor.place, direction),
                 np.zeros_like(system.u.x.array),
             )
             size = derivatives.by_u.shape[2]
@@ -171,6 +210,7 @@ class SensorsObservables(Observables):
         by_mu = dict[str, float]()
         applied = view.loads.magnetic
         if applied and (sensor.total or applied.soft):
+            # amplitudes of the applied field
             names = {
                 "lambda_m",
                 *TRANSVERSE_AMPLITUDES,
@@ -182,18 +222,18 @@ class SensorsObservables(Observables):
                     (steps, State(state.u, {**state.mu, name: value + steps * size}))
                     for steps, _ in DIFFERENCE_WEIGHTS
                 )
-                values = {
+                readings_at_steps = {
                     steps: self._readings(view, moved_state, [sensor])[0][i]
                     for steps, moved_state in moved_states
                 }
                 by_mu[name] = float(
-                    sum(w / size * values[steps] for steps, w in DIFFERENCE_WEIGHTS)
+                    sum(w / size * readings_at_steps[steps] for steps, w in DIFFERENCE_WEIGHTS)
                 )
         value = float(self._readings(view, state, [sensor])[0][i])
         return Slope(value, at_state.summed(by_u), by_mu, self_field_of_model.Br, by_remanence)
 
     def _readings(self, view: ModelView, state: "State", sensors: Sequence[Sensor]) -> Array:
-        """Return the readings (sensors, 3) in the frame of the case."""
+        """Return the readings (sensors, 3) in the frame of the case; collective."""
         places, reads_total = (
             np.array([sensor.place for sensor in sensors]),
             np.array([sensor.total for sensor in sensors]),
@@ -214,16 +254,17 @@ def field_at(
     own_factor: Array | float,
     applied_factor: Array | float,
 ) -> Array:
-    """The field (n, 3) at places (n, 3) over R of the model's frame, in the frame of the case;
-    collective.
+    """Return the flux density (n, 3) at places over R, in the frame of the case; collective.
 
     It is nan in the shell.
 
     Parameters
     ----------
+    places
+        (n, 3) over R, in the frame of the model.
     own_factor, applied_factor
-        What the field of a remanence of length one, and an applied one of lambda_m = 1 count; (n,
-        1), or of all.
+        Units of the shell's own field and of the applied one: what a remanence of length one, and
+        lambda_m = 1, count for. Numbers, or (n, 1) for each place.
     """
     from magshell_fenicsx.parts.magnetism.self_field import magnetisation_of, self_field
 

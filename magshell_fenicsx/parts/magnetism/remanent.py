@@ -57,6 +57,7 @@ class RemanentSection(FileKeys, Direction):
 
     @model_validator(mode="after")
     def _keys_of_the_kind(self) -> Self:
+        """Refuse keys that do not belong to the kind, or are missing for it, with a ValueError."""
         belongs = {"components": "expression", "patches": "patches", "layers": "layers"}
         belongs |= {"file": "points", "filter": "points"}
         for key, kind in belongs.items():
@@ -83,12 +84,13 @@ class RemanentSection(FileKeys, Direction):
 
     @property
     def of_shell(self) -> tuple[ShellPose, float] | None:
-        """The place of its shell and its factor; None where the frame is that of the case."""
+        """Place of its shell and factor of the remanence; None in the frame of the case."""
         return self._of_shell
 
     def directions(self) -> list[Direction]:
-        """All directions that a mirror plane must hold; radial and tangential patterns allow every
-        plane.
+        """Return all directions that a mirror plane must hold.
+
+        There are none for radial and tangential patterns, which allow every plane.
         """
         if self.kind == "uniform":
             return [self]
@@ -96,5 +98,8 @@ class RemanentSection(FileKeys, Direction):
 
 
 def layer_average(layers: list[Layer], turn: float = 0.0) -> NDArray[np.float64]:
-    """Average (3,) of the layers' unit vectors over the thickness: all that B0 keeps of them."""
+    """Return the average (3,) of the layers' unit vectors over the thickness.
+
+    A shell keeps only this average. `turn` is the frame's azimuth in radians.
+    """
     return np.asarray(np.sum([layer.fraction * layer.vector(turn) for layer in layers], axis=0))

@@ -1,9 +1,9 @@
-"""The magnetic densities of a remanence that turns with the solid and does not stretch: R Br in
-place of F Br.
+"""Magnetic densities of a remanence that turns with the solid without stretch: R Br, not F Br.
 
 F = R U. With C = U^2 and the invariants i1, i2, i3 of U, the theorem of Cayley and Hamilton gives R
-= (i1 cof F + (i1^2 - i2) F - F C)/(i1 i2 - i3), whose denominator is the product of the sums of two
-stretches: smooth at equal stretches too. In units and arguments as `densities`.
+= (i1 cof F + (i1^2 - i2) F - F C)/(i1 i2 - i3). The denominator is the product of the sums of two
+stretches, so that it is smooth at equal stretches too. Units and arguments are those of
+`body_densities`: X place, u displacement, H = du/dX, Br remanence, h thickness over R.
 """
 
 import ufl
@@ -11,33 +11,37 @@ from ufl.core.expr import Expr
 
 from magshell_fenicsx.models.shell.densities import field_at_displacement
 
-STEPS = 3  # from sqrt(3 I): rounding after three, for any stretches from 0.05 to 20
+STEPS = 3  # Newton steps from sqrt(3 I): exact to rounding for stretches from 0.05 to 20
 
 
 def magnetic(X: Expr, u: Expr, H: Expr, Br: Expr, Ba: Expr, h: Expr) -> Expr:
-    """-Ba . (R - 1) Br."""
+    """Return the density -Ba . (R - 1) Br/h in a uniform field Ba."""
     return -(ufl.dot(Ba, rotated(ufl.Identity(3) + H, Br)) - ufl.dot(Ba, Br)) / h
 
 
 def magnetic_gradient(X: Expr, u: Expr, H: Expr, Br: Expr, G: Expr, h: Expr) -> Expr:
-    """The part of Ba = G x: -(G x) .
+    """Return the density of the part G x of the field, -(G x) . R Br/h at x = X + u.
 
-    R Br at the deformed place x = X + u, without its value at u = 0.
+    Its value at u = 0 is subtracted.
     """
     turned = rotated(ufl.Identity(3) + H, Br)
     return -(ufl.dot(ufl.dot(G, X + u), turned) - ufl.dot(ufl.dot(G, X), Br)) / h
 
 
 def magnetic_in_space(X: Expr, u: Expr, H: Expr, Br: Expr, P: Expr, h: Expr) -> Expr:
-    """Return the energy of a field known by values, less its value at u = 0; P see
-    `field_at_displacement`.
+    """Return the density in a field known by values, less its value at u = 0.
+
+    P is the field's polynomial, see `field_at_displacement`.
     """
     B, change = field_at_displacement(P, u)
     return magnetic(X, u, H, Br, B, h) - ufl.dot(change, Br) / h
 
 
 def rotated(F: Expr, v: Expr) -> Expr:
-    """Return R v, with the rotation R of F = R U."""
+    """Return R v, with the rotation R of the polar decomposition F = R U.
+
+    Cayley and Hamilton's theorem gives R without a decomposition; see the module.
+    """
     f1, f2, f3 = (F[:, i] for i in range(3))
     cofactor = ufl.as_tensor([ufl.cross(f2, f3), ufl.cross(f3, f1), ufl.cross(f1, f2)]).T
     first, second, i3 = (
@@ -53,11 +57,11 @@ def rotated(F: Expr, v: Expr) -> Expr:
 
 
 def _trace(first: Expr, second: Expr, i3: Expr) -> Expr:
-    """Compute i1 = tr U from the invariants of C: i1^2 = I + 2 i2 and i2^2 = II + 2 i1 i3, by
-    Newton's method.
+    """Return i1 = tr U from the invariants of C, by Newton's method.
 
-    The fixed point of x -> sqrt(I + 2 sqrt(II + 2 i3 x)), which is almost linear with a slope of at
-    most 1/9.
+    `first` and `second` are I = tr C and II = tr cof C, and i3 = det F. From i1^2 = I + 2 i2 and
+    i2^2 = II + 2 i1 i3 it is the fixed point of x -> sqrt(I + 2 sqrt(II + 2 i3 x)). That map is
+    almost linear, with a slope of at most 1/9.
     """
     x = ufl.sqrt(3 * first)
     for _ in range(STEPS):

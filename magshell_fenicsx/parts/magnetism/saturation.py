@@ -33,11 +33,11 @@ ORDERS = [(i, j) for total in range(4) for i in range(total, -1, -1) for j in [t
 SIZE = 2 + len(ORDERS)  # numbers of a polynomial: p and s, then its coefficients
 SERIES_LIMIT = 1.0  # y below which a series is summed; its terms are those of y/pi²
 SERIES_TERMS = 18
-MAX_NEWTON_STEPS = 100  # of Newton's method at most, some six in practice
+MAX_NEWTON_STEPS = 100  # limit of Newton's method, which takes some six
 
 
 def _series() -> Array:
-    """Return the coefficients of k(y), from its differential equation."""
+    """Return the coefficients of k(y) in powers of y, from its differential equation."""
     a = [1.0]
     for n in range(1, SERIES_TERMS):
         a.append(-sum(a[i] * a[n - 1 - i] for i in range(n)) / (3 * (2 * n + 3)))
@@ -49,7 +49,7 @@ COENERGY = np.polynomial.Polynomial(_series() / np.arange(1, SERIES_TERMS + 1))
 
 
 def ratio(y: Array) -> Array:
-    """Return k(y)."""
+    """Return k(y) = 3 L(x)/x, with Langevin's function L and y = x²; a series for small y."""
     y_above = np.maximum(y, SERIES_LIMIT)
     x = np.sqrt(y_above)
     return np.asarray(
@@ -60,7 +60,10 @@ def ratio(y: Array) -> Array:
 
 
 def slopes_of_ratio(y: Array, k: Array) -> tuple[Array, Array]:
-    """Return k'(y) and k''(y)."""
+    """Return k'(y) and k''(y), with k = k(y) given.
+
+    Below `SERIES_LIMIT` they are derivatives of the series, above closed forms.
+    """
     y_below, y_above, is_below = (
         np.minimum(y, SERIES_LIMIT),
         np.maximum(y, SERIES_LIMIT),
@@ -76,7 +79,7 @@ def slopes_of_ratio(y: Array, k: Array) -> tuple[Array, Array]:
 
 
 def coenergy(y: Array) -> Array:
-    """Return W(y)."""
+    """Return W(y) = 6 ln(sinh x/x)/x², y = x²; the coenergy is chi b² W/2."""
     y_above = np.maximum(y, SERIES_LIMIT)
     x = np.sqrt(y_above)
     log = x + np.log(-np.expm1(-2 * x) / (2 * x))
@@ -86,18 +89,31 @@ def coenergy(y: Array) -> Array:
 
 
 def normal_field(chi: Array, p: Array, s: Array, J: float) -> Array:
-    """Return |b_n| by Newton's method from below, where the function is concave, within bounds."""
+    """Return |b_n|, the root of B_n = b_n (1 + chi k), at points.
+
+    Newton's method starts from below, where the function is concave, and stays within bounds.
+
+    Parameters
+    ----------
+    chi
+        Susceptibility.
+    p, s
+        B_n² and |B_t|² of the field across and along the sheet.
+    J
+        Saturation, in the unit of B.
+    """
     scale, normal = (3 * chi / J) ** 2, np.sqrt(p)
+    # bounds: k lies between 0 and 1
     lowest = normal / (1 + chi)
     b = lowest
     for _ in range(MAX_NEWTON_STEPS):
         y = scale * (s + b**2)
         k = ratio(y)
-        change = (normal - b * (1 + chi * k)) / (
+        newton_step = (normal - b * (1 + chi * k)) / (
             1 + chi * (k + 2 * scale * b**2 * slopes_of_ratio(y, k)[0])
         )
-        b = np.clip(b + change, lowest, normal)
-        if np.all(np.abs(change) <= 4e-16 * normal):
+        b = np.clip(b + newton_step, lowest, normal)
+        if np.all(np.abs(newton_step) <= 4e-16 * normal):
             break
     return np.asarray(b)
 
@@ -105,7 +121,7 @@ def normal_field(chi: Array, p: Array, s: Array, J: float) -> Array:
 def polarisation(chi: Array, along: Array, normal: Array, n: Array, J: float) -> Array:
     """Return mu0 M (..., 3) from the field along the sheet (..., 3) and across it (..., 1).
 
-    `n` (..., 3) are the normals, `J` is the saturation.
+    `chi` is the susceptibility, `n` (..., 3) are the normals, `J` is the saturation.
     """
     s = np.sum(along * along, axis=-1, keepdims=True)
     kappa = chi * ratio((3 * chi / J) ** 2 * (s + normal_field(chi, normal**2, s, J) ** 2))
@@ -113,18 +129,24 @@ def polarisation(chi: Array, along: Array, normal: Array, n: Array, J: float) ->
 
 
 def expand_energy(chi: Array, p: Array, s: Array, J: float) -> Array:
-    """Return p, s and the coefficients of the energy's polynomial (..., SIZE); see `energy`."""
+    """Return the energy's polynomial at points: p, s and its coefficients, (..., SIZE).
+
+    It is Taylor's polynomial of third order about p = B_n² and s = |B_t|², in the order of
+    `ORDERS`; `energy` evaluates it. `chi` is the susceptibility, `J` the saturation.
+    """
     b, scale = normal_field(chi, p, s, J), (3 * chi / J) ** 2
     y = scale * (s + b**2)
     k = ratio(y)
     k1, k2 = slopes_of_ratio(y, k)
+    # T(y) = 1/(1 + kappa)², with b_n² = p T
     q = 1 / (1 + chi * k)
     T, T1, T2 = q**2, -2 * chi * k1 * q**3, -2 * chi * k2 * q**3 + 6 * (chi * k1) ** 2 * q**4
-    D = 1 - scale * p * T1  # of y = scale (s + p T(y)), whose derivatives follow
+    D = 1 - scale * p * T1  # derivatives of y follow from y = scale (s + p T(y))
     y_s, y_p = scale / D, scale * T / D
     D_s, D_p = -scale * p * T2 * y_s, -scale * (T1 + p * T2 * y_p)
     y_ss, y_ps = -y_s * D_s / D, -y_s * D_p / D
     y_pp = scale * T1 * y_p / D - y_p * D_p / D
+    # from e_p = -kappa/(1 + kappa)/2 and e_s = -kappa/2
     half = -chi / 2
     derivatives = {
         (0, 0): half * (s + b**2) * coenergy(y) - (np.sqrt(p) - b) ** 2 / 2,
@@ -143,13 +165,16 @@ def expand_energy(chi: Array, p: Array, s: Array, J: float) -> Array:
 
 
 def energy(P: Sequence[Expr], p: Expr, s: Expr) -> Expr:
-    """Return e(p, s) from the polynomial P (`SIZE`,)."""
+    """Return the energy e(p, s) from the polynomial P (`SIZE`,); see `expand_energy`."""
     dp, ds = p - P[0], s - P[1]
     return sum(P[2 + number] * dp**i * ds**j for number, (i, j) in enumerate(ORDERS))
 
 
 def induced(P: Sequence[Expr], B: Expr, normal: Expr, n: Expr) -> Expr:
-    """Return mu0 M = -de/dB at the present field."""
+    """Return mu0 M = -de/dB at the present field B, of which `normal` is the component along n.
+
+    P is the polynomial at this field.
+    """
     by_normal, by_along = (P[2 + ORDERS.index(order)] for order in ((1, 0), (0, 1)))
     return -2 * (by_along * (B - normal * n) + by_normal * normal * n)
 
@@ -161,25 +186,34 @@ def point_field(
     fields_and_normals: Callable[[], Sequence[tuple[Array, Array]]],
     inputs: Callable[[], tuple[Any, ...]],
 ) -> PointField:
-    """Let a field of twice `SIZE` numbers follow the polynomials at u and at u = 0.
+    """Let `field`, of twice `SIZE` numbers, follow the energy's polynomials at u and at u = 0.
+
+    It is recomputed when its inputs change. Returns `field`.
 
     Parameters
     ----------
+    field
+        Field at the quadrature points of cells.
+    chi
+        Susceptibility: a constant or a field.
+    J
+        Saturation, in the unit of the field.
     fields_and_normals
-        The field and the normals (cells, points, 3) at both.
+        Function that gives the magnetic field and the normals (cells, points, 3), at u and at u =
+        0.
     inputs
-        The values that these depend on.
+        Function that gives the values on which these depend.
     """
 
     def values() -> Array:
-        numbers = (
+        chi_at_points = (
             at_quadrature(chi, field.points)[..., 0] if isinstance(chi, fem.Function) else chi.value
         )
         polynomials = []
         for B, n in fields_and_normals():
             p = np.sum(B * n, axis=-1) ** 2
             s = np.maximum(np.sum(B * B, axis=-1) - p, 0.0)
-            polynomials.append(expand_energy(np.broadcast_to(numbers, p.shape), p, s, J))
+            polynomials.append(expand_energy(np.broadcast_to(chi_at_points, p.shape), p, s, J))
         return np.concatenate(polynomials, axis=-1)
 
     values_of_chi = chi.x.array if isinstance(chi, fem.Function) else chi.value

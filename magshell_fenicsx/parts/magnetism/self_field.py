@@ -38,9 +38,9 @@ from magshell_fenicsx.parts.magnetism.magnetised_cells import MagnetisedShell, N
 from magshell_fenicsx.parts.observables import ModelView
 
 Array = NDArray[np.float64]
-JUMP_TOLERANCE = 1e-6  # of the remanence between two cells, over the largest
+JUMP_TOLERANCE = 1e-6  # jump of the remanence between two cells, over the largest remanence
 AXIS_TOLERANCE = 1e-9  # distance from the axis, over R
-DIFFERENCE_STEP = 1e-4  # of central differences of fourth order
+DIFFERENCE_STEP = 1e-4  # step of central differences of fourth order
 DIFFERENCE_WEIGHTS = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
 
 
@@ -52,10 +52,13 @@ def magnetisation_of(loads: Loads) -> Magnetisation | None:
 class SelfField:
     """Field of a model's shell; solids have `self_field_of_solid.SelfFieldOfSolid`.
 
+    Fields are over |Br|. Amplitudes mu matter for induced magnetisation and mirror images.
+    Construction is collective.
+
     Parameters
     ----------
     view
-        The model; its system has the displacement and the amplitudes that are asked about.
+        The model; its system has the displacement at which the field is asked for.
 
     Attributes
     ----------
@@ -68,6 +71,7 @@ class SelfField:
     """
 
     def __init__(self, view: ModelView) -> None:
+        """Find the charged edges of the model's remanence; collective."""
         magnetisation = magnetisation_of(view.loads)
         assert magnetisation
         self._sight, self._model, self.magnetisation = view, view.model, magnetisation
@@ -89,19 +93,23 @@ class SelfField:
         return pattern_field(self._pattern, self._model.r0)[0]
 
     def _node_places(self) -> tuple[Array, Array]:
-        """Return places and normals at the nodes of cells."""
+        """Return places and normals (cells, nodes, 3) at the nodes of cells."""
         return positions_and_normals(self._model.r0)
 
     def _interpolation_element(self) -> Any:
         """Return the element that interpolates a remanence that rotates or is induced."""
-        return self._model.domain.discontinuous(3).element.basix_element  # type: ignore[attr-defined]  # of thin models
+        # only thin models have a domain
+        return self._model.domain.discontinuous(  # type: ignore[attr-defined]
+            3
+        ).element.basix_element
 
     def families(
         self, mu: Mapping[str, float], *, include_uncharged: bool = False
     ) -> tuple[Any, list[ChargedElements]]:
-        """Return the magnetised cells and their charges at the displacement of the system.
+        """Return the magnetised cells and their charges at the system's displacement.
 
-        With `include_uncharged`, elements that another remanence may charge are there too.
+        The charges are families of charged elements: faces, then edges. With `include_uncharged`,
+        elements that another remanence may charge are there too.
         """
         shape = self.shape(mu)
         cells, edges = self.chargeable if include_uncharged else self.edges
@@ -116,10 +124,14 @@ class SelfField:
     def B(
         self, families: Sequence[ChargedElements], mu: Mapping[str, float], places: Array
     ) -> Array:
-        """Return the flux density (n, 3) at places (n, 3), nan in the shell; collective."""
+        """Return the flux density (n, 3) at places (n, 3) over R, nan in the shell; collective.
+
+        `families` are those of `families`, on each rank its own cells.
+        """
         total = np.zeros_like(places)
         for image in self._images:
             sign = self.sign_of_images(mu) if image.sign < 0 else 1.0
+            # the field of an image is the image of the field where it came from
             original_places = image.apply_inverse(places)
             total[self._contains(families, original_places)] = np.nan
             is_outside = ~np.isnan(total[:, 0])
@@ -127,22 +139,22 @@ class SelfField:
         return np.asarray(self._model.system.comm.allreduce(total))
 
     def _contains(self, families: Sequence[ChargedElements], places: Array) -> NDArray[np.bool_]:
-        """Return which of places (n, 3) are in the modelled cells of this rank."""
+        """Return a mask (n,) of places (n, 3) that are in the modelled cells of this rank."""
         faces = families[0]
         assert isinstance(faces, ShellFaces)
         return faces.contains(places)
 
     def surface_charges(self, families: Sequence[ChargedElements]) -> Sequence[ChargedElements]:
-        """Return the same charges, all of them on surfaces."""
+        """Return the same charges, all of them on surfaces; those of a shell are there already."""
         return families
 
     def derivatives(self, mu: Mapping[str, float], x: Array, e: Array) -> NodalDerivatives:
         """Return the derivatives of e . B(x) by displacement and remanence at this rank's nodes.
 
-        `x` (3,) is a place and `e` (3,) a direction.
+        `x` (3,) is a place over R and `e` (3,) a direction.
         """
         derivatives_of_families = list[NodalDerivatives]()
-        # charges that are zero have derivatives by the remanence
+        # uncharged elements have derivatives by the remanence, too
         for include_uncharged in (False, True) if self._is_convected else (True,):
             shape, families = self.families(mu, include_uncharged=include_uncharged)
             nodal_derivatives = NodalDerivatives(
@@ -174,7 +186,11 @@ class SelfField:
         return mirror.images if mirror else [Image(np.eye(3), np.zeros(3), 1.0)]
 
     def shape(self, mu: Mapping[str, float]) -> Any:
-        """Return the magnetised cells of this rank at the displacement of the system."""
+        """Return the magnetised cells of this rank at the system's displacement.
+
+        Their remanence is what stays with the material: it stays constant, or is computed as F^-1
+        J.
+        """
         model, V = self._model, self._model.r0.function_space
         nodes, components = V.dofmap.list[: self._owned], V.dofmap.bs
         r0, u = (f.x.array.reshape(-1, components)[nodes] for f in (model.r0, model.system.u))
@@ -208,17 +224,21 @@ class SelfField:
         return np.asarray(thins)[: self._owned] if np.ndim(thins) else thins
 
     def _nodal_remanence(self, cells: int | None = None) -> Array:
-        """Return the remanence (cells, nodes, 3) at nodes of the first or all own cells."""
+        """Return the remanence (cells, nodes, 3) at the nodes of the first `cells` cells.
+
+        None stands for all own cells.
+        """
         V = self.Br.function_space
         return np.asarray(
             self.Br.x.array.reshape(-1, 3)[V.dofmap.list[: self._owned if cells is None else cells]]
         )
 
     def _jets(self, nodal: Array) -> Array:
-        """Return a field's values and derivatives (.., cells, nodes, 3) at interpolation nodes.
+        """Return jets of a field at interpolation nodes, (1 + d, cells, nodes, 3).
 
-        `nodal` (cells, nodes, components) are its nodal values; of a meridian, the derivative by
-        the azimuth comes last.
+        They are its value and its derivatives by the d reference coordinates. On a meridian d is 2,
+        and the azimuth is the second coordinate. `nodal` (cells, nodes, components) are the field's
+        nodal values.
         """
         V = self._model.r0.function_space
         T = V.element.basix_element.tabulate(1, self._interpolation.points)[..., 0]
@@ -232,7 +252,8 @@ class SelfField:
     def _material(self, r0: Array, u: Array, mu: Mapping[str, float]) -> Array:
         """Return F^-1 J (cells, nodes, 3), J the polarisation per undeformed volume over |Br|.
 
-        Charges of this field stay with the material. `r0` and `u` are jets at its nodes.
+        Charges of this field stay with the material. `r0` and `u` are jets of placement and
+        displacement at the interpolation nodes; see `_jets`.
         """
         frame, magnetisation = (
             TangentFrame.from_jet(np.concatenate([r0, 0 * r0])),
@@ -256,12 +277,14 @@ class SelfField:
         r1, r2 = r0[1] + u[1], r0[2] + u[2]
         area_vector = np.cross(r1, r2)
         area = np.sum(area_vector * n, axis=-1, keepdims=True)
+        # components of J along the deformed basis r1, r2, n
         along_r1, along_r2 = (
             np.sum(dual * J, axis=-1, keepdims=True) / area
             for dual in (np.cross(r2, n), np.cross(n, r1))
         )
         along_normal = np.sum(n * J, axis=-1, keepdims=True)
-        if np.any(self._incompressible):  # over the stretch of the thickness
+        # over the thickness stretch, the inverse of the area ratio
+        if np.any(self._incompressible):
             along_normal = along_normal * (
                 1 + np.asarray(self._incompressible)[..., None] * (area / frame.area[..., None] - 1)
             )
@@ -270,7 +293,11 @@ class SelfField:
     def _to_material(
         self, nodal_derivatives: NodalDerivatives, mu: Mapping[str, float]
     ) -> NodalDerivatives:
-        """Return derivatives by displacement and remanence, from those by F^-1 J (`_material`)."""
+        """Return derivatives by displacement and remanence, from those by F^-1 J.
+
+        See `_material` for F^-1 J. The chain rule takes differences of fourth order by u; in the
+        remanence F^-1 J is linear.
+        """
         V, model = self._model.r0.function_space, self._model
         nodes, components = V.dofmap.list[: self._owned], V.dofmap.bs
         r0, u = (
@@ -316,10 +343,10 @@ class SelfField:
     def _charged_sides(
         self, *, include_all: bool = False
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Return own cells and local edges that are charged.
+        """Return own cells and local edges that are charged, each (n,).
 
-        Edges at the boundary are charged, and those across which the remanence jumps, or all with
-        `include_all`; those on a mirror plane are not.
+        Edges at the boundary are charged, and edges across which the remanence jumps, or all with
+        `include_all`. Edges on a mirror plane or at a pole are not.
         """
         V = self._model.r0.function_space
         mesh = V.mesh
@@ -332,40 +359,45 @@ class SelfField:
         )
         facets_of_cells = to_facets.array.reshape(-1, dim + 1)
         cells_of_facet = np.diff(to_cells.offsets)
-        values = self._nodal_remanence(len(facets_of_cells))
-        largest = np.abs(values).max(initial=0.0) or 1.0
-        at_edges = self._remanence_at_edges(len(facets_of_cells), values)
+        nodal_remanence = self._nodal_remanence(len(facets_of_cells))
+        largest = np.abs(nodal_remanence).max(initial=0.0) or 1.0
+        at_edges = self._remanence_at_edges(len(facets_of_cells), nodal_remanence)
         cells, edges = list[int](), list[int]()
         mirrored_facets = {int(facet) for facet in self._model.mirrored_facets}
         for cell in range(self._owned):
-            for local, facet in enumerate(facets_of_cells[cell]):
+            for local_edge, facet in enumerate(facets_of_cells[cell]):
                 if facet in mirrored_facets:
                     continue
                 if cells_of_facet[facet] == 1:
                     cells.append(cell)
-                    edges.append(local)
+                    edges.append(local_edge)
                     continue
                 neighbour = next(int(c) for c in to_cells.links(facet) if c != cell)
                 edge_of_neighbour = int(np.flatnonzero(facets_of_cells[neighbour] == facet)[0])
-                jump = np.abs(at_edges[cell, local] - at_edges[neighbour, edge_of_neighbour]).max()
+                jump = np.abs(
+                    at_edges[cell, local_edge] - at_edges[neighbour, edge_of_neighbour]
+                ).max()
                 always = include_all or not self._is_convected
                 if always or jump > JUMP_TOLERANCE * largest:
                     cells.append(cell)
-                    edges.append(local)
-        sides = np.array(cells, dtype=np.intp), np.array(edges, dtype=np.intp)
+                    edges.append(local_edge)
+        charged_sides = np.array(cells, dtype=np.intp), np.array(edges, dtype=np.intp)
         if dim == 2:
-            return sides
+            return charged_sides
         # a pole has no edge; local facets of an interval are its ends
         X = np.array([[0.0], [1.0]])
         T = V.element.basix_element.tabulate(0, X)[0, :, :, 0]
         rho = np.einsum(
             "mk,nk->nm", T, self._model.r0.x.array.reshape(-1, 2)[V.dofmap.list][..., 0]
         )
-        is_off_axis = np.abs(rho[sides]) > AXIS_TOLERANCE
-        return sides[0][is_off_axis], sides[1][is_off_axis]
+        is_off_axis = np.abs(rho[charged_sides]) > AXIS_TOLERANCE
+        return charged_sides[0][is_off_axis], charged_sides[1][is_off_axis]
 
     def _remanence_at_edges(self, count: int, values: Array) -> Array:
-        """Return the remanence in the middle of each local edge, (count, edges, 3)."""
+        """Return the remanence in the middle of each local edge, (count, edges, 3).
+
+        `values` (cells, nodes, 3) are nodal; the first `count` cells are taken.
+        """
         middles = np.array([[0.0], [1.0]])
         if self._dim == 2:
             middles = np.array([[0.5, 0.5], [0.0, 0.5], [0.5, 0.0]])
@@ -373,7 +405,11 @@ class SelfField:
         return np.asarray(np.einsum("mk,nki->nmi", T, values[:count]))
 
     def sign_of_images(self, mu: Mapping[str, float]) -> float:
-        """Return 1 if mirror images continue the magnetisation, -1 if their opposites do."""
+        """Return 1 if mirror images continue the magnetisation, -1 if their opposites do.
+
+        Where no remanence decides this, the applied field at amplitudes `mu` does; then the call is
+        collective.
+        """
         sign = self._image_sign
         if sign == 0.0 and self._sight.loads.magnetic and self._sight.mirror:
             amplitudes_shown = {**mu, "lambda_m": mu.get("lambda_m", 0.0) or 1.0}
@@ -385,7 +421,7 @@ class SelfField:
     def _parity(self) -> float:
         """Return 1 if mirror images continue the remanence, -1 if their opposites do, else 0.
 
-        Collective.
+        It is 1 without a mirror. Collective.
         """
         if self._sight.mirror is None:
             return 1.0
@@ -406,12 +442,15 @@ def magnetic_moment(view: ModelView, mu: Mapping[str, float]) -> Array:
 
 
 def self_field(view: ModelView) -> SelfField:
-    """Return the self-field of a model, which keeps it until its magnetisation is replaced."""
+    """Return the self-field of a model, cached there until its magnetisation is replaced.
+
+    The first call is collective.
+    """
     model, magnetisation = view.model, magnetisation_of(view.loads)
     field_of_model = model.part_caches.get(SelfField)
     if field_of_model is None or field_of_model.magnetisation is not magnetisation:
         if view.model.r0.function_space.mesh.topology.dim == 3:
-            # late, as it derives from the class here
+            # imported late: that class derives from `SelfField`
             from magshell_fenicsx.parts.magnetism.self_field_of_solid import SelfFieldOfSolid
 
             field_of_model = SelfFieldOfSolid(view)
@@ -422,12 +461,15 @@ def self_field(view: ModelView) -> SelfField:
 
 
 def to_magpylib(view: ModelView, state: State, parts: int = 8) -> Any:
-    """Return the magnetised shell at a state as a source of magpylib, of charged triangles.
+    """Return the magnetised shell at a state as a source of magpylib; collective.
 
-    It is in m and T; in a case without units, over R and |Br|.
+    The source is made of charged triangles. It is in m and T; in a case without units, over R and
+    |Br|.
 
     Parameters
     ----------
+    view
+        The model and its frame.
     parts
         Number of parts into which each side of a cell is divided.
 
@@ -449,9 +491,9 @@ def to_magpylib(view: ModelView, state: State, parts: int = 8) -> Any:
     def charged_triangles() -> list[tuple[Array, Array]]:
         _, families = field_of_model.families(state.mu)
         triangles_and_charges = [
-            part
+            chunk
             for family in field_of_model.surface_charges(families)
-            for part in triangles(family, parts)
+            for chunk in triangles(family, parts)
         ]
         if mirror:
             sign = field_of_model.sign_of_images(state.mu)
@@ -465,15 +507,16 @@ def to_magpylib(view: ModelView, state: State, parts: int = 8) -> Any:
 
     system = view.model.system
     on_all_ranks = system.comm.allgather(system.at_state(state).evaluate(charged_triangles))
-    triangles_and_charges = [part for on_rank in on_all_ranks for part in on_rank]
+    triangles_and_charges = [chunk for on_rank in on_all_ranks for chunk in on_rank]
     corners, charges = (
-        np.concatenate([part[i] for part in triangles_and_charges]) for i in range(2)
+        np.concatenate([chunk[i] for chunk in triangles_and_charges]) for i in range(2)
     )
     corners = R * corners @ Q
     area_vectors = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
     charges_per_area = (
         magnetisation.tesla * R**2 * charges / np.sum(area_vectors * area_vectors, axis=-1)
     )
+    # a polarisation normal to a triangle gives it that charge per area
     J = charges_per_area[:, None] * area_vectors
 
     def flux_density(field: str, observers: Array) -> Array:
@@ -481,10 +524,10 @@ def to_magpylib(view: ModelView, state: State, parts: int = 8) -> Any:
         B = np.zeros((len(observers), 3))
         for i, x in enumerate(observers):
             observer = np.broadcast_to(x, (len(J), 3))
-            of_triangles = module.core.triangle_Bfield(
+            field_of_triangles = module.core.triangle_Bfield(
                 observers=observer, vertices=corners, polarizations=J
             )
-            B[i] = of_triangles.sum(axis=0)
+            B[i] = field_of_triangles.sum(axis=0)
         return np.asarray(B / MU_0 if field == "H" else B)
 
     return module.misc.CustomSource(field_func=flux_density)

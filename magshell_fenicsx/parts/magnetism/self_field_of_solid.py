@@ -32,15 +32,24 @@ FACE_SAMPLES = np.array([[0.5, 0.5], [0.0, 0.0], [0.0, 1.0], [1.0, 0.0], [1.0, 1
 
 
 class SelfFieldOfSolid(SelfField):
-    """Field of a model's solid; `edges` are own cells and their local faces that are charged."""
+    """Field of a model's solid, from charges of faces and interiors of cells.
+
+    Methods have the contracts of `SelfField`. `edges` are own cells and their local faces that are
+    charged.
+    """
 
     def _remanence_function(self) -> fem.Function:
+        """Return the remanence at nodes of the body."""
         return field_in_body(self._pattern, self._model.r0.function_space)
 
     def _node_places(self) -> tuple[Array, Array]:
         return body_positions_and_normals(self._model.r0.function_space)
 
     def _interpolation_element(self) -> Any:
+        """Return the element that interpolates a remanence that rotates or is induced.
+
+        Its degree is above that of the displacement.
+        """
         family, degree = (
             basix.ElementFamily.P,
             self._model.r0.function_space.element.basix_element.degree + DEGREE_INCREMENT,
@@ -52,6 +61,11 @@ class SelfFieldOfSolid(SelfField):
     def families(
         self, mu: Mapping[str, float], *, include_uncharged: bool = False
     ) -> tuple[MagnetisedSolid, list[ChargedElements]]:
+        """Return the magnetised cells and their charges at the system's displacement.
+
+        Charges are those of faces, then those of cells' interiors. With `include_uncharged`, all
+        elements that another remanence may charge are there.
+        """
         shape = self.shape(mu)
         cells = np.arange(self._owned) if include_uncharged else cells_with_varying_remanence(shape)
         inside = [CellInteriors(shape, cells)] if len(cells) else []
@@ -61,6 +75,7 @@ class SelfFieldOfSolid(SelfField):
         ]
 
     def shape(self, mu: Mapping[str, float]) -> MagnetisedSolid:
+        """Return the magnetised cells of this rank at the system's displacement."""
         V = self._model.r0.function_space
         nodes = V.dofmap.list[: self._owned]
         X, u = (f.x.array.reshape(-1, 3)[nodes] for f in (self._model.r0, self._model.system.u))
@@ -84,10 +99,19 @@ class SelfFieldOfSolid(SelfField):
     def _polarised(
         self, X: Array, u: Array, Br: Array, mu: Mapping[str, float]
     ) -> tuple[Array, Array]:
-        """Return F, and the polarisation per undeformed volume over |Br|.
+        """Return F and the polarisation J per undeformed volume over |Br|, at points of cells.
 
-        `X` and `u` are jets (4, cells, points, 3) of undeformed places and displacements, `Br` the
-        remanence (cells, points, 3) there.
+        F is (cells, points, 3, 3) and J (cells, points, 3).
+
+        Parameters
+        ----------
+        X, u
+            Jets (4, cells, points, 3) of undeformed places and displacements: value and reference
+            derivatives.
+        Br
+            Remanence (cells, points, 3) there.
+        mu
+            Amplitudes of the applied field, which induces a part of J.
         """
         magnetisation = self.magnetisation
         G, H = (np.moveaxis(jet[1:], 0, -1) for jet in (X, u))
@@ -96,22 +120,29 @@ class SelfFieldOfSolid(SelfField):
         if not (soft and soft.alone):
             carrier = F
             if magnetisation.law == "rotation":
+                # R of the polar decomposition
                 U, _, W = np.linalg.svd(F)
                 carrier = U @ W
             J = np.einsum("cqij,cqj->cqi", carrier, Br)
         if soft:
+            # F^-T n0: the deformed normal of layers
             n = unit(np.asarray(np.linalg.solve(np.swapaxes(F, -1, -2), n0[..., None]))[..., 0])
             B = magnetisation.field_at(mu, X[0] + u[0])
             J = J + soft.scale**2 * soft.polarisation(X[0], n0, n, B)
         return F, J
 
     def _material(self, r0: Array, u: Array, mu: Mapping[str, float]) -> Array:
+        """Return F^-1 J (cells, nodes, 3), the polarisation that stays with the material.
+
+        `r0` and `u` are jets at the interpolation nodes.
+        """
         element = self.Br.function_space.element.basix_element
         T = element.tabulate(0, self._interpolation.points)[0, :, :, 0]
         F, J = self._polarised(r0, u, np.einsum("mk,nki->nmi", T, self._nodal_remanence()), mu)
         return np.asarray(np.linalg.solve(F, J[..., None])[..., 0])
 
     def _moment(self, mu: Mapping[str, float]) -> Array:
+        """Return the moment (3,) of this rank's modelled cells, over R³."""
         V = self._model.r0.function_space
         points, weights = basix.make_quadrature(V.mesh.basix_cell(), QUADRATURE_DEGREE)
         T, TB = (
@@ -131,10 +162,10 @@ class SelfFieldOfSolid(SelfField):
         return self._charged_sides(include_all=True)
 
     def _charged_sides(self, *, include_all: bool = False) -> CellsAndFaces:
-        """Return own cells and local faces that are charged.
+        """Return own cells and local faces that are charged, each (n,).
 
-        Faces on the surface are charged, and those across which the remanence jumps, or all with
-        `include_all`; those on a mirror plane are not.
+        Faces on the surface are charged, and faces across which the remanence jumps, or all with
+        `include_all`. Faces on a mirror plane are not.
         """
         V = self._model.r0.function_space
         topology = V.mesh.topology
@@ -149,9 +180,9 @@ class SelfFieldOfSolid(SelfField):
         return cells, faces
 
     def _jumps(self, facets_of_cells: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Return (cells, 6) whether the remanence of the neighbour across each face differs."""
+        """Return a mask (cells, 6) of faces across which the remanence jumps."""
         space_of_Br, V = self.Br.function_space, self._model.r0.function_space
-        values = self._nodal_remanence(len(facets_of_cells))
+        nodal_remanence = self._nodal_remanence(len(facets_of_cells))
         coordinates = np.broadcast_to(FACE_SAMPLES, (6, *FACE_SAMPLES.shape))
         samples = places_on_faces(np.arange(6), coordinates).reshape(-1, 3)
         T, TB = (
@@ -159,15 +190,17 @@ class SelfFieldOfSolid(SelfField):
             for space in (V, space_of_Br)
         )
         X = np.einsum("mk,nki->nmi", T, self._model.r0.x.array.reshape(-1, 3)[V.dofmap.list])
-        B = np.einsum("mk,nki->nmi", TB, values).reshape(-1, len(FACE_SAMPLES), 3)
+        B = np.einsum("mk,nki->nmi", TB, nodal_remanence).reshape(-1, len(FACE_SAMPLES), 3)
         X = X.reshape(-1, len(FACE_SAMPLES), 3)
+        # both sides of an inner face have one facet number
         order = np.argsort(facets_of_cells.ravel(), kind="stable")
         pairs = np.flatnonzero(np.diff(facets_of_cells.ravel()[order]) == 0)
         sides, sides_of_neighbours = order[pairs], order[pairs + 1]
         distances = X[sides][:, :, None] - X[sides_of_neighbours][:, None]
+        # sample places of both sides, matched by distance
         matching = np.linalg.norm(distances, axis=-1).argmin(axis=2)
         B_of_neighbours = np.take_along_axis(B[sides_of_neighbours], matching[..., None], axis=1)
-        largest = np.abs(values).max(initial=0.0) or 1.0
+        largest = np.abs(nodal_remanence).max(initial=0.0) or 1.0
         jump = np.abs(B[sides] - B_of_neighbours).max(axis=(1, 2), initial=0.0)
         differs = jump > JUMP_TOLERANCE * largest
         jumps = np.zeros(facets_of_cells.size, dtype=bool)

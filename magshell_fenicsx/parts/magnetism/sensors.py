@@ -18,10 +18,8 @@ from magshell_fenicsx.shape.reference_shell import Coordinates
 from magshell_fenicsx.shape.shell_sections import MeshSurface, ShellSection, Surface
 
 Array = NDArray[np.float64]
-NEWTON_STEPS, DIFFERENCE_STEP = (
-    8,
-    1e-6,
-)  # of Gauss's and Newton's method for the nearest place of a surface
+# iterations and difference step of Gauss and Newton's method for the nearest place of a surface
+NEWTON_STEPS, DIFFERENCE_STEP = 8, 1e-6
 
 
 class SensorSection(Section):
@@ -47,13 +45,15 @@ class Sensor:
 
     Attributes
     ----------
+    name
+        Name in the case, with which its columns begin.
     place
         (3,) over R.
     total
         Whether it reads the applied field too.
     own, applied
-        In the unit of the columns: the field of a remanence of length one, and an applied field of
-        lambda_m = 1.
+        Flux densities in the unit of the columns: of a remanence of length one, and of lambda_m =
+        1.
     half
         Half of the thickness over R.
     """
@@ -71,7 +71,10 @@ class Sensor:
 
 
 def sensors(context: Context, turn: float) -> tuple[Sensor, ...]:
-    """Return the sensors of a case, in a frame turned by `turn` about e3 (rad)."""
+    """Return the sensors of a case in the frame of a model.
+
+    `turn` is the azimuth of that frame about e3 in radians.
+    """
     sections: dict[str, SensorSection] = context.sections.get("sensors") or {}
     shell, field_units = context.shell, units(context)
     R, half = shell.reference, 0.5 / shell.R_over_h
@@ -90,7 +93,7 @@ def sensors(context: Context, turn: float) -> tuple[Sensor, ...]:
 def units(context: Context) -> tuple[float, float]:
     """Return the flux densities of a remanence of length one and of lambda_m = 1.
 
-    They are in T, or over |Br|; nan if unknown.
+    They are in T, or over |Br| without flux densities; nan if unknown.
     """
     magnetic, E = context.section_of(MagneticSection), context.shell.youngs_modulus
     if magnetic is None:
@@ -103,16 +106,22 @@ def units(context: Context) -> tuple[float, float]:
 
 
 class Sensing(KeyAbility[Mapping[str, SensorSection]]):
-    """All sensors of a case."""
+    """The part of all sensors of a case: its checks."""
 
     key = "sensors"
 
     def refuse_unfit(self, context: Context) -> None:
-        """Refuse a case in which nothing is magnetised."""
+        """Refuse a case in which nothing is magnetised, with a ValueError."""
         refuse_unfit_reading(self.key, context)
 
     def refuse_unfit_values(self, context: Context, places: Array) -> None:
-        """Refuse sensors in the undeformed shell."""
+        """Refuse sensors in the undeformed shell, and names that are no identifiers.
+
+        Raises
+        ------
+        CaseError
+            With the sensor.
+        """
         for name, section in self.sections.items():
             if not name.isidentifier():
                 raise CaseError(
@@ -133,7 +142,7 @@ class Sensing(KeyAbility[Mapping[str, SensorSection]]):
 
 
 def refuse_unfit_reading(key: str, context: Context) -> None:
-    """Refuse a key that asks for a field which cannot be read.
+    """Refuse a key that asks for a field which cannot be read in this case.
 
     Raises
     ------
@@ -143,12 +152,15 @@ def refuse_unfit_reading(key: str, context: Context) -> None:
     if context.section_of(MagneticSection) is None:
         raise ValueError(f"{key}: need magnetic: nothing is magnetised, and no field applied")
     context.needs(key, "the whole shell")
-    if "a thickness that does not change" in context.missing_offers:  # it follows from the area
+    # the thickness follows from the area
+    if "a thickness that does not change" in context.missing_offers:
         context.needs(key, "the area as drawn")
 
 
 def refuse_unknown_field(key: str, field: str, context: Context) -> None:
-    """Refuse the total field where the strength of the applied one is unknown.
+    """Refuse a reading of the total field where the strength of the applied one is unknown.
+
+    `key` is the key of the reading, `field` is "own" or "total".
 
     Raises
     ------
@@ -163,13 +175,15 @@ def refuse_unknown_field(key: str, field: str, context: Context) -> None:
 
 
 def is_read(context: Context) -> bool:
-    """Return whether a case asks for the field at places outside the shell."""
+    """Return whether a case asks for the field outside the shell, by sensors or field maps."""
     return bool(context.sections.get("sensors") or context.sections.get("field_maps"))
 
 
 def depth(shell: "ShellSection | Surface", x: Array) -> float:
-    """How far a place (3,) over R is from the nearest face of an undeformed shell; negative
-    inside."""
+    """Return the distance over R of a place from the nearest face of an undeformed shell.
+
+    It is negative inside. `x` (3,) is over R.
+    """
     from magshell_fenicsx.shape.outline import outline  # reads meshes
 
     outline_of_shell = outline(shell)
@@ -177,13 +191,14 @@ def depth(shell: "ShellSection | Surface", x: Array) -> float:
     for _ in range(NEWTON_STEPS):
         steps = np.vstack([chart, *(chart + DIFFERENCE_STEP * e for e in np.eye(len(chart)))])
         foot, *neighbours = outline_of_shell.embedding(steps)
-        change = np.linalg.lstsq(
+        # Gauss and Newton: tangents by differences, nearest foot by least squares
+        newton_step = np.linalg.lstsq(
             np.array([place - foot for place in neighbours]).T / DIFFERENCE_STEP,
             x - foot,
             rcond=None,
         )[0]
         next_chart = np.asarray(
-            outline_of_shell.inverse(outline_of_shell.embedding((chart + change)[None])[0]),
+            outline_of_shell.inverse(outline_of_shell.embedding((chart + newton_step)[None])[0]),
             dtype=float,
         )
         if not np.isfinite(next_chart).all():

@@ -41,8 +41,8 @@ from magshell_fenicsx.parts.magnetism.pairs import NO_IMAGES, Copies, Pairs, Poi
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-CHARGE_TOLERANCE = 1e-13  # over the largest charge: elements with less have none
-MAX_POINTS_AT_ONCE = 40_000  # at which charges are computed
+CHARGE_TOLERANCE = 1e-13  # over the largest charge: elements with smaller ones count as uncharged
+MAX_POINTS_AT_ONCE = 40_000  # points at which charges are computed together
 # nodes along and across a strip at which charges are computed; between them they are polynomials
 STRIP_NODES = (8, 4)
 FACE_NODES = basix.create_element(
@@ -67,7 +67,7 @@ class Places:
     weights
         (n,)
     at
-        (n, 2) coordinates on a strip, in [0, 1]; None for faces.
+        (n, 2) coordinates along and across a strip, in [0, 1]; None for faces.
     """
 
     X: Array
@@ -76,12 +76,13 @@ class Places:
 
     @classmethod
     def of_strip(cls, edge: int, t: Array, eta: Array, weights: Array) -> "Places":
+        """Return points of a strip on a local edge, at t (n,) along it and eta (n,) across it."""
         return cls(on_edge(edge, t), weights, np.column_stack([t, eta]))
 
 
 @dataclass(frozen=True)
 class Batch:
-    """Pairs of cells with elements of one kind each.
+    """Pairs of cells with one kind of element on each.
 
     Attributes
     ----------
@@ -90,9 +91,10 @@ class Batch:
     own
         Number of pairs, the first ones, whose first cell is on this rank.
     left, right
-        Charged points of both elements.
+        Charged points on the first and on the second element of each pair.
     charges_of_left, charges_of_right
-        Places of the charges, the local edge of strips, and the factor of the charges.
+        Of each element: places of the charges, the local edge of a strip (None for faces), and the
+        factor of the charges.
     """
 
     pairs: Ints
@@ -114,10 +116,17 @@ class SingularPairs:
         (copies * cells, 3) numbers of the corners of all copies.
     cells, edges
         Edges that may be charged, by cell and local number.
-    own
-        The cells of this rank; pairs without one of them are left to others.
+    own_cells
+        The cells of this rank; pairs without an own cell are left to other ranks.
+    copies
+        Images that make the whole shell, the modelled cells first.
     include_uncharged
-        Whether elements without a charge are there too.
+        Whether elements without a charge are kept.
+
+    Attributes
+    ----------
+    neighbours
+        Of each cell: all cells with a common node, itself included.
     """
 
     def __init__(
@@ -132,39 +141,44 @@ class SingularPairs:
         *,
         include_uncharged: bool = False,
     ) -> None:
+        """Find all singular pairs of cells and compute their charges."""
         self._pairs, self._copies, self._include_uncharged = Pairs(comm), copies, include_uncharged
         self._shape, self._corners, self._own = shape, corners, own_cells
         strips = np.zeros((len(shape.r0), 3), dtype=bool)
         strips[cells, edges] = True
         self._strips = np.tile(strips, (len(copies.images), 1))
-        sides = [np.linalg.norm(shape.r0[:, i] - shape.r0[:, j], axis=-1) for i, j in ENDS]
-        self._scale = float(shape.h / np.median(sides))
+        side_lengths = [np.linalg.norm(shape.r0[:, i] - shape.r0[:, j], axis=-1) for i, j in ENDS]
+        self._scale = float(shape.h / np.median(side_lengths))
         self._heights = heights(
             ShellFaces(shape, np.arange(1), include_uncharged=include_uncharged)
         )
         cells_at_corner: dict[int, list[int]] = {}
-        numbers = [[int(corner) for corner in corners[cell]] for cell in range(len(corners))]
-        for cell, corners_of_cell in enumerate(numbers):
+        corner_numbers = [[int(corner) for corner in corners[cell]] for cell in range(len(corners))]
+        for cell, corners_of_cell in enumerate(corner_numbers):
             for corner in corners_of_cell:
                 cells_at_corner.setdefault(corner, []).append(cell)
         self.neighbours = [
-            sorted({other for corner in corners_of_cell for other in cells_at_corner[corner]})
-            for corners_of_cell in numbers
+            sorted(
+                {neighbour for corner in corners_of_cell for neighbour in cells_at_corner[corner]}
+            )
+            for corners_of_cell in corner_numbers
         ]
         self._boundary_sides = self._at_boundary()
-        kinds: dict[PairKind, list[tuple[int, int]]] = {}
-        for c, others in enumerate(self.neighbours):
-            for d in others:
+        # pairs of one kind share their rules
+        pairs_of_kinds: dict[PairKind, list[tuple[int, int]]] = {}
+        for c, neighbours_of_cell in enumerate(self.neighbours):
+            for d in neighbours_of_cell:
                 if c in own_cells or d in own_cells:
                     for kind in self._kinds_of_pair(c, d):
-                        kinds.setdefault(kind, []).append((c, d))
+                        pairs_of_kinds.setdefault(kind, []).append((c, d))
         self._largest_charge = 0.0
-        self._batches = list(self._charged_batches(kinds))
+        self._batches = list(self._charged_batches(pairs_of_kinds))
 
     def add(self, nodes: Array, gradient: Array, stiffness: Stiffness | None = None) -> float:
         """Return the energy of pairs whose first cell is on this rank, and add derivatives.
 
-        The gradient (cells, k, 3) is complete for own cells.
+        They are added to `gradient` (cells, k, 3), which is complete for own cells, and to
+        `stiffness`. `nodes` (cells, k, 3) are the nodes of all copies.
         """
         energy = 0.0
         for batch in self._batches:
@@ -179,17 +193,20 @@ class SingularPairs:
         return energy
 
     def _at_boundary(self) -> NDArray[np.bool_]:
-        """Return (cells, 3) which sides no other cell has."""
+        """Return a mask (cells, 3) of sides that no other cell has."""
         at_boundary = np.ones((len(self._corners), 3), dtype=bool)
-        for c, others in enumerate(self.neighbours):
-            for d in others:
+        for c, neighbours_of_cell in enumerate(self.neighbours):
+            for d in neighbours_of_cell:
                 for edge in range(3):
                     if c != d and self._common_side(c, edge, d):
                         at_boundary[c, edge] = False
         return at_boundary
 
     def _common_side(self, c: int, edge: int, d: int) -> tuple[int, bool] | None:
-        """Return the local number in cell d of a side of cell c, and whether it runs back there."""
+        """Return the local number in cell d of a side of cell c, and whether it runs back there.
+
+        None if cell d does not have the side.
+        """
         a, b = (int(self._corners[c, i]) for i in ENDS[edge])
         for side, (i, j) in enumerate(ENDS):
             ends = int(self._corners[d, i]), int(self._corners[d, j])
@@ -198,20 +215,24 @@ class SingularPairs:
         return None
 
     def _kinds_of_pair(self, c: int, d: int) -> Iterator[PairKind]:
-        """Yield the kinds of all pairs of elements of two adjacent cells c and d."""
+        """Yield the kinds of all pairs of elements of two adjacent cells c and d.
+
+        Elements are the faces of a cell and the strips of its charged edges. A kind begins with
+        "faces", "strip" (of c, with the faces of d) or "strips"; it tells where the elements touch.
+        """
         own_corners, other_corners = (
             [int(corner) for corner in self._corners[cell]] for cell in (c, d)
         )
         boundary_sides = tuple(map(bool, self._boundary_sides[c]))
-        sides = [
+        common_sides = [
             (edge, side_in_other)
             for edge in range(3)
             if c != d and (side_in_other := self._common_side(c, edge, d))
         ]
         if c == d:
             yield "faces", boundary_sides, "self"
-        elif sides:
-            edge, (side_of_other, flip) = sides[0]
+        elif common_sides:
+            edge, (side_of_other, flip) = common_sides[0]
             yield "faces", boundary_sides, "side", edge, side_of_other, flip
         else:
             yield (
@@ -250,6 +271,10 @@ class SingularPairs:
                     yield "strips", edge, "apart", other_edge
 
     def _charged_batches(self, kinds: dict[PairKind, list[tuple[int, int]]]) -> Iterator[Batch]:
+        """Yield the batches of all kinds, without those whose elements have no charge.
+
+        `kinds` gives the pairs of cells of each kind.
+        """
         batches = []
         for kind, pairs in sorted(kinds.items(), key=lambda batch: str(batch[0])):
             order = sorted(pairs, key=lambda pair: pair[0] not in self._own)
@@ -274,20 +299,25 @@ class SingularPairs:
                 yield batch
 
     def _batch(self, kind: PairKind, pairs: Ints, own_pairs: int) -> Batch:
+        """Return the batch of all pairs (n, 2) of one kind, with their charged points.
+
+        The first cells of the first `own_pairs` pairs are on this rank.
+        """
         first, second, is_shared = self._rules_of_pair(kind)
         on_strips = kind[0] == "strips"
         left = self._points(pairs[:, 0], first, kind[1] if kind[0] != "faces" else None)
         right = self._points(pairs[:, 1], second, kind[3] if on_strips else None)
         T, heights_of_points, t, q = right
+        # each point of the first element has points of its own on the second
         if not is_shared:
-            count = len(first.weights)
-            T = T.reshape(count, -1, *T.shape[1:])
+            points_of_first = len(first.weights)
+            T = T.reshape(points_of_first, -1, *T.shape[1:])
             heights_of_points, t, q = (
-                heights_of_points.reshape(count, -1, heights_of_points.shape[-1]),
-                t.reshape(len(t), count, -1),
-                q.reshape(len(q), count, -1, heights_of_points.shape[-1]),
+                heights_of_points.reshape(points_of_first, -1, heights_of_points.shape[-1]),
+                t.reshape(len(t), points_of_first, -1),
+                q.reshape(len(q), points_of_first, -1, heights_of_points.shape[-1]),
             )
-        weight = 1.0 if kind[0] == "strip" else 0.5  # where the pair stands in both orders
+        weight = 1.0 if kind[0] == "strip" else 0.5  # pairs of equal elements occur in both orders
         left_points = Points(left[0], left[1], left[2], weight * left[3])
         sides = (
             (first, kind[1] if kind[0] != "faces" else None, weight),
@@ -296,16 +326,17 @@ class SingularPairs:
         return Batch(pairs, own_pairs, left_points, Points(T, heights_of_points, t, q), *sides)
 
     def _rules_of_pair(self, kind: PairKind) -> tuple[Places, Places, bool]:
-        """Return the points of both elements of a kind of pairs.
+        """Return the points of both elements of a kind of pairs, and whether they are shared.
 
-        If the third value is true, the second element has the same points for all points of the
-        first one, else others for each.
+        If true, the second element has the same points for all points of the first one. Otherwise
+        it has others for each, one group after the other.
         """
         s = self._scale
         if kind[0] == "faces":
             first = Places(*rule_along_sides(kind[1], s))
             if kind[2] == "corner":
                 return first, Places(*at_corner(kind[3])), True
+            # pole of the polar rule: the point itself, or its continuation into the neighbour
             apex = (
                 first.X if kind[2] == "self" else continued_across_side(first.X, kind[3:5], kind[5])
             )
@@ -321,7 +352,8 @@ class SingularPairs:
             return first, self._padded([polar(point, STRIP_SCALE * s) for point in foot]), False
         if kind[2] in ("side", "end"):
             positions = 1 - t if kind[4] else t
-            if kind[2] == "end":  # as far from the common end as the place is, beyond it
+            # continue the other edge beyond the common end, as far as the place is from it
+            if kind[2] == "end":
                 positions = (1 - t if kind[5] else t) * (-1 if kind[4] == 0 else 1) + kind[4]
             strips = [
                 strip_rule_seen_from(float(position), float(height), s)
@@ -337,7 +369,7 @@ class SingularPairs:
         return first, Places.of_strip(kind[3], t, eta, w), True
 
     def _padded(self, rules: list[tuple[Array, Array]]) -> Places:
-        """Return rules, padded to the length of the longest with points of weight zero."""
+        """Return rules as one, each padded to the longest with points of weight zero."""
         count = max(len(w) for _, w in rules)
         X = [np.concatenate([X, np.repeat(X[:1], count - len(X), axis=0)]) for X, _ in rules]
         w = [np.concatenate([w, np.zeros(count - len(w))]) for _, w in rules]
@@ -348,12 +380,14 @@ class SingularPairs:
     ) -> tuple[Array, Array, Array, Array]:
         """Return shape functions, heights, thickness and charges at points of cells.
 
-        They are (n, 3, k), (n, layers), (cells, n) and (cells, n, layers).
+        They are (n, 3, k), (n, layers), (cells, n) and (cells, n, layers). `edge` is the local edge
+        of strips, None for faces; charges are times the weights of the points.
         """
         shape, X = self._shape, points.X
         copy, cells = np.divmod(cells, len(shape.r0))
         normal_signs, charge_factors = (
-            each[copy][:, None] for each in (self._copies.normal_signs, self._copies.charge_factors)
+            factors[copy][:, None]
+            for factors in (self._copies.normal_signs, self._copies.charge_factors)
         )
         T = np.ascontiguousarray(shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2))
         t = normal_signs * shape.thickness(cells, np.broadcast_to(X, (len(cells), *X.shape)))[0]
@@ -373,24 +407,31 @@ class SingularPairs:
 
     @cached_property
     def _on_faces(self) -> Array:
-        """(modelled cells, nodes, layers) charges per area of the reference triangle."""
+        """Charges (modelled cells, nodes, layers) per area of the reference triangle."""
         return np.concatenate([point_charges.q for _, point_charges in self._face_charges(None)])
 
     def _face_charges(
         self, nodal_derivatives: NodalDerivatives | None
     ) -> Iterator[tuple[Ints, PointCharges]]:
+        """Yield cells, some at a time, with their charges at the nodes `FACE_NODES`.
+
+        With `nodal_derivatives` the charges can add derivatives to them; see `PointCharges`.
+        """
         X, cells = FACE_NODES.points, np.arange(len(self._shape.r0))
+        # coordinates of the square that is folded onto the triangle
         ab, weights = np.column_stack([X[:, 0], X[:, 1] / (1 - X[:, 0])]), 1 / (1 - X[:, 0])
         cells_at_once = max(1, MAX_POINTS_AT_ONCE // len(X))
         for first in range(0, len(cells), cells_at_once):
-            part = cells[first : first + cells_at_once]
-            faces = ShellFaces(self._shape, part, include_uncharged=self._include_uncharged)
-            boxes = Boxes.undivided(len(part))
-            yield part, faces.charges_at(boxes, ab, weights, nodal_derivatives)
+            cells_of_chunk = cells[first : first + cells_at_once]
+            faces = ShellFaces(
+                self._shape, cells_of_chunk, include_uncharged=self._include_uncharged
+            )
+            boxes = Boxes.undivided(len(cells_of_chunk))
+            yield cells_of_chunk, faces.charges_at(boxes, ab, weights, nodal_derivatives)
 
     @cached_property
     def _on_strips(self) -> list[Array]:
-        """(cells, nodes) charges per area of the coordinates of strips, for each local edge."""
+        """Charges (cells, nodes) per area of the coordinates of strips, for each local edge."""
         charges: list[Array] = [
             np.zeros((len(self._shape.r0), int(np.prod(STRIP_NODES)))) for _ in range(3)
         ]
@@ -401,6 +442,10 @@ class SingularPairs:
     def _strip_charges(
         self, nodal_derivatives: NodalDerivatives | None
     ) -> Iterator[tuple[int, Ints, PointCharges]]:
+        """Yield local edge, cells and charges at the nodes of strips, for each local edge.
+
+        With `nodal_derivatives` the charges can add derivatives to them; see `PointCharges`.
+        """
         (a, _), (b, _) = (gauss(n) for n in STRIP_NODES)
         points = np.stack(np.meshgrid(a, b, indexing="ij"), axis=-1).reshape(-1, 2)
         for edge in range(3):
@@ -418,7 +463,11 @@ class SingularPairs:
     def field_derivatives(
         self, moved_nodes: Complex, weights: Weights, nodal_derivatives: NodalDerivatives
     ) -> None:
-        """Add derivatives by nodal values: see `InteractingCharges.field_derivatives`."""
+        """Add derivatives by nodal values to `nodal_derivatives`.
+
+        The number that is differentiated is `weights.energy` W + `weights.force` v . dW/du, see
+        `Weights`. Arguments are those of `InteractingCharges.field_derivatives`.
+        """
         on_faces, on_strips = (
             np.zeros_like(self._on_faces),
             [np.zeros_like(charges_of_edge) for charges_of_edge in self._on_strips],
@@ -432,13 +481,13 @@ class SingularPairs:
             )
             if nodal_derivatives.by_thickness is not None:
                 self._by_heights(batch, pairs, moved_nodes, weights, nodal_derivatives)
-            for side, (points, edge, share) in sides:
+            for side, (points, edge, factor) in sides:
                 copy, cells = np.divmod(pairs[:, side], len(self._shape.r0))
                 by_charges = by_charges_of_both[side][: len(pairs)].reshape(
                     len(pairs), len(points.weights), -1
                 )
                 by_charges = (
-                    share
+                    factor
                     * points.weights[:, None]
                     * self._copies.charge_factors[copy][:, None, None]
                     * by_charges
@@ -451,9 +500,10 @@ class SingularPairs:
                     )
                 else:
                     np.add.at(on_strips[edge], cells, by_charges[..., 0] @ _basis(points))
-        for part, charges in self._face_charges(nodal_derivatives):
+        # from derivatives by charges to those by nodal values
+        for cells_of_chunk, charges in self._face_charges(nodal_derivatives):
             assert charges.add_derivatives
-            charges.add_derivatives(np.zeros_like(charges.x), on_faces[part])
+            charges.add_derivatives(np.zeros_like(charges.x), on_faces[cells_of_chunk])
         for edge, cells, charges in self._strip_charges(nodal_derivatives):
             assert charges.add_derivatives
             charges.add_derivatives(np.zeros_like(charges.x), on_strips[edge][cells][..., None])
@@ -466,6 +516,10 @@ class SingularPairs:
         weights: Weights,
         nodal_derivatives: NodalDerivatives,
     ) -> None:
+        """Add the derivatives by the thickness, which moves charges off the mid-surface.
+
+        `pairs` are those of the batch whose first cell is on this rank.
+        """
         rows, points_of_both = np.arange(len(pairs)), (batch.left, batch.right)
         by_heights = pair_derivatives(
             moved_nodes, pairs, (batch.left, rows), (batch.right, rows), weights, heights=True
@@ -474,14 +528,17 @@ class SingularPairs:
             copy, cells = np.divmod(pairs[:, side], len(self._shape.r0))
             shape = len(pairs), len(places.weights), -1
             heights = points_of_both[side].heights.reshape(shape[1:])
-            on_t = self._copies.normal_signs[copy][:, None] * np.sum(
+            by_thickness = self._copies.normal_signs[copy][:, None] * np.sum(
                 heights * by_heights[side][: len(pairs)].reshape(shape), axis=-1
             )
-            self._shape.add_thickness_derivatives(cells, places.X, on_t, nodal_derivatives)
+            self._shape.add_thickness_derivatives(cells, places.X, by_thickness, nodal_derivatives)
 
 
 def _basis(points: Places) -> Array:
-    """Return values (m, n) at points of the Lagrange basis of the nodes of charges."""
+    """Return values (m, n) at m points of the Lagrange basis of the n nodes of charges.
+
+    Nodes of faces are `FACE_NODES`, nodes of strips the Gauss points of `STRIP_NODES`.
+    """
     if points.at is None:
         return np.asarray(FACE_NODES.tabulate(0, points.X)[0, :, :, 0])
     basis = np.einsum(
@@ -497,5 +554,6 @@ def _lagrange(n: int, x: Array) -> Array:
 
 
 def _quadrature(degree: int) -> tuple[Array, Array]:
+    """Return Gauss's rule of a degree on the reference triangle: points (n, 2), weights (n,)."""
     X, w = basix.make_quadrature(basix.CellType.triangle, degree)
     return np.asarray(X), np.asarray(w)

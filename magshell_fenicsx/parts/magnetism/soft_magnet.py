@@ -42,7 +42,8 @@ class SoftMagnet:
     Attributes
     ----------
     susceptibility
-        A number mu_r - 1, or a pattern of numbers (cells, nodes, 1).
+        A number mu_r - 1, or a pattern: a function of undeformed places and normals to numbers
+        (cells, nodes, 1).
     scale
         sqrt(mu0 E)/|Br|; 1 without remanence.
     tesla
@@ -50,7 +51,7 @@ class SoftMagnet:
     alone
         Whether nothing is remanent.
     patches
-        Numbers (1,) of named patches of a mesh, in place of `susceptibility`.
+        Patch of a mesh -> number (1,), in place of `susceptibility`.
     saturation
         The largest polarisation in the unit of lambda_m; None if it grows in proportion.
     """
@@ -63,7 +64,10 @@ class SoftMagnet:
     saturation: float | None = None
 
     def with_patches(self, pattern_of: "Callable[[Mapping[str, Array]], Pattern]") -> "SoftMagnet":
-        """Return the same material with a pattern in place of patches."""
+        """Return the same material with a pattern in place of patches.
+
+        `pattern_of` makes a pattern of the numbers of patches.
+        """
         return (
             replace(self, susceptibility=pattern_of(self.patches), patches=None)
             if self.patches
@@ -76,8 +80,16 @@ class SoftMagnet:
         return np.asarray(chi(r0, n0)[..., 0] if callable(chi) else np.full(r0.shape[:-1], chi))
 
     def polarisation(self, r0: Array, n0: Array, n: Array, B: Array) -> Array:
-        """mu0 M (..., 3) in the unit of B at places of the undeformed shell, with the present
-        normals n (..., 3).
+        """Return the induced polarisation mu0 M (..., 3), in the unit of B.
+
+        Parameters
+        ----------
+        r0, n0
+            Undeformed places and normals (..., 3), at which the susceptibility is taken.
+        n
+            Present normals (..., 3).
+        B
+            Applied field (..., 3).
         """
         chi = self.susceptibility_at(r0, n0)[..., None]
         normal_field = np.sum(n * B, axis=-1, keepdims=True)
@@ -88,20 +100,25 @@ class SoftMagnet:
 
 @dataclass(frozen=True)
 class Sheet:
-    """The densities of a field's soft part, of numbers and vectors in this order.
+    """Densities of a soft-magnetic shell or solid in the applied field.
 
-    chi, s, an amplitude for each uniform part of the field, then either these parts and perhaps the
-    gradient, or the polynomial of a field known by its values.
+    They take parameters in this order: the susceptibility chi (or the magnetisation state), the
+    scale s, and an amplitude for each uniform part of the field. Then follow these parts, and
+    perhaps the gradient, or the polynomial of a field known by its values.
+
+    Attributes
+    ----------
+    field
+        The magnetisation with its soft material and the applied field.
     """
 
     field: "Magnetisation"
 
     @cached_property
     def amplitudes(self) -> tuple[str, ...]:
-        """Names of the amplitudes of the field's uniform parts."""
-        from magshell_fenicsx.parts.magnetism.magnetised import (
-            TRANSVERSE_AMPLITUDES,
-        )  # it needs this module
+        """Names of the amplitudes of the field's uniform parts, lambda_m first."""
+        # imported late: that module imports this one
+        from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES
 
         return (
             "lambda_m",
@@ -117,16 +134,22 @@ class Sheet:
         return [field.applied, *field.across, *([] if field.gradient is None else [field.gradient])]
 
     def fields(self, x0: Expr, u: Expr, given: Sequence[Expr]) -> tuple[Expr, Expr]:
-        """Return the applied field at the displacement u and at u = 0."""
+        """Return the applied field at the displacement u and at u = 0, as vectors of UFL.
+
+        `given` are the amplitudes, then the field's vectors or its polynomial.
+        """
         count = len(self.amplitudes)
-        numbers, parts = given[:count], given[count:]
+        amplitudes, vectors = given[:count], given[count:]
         if self.field.in_space:
-            B, change = field_at_displacement(parts[0], u)
-            return numbers[0] * B, numbers[0] * (B - change)
-        B = sum((number * part for number, part in zip(numbers, parts, strict=False)), ufl.zero(3))
+            B, change_from_rest = field_at_displacement(vectors[0], u)
+            return amplitudes[0] * B, amplitudes[0] * (B - change_from_rest)
+        B = sum(
+            (amplitude * part for amplitude, part in zip(amplitudes, vectors, strict=False)),
+            ufl.zero(3),
+        )
         if self.field.gradient is None:
             return B, B
-        G = numbers[0] * parts[-1]
+        G = amplitudes[0] * vectors[-1]
         return B + ufl.dot(G, x0 + u), B + ufl.dot(G, x0)
 
     def saturated(
@@ -138,14 +161,22 @@ class Sheet:
         followed: Sequence[fem.Function],
         places_and_normals: Callable[[], Sequence[Array]],
     ) -> PointField:
-        """Let a field follow the polynomials of the energy at u and at u = 0 (`saturation`).
+        """Let `field` follow the polynomials of the energy at u and at u = 0, and return it.
+
+        See `saturation` for the polynomials.
 
         Parameters
         ----------
+        chi
+            Susceptibility.
+        amplitudes
+            Constants of `amplitudes`.
+        applied
+            A field known by its values; None for a uniform or linear one.
         followed
             Placement and displacement.
         places_and_normals
-            Gives x0, u, n and n0 (cells, points, 3) at the points of the field.
+            Function that gives x0, u, n and n0 (cells, points, 3) at the points of `field`.
         """
         assert self.saturation is not None
 
@@ -165,19 +196,38 @@ class Sheet:
     def _fields_at_points(
         self, amplitudes: Sequence[fem.Constant], polynomials: Array | None, x0: Array, u: Array
     ) -> list[Array]:
-        """Return the values (cells, points, 3) of both `fields` at points."""
-        numbers = [float(amplitude.value) for amplitude in amplitudes]
+        """Return the values (cells, points, 3) of both `fields` at points.
+
+        `x0` and `u` are undeformed places and displacements there. `polynomials` are those of a
+        field known by its values, else None.
+        """
+        amplitude_values = [float(amplitude.value) for amplitude in amplitudes]
         if polynomials is not None:
-            return [numbers[0] * polynomials[..., 6:9], numbers[0] * polynomials[..., 3:6]]
-        parts = [self.field.applied, *self.field.across]
-        B = sum((number * part for number, part in zip(numbers, parts, strict=True)), np.zeros(3))
-        G = np.zeros((3, 3)) if self.field.gradient is None else numbers[0] * self.field.gradient
+            # components 3 to 5 are B at u = 0, 6 to 8 B at u
+            return [
+                amplitude_values[0] * polynomials[..., 6:9],
+                amplitude_values[0] * polynomials[..., 3:6],
+            ]
+        vectors = [self.field.applied, *self.field.across]
+        B = sum(
+            (
+                amplitude_value * vector
+                for amplitude_value, vector in zip(amplitude_values, vectors, strict=True)
+            ),
+            np.zeros(3),
+        )
+        G = (
+            np.zeros((3, 3))
+            if self.field.gradient is None
+            else amplitude_values[0] * self.field.gradient
+        )
         return [B + x @ G.T for x in (x0 + u, x0)]
 
     def energy_per_area(self, r0: Jet, u: Jet, law: Expr, s: Expr, *given: Expr) -> Expr:
-        """Return the energy over E h per area, less its value at u = 0 in this field.
+        """Return the energy over E h per area of a shell, less its value at u = 0 in this field.
 
-        `law` is the susceptibility or, of what saturates, the polynomials at u and at u = 0.
+        `law` is the susceptibility or, of a saturating material, its polynomials at u and at u = 0.
+        `s` is the scale and `given` the field, as in `fields`.
         """
         (B, B0), (present, at_first) = self.fields(r0.r, u.r, given), self._halves(law)
         return s**2 * (
@@ -186,7 +236,10 @@ class Sheet:
         )
 
     def induced(self, r0: Jet, u: Jet, law: Expr, e: Expr, *given: Expr) -> Expr:
-        """Return the polarisation along a vector e, in the unit of lambda_m."""
+        """Return the polarisation along a vector e, in the unit of lambda_m.
+
+        The arguments are those of `energy_per_area`.
+        """
         B, _ = self.fields(r0.r, u.r, given)
         return ufl.dot(e, self.polarisation(self._halves(law)[0], B, kin.normal(r0 + u)))
 
@@ -195,7 +248,8 @@ class Sheet:
     ) -> Expr:
         """Return the energy per volume in a solid, in E h R², less its value at u = 0.
 
-        Layers of the solid are sheets, with the undeformed normal n0.
+        Layers of the solid are sheets, with the undeformed normal n0. H is du/dX, h the thickness
+        over R; other arguments are those of `energy_per_area`.
         """
         (B, B0), (present, at_first) = self.fields(X, u, given), self._halves(law)
         return (
@@ -210,7 +264,10 @@ class Sheet:
     def induced_in_solid(
         self, X: Expr, u: Expr, H: Expr, law: Expr, e: Expr, n0: Expr, *given: Expr
     ) -> Expr:
-        """Return the polarisation along a vector e in a solid, in the unit of lambda_m."""
+        """Return the polarisation along a vector e in a solid, in the unit of lambda_m.
+
+        The arguments are those of `energy_in_solid`.
+        """
         B, _ = self.fields(X, u, given)
         return ufl.dot(e, self.polarisation(self._halves(law)[0], B, deformed_normal(H, n0)))
 
@@ -229,7 +286,10 @@ class Sheet:
         return saturation.energy(law, normal, ufl.dot(B, B) - normal)
 
     def _halves(self, law: Expr) -> tuple[Any, Any]:
-        """Return the material's data at u and at u = 0: susceptibilities or polynomials."""
+        """Return the material's data at u and at u = 0: susceptibilities or polynomials.
+
+        A susceptibility is the same at both.
+        """
         if self.saturation is None:
             chi = law[0] if law.ufl_shape else law  # a field (1,), or a constant
             return chi, chi
@@ -243,7 +303,10 @@ class Sheet:
 
 
 def deformed_normal(H: Expr, n0: Expr) -> Expr:
-    """Return the deformed normal of a layer of a solid: cof F n0 over its length, F = 1 + H."""
+    """Return the deformed unit normal of a layer of a solid: cof F n0 over its length.
+
+    F = 1 + H, with H = du/dX, and n0 is the undeformed normal.
+    """
     F = ufl.Identity(3) + H
     f = [F[:, i] for i in range(3)]
     cofactor = ufl.as_tensor(

@@ -59,6 +59,10 @@ class SourceStep(LoadStep):
 
     @model_validator(mode="after")
     def _one_change(self) -> Self:
+        """Refuse a step without exactly one change, or with a name that is taken.
+
+        Pydantic calls it after the fields are read; it raises a ValueError.
+        """
         changes = [
             key for key in ("move", "to", "turn", "strength") if getattr(self, key) is not None
         ]
@@ -78,6 +82,7 @@ class SourceStep(LoadStep):
 
     @property
     def place(self) -> Any:
+        """What distinguishes two steps of kind source: the source and its change."""
         return self.source, self.move, self.to, self.turn, self.strength
 
     @property
@@ -88,12 +93,17 @@ class SourceStep(LoadStep):
         return abs(self.factor or 1.0)
 
     def number(self, sources: Sequence[SourceSection]) -> int | None:
-        """The number of its source; None if there is no such source."""
+        """Return the number of the step's source in the list; None if there is no such source."""
         if isinstance(self.source, int):
             return self.source if 0 <= self.source < len(sources) else None
         return next((i for i, source in enumerate(sources) if source.name == self.source), None)
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        """Refuse a step that does not fit the case, with a ValueError.
+
+        It needs its source, a field that was applied before, and no other motion of the same source
+        with `to`.
+        """
         magnetic, key = context.section_of(MagneticSection), step.key
         sources = (magnetic.applied.sources if magnetic else None) or []
         if self.number(sources) is None:
@@ -116,15 +126,19 @@ class SourceStep(LoadStep):
             for step_of_other in loads
             if isinstance(step_of_other.load, SourceStep)
         ]
-        of_same_source = (
-            other for other in other_loads if other.number(sources) == self.number(sources)
+        loads_of_same_source = (
+            load for load in other_loads if load.number(sources) == self.number(sources)
         )
-        if self.to and any(other.move or other.to for other in of_same_source):
+        if self.to and any(load.move or load.to for load in loads_of_same_source):
             raise ValueError(f"{key}.to: another step moves the same source: give move")
 
 
 def source_columns(loads: "Loads") -> dict[str, str]:
-    """Amplitude of a source -> the column of the force, the torque or the work on it."""
+    """Return amplitude of a source -> column of its conjugate.
+
+    The conjugate is a force, a torque or a work. Where several have one kind, the name of the
+    amplitude is appended to the column.
+    """
     kinds_of: dict[str, str] = {}
     turns = [motion.name for motion in loads.magnetic.turns] if loads.magnetic else []
     for field in loads.magnetic.driven if loads.magnetic else ():
@@ -142,7 +156,15 @@ def source_columns(loads: "Loads") -> dict[str, str]:
 
 
 def source_size(loads: "Loads", name: str) -> float:
-    """The length over R, the angle (rad) or the change of the factor for an amplitude of one."""
+    """Return the change of a source at an amplitude of one.
+
+    It is a length over R, an angle in radians, or the change of the field's factor.
+
+    Raises
+    ------
+    KeyError
+        If no source has the amplitude `name`.
+    """
     assert loads.magnetic
     for field in loads.magnetic.driven:
         if name in field.factors:
@@ -154,7 +176,7 @@ def source_size(loads: "Loads", name: str) -> float:
 
 
 class SourcesObservables(Observables):
-    """Amplitudes of sources, and their conjugates in SI."""
+    """Observables of driven sources: their amplitudes, and their conjugates in SI units."""
 
     quantities = (
         Quantity(
@@ -193,9 +215,15 @@ class SourcesObservables(Observables):
     )
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
-        from magshell_fenicsx.models.shell.spatial_fields import (
-            by_patch,
-        )  # the solver takes long to import
+        """Refuse patches of a remanence that the surface does not have.
+
+        Raises
+        ------
+        MeshError
+            With the name of the patch.
+        """
+        # the solver takes long to import
+        from magshell_fenicsx.models.shell.spatial_fields import by_patch
 
         if loads.magnetic and loads.magnetic.patches:
             by_patch(loads.magnetic.patches, surface.patches, len(surface.cells))
@@ -207,6 +235,7 @@ class SourcesObservables(Observables):
         return source_columns(loads)
 
     def motions(self, loads: "Loads") -> dict[str, tuple[bool, float]]:
+        """Return motion of a source -> whether it turns, and its way at one (over R, or rad)."""
         motions = [
             motion
             for field in (loads.magnetic.driven if loads.magnetic else ())
@@ -217,17 +246,20 @@ class SourcesObservables(Observables):
         }
 
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
-        values: dict[str, float] = {}
+        """Return the amplitudes of sources and their conjugates in SI units, column -> value."""
+        values_by_column: dict[str, float] = {}
         for name, column in source_columns(view.loads).items():
-            values |= {
+            values_by_column |= {
                 name: state.mu[name],
                 column: -view.potential(state, name) / self._unit(view, name),
             }
-        return values
+        return values_by_column
 
     def conjugate_unit(self, view: ModelView, name: str) -> float | None:
+        """Return -dPi/dmu of one unit of a source's conjugate; None for other amplitudes."""
         return self._unit(view, name) if name in self.amplitudes(view.loads) else None
 
     def _unit(self, view: ModelView, name: str) -> float:
+        """Return -dPi/dmu of one unit (N, N m or J) of the conjugate of `name`, in E h R²."""
         arm = 1.0 if source_columns(view.loads)[name].startswith("source_force") else view.length
         return source_size(view.loads, name) / (view.force * arm * view.model.multiplicity)

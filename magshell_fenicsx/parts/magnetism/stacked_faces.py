@@ -37,7 +37,7 @@ from magshell_fenicsx.parts.magnetism.pairs import Copies, Pairs, Points, Stiffn
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.intp]
-DEGREE = 14  # of the rule on the first cell
+DEGREE = 14  # degree of the rule on the first cell
 ROWS_AT_EDGE, POINTS_ALONG_ROWS = 10, 7  # of points at free edges
 ROW_SCALE = 0.05  # distance of the first rows from the edge, over the thickness
 PRECISION = 1e-9  # relative, of the field of the second cell at a point of the first
@@ -81,7 +81,12 @@ def coefficients_of_nodes(element: basix.finite_element.FiniteElement) -> Array:
 def corner_distances(x: Array, corners: Array) -> tuple[Array, Array]:
     """Return the least distance (n,) of places x (n, m, 3) from flat triangles (n, 3, 3).
 
-    With it comes its part (n,) across the triangles.
+    Returns
+    -------
+    distance
+        Least over the m places of each triangle.
+    normal_distance
+        Its part across the triangle's plane, at the nearest place.
     """
     sides = corners[:, [1, 2, 0]] - corners
     normal = unit(np.asarray(np.cross(sides[:, 0], sides[:, 1]), dtype=np.float64))
@@ -91,6 +96,7 @@ def corner_distances(x: Array, corners: Array) -> tuple[Array, Array]:
     square = np.sum(sides * sides, axis=-1)
     t = np.clip(np.einsum("nmki,nki->nmk", separations, sides) / square[:, None], 0.0, 1.0)
     to_sides = np.linalg.norm(separations - t[..., None] * sides[:, None], axis=-1).min(axis=-1)
+    # places above a triangle have the distance of its plane
     distance = np.where((side_heights >= 0).all(axis=-1), np.abs(normal_distance), to_sides)
     rows, nearest = np.arange(len(x)), distance.argmin(axis=1)
     return distance[rows, nearest], np.abs(normal_distance[rows, nearest])
@@ -102,19 +108,20 @@ FreeSides = tuple[bool, bool, bool]  # whether each side of a cell is at a free 
 def graded_at(free_sides: FreeSides, s: float) -> tuple[Array, Array]:
     """Return a rule of the reference triangle with rows of points along its free sides.
 
-    Rows are dense there on the scale s.
+    Rows are dense there on the scale s, over the side of a cell. Points are (n, 2), weights (n,).
     """
     sides = [side for side, is_free in zip(ENDS, free_sides, strict=True) if is_free]
     if not sides:
         X, w = basix.make_quadrature(basix.CellType.triangle, DEGREE)
         return np.array(X), np.array(w)
-    apex = CORNERS.mean(axis=0)  # of a triangle on each side
+    apex = CORNERS.mean(axis=0)  # tip of the triangle on each free side
     if len(sides) == 1:
         (apex,) = (CORNERS[i] for i in range(3) if i not in sides[0])
     elif len(sides) == 2:
         apex = CORNERS[[i for i in range(3) if not all(i in side for side in sides)]].mean(axis=0)
     (a, wa), (b, wb) = graded(ROWS_AT_EDGE, s), gauss(POINTS_ALONG_ROWS)
     points, weights = list[Array](), list[Array]()
+    # a triangle between each free side and the apex
     for i, j in sides:
         A, B = CORNERS[i], CORNERS[j]
         side = (1 - a)[:, None, None] * (A + b[:, None] * (B - A))
@@ -125,7 +132,10 @@ def graded_at(free_sides: FreeSides, s: float) -> tuple[Array, Array]:
 
 
 def find_free_sides(corners: Array, parts: Ints) -> list[FreeSides]:
-    """Return which sides of flat triangles (n, 3, 3) no other cell of their part shares."""
+    """Return which sides of flat triangles (n, 3, 3) no other cell of their part shares.
+
+    `parts` (n,) is the part of each cell. Cells share a side where the middles coincide.
+    """
     from scipy.spatial import cKDTree  # takes long to import
 
     middles = np.stack([corners[:, [i, j]].mean(axis=1) for i, j in ENDS], axis=1).reshape(-1, 3)
@@ -138,10 +148,16 @@ def find_free_sides(corners: Array, parts: Ints) -> list[FreeSides]:
 class StackedFaces:
     """Charges of the faces of all cells, for pairs of cells with stacked faces.
 
+    Construction compiles C functions and is collective.
+
     Parameters
     ----------
     shape
         All modelled cells.
+    faces
+        Their charged faces.
+    copies
+        Images that make the whole shell, the modelled cells first.
     parts
         (copies * cells,) part of each cell.
     order
@@ -157,17 +173,21 @@ class StackedFaces:
         order: Ints,
         comm: MPI.Comm,
     ) -> None:
+        """Sort the cells by their free sides; parameters are those of the class."""
         self._shape, self._faces, self._copies, self._order = shape, faces, copies, order
         self._pairs = Pairs(comm)
         free_sides = find_free_sides(copies.nodes_of_all(shape.r0)[:, :3], parts)
-        self._kinds = sorted(set(free_sides))  # of first cells, by their free sides
+        self._kinds = sorted(set(free_sides))  # kinds of first cells, by their free sides
         self._kind = np.array([self._kinds.index(sides) for sides in free_sides])
         self._border = shape.element.tabulate(0, BORDER)[0, :, :, 0]
 
     def find_stacked(
         self, nodes: Array, own_cells: range, has_rule: NDArray[np.uint8]
     ) -> NDArray[np.bool_]:
-        """Return which of the pairs `has_rule` (own cells, cells) have stacked faces."""
+        """Return a mask (own cells, cells) of pairs with stacked faces, among those of `has_rule`.
+
+        `nodes` (cells, k, 3) are present places over R of all copies.
+        """
         is_stacked, h = np.zeros(has_rule.shape, dtype=bool), self._shape.h
         middle = nodes.mean(axis=1)
         radius = np.linalg.norm(nodes - middle[:, None], axis=-1).max(axis=1)
@@ -178,27 +198,28 @@ class StackedFaces:
         )
         first, second = np.nonzero(has_rule)
         first_cell = first + own_cells.start
-        size = 2 * np.maximum(radius[first_cell], radius[second])
-        ball = (
+        pair_size = 2 * np.maximum(radius[first_cell], radius[second])
+        ball_distance = (
             np.linalg.norm(middle[first_cell] - middle[second], axis=-1)
             - radius[first_cell]
             - radius[second]
         )
-        is_candidate = (ball < h + STACKED_DISTANCE * size) & (
+        is_candidate = (ball_distance < h + STACKED_DISTANCE * pair_size) & (
             np.abs(np.sum(normal[first_cell] * normal[second], axis=-1)) > MIN_COSINE
         )
         if not is_candidate.any():
             return is_stacked
-        first, second, first_cell, size = (
-            array[is_candidate] for array in (first, second, first_cell, size)
+        first, second, first_cell, pair_size = (
+            array[is_candidate] for array in (first, second, first_cell, pair_size)
         )
+        # twelve places on the sides of each cell stand for it
         border = np.einsum("mk,nki->nmi", self._border, nodes)
         from_second, from_first = (
             corner_distances(border[a], nodes[b, :3])
             for a, b in ((first_cell, second), (second, first_cell))
         )
         distance, height = np.where(from_second[0] < from_first[0], from_second, from_first)
-        is_stacked[first, second] = (distance - h < STACKED_DISTANCE * size) & (
+        is_stacked[first, second] = (distance - h < STACKED_DISTANCE * pair_size) & (
             height > OVERLAP_DISTANCE * h
         )
         return is_stacked
@@ -211,15 +232,18 @@ class StackedFaces:
         gradient: Array,
         stiffness: Stiffness | None = None,
     ) -> float:
-        """Return the energy of pairs with own cells, half of each; add to gradient (cells, k, 3).
+        """Return the energy of stacked pairs with own cells, and add derivatives.
 
-        The energy is nan if two cells overlap.
+        Of a pair with one own cell it is half the energy. It is nan if two cells overlap.
+        Derivatives are added to `gradient` (cells, k, 3) and `stiffness`.
         """
         pairs, is_own_pair = self._ordered(own_cells, is_stacked)
-        energy, kinds = 0.0, self._kind[pairs[:, 0]]
-        for kind, share in product(np.unique(kinds), (0.5, 1.0)):
-            pairs_of_kind = pairs[(kinds == kind) & (is_own_pair == (share == 1.0))]
-            energy += share * self._pairs.add_stacked(
+        energy, kinds_of_first_cells = 0.0, self._kind[pairs[:, 0]]
+        for kind, counted_share in product(np.unique(kinds_of_first_cells), (0.5, 1.0)):
+            pairs_of_kind = pairs[
+                (kinds_of_first_cells == kind) & (is_own_pair == (counted_share == 1.0))
+            ]
+            energy += counted_share * self._pairs.add_stacked(
                 self._structs[kind], nodes, pairs_of_kind, gradient, stiffness
             )
         return energy
@@ -233,7 +257,11 @@ class StackedFaces:
         weights: Weights,
         nodal_derivatives: NodalDerivatives,
     ) -> None:
-        """Add derivatives of own cells: see `InteractingCharges.field_derivatives`."""
+        """Add derivatives by nodal values of own cells to `nodal_derivatives`.
+
+        The number that is differentiated is `weights.energy` W + `weights.force` v . dW/du, see
+        `Weights`. Arguments are those of `InteractingCharges.field_derivatives` and of `add`.
+        """
         on_charges, first_row, basis = (
             np.zeros_like(self._nodal_charges),
             np.zeros(1, dtype=np.int64),
@@ -251,20 +279,21 @@ class StackedFaces:
             if rule is None:
                 continue
             X, w, *layer_shifts = rule
-            places, sizes = (first_points, X.reshape(-1, 2)), (len(first_points), w.shape[1])
+            places, rule_sizes = (first_points, X.reshape(-1, 2)), (len(first_points), w.shape[1])
             (t, q), (t_of_second, q_of_second) = (
                 self._thickness_and_charges(cell, points)
                 for cell, points in zip((first_cell, second_cell), places, strict=True)
             )
+            # the charges of the near face are in three layers
             layers, layer_factors, heights_of_layers = self._extrapolated_layers(t, *layer_shifts)
             q = first_weights[:, None] * np.einsum("pls,ps->pl", layer_factors, q)
             left = Points(self._tabulated(first_points), layers, t[None], q[None])
-            q_of_second = w.reshape(1, *sizes, 1) * q_of_second.reshape(1, *sizes, -1)
-            tables = self._tabulated(places[1]).reshape(*sizes, 3, -1)
+            q_of_second = w.reshape(1, *rule_sizes, 1) * q_of_second.reshape(1, *rule_sizes, -1)
+            tables = self._tabulated(places[1]).reshape(*rule_sizes, 3, -1)
             right = Points(
                 tables,
                 np.broadcast_to(self._heights, q_of_second.shape[1:]),
-                t_of_second.reshape(1, *sizes),
+                t_of_second.reshape(1, *rule_sizes),
                 q_of_second,
             )
             pairs, sides = (
@@ -282,7 +311,7 @@ class StackedFaces:
             ):
                 if cell not in own_cells:
                     continue
-                copy, number = divmod(cell, len(self._shape.r0))
+                copy, modelled_cell = divmod(cell, len(self._shape.r0))
                 by_nodal_charges, heights_of_side = (
                     by_charges[side].reshape(len(points), -1),
                     self._heights if side else heights_of_layers,
@@ -295,7 +324,7 @@ class StackedFaces:
                 by_nodal_charges = (
                     self._copies.charge_factors[copy] * weight[:, None] * by_nodal_charges
                 )
-                on_charges[number] += (
+                on_charges[modelled_cell] += (
                     monomials(points, CHARGE_DEGREE) @ basis
                 ).T @ by_nodal_charges
                 if on_heights:
@@ -303,8 +332,9 @@ class StackedFaces:
                         on_heights[side].reshape(len(points), -1) * heights_of_side, axis=-1
                     )
                     self._shape.add_thickness_derivatives(
-                        np.array([number]), points, by_thickness[None], nodal_derivatives
+                        np.array([modelled_cell]), points, by_thickness[None], nodal_derivatives
                     )
+        # from derivatives by charges to those by nodal values
         charges = self._faces.charges_at(*self._nodes_of_charges, nodal_derivatives)
         assert charges.add_derivatives
         charges.add_derivatives(np.zeros_like(charges.x), on_charges)
@@ -312,12 +342,30 @@ class StackedFaces:
     def _extrapolated_layers(
         self, t: Array, inward: Array, shift: Array
     ) -> tuple[Array, Array, Array]:
-        """Return heights (n, L) of layers, factors (n, L, S) of charges, and heights over t.
+        """Return the layers into which the charges at points of the first cell are moved.
 
-        The last are the part of the heights that is proportional to the thickness t. See `layered`
-        of stacked_faces.c.
+        See `layered` of stacked_faces.c.
+
+        Parameters
+        ----------
+        t
+            (n,) thickness over R.
+        inward
+            (n,) 1 where the normal leads away from the other cell, else -1.
+        shift
+            (n,) distance over R by which charges are moved inward.
+
+        Returns
+        -------
+        heights
+            (n, L) heights of the layers over t.
+        layer_factors
+            (n, L, S) charges of the layers from those of the S layers of the cell.
+        heights_of_layers
+            (n, L) the part of the heights that grows with the thickness.
         """
         S, n = len(self._heights), np.arange(len(t))
+        # number of the face that is near the other cell: 0 outer, 1 inner
         near_face = np.where(inward * t < 0, 0, 1)
         layer_factors = np.broadcast_to(np.eye(S + 2, S), (len(t), S + 2, S)).copy()
         layer_factors[n, near_face] = 0.0
@@ -341,12 +389,13 @@ class StackedFaces:
     def _ordered(
         self, own_cells: range, is_stacked: NDArray[np.bool_]
     ) -> tuple[Ints, NDArray[np.bool_]]:
-        """Return the stacked pairs (n, 2), each once, and which of them have own cells only."""
+        """Return the stacked pairs (n, 2), each once, and a mask of pairs of own cells only."""
         first, second = np.nonzero(is_stacked)
         first = first + own_cells.start
         is_own_pair = (second >= own_cells.start) & (second < own_cells.stop)
         is_counted = ~is_own_pair | (first < second)
         pairs, is_own_pair = np.column_stack([first, second])[is_counted], is_own_pair[is_counted]
+        # the cell with the lower order is the first one
         swap = self._order[pairs[:, 0]] > self._order[pairs[:, 1]]
         pairs[swap] = pairs[swap, ::-1]
         return pairs, is_own_pair
@@ -356,7 +405,7 @@ class StackedFaces:
         return np.asarray(self._shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2))
 
     def _thickness_and_charges(self, cell: int, X: Array) -> tuple[Array, Array]:
-        """Return thickness (n,) and charges (n, layers) at places X (n, 2) of a cell.
+        """Return thickness (n,) and charges (n, layers) of a cell at places X (n, 2).
 
         Charges are per area of the reference triangle.
         """
@@ -365,18 +414,18 @@ class StackedFaces:
 
     @cached_property
     def _rules_of_kinds(self) -> list[tuple[Array, Array]]:
-        """Points and weights on the first cell, for each kind of free sides."""
-        sides = [
+        """Points (n, 2) and weights (n,) on the first cell, for each kind of free sides."""
+        side_lengths = [
             np.linalg.norm(self._shape.r0[:, i] - self._shape.r0[:, j], axis=-1) for i, j in ENDS
         ]
         return [
-            graded_at(free_sides, ROW_SCALE * self._shape.h / float(np.median(sides)))
+            graded_at(free_sides, ROW_SCALE * self._shape.h / float(np.median(side_lengths)))
             for free_sides in self._kinds
         ]
 
     @cached_property
     def _structs(self) -> list[object]:
-        """Structs in C for each kind of first cells."""
+        """Structs `Cells` in C, for each kind of first cells."""
         rules = [np.column_stack(gauss(n)).ravel() for n in range(1, MAX_GAUSS_POINTS + 1)]
         shared_arrays = {
             "shape": coefficients_of_nodes(self._shape.element),
@@ -385,12 +434,12 @@ class StackedFaces:
             "heights": self._heights,
             "gauss": np.concatenate(rules),
         }
-        numbers = {
+        struct_numbers = {
             "k": shared_arrays["shape"].shape[1],
             "degree": self._shape.element.degree,
             "of_charges": CHARGE_DEGREE,
         }
-        numbers |= {
+        struct_numbers |= {
             "S": len(self._heights),
             "h": self._shape.h,
             "depth": LAYER_DEPTH,
@@ -404,35 +453,45 @@ class StackedFaces:
                 "X": X,
                 "weights": w,
             }
-            structs.append(self._pairs.cells(arrays, **numbers, P=len(w), precision=PRECISION))
+            structs.append(
+                self._pairs.cells(arrays, **struct_numbers, P=len(w), precision=PRECISION)
+            )
         return structs
 
     @cached_property
     def _heights(self) -> Array:
+        """Heights (S,) of the layers of charges, over the thickness; faces first."""
         return heights(self._faces)
 
     @cached_property
     def _nodal_charges(self) -> Array:
-        """(modelled cells, nodes, layers) charges per area of the reference triangle."""
+        """Charges (modelled cells, nodes, layers) per area of the reference triangle."""
         return self._faces.charges_at(*self._nodes_of_charges).q
 
     @cached_property
     def _charge_polynomials(self) -> Array:
-        """(copies * cells, monomials, layers) coefficients of charges."""
+        """Coefficients (copies * cells, monomials, layers) of charges."""
         q = coefficients_of_nodes(CHARGE_ELEMENT) @ self._nodal_charges
         return np.concatenate([factor * q for factor in self._copies.charge_factors])
 
     @cached_property
     def _thickness(self) -> Array:
-        """(copies * cells, monomials) coefficients of the thickness."""
+        """Coefficients (copies * cells, monomials) of the thickness.
+
+        They are negative for images that turn normals over.
+        """
         cells, X = np.arange(len(self._shape.r0)), np.asarray(CHARGE_ELEMENT.points)
         t = (
             self._shape.thickness(cells, np.broadcast_to(X, (len(cells), *X.shape)))[0]
             @ coefficients_of_nodes(CHARGE_ELEMENT).T
         )
-        return np.concatenate([up * t for up in self._copies.normal_signs])
+        return np.concatenate([normal_sign * t for normal_sign in self._copies.normal_signs])
 
     @property
     def _nodes_of_charges(self) -> tuple[Boxes, Array, Array]:
+        """Boxes, points and weights with which `charges_at` gives charges at the nodes.
+
+        The points are those of the unit square that is folded onto the triangle.
+        """
         a, b = CHARGE_ELEMENT.points.T
         return Boxes.undivided(self._faces.count), np.column_stack([a, b / (1 - a)]), 1 / (1 - a)

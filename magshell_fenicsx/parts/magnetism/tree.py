@@ -13,7 +13,7 @@ Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 # sum of the radii of two boxes over the distance of their middles, up to which multipoles serve
 MAX_RADII_OVER_DISTANCE = 0.5
-CELLS_PER_BOX = 4  # of the finest level, about
+CELLS_PER_BOX = 4  # about as many cells in a box of the finest level
 MAX_DEPTH = 10
 ROOT_BOX_FACTOR = 1.0137  # no simple number: cells of a regular mesh are not on sides of boxes
 
@@ -24,6 +24,8 @@ class Level:
 
     Attributes
     ----------
+    width
+        Side of the boxes over R.
     keys
         (boxes, 5) the part, the group, and the place in the grid.
     middle
@@ -50,13 +52,15 @@ class Level:
 
 @dataclass(frozen=True)
 class Tree:
-    """Levels from the largest boxes to the smallest.
+    """Levels from the largest boxes to the smallest, and how boxes act on each other.
 
     Attributes
     ----------
+    levels
+        The boxes of each size.
     G
         (offsets, sum of `multipoles.ends`) entries of `multipoles.translations` that are not zero,
-        of boxes of size one.
+        for boxes of width one.
     near
         (own cells, cells) whether two cells act on each other directly.
     """
@@ -72,21 +76,22 @@ class Octree:
     Parameters
     ----------
     places
-        (cells, 3) of the undeformed cells.
+        (cells, 3) of the undeformed cells, over R.
     parts
         (cells,) part of each cell.
     groups
         (cells,) cells of different groups act on each other directly: copies whose boxes are not
         images of each other.
-    own
+    own_cells
         The cells of this rank.
-    itself
+    acts_on_itself
         Whether a part acts on itself, too.
     """
 
     def __init__(
         self, places: Array, parts: Ints, groups: Ints, own_cells: range, *, acts_on_itself: bool
     ) -> None:
+        """Choose the size of the finest boxes; parameters are those of the class."""
         self._places, self._own_cells, self._acts_on_itself, self._kinds = (
             places,
             own_cells,
@@ -97,8 +102,9 @@ class Octree:
         self._size = float((highest - lowest).max()) * ROOT_BOX_FACTOR or 1.0
         self._origin = (
             lowest + highest - self._size
-        ) / 2  # a mirror plane of the whole is one of the boxes
+        ) / 2  # so a mirror plane of the shell is one of the boxes, too
         self._depth = 0
+        # until boxes hold about `CELLS_PER_BOX` cells each
         while self._depth < MAX_DEPTH and len(places) > CELLS_PER_BOX * len(
             np.unique(self._keys(places), axis=0)
         ):
@@ -107,18 +113,36 @@ class Octree:
 
     @cached_property
     def step(self) -> float:
-        """Cells that move by less than half of this stay in their boxes."""
+        """Quarter of the width of the finest boxes.
+
+        Cells that move by less than half of it stay in their boxes.
+        """
         return float(self._size / 2**self._depth / 4)
 
     def steps_moved(self, places: Array) -> Ints:
-        """Return (cells, 3) by how many steps cells have moved: boxes follow from this alone."""
+        """Return the numbers of steps (cells, 3) by which cells have moved.
+
+        `places` (cells, 3) are over R. Boxes follow from these numbers alone.
+        """
         return np.asarray(np.rint((places - self._places) / self.step), dtype=np.int64)
 
     def tree(self, steps: Ints, radii: Array) -> Tree:
-        """Return the boxes of cells that have moved; radii (cells,) contain their charges."""
+        """Return the boxes of cells that have moved, and how they act on each other.
+
+        Pairs of boxes are followed from large to small ones. Where both are far apart for their
+        size they act by multipoles; pairs that remain at the finest level act directly.
+
+        Parameters
+        ----------
+        steps
+            (cells, 3) numbers of steps; see `steps_moved`.
+        radii
+            (cells,) radii over R of balls about the cells that contain their charges.
+        """
         places = self._places + self.step * steps
         keys, levels = self._keys(places), list[Level]()
         pairs: Ints = np.zeros((0, 2), dtype=np.int64)
+        # place of each cell's box in the grid, level by level
         grids = [
             np.column_stack([keys[:, :2], keys[:, 2:] >> (self._depth - k)])
             for k in range(self._depth + 1)
@@ -151,6 +175,7 @@ class Octree:
             if not self._acts_on_itself:
                 pairs = pairs[boxes[pairs[:, 0], 0] != boxes[pairs[:, 1], 0]]
             distance = np.linalg.norm(middle[pairs[:, 0]] - middle[pairs[:, 1]], axis=-1)
+            # far for their size, and of one group
             is_separated = (radius[pairs].sum(axis=1) < MAX_RADII_OVER_DISTANCE * distance) & (
                 boxes[pairs[:, 0], 1] == boxes[pairs[:, 1], 1]
             )
@@ -182,12 +207,17 @@ class Octree:
         return Tree(levels, self._translation_matrices(list(offsets)), near_cells)
 
     def _keys(self, places: Array) -> Ints:
+        """Return part, group and place in the finest grid of cells, (cells, 5)."""
         grid_places = np.floor((places - self._origin) * (2**self._depth / self._size)).astype(
             np.int64
         )
         return np.column_stack([self._kinds, grid_places])
 
     def _translation_matrices(self, offsets: list[tuple[int, ...]]) -> Array:
+        """Return the entries of translation matrices for offsets between boxes; see `Tree.G`.
+
+        Matrices are kept for later trees.
+        """
         new_offsets = [offset for offset in offsets if offset not in self._translations]
         if new_offsets:
             is_nonzero = np.arange(COUNT) < ends()[:, None]
@@ -206,16 +236,23 @@ class Octree:
 
 
 def _children(pairs: Ints, parent: Ints, parents: int) -> Ints:
-    """Return all pairs of children of pairs (n, 2) of boxes."""
-    order, count = np.argsort(parent, kind="stable"), np.bincount(parent, minlength=parents)
-    first_of_parent = np.concatenate([[0], np.cumsum(count)])
-    sizes = count[pairs]
-    children_of_pair = sizes.prod(axis=1)
+    """Return all pairs of children (m, 2) of pairs (n, 2) of boxes.
+
+    `parent` (children,) is the parent of each box, `parents` the number of parents.
+    """
+    order, child_counts = np.argsort(parent, kind="stable"), np.bincount(parent, minlength=parents)
+    first_of_parent = np.concatenate([[0], np.cumsum(child_counts)])
+    child_counts_of_pairs = child_counts[pairs]
+    children_of_pair = child_counts_of_pairs.prod(axis=1)
     parent_pair = np.repeat(np.arange(len(pairs)), children_of_pair)
-    number = np.arange(len(parent_pair)) - np.repeat(
+    # number of a pair of children among those of its pair of parents
+    number_in_pair = np.arange(len(parent_pair)) - np.repeat(
         np.cumsum(children_of_pair) - children_of_pair, children_of_pair
     )
-    first_child, second_child = number // sizes[parent_pair, 1], number % sizes[parent_pair, 1]
+    first_child, second_child = (
+        number_in_pair // child_counts_of_pairs[parent_pair, 1],
+        number_in_pair % child_counts_of_pairs[parent_pair, 1],
+    )
     return np.column_stack(
         [
             order[first_of_parent[pairs[parent_pair, 0]] + first_child],

@@ -21,7 +21,15 @@ Curve = Callable[
 
 
 def measured(unit: str) -> Any:
-    """A number, or text with a unit, which stays text: what a number means depends on the case."""
+    """Return the type of a number or text with a unit, for keys of the case file.
+
+    Text stays text, since what a number without a unit means depends on the case.
+
+    Parameters
+    ----------
+    unit
+        Unit that the text must have, such as "second".
+    """
 
     def check(value: float | str) -> float | str:
         in_units(unit)(value)
@@ -33,6 +41,7 @@ def measured(unit: str) -> Any:
 
 
 def _level(value: float | str) -> float | str:
+    """Return a value of a history; text without a unit is refused with a ValueError."""
     if isinstance(value, str) and not number_and_unit(value)[1]:
         raise ValueError('is not a number with a unit such as "400 Pa"')
     return value
@@ -80,6 +89,7 @@ class WaveHistory(Section):
 
 
 def _formula(text: str) -> str:
+    """Return a formula of the time t; other text is refused with a ValueError."""
     try:
         if re.search(r"\b[xyz]\b", text):
             raise ValueError(text)
@@ -103,6 +113,10 @@ History: TypeAlias = Annotated[
 
 
 def _tag(data: Any) -> str | None:
+    """Return the tag of a history's type for pydantic: of text, a list, or a section by its kind.
+
+    None: it is none of these.
+    """
     if isinstance(data, str | list):
         return "formula" if isinstance(data, str) else "table"
     kind = data.get("kind") if isinstance(data, dict) else getattr(data, "kind", None)
@@ -110,31 +124,37 @@ def _tag(data: Any) -> str | None:
 
 
 def curve(history: History, time: Value, level: Value, start: float) -> Curve:
-    """Return the value of a load over the time since the begin of its history.
+    """Return a load's history as a function of time: (t, before) -> value.
+
+    `t` is the time since the history began. With `before` the value at a jump is that before it.
 
     Parameters
     ----------
+    history
+        A ramp, step, wave, formula or table of the case.
     time, level
-        Return a time, and a value of the history, as a number.
+        Convert a time, and a value of the history, to a number; either may have a unit.
     start
-        The value before.
+        The value before the history began.
     """
     if isinstance(history, str):
         function = formula(re.sub(r"\bt\b", "x", history))
         return lambda t, before: float(function(*np.array([t, 0.0, 0.0]).reshape(3, 1))[0])
     if isinstance(history, RampHistory):
-        duration, end = time(history.over), level(history.to)
-        return lambda t, before: float(start + (end - start) * min(t / duration, 1.0))
+        duration, end_value = time(history.over), level(history.to)
+        return lambda t, before: float(start + (end_value - start) * min(t / duration, 1.0))
     if isinstance(history, StepHistory):
-        jump, end = time(history.at), level(history.to)
-        return lambda t, before: end if t > jump or (t == jump and not before) else start
+        jump_time, end_value = time(history.at), level(history.to)
+        return lambda t, before: (
+            end_value if t > jump_time or (t == jump_time and not before) else start
+        )
     if isinstance(history, WaveHistory):
         return _wave(history, time, level)
     return _interpolation([time(t) for t, _ in history], [level(v) for _, v in history])
 
 
 def _wave(history: WaveHistory, time: Value, level: Value) -> Curve:
-    """Return a sine, or a triangle that has the turning points of the sine."""
+    """Return a sine, or a triangle that has the turning points of the sine, as a `Curve`."""
     size, period, mean = level(history.size), time(history.period), level(history.mean)
     if history.kind == "sine":
         return lambda t, before: float(mean + size * np.sin(2 * np.pi * t / period))
@@ -144,7 +164,10 @@ def _wave(history: WaveHistory, time: Value, level: Value) -> Curve:
 
 
 def _interpolation(times: Sequence[float], values: Sequence[float]) -> Curve:
-    """Return straight lines between the values of a table, with its jumps."""
+    """Return straight lines between the values of a table, with its jumps, as a `Curve`.
+
+    Two rows at one time make a jump. Outside the table the first or last value holds.
+    """
 
     def interpolated(t: float, before: bool) -> float:
         row = int(np.searchsorted(times, t, side="left" if before else "right"))
@@ -157,7 +180,13 @@ def _interpolation(times: Sequence[float], values: Sequence[float]) -> Curve:
 
 
 def marks(history: History, time: Value, end: float) -> list[float]:
-    """Return the times within (0, end) at which a history jumps or has a kink."""
+    """Return the times within (0, end) at which a history jumps or has a kink.
+
+    Parameters
+    ----------
+    time
+        Converts a time of the history to a number.
+    """
     times: list[float] = []
     if isinstance(history, RampHistory):
         times = [time(history.over)]
@@ -172,14 +201,14 @@ def marks(history: History, time: Value, end: float) -> list[float]:
 
 
 def times_of(history: History) -> list[float | str]:
-    """Return all times of a history."""
+    """Return all times that a history names, as in the case."""
     if isinstance(history, list):
         return [t for t, _ in history]
     return [getattr(history, key) for key in ("over", "at", "period") if hasattr(history, key)]
 
 
 def levels_of(history: History) -> list[float | str]:
-    """Return all values of a history."""
+    """Return all values that a history names, as in the case."""
     if isinstance(history, list):
         return [level for _, level in history]
     return [getattr(history, key) for key in ("to", "size", "mean") if hasattr(history, key)]
@@ -202,13 +231,22 @@ Branches = Annotated[list[BranchSection], Field(max_length=20)]
 
 @dataclass(frozen=True)
 class ViscousMaterial(Ability):
-    """The viscosity and relaxation of a shell."""
+    """The viscosity and relaxation of a shell.
+
+    Attributes
+    ----------
+    viscosity
+        A time, as in the case; None without.
+    branches
+        Maxwell's springs and dashpots in series.
+    """
 
     viscosity: float | str | None
     branches: Sequence[BranchSection]
 
     @classmethod
     def from_context(cls, context: Context) -> "ViscousMaterial | None":
+        """Return the viscosity and relaxation of a case's shell; None without."""
         shell = context.shell
         return (
             cls(shell.viscosity, shell.relaxation)
@@ -217,23 +255,29 @@ class ViscousMaterial(Ability):
         )
 
     def withdraws(self, context: Context) -> dict[Offer, str]:
-        """Return that stress depends on the history of strain."""
+        """Return the offer that a viscous shell takes from the case -> what to do."""
         return {"a material without viscosity": "leave out shell.viscosity and shell.relaxation"}
 
     def refuse_unfit(self, context: Context) -> None:
-        """Check that its numbers are positive and that their units have a meaning."""
+        """Check that the viscous numbers are positive and that their units have a meaning.
+
+        Raises
+        ------
+        ValueError
+            With the key and what is needed.
+        """
         times = {f"relaxation.{i}.time": branch.time for i, branch in enumerate(self.branches)}
         moduli = {
             f"relaxation.{i}.modulus": branch.modulus for i, branch in enumerate(self.branches)
         }
         if self.viscosity is not None:
             times = {"viscosity": self.viscosity, **times}
-        units = context.time_unit is not None and context.shell.with_units
+        has_units = context.time_unit is not None and context.shell.with_units
         for key, value in (times | moduli).items():
             context.needs(f"shell.{key}", "a mid-surface", "the area as drawn")
             if in_units("pascal" if key in moduli else "second")(value) <= 0:
                 raise ValueError(f"shell.{key}: {value}: must be positive")
-            if isinstance(value, str) and not units:
+            if isinstance(value, str) and not has_units:
                 raise ValueError(
                     f"shell.{key}: {value}: its unit needs shell.density, youngs_modulus and "
                     "lengths"

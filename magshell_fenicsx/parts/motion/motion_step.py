@@ -101,20 +101,24 @@ class TimeSection(Step):
 
     @model_validator(mode="after")
     def _keys_fit(self) -> Self:
-        for name, how in self.hold.items():
-            if how != "load" and name in self.drives:
+        """Check that the keys of the step go together, and that its times are positive.
+
+        Histories that do not jump need positive times; those of a table must not fall.
+        """
+        for name, quantity in self.hold.items():
+            if quantity != "load" and name in self.drives:
                 raise ValueError(f"hold.{name}: it follows its history: only load is allowed")
         if (self.event is None) == (self.until == "event"):
             raise ValueError("event: goes with until: event, which needs one")
         if self.search:
             raise ValueError("search: is for steps that end in equilibrium")
         for key, value in (("duration", self.duration), ("step", self.step), ("drag", self.drag)):
-            size = (
+            number = (
                 in_units("1/second" if key == "drag" else "second")(value)
                 if value is not None
                 else 1.0
             )
-            if size < 0 or (size == 0 and key != "drag"):
+            if number < 0 or (number == 0 and key != "drag"):
                 raise ValueError(f"{key}: {value}: must be positive")
         for name, history in self.history.items():
             times = [float(in_units("second")(t)) for t in times_of(history)]
@@ -141,6 +145,7 @@ class TimeSection(Step):
     def expected_end(
         self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float
     ) -> ExpectedEnd:
+        """Return the end of the step in words, after its number of rows."""
         return ExpectedEnd("the end", steps=self.points)
 
     @property
@@ -149,22 +154,27 @@ class TimeSection(Step):
 
     @property
     def needs_inertia_alone(self) -> bool:
-        """Whether neither an equilibrium nor a mode of the shell is asked for, so that it may be
-        free.
-        """
+        """Whether the step needs neither an equilibrium nor a mode: then the shell may be free."""
         return self.until in ("duration", "event") and self.push is None and not self.hold
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        """Check that the case has the loads whose histories the step gives, in units that it knows.
+
+        Raises
+        ------
+        ValueError
+            With the key and what is allowed.
+        """
         key, driven_amplitudes = step.key, context.driven_before(step.number)
-        timed = {
+        load_in_time = {
             in_time.name: in_time
             for ability in context.abilities
             if (in_time := ability.in_time(context, driven_amplitudes))
         }
         if "field" in self.history and (
-            why := timed["field"].refused if "field" in timed else NO_FIELD
+            refusal := load_in_time["field"].refused if "field" in load_in_time else NO_FIELD
         ):
-            raise ValueError(f"{key}.history.field: {why}")
+            raise ValueError(f"{key}.history.field: {refusal}")
         for time_key, text in self.with_units():
             if context.time_unit is None or not context.shell.with_units:
                 raise ValueError(
@@ -172,8 +182,8 @@ class TimeSection(Step):
                     "youngs_modulus and lengths"
                 )
         loads = {in_time.name: in_time.load for in_time in context.steps}
-        factors = _factors_of_sections(context)
-        allowed = {"field", "pressure", *factors, *loads} - {"lambda_m", "angle", "time"}
+        section_amplitudes = _factors_of_sections(context)
+        allowed = {"field", "pressure", *section_amplitudes, *loads} - {"lambda_m", "angle", "time"}
         for name, history in self.history.items():
             if name not in allowed:
                 raise ValueError(
@@ -192,25 +202,29 @@ class TimeSection(Step):
     def symmetry_constraints(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
+        """Return the symmetry that the initial velocity preserves; all without one."""
         if not self.velocity:
             return []
-        initial_velocity, R = vector_function(self.velocity), context.shell.reference
+        initial_velocity, length = vector_function(self.velocity), context.shell.reference
 
         def keeps(mirror: Mirror) -> bool:
+            """Return whether the initial velocity is mirror symmetric at sampled places."""
             S, x = mirror.reflection, outline.sample()
             return equal_to_rounding(
-                initial_velocity(R * x) @ S, initial_velocity(R * mirror.image(x))
+                initial_velocity(length * x) @ S, initial_velocity(length * mirror.image(x))
             )
 
-        turns = outline.meridian and vector_is_axisymmetric(self.velocity, outline.meridian, R)
+        is_axisymmetric = outline.meridian and vector_is_axisymmetric(
+            self.velocity, outline.meridian, length
+        )
         return [
             SymmetryConstraint(
-                None if turns else "the initial velocity differs around e3", (), keeps
+                None if is_axisymmetric else "the initial velocity differs around e3", (), keeps
             )
         ]
 
     def with_units(self) -> Iterator[tuple[str, str]]:
-        """Yield key and text of each time with a unit."""
+        """Yield (key below the step, text) for each time or rate that has a unit."""
         times: dict[str, Any] = {"duration": self.duration, "step": self.step, "drag": self.drag}
         for name, history in self.history.items():
             times |= {f"history.{name} {i}": t for i, t in enumerate(times_of(history))}
@@ -220,7 +234,10 @@ class TimeSection(Step):
 
 
 def _factors_of_sections(context: Context) -> set[str]:
-    """Return the amplitudes of what sections ask for and no step drives, such as "interaction"."""
+    """Return amplitudes that sections of the case ask for, such as "interaction".
+
+    They grow to a factor without a step of the programme.
+    """
     from magshell_fenicsx.parts.path_step import FactorStep
     from magshell_fenicsx.parts.registered import (  # which has this step too
         KINDS_BEFORE_LOAD,
@@ -236,16 +253,23 @@ def _factors_of_sections(context: Context) -> set[str]:
 
 
 def level_in(context: Context, name: str, level: Level) -> float:
-    """Return a value of the history of a load as a number, as a target of that load would be.
+    """Return a value of a load's history as a number, as a target of that load would be.
+
+    Parameters
+    ----------
+    name
+        Name of the load's amplitude.
+    level
+        A number, or text with a unit.
 
     Raises
     ------
     ValueError
-        If it has a unit that the load has not in this case.
+        If the load has no such unit in this case.
     """
     from magshell_fenicsx.parts.registered import step_class  # which has this step too
 
     if not isinstance(level, str):
         return level
-    driving = next((type(step.load) for step in context.steps if step.name == name), None)
-    return (driving or step_class(name)).level(level, context)
+    step_kind = next((type(step.load) for step in context.steps if step.name == name), None)
+    return (step_kind or step_class(name)).level(level, context)

@@ -24,9 +24,14 @@ MERIDIAN = "meridian"
 
 
 def natural(context: Context, turn: float, patch_rims: Mapping[str, InsideRim]) -> Natural | None:
-    """Return the natural shape in a frame turned by `turn` about e3 (rad); None without one.
+    """Return the natural shape of a case in the frame of its model; None without one.
 
-    `patch_rims` has the rims of patches by name, see `Problem`.
+    Parameters
+    ----------
+    turn
+        Angle of the model's frame about e3 (rad).
+    patch_rims
+        Name of the patch of each dimple -> whether places are within the dimple's rim.
     """
     section = context.section_of(NaturalSection)
     if section is None:
@@ -36,6 +41,15 @@ def natural(context: Context, turn: float, patch_rims: Mapping[str, InsideRim]) 
     def varying(
         value: object, components_of: Callable[[object], list[float | str]], factor: float
     ) -> Varying | None:
+        """Return a curvature or stretch of the case as three numbers that may vary; None for None.
+
+        Parameters
+        ----------
+        components_of
+            Makes three numbers or formulas of the value, `_curvatures` or `_stretches`.
+        factor
+            Factor of the numbers.
+        """
         if value is None:
             return None
         if isinstance(value, UserField):
@@ -45,20 +59,25 @@ def natural(context: Context, turn: float, patch_rims: Mapping[str, InsideRim]) 
                 )
             )
         if not isinstance(value, dict):
-            parts = components_of(value)
-            if any(isinstance(v, str) for v in parts):
-                return FormulaVectors([formula_function(v) for v in parts], Q, R, factor)
-            return factor * np.array(parts, dtype=float)
+            components_of_value = components_of(value)
+            if any(isinstance(v, str) for v in components_of_value):
+                return FormulaVectors(
+                    [formula_function(v) for v in components_of_value], Q, R, factor
+                )
+            return factor * np.array(components_of_value, dtype=float)
         vectors = {
             name: factor * np.array(components_of(patch_value), dtype=float)
             for name, patch_value in value.items()
         }
         if isinstance(context.shell, MeshSurface):
             return vectors
-        rest = vectors.get("rest", np.zeros(3))
+        vector_elsewhere = vectors.get("rest", np.zeros(3))
         return WithinRims(
-            tuple((is_inside, vectors.get(name, rest)) for name, is_inside in patch_rims.items()),
-            rest,
+            tuple(
+                (is_inside, vectors.get(name, vector_elsewhere))
+                for name, is_inside in patch_rims.items()
+            ),
+            vector_elsewhere,
         )
 
     curvature, stretch = (
@@ -69,9 +88,10 @@ def natural(context: Context, turn: float, patch_rims: Mapping[str, InsideRim]) 
 
 
 def frame(context: Context, turn: float) -> Pattern:
-    """Return a pattern whose part in the surface is the first direction of the natural frame.
+    """Return a pattern of vectors whose part in the surface is t1 of the natural frame.
 
-    The model's frame is turned by `turn` about e3 (rad).
+    A pattern is a function of places and normals. The model's frame is turned by `turn` about e3
+    (rad).
     """
     direction = first_direction(context)
     if direction == MERIDIAN:
@@ -85,15 +105,20 @@ def frame(context: Context, turn: float) -> Pattern:
 
 
 def first_direction(context: Context) -> list[float | str] | str:
-    """Return the first direction of the frame, the default one without a natural shape."""
-    flat = isinstance(context.shell, MeshSurface | PlateSurface)
-    flat = flat or (isinstance(context.shell, ShellSection) and context.shell.geometry == "strip")
+    """Return the first direction t1 of the natural frame: three components, or "meridian".
+
+    Without a natural shape, or without its key `along`, it is the default of the geometry.
+    """
+    is_flat = isinstance(context.shell, MeshSurface | PlateSurface)
+    is_flat = is_flat or (
+        isinstance(context.shell, ShellSection) and context.shell.geometry == "strip"
+    )
     natural = context.section_of(NaturalSection)
-    return (natural and natural.along) or ([1.0, 0.0, 0.0] if flat else MERIDIAN)
+    return (natural and natural.along) or ([1.0, 0.0, 0.0] if is_flat else MERIDIAN)
 
 
 def is_anisotropic(context: Context) -> bool:
-    """Return whether curvature or stretch differ with direction, so that the frame matters."""
+    """Return whether curvature or stretch depends on the direction, so that the frame matters."""
     section = context.section_of(NaturalSection)
     assert section
     values = [section.curvature, section.stretch]
@@ -106,16 +131,23 @@ def is_anisotropic(context: Context) -> bool:
 
 
 def not_axisymmetric_because(context: Context, outline: Outline) -> str | None:
-    """Return why the natural shape is not axisymmetric about e3; None if it is."""
+    """Return why the natural shape is not axisymmetric about e3, as a phrase; None if it is.
+
+    It is if nothing twists, the frame is along the meridians or not needed, and formulas do not
+    vary around e3.
+    """
     section = context.section_of(NaturalSection)
     assert section
     direction, R = first_direction(context), context.shell.reference
-    k = components(section.curvature)
-    patch_constraint = section.curvature.values() if isinstance(section.curvature, dict) else []
-    if any(len(c) == 3 and c[2] not in (0, "0") for c in map(components, [k, *patch_constraint])):
+    curvature = components(section.curvature)
+    patch_curvatures = section.curvature.values() if isinstance(section.curvature, dict) else []
+    if any(
+        len(c) == 3 and c[2] not in (0, "0")
+        for c in map(components, [curvature, *patch_curvatures])
+    ):
         return "the natural curvature twists: k12 is not zero"
-    upright = [v == 0 for v in direction] == [True, True, False]
-    if is_anisotropic(context) and direction != MERIDIAN and not upright:
+    is_vertical = [v == 0 for v in direction] == [True, True, False]
+    if is_anisotropic(context) and direction != MERIDIAN and not is_vertical:
         return "the natural shape is not along the meridians"
     if outline.meridian and not all(
         scalar_is_axisymmetric(text, outline.meridian, R) for text in section.texts
@@ -125,7 +157,10 @@ def not_axisymmetric_because(context: Context, outline: Outline) -> str | None:
 
 
 def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
-    """Return whether a plane mirrors the natural shape; patches are mapped onto themselves."""
+    """Return whether a plane mirrors the natural shape onto itself.
+
+    It is decided by values at samples of the surface; patches are taken to be their own images.
+    """
     section = context.section_of(NaturalSection)
     assert section
     if section.user_fields:
@@ -133,13 +168,14 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
     x, R, direction = outline.sample(), context.shell.reference, first_direction(context)
 
     def is_mirrored(text: float | str, sign: float = 1.0) -> bool:
-        values, of_image = (
+        """Return whether a number or formula has the same values at images, but for the `sign`."""
+        values, values_of_image = (
             formula_function(text)(*(R * places).T) for places in (x, mirror.image(x))
         )
         size = np.abs(values).max(initial=0.0)
         return bool(
             np.isfinite(values).all()
-            and (np.abs(values - sign * of_image) <= EQUALITY_TOLERANCE * size).all()
+            and (np.abs(values - sign * values_of_image) <= EQUALITY_TOLERANCE * size).all()
         )
 
     twists = [c[2] for c in _components_of_patches(section.curvature) if len(c) == 3]
@@ -159,14 +195,15 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
         return True
     if direction == MERIDIAN:
         return mirror.through_e3 or bool(np.hypot(*mirror.normal[:2]) == 0)
-    d, image = (
+    directions, directions_at_images = (
         np.stack([formula_function(v)(*(R * p).T) for v in direction], -1)
         for p in (x, mirror.image(x))
     )
     return any(
         bool(
             (
-                np.abs(d @ mirror.reflection - sign * image) <= EQUALITY_TOLERANCE * np.abs(d).max()
+                np.abs(directions @ mirror.reflection - sign * directions_at_images)
+                <= EQUALITY_TOLERANCE * np.abs(directions).max()
             ).all()
         )
         for sign in (1, -1)
@@ -174,23 +211,32 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
 
 
 def _components_of_patches(value: object) -> list[list[float | str]]:
+    """Return the numbers and formulas of each patch, or of the one value without patches."""
     return [components(v) for v in (value.values() if isinstance(value, dict) else [value])]
 
 
 def _curvatures(value: object) -> list[float | str]:
+    """Return curvatures k11, k22, k12; of one number k11 and k22 are equal, and k12 is zero."""
     values = components(value)
     return values if len(values) == 3 else [*values, *values, 0.0]
 
 
 def _stretches(value: object) -> list[float | str]:
-    """Return stretches less one, (t1, t2, thickness); of one number the thickness grows too."""
+    """Return stretches less one, along t1, along t2 and of the thickness.
+
+    Of one number all three are equal; of two the thickness keeps its size.
+    """
     values = components(value)
     strains = [f"{v} - 1" if isinstance(v, str) else v - 1 for v in values]
     return [*strains, 0.0] if len(values) == 2 else strains * 3
 
 
 def _three_numbers(numbers: Array, *, stretch: bool) -> Array:
-    """Return values (..., 1, 2 or 3) of a program's function as three numbers."""
+    """Return values (..., 1, 2 or 3) of a program's function as three numbers (..., 3).
+
+    With `stretch` they are stretches less one as of `_stretches`, else curvatures as of
+    `_curvatures`.
+    """
     if stretch and numbers.shape[-1] == 2:
         return np.concatenate([numbers - 1, np.zeros_like(numbers[..., :1])], axis=-1)
     if stretch:
@@ -203,10 +249,15 @@ def _three_numbers(numbers: Array, *, stretch: bool) -> Array:
 
 
 def natural_constraints(context: Context, outline: Outline) -> list[SymmetryConstraint]:
-    """Return the symmetry that the natural shape preserves."""
+    """Return the symmetry that the natural shape of a case preserves.
+
+    Its planes must contain the first direction of the frame, if the frame matters and is constant.
+    """
     direction = first_direction(context) if is_anisotropic(context) else MERIDIAN
-    fixed = not isinstance(direction, str) and all(isinstance(v, float | int) for v in direction)
-    vectors = [unit(np.array(direction, dtype=float))] if fixed else []
+    is_constant = not isinstance(direction, str) and all(
+        isinstance(v, float | int) for v in direction
+    )
+    vectors = [unit(np.array(direction, dtype=float))] if is_constant else []
     return [
         SymmetryConstraint(
             not_axisymmetric_because(context, outline),
@@ -217,7 +268,7 @@ def natural_constraints(context: Context, outline: Outline) -> list[SymmetryCons
 
 
 def account(context: Context, loads: Loads) -> Account:
-    """Describe what grows."""
+    """Return the line of `magshell check` on the natural shape: what grows."""
     if not loads.natural:
         return Account(left_out=["natural shape: as drawn"])
     names = " and ".join(name.removeprefix("natural_") for name in loads.natural.amplitudes)

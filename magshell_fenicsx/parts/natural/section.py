@@ -30,7 +30,10 @@ PLACE = ("x", "y", "z", "pi")
 
 
 def per_length(value: Any) -> Any:
-    """Return text such as "5/m" or "5 m^-1" as a number in 1/m, and all else as it is."""
+    """Return text such as "5/m" or "5 m^-1" as a number in 1/m, and any other value unchanged.
+
+    Formulas such as "5/x" are left as they are.
+    """
     matched = _PER_LENGTH.fullmatch(value) if isinstance(value, str) else None
     unit = matched and (matched["below"] or matched["power"])
     if not matched or unit in PLACE:
@@ -41,12 +44,19 @@ def per_length(value: Any) -> Any:
 def _components(
     numbers: int, minimum: float, maximum: float, *, lengths: bool = False
 ) -> BeforeValidator:
-    """Return a validator of one value, a list of `numbers`, or a mapping of patches to either.
+    """Return a validator of a curvature or stretch: one value, a list of `numbers`, or a mapping.
 
-    A value is a number within bounds, or a formula.
+    A value is a number within bounds, or a formula; a mapping has a number or a list for each
+    patch. A function of a program with one or `numbers` values is allowed too.
+
+    Parameters
+    ----------
+    lengths
+        Whether numbers may be text per length, such as "5/m".
     """
 
     def checked_number(value: Any) -> Any:
+        """Return a value that is a number within bounds, or a formula."""
         value = per_length(value) if lengths else value
         if isinstance(value, str):
             formula(value)
@@ -62,6 +72,7 @@ def _components(
         return value
 
     def checked_list(value: Any) -> Any:
+        """Return a checked value, or a list of `numbers` checked values."""
         if isinstance(value, list) and len(value) != numbers:
             raise ValueError(f"a list has {numbers} values, this has {len(value)}")
         return (
@@ -69,6 +80,7 @@ def _components(
         )
 
     def read(value: Any) -> Any:
+        """Return the checked curvature or stretch."""
         if isinstance(value, UserField):
             if value.size not in (1, numbers):
                 raise ValueError(f"a function of {value.size} numbers; allowed are 1 and {numbers}")
@@ -85,7 +97,7 @@ def _components(
 
 
 def _refuse_formulas_of_patches(value_of_patch: dict[str, Any]) -> None:
-    """Check that patches have numbers, with or without a unit."""
+    """Check that the values of patches are numbers, with or without a unit, and no formulas."""
     for name, value in value_of_patch.items():
         values = value if isinstance(value, list) else [value]
         if any(isinstance(v, str) and per_length(v) is v for v in values):
@@ -134,7 +146,7 @@ class NaturalSection(Section, Ability):
 
     @property
     def user_fields(self) -> list[UserField]:
-        """Curvature and stretch that are functions of a program."""
+        """The curvature and the stretch, where they are functions that a program gives."""
         return [value for value in (self.curvature, self.stretch) if isinstance(value, UserField)]
 
     @property
@@ -163,6 +175,7 @@ class NaturalSection(Section, Ability):
     def symmetry_constraints(
         self, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
+        """Return the symmetry of a shell that its natural shape preserves."""
         from magshell_fenicsx.parts.natural.planned import (
             natural_constraints,  # the solver takes long to import
         )
@@ -170,6 +183,10 @@ class NaturalSection(Section, Ability):
         return natural_constraints(context, outline)
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
+        """Return the formulas of stretch and curvature, with the values that are allowed.
+
+        Places are in the shell's unit of length, and curvatures in one over this unit.
+        """
         from magshell_fenicsx.parts.natural.shape import (
             LARGEST,
             SMALLEST,
@@ -185,6 +202,7 @@ class NaturalSection(Section, Ability):
             yield Formulas(f"natural.{name}", components(value), minimum, maximum, R)
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
+        """Return the natural shape as the model's `Loads` have it."""
         from magshell_fenicsx.parts.natural.planned import (
             natural,
         )  # the solver takes long to import
@@ -193,7 +211,10 @@ class NaturalSection(Section, Ability):
 
 
 def components(value: Any) -> list[float | str]:
-    """Return the numbers and formulas of a curvature or stretch, none of patches and functions."""
+    """Return the numbers and formulas of a curvature or stretch.
+
+    Empty for values by patch, and for functions of a program.
+    """
     return (
         value
         if isinstance(value, list)
@@ -224,8 +245,9 @@ class GrowthSection(LoadStep):
 
     @model_validator(mode="after")
     def _one_grows(self) -> Self:
-        said = {self.grows, *self._given_targets} - {None}
-        if len(said) != 1:
+        """Check that one of curvature and stretch grows, by a target or by `grows`."""
+        growing_keys = {self.grows, *self._given_targets} - {None}
+        if len(growing_keys) != 1:
             raise ValueError(
                 "give curvature or stretch, the factor that it grows to, or without a target grows"
             )
@@ -233,7 +255,7 @@ class GrowthSection(LoadStep):
 
     @property
     def key(self) -> str:
-        """The key of `natural` that grows."""
+        """The key of `natural` that grows: curvature or stretch."""
         return self.grows or "".join(self._given_targets)
 
     @property
@@ -242,6 +264,7 @@ class GrowthSection(LoadStep):
 
     @classmethod
     def steps_before_load(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
+        """Return steps that let stretch and curvature grow to 1 before the only load of a case."""
         natural = context.section_of(NaturalSection)
         if isinstance(loading, cls) or natural is None:
             return []
@@ -277,6 +300,13 @@ class NaturalObservables(Observables):
         return tuple(loads.natural.amplitudes) if loads.natural else ()
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
+        """Check that the surface has the patches with values of curvature and stretch.
+
+        Raises
+        ------
+        MeshError
+            With the name of a missing patch.
+        """
         from magshell_fenicsx.models.shell.spatial_fields import (
             by_patch,
         )  # the solver takes long to import

@@ -68,9 +68,10 @@ class Natural:
         vector (3,), a pattern, vectors of named patches, or a field that was given on the mesh.
         None: it does not grow, and there is no such amplitude.
     stretch
-        The stretches along t1, along t2 and of the thickness, less one; likewise.
+        The stretches along t1, along t2 and of the thickness, less one, given as the curvature is.
     along
-        A pattern whose part in the surface is along t1; t2 = n x t1.
+        A pattern (function of places and normals) of vectors, whose part in the surface is along
+        t1; t2 = n x t1.
     """
 
     curvature: Varying | None
@@ -79,7 +80,7 @@ class Natural:
 
     @property
     def amplitudes(self) -> tuple[str, ...]:
-        """Names of the amplitudes."""
+        """Names of the amplitudes of the growing parts: natural_curvature, natural_stretch."""
         values_by_amplitude = {CURVATURE: self.curvature, STRETCH: self.stretch}
         return tuple(name for name, value in values_by_amplitude.items() if value is not None)
 
@@ -89,12 +90,21 @@ class Natural:
         cells: int,
         pattern_of: Callable[[UserField], Pattern] | None = None,
     ) -> "Natural":
-        """Return the shape with vectors for each cell in place of patches, and patterns of fields.
+        """Return the shape with arrays for cells in place of patches, and patterns for fields.
+
+        Parameters
+        ----------
+        patches
+            Name of a patch -> whether each cell belongs to it.
+        cells
+            Number of cells on this rank.
+        pattern_of
+            Function that makes a pattern (function of places and normals) of a field of a program.
 
         Raises
         ------
         MeshError
-            If there is no such patch.
+            If a named patch does not exist.
         """
         values = {"curvature": self.curvature, "stretch": self.stretch}
         by_cell = {
@@ -112,7 +122,13 @@ class Natural:
     def tensors_at(self, r0: Array, n0: Array) -> tuple[Array, Array, Array]:
         """Return T and kappa (..., 3, 3) in space, and t (...), at undeformed places.
 
-        Places and normals are (cells, nodes, 3).
+        T is the stretch in the surface less one, kappa the natural curvature, t the stretch of the
+        thickness less one. Places `r0` over R and unit normals `n0` are (cells, nodes, 3).
+
+        Raises
+        ------
+        MeshError
+            If a tensor that depends on the direction has no frame at some place.
         """
         stretch, curvature = (_values(value, r0, n0) for value in (self.stretch, self.curvature))
         t1, t2 = self._frame(
@@ -121,17 +137,22 @@ class Natural:
         return _tensor(stretch[..., :2], t1, t2), _tensor(curvature, t1, t2), stretch[..., 2]
 
     def in_frame(self, forces: Array, r0: Array, n0: Array) -> Array:
-        """Return derivatives (..., 3) by kappa_11, kappa_22 and kappa_12, from those by the field.
+        """Return derivatives (..., 3) of an energy by kappa_11, kappa_22, kappa_12 in the frame.
 
-        `forces` (..., 6) are derivatives by the six numbers of kappa in the field.
+        `forces` (..., 6) are derivatives by the six numbers of kappa in the field. Places and
+        normals are (..., 3).
         """
         t1, t2 = self._frame(r0, n0, np.zeros(r0.shape[:-1], dtype=bool))
-        ones = (_tensor(np.broadcast_to(e, r0.shape), t1, t2)[..., *FIELD] for e in np.eye(3))
-        return np.stack([np.sum(forces * unit_tensor, axis=-1) for unit_tensor in ones], axis=-1)
+        unit_tensors = (
+            _tensor(np.broadcast_to(e, r0.shape), t1, t2)[..., *FIELD] for e in np.eye(3)
+        )
+        return np.stack(
+            [np.sum(forces * unit_tensor, axis=-1) for unit_tensor in unit_tensors], axis=-1
+        )
 
     @property
     def formulas(self) -> FormulaGroup | None:
-        """Formulas of stretch and curvature; None without any."""
+        """The formulas of stretch and curvature in one group; None without any."""
         groups = (getattr(value, "formulas", None) for value in (self.stretch, self.curvature))
         known_groups = [value for value in groups if value]
         return (
@@ -143,29 +164,56 @@ class Natural:
         )
 
     def _frame(self, r0: Array, n0: Array, needed: NDArray[np.bool_]) -> tuple[Array, Array]:
-        """Return t1 and t2 (cells, nodes, 3); zero where they do not exist and are not needed."""
-        d = self.along(r0, n0)
-        d = d - np.einsum("...i,...i->...", d, n0)[..., None] * n0
-        length = np.linalg.norm(d, axis=-1, keepdims=True)
+        """Return the unit vectors t1 and t2 (cells, nodes, 3) of the frame in the surface.
+
+        Both are zero where they do not exist and are not needed.
+
+        Parameters
+        ----------
+        needed
+            (cells, nodes) whether a tensor depends on the direction.
+
+        Raises
+        ------
+        MeshError
+            If the frame does not exist at a place where it is needed.
+        """
+        along = self.along(r0, n0)
+        along = along - np.einsum("...i,...i->...", along, n0)[..., None] * n0
+        length = np.linalg.norm(along, axis=-1, keepdims=True)
         if (has_no_direction := needed & ~(length[..., 0] > NORMAL)).any():
             x, y, z = r0[has_no_direction][0]
             raise MeshError(
                 f"natural.along: has no direction in the surface at (x, y, z)/R = ({x:.3g}, "
                 f"{y:.3g}, {z:.3g})"
             )
-        t1 = np.where(length > NORMAL, d / np.maximum(length, 1e-300), 0.0)
+        t1 = np.where(length > NORMAL, along / np.maximum(length, 1e-300), 0.0)
         return t1, np.cross(n0, t1)
 
 
 def meridians(r0: Array, n0: Array) -> Array:
-    """Return the directions (..., 3) of meridians, e_theta x n; on the axis e1."""
+    """Return the directions (..., 3) of meridians at places and normals, e_theta x n.
+
+    On the axis they are e1. Places and unit normals are (..., 3); the directions are not
+    normalised.
+    """
     x, y = r0[..., 0], r0[..., 1]
-    off = np.hypot(x, y)[..., None] > NORMAL
-    return np.where(off, np.cross(np.stack([-y, x, 0 * x], axis=-1), n0), np.array([1.0, 0.0, 0.0]))
+    is_off_axis = np.hypot(x, y)[..., None] > NORMAL
+    return np.where(
+        is_off_axis, np.cross(np.stack([-y, x, 0 * x], axis=-1), n0), np.array([1.0, 0.0, 0.0])
+    )
 
 
 def natural_field(natural: Natural, cells: CellGeometry, V: fem.FunctionSpace) -> fem.Function:
     """Return the natural shape as a field that may jump between cells of V; collective.
+
+    The field has the 13 numbers of `_numbers` at each node. Formulas are projected onto
+    polynomials.
+
+    Parameters
+    ----------
+    cells
+        The cells of this rank with their undeformed places over R.
 
     Raises
     ------
@@ -203,11 +251,21 @@ def natural_field(natural: Natural, cells: CellGeometry, V: fem.FunctionSpace) -
 
 
 def _numbers(T: Array, kappa: Array, t: Array) -> Array:
-    """Return the numbers (..., SIZE) of a field."""
+    """Return the numbers (..., 13) of the field: six of kappa, six of T, and t.
+
+    A symmetric tensor has its components in the order of `FIELD`: xx, yy, zz, xy, xz, yz.
+    """
     return np.concatenate([kappa[..., *FIELD], T[..., *FIELD], t[..., None]], axis=-1)
 
 
 def _refuse_unfit(natural: Natural, r0: Array, n0: Array) -> None:
+    """Refuse stretches and curvatures out of bounds at places and normals (cells, nodes, 3).
+
+    Raises
+    ------
+    MeshError
+        With the first such place.
+    """
     stretch, curvature = 1 + _values(natural.stretch, r0, n0), _values(natural.curvature, r0, n0)
     is_valid = {
         f"stretch: is not within {SMALLEST:g} to {LARGEST:g}": (stretch >= SMALLEST)
@@ -222,7 +280,15 @@ def _refuse_unfit(natural: Natural, r0: Array, n0: Array) -> None:
 
 @dataclass(frozen=True)
 class Shape:
-    """A natural shape in the densities of a model: its field and its amplitudes; None for 0."""
+    """A natural shape in the densities of a model.
+
+    Attributes
+    ----------
+    field
+        The natural shape at amplitudes of one, see `natural_field`.
+    curvature, stretch
+        The amplitudes; None for one that stays 0.
+    """
 
     field: fem.Function
     curvature: fem.Constant | None
@@ -230,7 +296,11 @@ class Shape:
 
     @classmethod
     def from_field(cls, field: fem.Function, natural: Natural, constants: Constants) -> "Shape":
-        """Return the shape with amplitudes from `constants`, which all terms of a model use."""
+        """Return the shape of a field, with amplitudes from `constants`.
+
+        `constants` maps names to the constants that all terms of a model share; missing ones are
+        added.
+        """
         domain = field.function_space.mesh
         amplitudes = {
             name: constants.setdefault(name, fem.Constant(domain, 0.0))
@@ -240,18 +310,23 @@ class Shape:
 
     @property
     def parameters(self) -> tuple[Parameter, ...]:
-        """The field, and the amplitudes that there are."""
+        """The field and the amplitudes, as parameters of a density."""
         return (self.field, *(p for p in (self.curvature, self.stretch) if p is not None))
 
     @property
     def values(self) -> tuple[Array, ...] | None:
-        """Values that the natural volume depends on; None if it is the undeformed one."""
+        """The values that the natural volume depends on; None if it is the undeformed one."""
         return None if self.stretch is None else (self.field.x.array, self.stretch.value)
 
     def volume(self, first: Array, points: Array) -> Array:
-        """Return natural over undeformed volume (cells, places).
+        """Return the natural over the undeformed volume (cells, places) at the present amplitude.
 
-        `first` (2, cells, places, 3) are the tangents of the surface.
+        Parameters
+        ----------
+        first
+            (2, cells, places, 3) tangents of the undeformed surface.
+        points
+            Reference points (places, 2) of the cells.
         """
         assert self.stretch is not None
         return np.asarray(
@@ -263,12 +338,13 @@ class Shape:
     def volume_coefficients(self, first: Array, points: Array) -> Array:
         """Return the coefficients (4, cells, places) of det(1 + mu T) (1 + mu t) by powers of mu.
 
-        mu is the amplitude of the stretch.
+        mu is the amplitude of the stretch. `first` and `points` are those of `volume`.
         """
         numbers = at_quadrature(self.field, points)
         T = np.empty((*numbers.shape[:2], 3, 3))
         T[..., *FIELD] = T[..., *FIELD[::-1]] = numbers[..., 6:12]
         tangents = np.moveaxis(first, 0, -2)
+        # mixed components of T in the surface, whose determinant is that of the tensor
         mixed = np.linalg.solve(
             tangents @ np.swapaxes(tangents, -1, -2), tangents @ T @ np.swapaxes(tangents, -1, -2)
         )
@@ -276,17 +352,38 @@ class Shape:
         return np.array([np.ones_like(t), trace + t, det + trace * t, det * t])
 
     def forms(self, r0: Jet, field: Expr, *amplitudes: Expr) -> Forms:
-        """Return the natural forms at a point where the field and the amplitudes have values."""
-        values = list(amplitudes)
-        bent, stretched = (
-            values.pop(0) if p is not None else None for p in (self.curvature, self.stretch)
+        """Return the natural forms (metric, curvature, thickness) at a point, as UFL expressions.
+
+        Parameters
+        ----------
+        r0
+            Jet of the undeformed placement: the map with its first and second derivatives.
+        field, amplitudes
+            The values of `parameters` at the point.
+        """
+        remaining_amplitudes = list(amplitudes)
+        curvature_factor, stretch_factor = (
+            remaining_amplitudes.pop(0) if p is not None else None
+            for p in (self.curvature, self.stretch)
         )
-        return _forms(r0, field, bent, stretched)
+        return _forms(r0, field, curvature_factor, stretch_factor)
 
 
 def _forms(
     r0: Jet, field: Expr, curvature_factor: Expr | None, stretch_factor: Expr | None
 ) -> Forms:
+    """Return the natural forms at a point: strain, bend, metric, area and thickness, see `Forms`.
+
+    The equations are those of the module's docstring, with mu_s the stretch factor. A factor of
+    None stands for an amplitude that stays zero.
+
+    Parameters
+    ----------
+    r0
+        Jet of the undeformed placement: the map with its first and second derivatives.
+    field
+        The numbers of the natural shape, see `_numbers`.
+    """
     a0, up, n0 = kin.metric(r0), kin.inverse_metric(r0), kin.normal(r0)
     kappa = (
         ufl.zero((2, 2)) if curvature_factor is None else curvature_factor * covariant(r0, field, 0)
@@ -296,14 +393,15 @@ def _forms(
     b12 = ufl.dot(n0, r0.r12)
     b0 = ufl.as_matrix([[ufl.dot(n0, r0.r11), b12], [b12, ufl.dot(n0, r0.r22)]])
     t = stretch_factor * field[12]
-    mixed = stretch_factor * ufl.dot(up, covariant(r0, field, 6))
-    U = ufl.Identity(2) + mixed
-    twice = 2 * mixed + ufl.dot(mixed, mixed)  # U^2 - 1
-    metric = a0 + ufl.dot(a0, twice)
-    grown = (ufl.sym(ufl.dot(b0, twice)) - t * b0) / (1 + t)
+    U_less_1 = stretch_factor * ufl.dot(up, covariant(r0, field, 6))
+    U = ufl.Identity(2) + U_less_1
+    U_squared_less_1 = 2 * U_less_1 + ufl.dot(U_less_1, U_less_1)  # U^2 - 1
+    metric = a0 + ufl.dot(a0, U_squared_less_1)
+    # change of sym(b0 U^2)/s against b0
+    bend = (ufl.sym(ufl.dot(b0, U_squared_less_1)) - t * b0) / (1 + t)
     return Forms(
-        ufl.dot(a0, twice) / 2,
-        grown if curvature_factor is None else grown + ufl.dot(ufl.transpose(U), ufl.dot(kappa, U)),
+        ufl.dot(a0, U_squared_less_1) / 2,
+        bend if curvature_factor is None else bend + ufl.dot(ufl.transpose(U), ufl.dot(kappa, U)),
         metric,
         ufl.inv(metric),
         ufl.det(U),
@@ -312,16 +410,28 @@ def _forms(
 
 
 def grown(density: Density, shape: Shape) -> Density:
-    """Return a density with natural forms, from one that takes `natural`."""
+    """Return the density of a shell with a growing natural shape.
+
+    The new density takes the arguments of the old one, then the field and the amplitudes of the
+    shape.
+
+    Parameters
+    ----------
+    density
+        Its function takes the natural forms as `natural`: of a point, or of both sides of an edge.
+    """
 
     def with_natural_forms(*arguments: Expr) -> Expr:
-        count = len(arguments) - len(shape.parameters)
-        of_density, (field, *amplitudes) = arguments[:count], arguments[count:]
-        r0 = of_density[0]
+        """Return the density; the last arguments are the values of the shape's parameters."""
+        own_count = len(arguments) - len(shape.parameters)
+        density_arguments, (field, *amplitudes) = arguments[:own_count], arguments[own_count:]
+        r0 = density_arguments[0]
         if isinstance(r0, Jet):
-            return density.function(*of_density, natural=shape.forms(r0, field, *amplitudes))
-        sides = tuple(shape.forms(j, side, *amplitudes) for j, side in zip(r0, field, strict=True))
-        return density.function(*of_density, natural=sides)
+            return density.function(*density_arguments, natural=shape.forms(r0, field, *amplitudes))
+        forms_of_sides = tuple(
+            shape.forms(j, side, *amplitudes) for j, side in zip(r0, field, strict=True)
+        )
+        return density.function(*density_arguments, natural=forms_of_sides)
 
     return replace(
         density, function=with_natural_forms, parameters=(*density.parameters, *shape.parameters)
@@ -329,7 +439,15 @@ def grown(density: Density, shape: Shape) -> Density:
 
 
 def covariant(r0: Jet, field: Expr, first: int) -> Expr:
-    """Return the components in the surface's coordinates of a symmetric tensor in space."""
+    """Return the components (2, 2) in the surface's coordinates of a symmetric tensor in space.
+
+    Parameters
+    ----------
+    r0
+        Jet of the placement, whose first derivatives are the tangents.
+    field, first
+        The tensor's six components (order of `FIELD`) begin at the index `first` of the field.
+    """
     xx, yy, zz, xy, xz, yz = (field[first + i] for i in range(6))
     S = ufl.as_matrix([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
     S1, S2 = ufl.dot(S, r0.r1), ufl.dot(S, r0.r2)
@@ -338,6 +456,7 @@ def covariant(r0: Jet, field: Expr, first: int) -> Expr:
 
 
 def _values(value: Varying | None, r0: Array, n0: Array) -> Array:
+    """Return the values (cells, nodes, 3) of a stretch or curvature; zero for None."""
     if value is None:
         return np.zeros_like(r0)
     assert not isinstance(value, Mapping | UserField)  # a model knows them in its cells
@@ -345,20 +464,22 @@ def _values(value: Varying | None, r0: Array, n0: Array) -> Array:
 
 
 def _is_anisotropic(curvature: Array) -> NDArray[np.bool_]:
+    """Return whether curvatures (..., 3) as 11, 22, 12 depend on the direction."""
     return np.asarray((curvature[..., 0] != curvature[..., 1]) | (curvature[..., 2] != 0))
 
 
 def _tensor(components: Array, t1: Array, t2: Array) -> Array:
-    """Return the tensor (..., 3, 3) with components S_11, S_22 and perhaps S_12 in a frame.
+    """Return the tensor (..., 3, 3) with components S_11, S_22 and perhaps S_12 in a frame t1, t2.
 
-    Where it is isotropic it is S_22 times the unit tensor, exactly.
+    Its normal component is S_22. Where S_11 = S_22 and S_12 = 0 it is S_22 times the unit tensor,
+    exactly.
     """
 
     def product(a: Array, b: Array) -> Array:
         return np.asarray(a[..., :, None] * b[..., None, :])
 
-    first, second = components[..., 0, None, None], components[..., 1, None, None]
-    tensor = second * np.eye(3) + (first - second) * product(t1, t1)
+    S_11, S_22 = components[..., 0, None, None], components[..., 1, None, None]
+    tensor = S_22 * np.eye(3) + (S_11 - S_22) * product(t1, t1)
     if components.shape[-1] == 3:
         tensor = tensor + components[..., 2, None, None] * (product(t1, t2) + product(t2, t1))
     return np.asarray(tensor)
@@ -367,7 +488,14 @@ def _tensor(components: Array, t1: Array, t2: Array) -> Array:
 def body_shape(
     natural: Natural, body: BodyMesh, V: fem.FunctionSpace, constants: dict[str, fem.Constant]
 ) -> Shape:
-    """Return the natural shape of a solid; collective.
+    """Return the natural shape of a solid, with normals and heights; collective.
+
+    Parameters
+    ----------
+    V
+        The vector space of the displacement of the solid.
+    constants
+        Name -> constant that all terms of the model share; amplitudes are added to it.
 
     Raises
     ------
@@ -378,36 +506,43 @@ def body_shape(
     _, normals = body_positions_and_normals(V)
     Z = fem.functionspace(V.mesh, ("Lagrange", V.element.basix_element.degree, (1,)))
     z = body.at_nodes(Z, (body.heights - MIDSURFACE_HEIGHT) * body.thickness)[Z.dofmap.list]
-    numbers = natural_field(natural, body_cell_geometry(V), V)
+    shell_field = natural_field(natural, body_cell_geometry(V), V)
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (HEIGHT_AT + 1,)))
     field = fem.Function(Q, name="natural")
     rows = field.x.array.reshape(-1, HEIGHT_AT + 1)
-    shell_numbers = numbers.x.array.reshape(-1, SIZE)[numbers.function_space.dofmap.list]
+    shell_numbers = shell_field.x.array.reshape(-1, SIZE)[shell_field.function_space.dofmap.list]
     rows[Q.dofmap.list] = np.concatenate([shell_numbers, normals, z[..., None]], axis=-1)
     return Shape.from_field(field, natural, constants)
 
 
 def growth_in_body(shape: Shape, field: Expr, *amplitudes: Expr) -> Expr:
-    """Return the growth tensor G in space at a point with values of field and amplitudes."""
-    values = list(amplitudes)
+    """Return the growth tensor G (3, 3) in space at a point, as a UFL expression.
+
+    See the module's docstring for G.
+    """
+    remaining_amplitudes = list(amplitudes)
     curvature_factor, stretch_factor = (
-        values.pop(0) if p is not None else None for p in (shape.curvature, shape.stretch)
+        remaining_amplitudes.pop(0) if p is not None else None
+        for p in (shape.curvature, shape.stretch)
     )
     n, z = ufl.as_vector([field[NORMAL_AT + i] for i in range(3)]), field[HEIGHT_AT]
     n = n / ufl.sqrt(ufl.dot(n, n))
     normal_projection = ufl.outer(n, n)
     P = ufl.Identity(3) - normal_projection
-    s, U = 1, P
+    thickness_stretch, U = 1, P
     if stretch_factor is not None:
-        s, U = (
+        thickness_stretch, U = (
             1 + stretch_factor * field[12],
             P + stretch_factor * ufl.dot(P, ufl.dot(_tensor_in_space(field, 6), P)),
         )
     if curvature_factor is not None:
-        U = U - s * z * curvature_factor * ufl.dot(P, ufl.dot(_tensor_in_space(field, 0), U))
-    return U + s * normal_projection
+        U = U - thickness_stretch * z * curvature_factor * ufl.dot(
+            P, ufl.dot(_tensor_in_space(field, 0), U)
+        )
+    return U + thickness_stretch * normal_projection
 
 
 def _tensor_in_space(field: Expr, first: int) -> Expr:
+    """Return the symmetric tensor whose six numbers begin at an index of a field."""
     xx, yy, zz, xy, xz, yz = (field[first + i] for i in range(6))
     return ufl.as_matrix([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])

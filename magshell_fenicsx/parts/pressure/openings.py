@@ -24,21 +24,27 @@ Array = NDArray[np.float64]
 def moving_edges(
     edges: Mapping[str, Set[Hashable]], conditions: Mapping[str, Condition]
 ) -> list[str]:
-    """Return the names of edges with sides that neither are held nor lie in a plane of symmetry.
+    """Return the names of edges with a part that neither is held nor lies in a plane of symmetry.
 
     Parameters
     ----------
     edges
-        Name -> sides of cells, in any way that two names share.
+        Name of each edge -> its sides of cells, in any labels. Two names may share sides.
+    conditions
+        Name of an edge -> its support; an edge without one is free.
     """
-    closed = set[Hashable]().union(
-        *(edges[name] for name, c in conditions.items() if name in edges and is_closed(c))
+    closed_sides = set[Hashable]().union(
+        *(
+            edges[name]
+            for name, condition in conditions.items()
+            if name in edges and is_closed(condition)
+        )
     )
-    return [name for name, sides in edges.items() if sides - closed]
+    return [name for name, sides in edges.items() if sides - closed_sides]
 
 
 def is_closed(condition: Condition) -> bool:
-    """Return whether an edge is held, or lies in a plane of symmetry."""
+    """Return whether an edge with this support is held, or lies in a plane of symmetry."""
     if isinstance(condition, HeldComponents):
         return len(condition.components) == 3
     return condition != "free"
@@ -49,13 +55,20 @@ def without_potential(
 ) -> tuple[str, ...]:
     """Return the moving edges at which a live pressure has no potential.
 
+    It has one where the edge moves in a single direction or in its own plane.
+
     Parameters
     ----------
+    names
+        Names of moving edges.
+    conditions
+        Name of an edge -> its support.
     places
-        Name -> places (n, 3) on the undeformed edge.
+        Name of an edge -> places (n, 3) on it, undeformed over R.
     """
 
     def has_potential(name: str) -> bool:
+        """Return whether an edge moves in a single direction, or in its own plane."""
         condition = conditions.get(name, "free")
         if not isinstance(condition, HeldComponents):
             return False
@@ -73,14 +86,18 @@ def edge_openings(
     conditions: Mapping[str, Condition],
     nodes: NDArray[np.bool_] | None = None,
 ) -> tuple[list[str], tuple[str, ...]]:
-    """Return the moving edges of a model, and those of them without potential; collective.
+    """Return the moving edges of a surface, and those of them without potential; collective.
 
     Parameters
     ----------
+    r0
+        Undeformed placement over R.
     edges
-        Name -> facets on this rank.
+        Name of each edge -> its facets on this rank.
+    conditions
+        Name of an edge -> its support.
     nodes
-        The nodes that are on the edges' line; None for all.
+        Flags of the nodes that are on the edges' line; None for all.
     """
     V = r0.function_space
     comm, dim = V.mesh.comm, V.mesh.topology.dim - 1
@@ -98,12 +115,12 @@ def edge_openings(
 
 
 def side_field(sides: Mapping[str, float], midsurface: Midsurface | Meridian) -> fem.Function:
-    """Return the side of each cell, (1,), on which a pressure acts; 0 on others.
+    """Return a cellwise constant field (1,): the side from which a pressure acts, else 0.
 
     Parameters
     ----------
     sides
-        Patch -> 1 from outside, -1 from inside.
+        Name of a patch -> 1 from outside, -1 from inside.
     """
     Q = fem.functionspace(midsurface.mesh, ("DG", 0, (1,)))
     side_of_cells = fem.Function(Q, name="pressed")
@@ -120,7 +137,15 @@ def sides_of_cells(side_of_cells: fem.Function) -> Array:
 def pressed_parts(
     edges: Mapping[str, NDArray[np.int32]], side_of_cells: fem.Function
 ) -> dict[str, NDArray[np.int32]]:
-    """Return the parts of edges, facets on this rank, whose cells are pressed."""
+    """Return the facets of each edge, on this rank, whose cells are pressed.
+
+    Parameters
+    ----------
+    edges
+        Name of each edge -> its facets.
+    side_of_cells
+        The side that is pressed in each cell, see `side_field`.
+    """
     topology, sides = side_of_cells.function_space.mesh.topology, sides_of_cells(side_of_cells)
     topology.create_connectivity(1, 2)
     links = topology.connectivity(1, 2)
@@ -135,9 +160,16 @@ def pressed_parts(
 
 
 def side_of(end: str, sides: Mapping[str, float]) -> float:
-    """Return the side on which a pressure acts on the shell of an end, see `side_field`.
+    """Return the side from which a pressure acts on the shell of an end: 1, -1, or 0.
 
-    Without sides all are pressed from outside.
+    Without sides all shells are pressed from outside.
+
+    Parameters
+    ----------
+    end
+        Name of an end, of several shells "SHELL_...".
+    sides
+        Name of a shell -> 1 from outside, -1 from inside.
     """
     return (
         next((side for shell, side in sides.items() if end.startswith(f"{shell}_")), 0.0)
@@ -149,12 +181,18 @@ def side_of(end: str, sides: Mapping[str, float]) -> float:
 def ring_openings(
     ends: Mapping[str, Array], conditions: Mapping[str, Condition], sides: Mapping[str, float]
 ) -> tuple[list[str], tuple[str, ...]]:
-    """Return `edge_openings` of a meridian with ends at (rho, z).
+    """Return the moving ends of a meridian, and those of them without potential.
+
+    Only ends of pressed shells count. An end is a circle about the axis, see `without_potential`.
 
     Parameters
     ----------
+    ends
+        Name of each end -> its place (rho, z) over R.
+    conditions
+        Name of an end -> its support.
     sides
-        Shell -> side on which a pressure acts, see `side_of`.
+        Name of a shell -> side on which a pressure acts, see `side_of`.
     """
     ends = {name: place for name, place in ends.items() if side_of(name, sides)}
 
@@ -169,7 +207,10 @@ def ring_openings(
 def meridian_openings(
     meridian: Meridian, conditions: Mapping[str, Condition], sides: Mapping[str, float]
 ) -> tuple[list[str], tuple[str, ...]]:
-    """Return the ends that are not held, and those where a live pressure has no potential."""
+    """Return the ends of a meridian that are not held, and those of them without potential.
+
+    See `ring_openings`.
+    """
     places = {
         name: meridian.section(np.array([meridian.parameter(name)]))[0] for name in meridian.ends
     }
@@ -177,7 +218,7 @@ def meridian_openings(
 
 
 def no_potential(names: Sequence[str]) -> str:
-    """Return the message about edges without a potential."""
+    """Return the message that a live pressure has no potential at some named edges."""
     edges = f"edge{'s' * (len(names) > 1)} {', '.join(names)}"
     return (
         f"a potential of the pressure, which follows the free {edges}: volume_change and the "

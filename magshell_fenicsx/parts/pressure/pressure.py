@@ -61,6 +61,13 @@ class PressureSection(PathStep):
     default all from outside. ΔV is then the volume that these sweep"""
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        """Refuse `on` without several shells or patches, or with another pressure elsewhere.
+
+        Raises
+        ------
+        ValueError
+            With the key of the step.
+        """
         if self.on is None:
             return
         if context.solid or not isinstance(context.shell, MeshSurface):
@@ -80,6 +87,7 @@ class PressureSection(PathStep):
     def symmetry_constraints(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
+        """Return the symmetry that a pressure on some patches preserves."""
         return [
             *super().symmetry_constraints(step, context, outline),
             patch_constraint(f"{step.key}.on", self.on or (), context.shell),
@@ -90,6 +98,10 @@ class PressureSection(PathStep):
         return {"pressed_sides": {name: sides[face] for name, face in (self.on or {}).items()}}
 
     def course(self, step_start: StepStart) -> StepCourse:
+        """Return the course of the step, by arc length where the pressure has no potential.
+
+        Rubber that is blown up gets longer steps, since it goes far beyond p_c.
+        """
         course = super().course(step_start)
         if step_start.open and "control" not in self.model_fields_set:
             course = replace(course, drive=replace(course.drive, control="arc"))
@@ -103,6 +115,7 @@ class PressureSection(PathStep):
         return course
 
     def on_perfect(self, *, last: bool) -> Step:
+        """Return this step for the perfect shell; the last one goes to the first instability."""
         return (
             PressureSection(kind="pressure", control=self.control, hold=self.hold, on=self.on)
             if last
@@ -114,8 +127,9 @@ class PressureSection(PathStep):
         return {"pressure": True}
 
     def largest(self, sizing: SizingContext) -> float | None:
-        """Return elements that show buckles, in waves of about 3.6 sqrt(Rh), without a local
-        imperfection.
+        """Return the largest size of elements over R: it shows buckles of about 3.6 sqrt(Rh).
+
+        With a local imperfection, around which elements are small, it is None.
         """
         return None if sizing.local else 1.2 * sqrt(sizing.h)
 
@@ -123,10 +137,12 @@ class PressureSection(PathStep):
         return step_start
 
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
+        """Return the first change of the pressure, 0.1 p_c towards the target."""
         return copysign(0.1, change)
 
 
 def _longer(factor: float, steps: "StepOptions") -> "StepOptions":
+    """Return step control with a largest step that is longer by a factor."""
     return replace(steps, largest=factor * steps.largest)
 
 
@@ -134,6 +150,13 @@ class PressureObservables(Observables):
     """The unit of the change of volume, which is conjugate to a live pressure; every run has it."""
 
     def refuse_unfit(self, loads: "Loads", surface: "PatchMesh") -> None:
+        """Check that the surface has the patches that are pressed.
+
+        Raises
+        ------
+        MeshError
+            With the name of a missing patch.
+        """
         from magshell_fenicsx.models.shell.thickness import (
             patch_of,
         )  # the solver takes long to import
@@ -142,12 +165,13 @@ class PressureObservables(Observables):
             patch_of(surface.patches, name, "loading.on")
 
     def conjugate_unit(self, view: ModelView, name: str) -> float | None:
-        """Return -dPi/dmu of one unit of ΔV/R³."""
+        """Return -dPi/dmu of one unit of the change of volume, R^3; None of other amplitudes."""
         if name != PressureSection.amplitude:
             return None
         return -view.model.material.classical_pressure / view.h / view.model.multiplicity
 
     def left_out(self, view: ModelView) -> list[str]:
+        """Return messages on edges at which the pressure has no potential."""
         from magshell_fenicsx.parts.pressure.openings import (
             no_potential,
         )  # the solver takes long to import
@@ -157,7 +181,7 @@ class PressureObservables(Observables):
 
 
 def account(context: Context, loads: "Loads") -> Account:
-    """Return whether there is a live pressure."""
+    """Return the line of `magshell check` on a live pressure, or on its absence."""
     if not loads.pressure:
         return Account(left_out=["pressure: not loaded by it (the volume is only reported)"])
     faces = ", ".join(
@@ -175,16 +199,23 @@ def account(context: Context, loads: "Loads") -> Account:
 
 @dataclass(frozen=True)
 class EnclosedGas:
-    """A gas from where it was closed in, an equilibrium: (ambient - p) V stays (Boyle's law).
+    """A gas under the shell that is closed in at an equilibrium, by Boyle's law.
+
+    (ambient - p) V is constant. Here p is the live pressure from outside, so the gas has the
+    pressure ambient - p.
 
     Attributes
     ----------
+    section
+        Section of the case on the gas.
+    shell
+        The shell, which gives the volume if the section does not.
     classical_pressure
         p_c/E.
     unit
-        -dPi/dp of ΔV/R³ = 1, with p over p_c.
+        -dPi/dp of a change of volume by R^3, with p over p_c.
     pressure, conjugate
-        p/p_c and -dPi/dp where it was closed in.
+        p/p_c and -dPi/dp where the gas was closed in.
     """
 
     section: GasSection
@@ -195,13 +226,13 @@ class EnclosedGas:
     conjugate: float
 
     def law(self) -> "Conjugate":
-        """Return the conjugate as a function of p/p_c.
+        """Return the conjugate -dPi/dp and its derivative as a function of p/p_c.
 
         Raises
         ------
         CaseError
-            If the volume under the shell is not known, or the pressure is not below the ambient
-            one.
+            If the volume or the ambient pressure is not known, if the volume would not be positive,
+            or if the pressure is not below the ambient one.
         """
         ambient = self.section.ambient_over_pc
         if ambient is None:
@@ -212,11 +243,11 @@ class EnclosedGas:
             ambient = float(self.section.ambient or 0.0) / (
                 self.classical_pressure * self.shell.youngs_modulus
             )
-        first, pressure, unit = self._volume(), self.pressure, self.unit
+        volume, pressure, unit = self._volume(), self.pressure, self.unit
         change = self.conjugate / unit
-        if first + change <= 0:
+        if volume + change <= 0:
             raise CaseError(
-                f"hold.pressure.gas.volume: {first:.4g}: the shell has shrunk by {-change:.4g} "
+                f"hold.pressure.gas.volume: {volume:.4g}: the shell has shrunk by {-change:.4g} "
                 "R^3 already"
             )
         if pressure >= ambient:
@@ -224,36 +255,41 @@ class EnclosedGas:
                 f"hold.pressure.gas: the pressure, {pressure:.4g} p_c, is not below the ambient "
                 f"{ambient:.4g} p_c"
             )
-        content = (ambient - pressure) * (first + change)
+        # Boyle's constant: pressure of the gas over p_c times its volume over R^3
+        content = (ambient - pressure) * (volume + change)
 
         def conjugate(p: float) -> tuple[float, float]:
-            return unit * (content / (ambient - p) - first), unit * content / (ambient - p) ** 2
+            return unit * (content / (ambient - p) - volume), unit * content / (ambient - p) ** 2
 
         return conjugate
 
     def by_begin(self, p: float) -> tuple[float, float]:
-        """Return derivatives of the conjugate at p/p_c by the conjugate, and p, where it was closed
-        in.
+        """Return derivatives of the conjugate at p/p_c by the state where the gas was closed in.
+
+        The first is by the conjugate there, the second by p/p_c there.
         """
         conjugate, slope = self.law()(p)
-        first = self._volume()
-        pressure_below_ambient = (conjugate / self.unit + first) / slope * self.unit  # ambient - p
+        initial_volume = self._volume()
+        pressure_below_ambient = (
+            (conjugate / self.unit + initial_volume) / slope * self.unit
+        )  # ambient - p
         share = (pressure_below_ambient + p - self.pressure) / pressure_below_ambient
-        return share, -(self.unit * first + self.conjugate) / pressure_below_ambient
+        return share, -(self.unit * initial_volume + self.conjugate) / pressure_below_ambient
 
     def _volume(self) -> float:
+        """Return the volume of the gas under the undeformed shell, over R^3."""
         return self.section.volume or cap_volume(self.shell)
 
 
 def cap_volume(shell: ShellSection | Surface) -> float:
-    """Return the volume between a spherical shell without its dimple and the plane of its edge.
+    """Return the volume over R^3 between a spherical shell and the plane of its edge.
 
-    It is over R^3.
+    A dimple is left out.
 
     Raises
     ------
     CaseError
-        On any other shape.
+        If the shell is neither a hemisphere nor a cap.
     """
     if shell.geometry == "hemisphere":
         return 2 * pi / 3

@@ -42,7 +42,13 @@ class HeldSection(Section):
 
 
 def _condition(value: Any) -> Any:
-    """Validate a condition, with one message for all kinds."""
+    """Return a condition of an edge, a point or a patch after validation.
+
+    Raises
+    ------
+    ValueError
+        With what is allowed, in one message for all kinds of conditions.
+    """
     if isinstance(value, HeldSection) or (
         isinstance(value, str) and value in get_args(EdgeCondition)
     ):
@@ -75,12 +81,14 @@ class BoundarySection(Section, Ability):
     ]
 
     def conditions(self) -> dict[str, EdgeCondition | HeldSection]:
-        """Return name -> condition."""
+        """Return name of each edge, point or patch -> its condition."""
         return dict(self.__pydantic_extra__ or {})
 
     def warning(self, context: Context, places: Array) -> str | None:
-        """Say that no shell theory holds where a pressure stretches thick rubber beside a clamped
-        edge."""
+        """Return a warning if pressure blows up thick rubber beside a clamped edge; None if not.
+
+        No shell theory holds in the layer at such an edge.
+        """
         clamped = [name for name, condition in self.conditions().items() if condition == "clamped"]
         blown_up = any(step.kind == "pressure" for step in context.steps)
         is_rubber = getattr(context.shell, "rubber", None) is not None
@@ -94,7 +102,13 @@ class BoundarySection(Section, Ability):
         )
 
     def refuse_unfit(self, context: Context) -> None:
-        """Refuse names of points that are taken, and of edges that the geometry does not have."""
+        """Refuse names of points that are taken, and of edges that the geometry does not have.
+
+        Raises
+        ------
+        ValueError
+            With the name.
+        """
         refuse_taken(context.points)
         shell = context.shell
         edges = EDGES[shell.geometry] if isinstance(shell, ShellSection) else ()
@@ -126,33 +140,43 @@ class BoundarySection(Section, Ability):
     def symmetry_constraints(
         self, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
-        """A half that is loaded does not see rigid motions across its plane: it needs a support
-        against all.
+        """Return the symmetry that the supports of a shell preserve.
+
+        A loaded half does not see rigid motions across its mirror plane. So without a support
+        against all motions the whole shell is needed.
         """
-        parts = list[SymmetryConstraint]()
+        constraints = list[SymmetryConstraint]()
         for name, condition in self.conditions().items():
             reason = None
             if isinstance(condition, HeldSection):
                 one_sided = len({0, 1} & set(condition.components)) == 1
-                off = tilted(np.array(context.points.get(name, [0.0, 0.0, 1.0])))
-                why = (
+                is_off_axis = tilted(np.array(context.points.get(name, [0.0, 0.0, 1.0])))
+                asymmetry = (
                     "is held along x or y alone"
                     if one_sided
                     else "is held off the axis"
-                    if off
+                    if is_off_axis
                     else None
                 )
-                reason = why and f"boundary.{name}: {why}"
-            parts.append(SymmetryConstraint(reason, mirrors=partial(self._mirrored, context, name)))
+                reason = asymmetry and f"boundary.{name}: {asymmetry}"
+            constraints.append(
+                SymmetryConstraint(reason, mirrors=partial(self._mirrored, context, name))
+            )
         at_rest = not context.steps and context.sections.get("frequencies") is not None
         if not at_rest and not self.fixes:  # a meridian asks for itself whether it is held
-            parts.append(SymmetryConstraint(mirrors=no_plane))
-        return parts
+            constraints.append(SymmetryConstraint(mirrors=no_plane))
+        return constraints
 
     def _mirrored(self, context: Context, name: str, mirror: Mirror) -> bool:
-        """Return whether the other half is held in the same way, a held point on the plane."""
+        """Return whether a plane maps a support onto an equal one.
+
+        A held point must lie on the plane.
+        """
         conditions = self.conditions()
-        condition, other = conditions[name], conditions.get(mirror.image_of_edge(name), "free")
+        condition, condition_of_image = (
+            conditions[name],
+            conditions.get(mirror.image_of_edge(name), "free"),
+        )
         if isinstance(condition, HeldSection):
             held_projection, S = (
                 np.diag([float(i in condition.components) for i in range(3)]),
@@ -161,16 +185,16 @@ class BoundarySection(Section, Ability):
             if np.abs(S @ held_projection @ S - held_projection).max() > PARALLEL:
                 return False
         place = context.points.get(name)
-        offset = (
+        distance_of_point = (
             0.0
             if place is None
             else float(mirror.signed_distance(np.array(place) / context.shell.reference))
         )
-        return abs(offset) < ROUNDING and condition == other
+        return abs(distance_of_point) < ROUNDING and condition == condition_of_image
 
 
 def refuse_taken(points: Iterable[str]) -> None:
-    """Refuse names of points that the program gives itself."""
+    """Refuse points whose names the program uses itself, by a ValueError."""
     for point in points:
         if point == "pole":
             raise ValueError(

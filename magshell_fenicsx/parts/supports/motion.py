@@ -89,14 +89,15 @@ class EdgeSection(PathStep):
 
     @model_validator(mode="after")
     def _each_once(self) -> Self:
+        """Check that the factor's name is free, and that no support moves twice in the step."""
         if self.name in ({*RESERVED_NAMES, *QUANTITIES} - {"motion"}):
             raise ValueError(
                 f"name: {self.name}: is taken; choose another name for the factor of the motion"
             )
         supports = [name for move in self.moves for name in move.supports]
-        if twice := next((name for name in supports if supports.count(name) > 1), None):
+        if repeated := next((name for name in supports if supports.count(name) > 1), None):
             raise ValueError(
-                f"moves: {twice}: moves twice in one step; let a later step move it again"
+                f"moves: {repeated}: moves twice in one step; let a later step move it again"
             )
         return self
 
@@ -122,6 +123,13 @@ class EdgeSection(PathStep):
         return abs(self.factor or 1.0)
 
     def refuse_unfit(self, step: ProgrammeStep, context: Context) -> None:
+        """Check that `boundary` holds all supports that move.
+
+        Raises
+        ------
+        ValueError
+            With the key, and the supports that can move.
+        """
         boundary = context.section_of(BoundarySection)
         conditions = boundary.conditions() if boundary else {}
         held_names = sorted(
@@ -138,6 +146,7 @@ class EdgeSection(PathStep):
     def symmetry_constraints(
         self, step: ProgrammeStep, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
+        """Return the symmetry that the motions of supports preserve."""
         R = context.shell.reference
         return [
             SymmetryConstraint(
@@ -146,6 +155,7 @@ class EdgeSection(PathStep):
         ]
 
     def adds(self, step: ProgrammeStep, context: Context, modelled: Modelled) -> dict[str, Any]:
+        """Return the motions of supports as the model's `Loads` have them, over R."""
         from magshell_fenicsx.models.shell.parameters import Move  # the solver takes long to import
 
         R, turn = context.shell.reference, modelled.turn
@@ -157,7 +167,17 @@ class EdgeSection(PathStep):
 
 
 def motion(move: MoveSection, name: str, R: float, turn: float = 0.0) -> RigidMotion:
-    """Return the rigid motion of a section with the amplitude `name`, over the length R."""
+    """Return the rigid motion of a section for a factor of one, in the frame of a model.
+
+    Parameters
+    ----------
+    name
+        Name of the amplitude.
+    R
+        Reference length, in the unit of the section's lengths.
+    turn
+        Angle of the model's frame about e3 (rad).
+    """
     Q, rotation_section, zero = rotation(turn), move.rotation, np.zeros(3)
     shift = Q @ (np.array(move.translation) / R) if move.translation else zero
     if rotation_section is None:
@@ -172,7 +192,7 @@ def motion(move: MoveSection, name: str, R: float, turn: float = 0.0) -> RigidMo
 
 
 def sideways(load: EdgeSection) -> str | None:
-    """Return why a motion is not axisymmetric; None if it is."""
+    """Return why the motion of supports is not axisymmetric about e3; None if it is."""
     for move in load.moves:
         if move.rotation or (move.translation and any(move.translation[:2])):
             return f"the motion of {move.supports[0]} is not along e3"
@@ -182,7 +202,7 @@ def sideways(load: EdgeSection) -> str | None:
 def held_vectors(load: EdgeSection) -> list[Array]:
     """Return unit vectors (3,) that a mirror plane through e3 must contain.
 
-    These are translations, and normals of axes of rotation.
+    They are the directions of translations, and the normals of e3 and the axes of rotation.
     """
     vectors = [np.array(move.translation) for move in load.moves if move.translation]
     vectors += [
@@ -192,7 +212,10 @@ def held_vectors(load: EdgeSection) -> list[Array]:
 
 
 def mirrored(load: EdgeSection, R: float, mirror: Mirror) -> bool:
-    """Return whether a plane maps the motions onto themselves."""
+    """Return whether a plane maps the motions of all supports onto each other.
+
+    `R` is the reference length in the unit of the section's lengths.
+    """
     motions = {name: motion(move, "", R) for move in load.moves for name in move.supports}
     return all(
         mirror.image_of_edge(name) in motions
@@ -202,7 +225,10 @@ def mirrored(load: EdgeSection, R: float, mirror: Mirror) -> bool:
 
 
 def _is_image(first: RigidMotion, second: RigidMotion, mirror: Mirror) -> bool:
-    """A mirrored rotation runs the other way about the mirrored axis."""
+    """Return whether the second rigid motion is the mirror image of the first.
+
+    A mirrored rotation runs the other way about the mirrored axis.
+    """
     S, axis = mirror.reflection, second.turn / (np.linalg.norm(second.turn) or 1.0)
     offset = mirror.image(first.centre) - second.centre
     size = max(np.abs([first.shift, first.turn]).max(), ROUNDING)

@@ -20,17 +20,17 @@ HORIZONTAL, AXIAL = {0, 1}, 2  # components of the displacement
 
 @dataclass(frozen=True)
 class RigidMotions:
-    """Rigid motions of a shell of revolution.
+    """Rigid motions of the bodies of a shell of revolution; a body is a shell, or joined shells.
 
     Attributes
     ----------
     axial
-        Displacements (n, nodes times 2) along e3.
+        Displacements (n, nodes times 2) along e3, as components (U, W).
     torsional
-        Waves m = 0 around e3, as coefficients (U + V, V, W), (n, nodes times 3).
+        Rotations about e3 as waves m = 0, by coefficients (U + V, V, W), (n, nodes times 3).
     transverse
-        Waves m = 1 that move the shell across e3 or turn it about an axis across it, likewise. Each
-        has a twin.
+        Waves m = 1 that move a body across e3, or turn it about an axis across e3; also
+        (n, nodes times 3). Each has a twin.
     """
 
     axial: Array
@@ -40,12 +40,12 @@ class RigidMotions:
 
 @dataclass(frozen=True)
 class Supports:
-    """Facets of the meridian by what is held there.
+    """Facets (points) of the meridian by the displacements that are zero there.
 
     Attributes
     ----------
     axis
-        The point on the axis, which no axisymmetric displacement moves off it.
+        The points on the axis, which no axisymmetric displacement moves off it.
     horizontal, axial
         Where the displacements normal to e3 and along e3 are zero.
     mirror
@@ -53,6 +53,8 @@ class Supports:
     by_name
         Name of an end, or of a point on the axis -> facets, and the components of (U, W) that are
         held there.
+    meridian
+        The meridian with its mesh.
     """
 
     axis: Facets
@@ -63,14 +65,15 @@ class Supports:
     meridian: Meridian
 
     def axisymmetric_conditions(self, V: fem.FunctionSpace) -> list[fem.DirichletBC]:
-        """Return the conditions on the axisymmetric displacement (U, W)."""
+        """Return the conditions of zero on the axisymmetric displacement (U, W) in the space V."""
         return [_zero(V, self.axis, 0), _zero(V, self.horizontal, 0), _zero(V, self.axial, 1)]
 
     def wave_conditions(self, V: fem.FunctionSpace, m: int) -> list[fem.DirichletBC]:
-        """Return the conditions on the coefficients (U + V, V, W) of waves m.
+        """Return the conditions of zero on the coefficients (U + V, V, W) of waves m in V.
 
         A wave m = 1 may move the axis across itself.
         """
+        # on the axis all coefficients are zero, but V of waves m = 1
         at_axis = [_zero(V, self.axis, i) for i in ((0, 2) if m == 1 else (0, 1, 2))]
         return [
             *at_axis,
@@ -79,11 +82,15 @@ class Supports:
         ]
 
     def unknowns_of_waves(self, r0: fem.Function, m: int) -> NDArray[np.int32]:
-        """Return the unknowns (U + V, V, W) of waves m that are zero, as `wave_conditions` does.
+        """Return the numbers of the unknowns (U + V, V, W) of waves m that are zero.
 
-        It needs no space of these waves.
+        They are those of `wave_conditions`, without a space of waves: nodes have the same numbers
+        in the spaces of displacements and of waves.
 
-        The nodes of the spaces of displacements and of waves have the same numbers.
+        Parameters
+        ----------
+        r0
+            Undeformed placement, in the space of displacements.
         """
         axis, horizontal, axial = (
             fem.locate_dofs_topological(r0.function_space, 0, facets)
@@ -93,7 +100,10 @@ class Supports:
         return np.concatenate([*at_axis, 3 * horizontal, 3 * horizontal + 1, 3 * axial + 2])
 
     def rigid_motions(self, r0: fem.Function) -> RigidMotions:
-        """Return the rigid motions of each shell, or of those joined, whatever holds them."""
+        """Return the rigid motions of each body, whatever supports hold it.
+
+        A body is a shell, or shells that are joined; `r0` is the undeformed placement.
+        """
         axial_motions, torsional_waves, transverse_waves = (
             list[Array](),
             list[Array](),
@@ -116,12 +126,12 @@ class Supports:
 
 
 def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Supports:
-    """Return the supports that conditions of named ends and points on the axis make.
+    """Return the supports of a meridian, from the conditions of its named ends and points.
 
     Raises
     ------
     MeshError
-        If an end lies in no plane of symmetry.
+        If an end with a plane of symmetry does not lie in one.
     """
     horizontal, axial, mirror = facets = [list[Facets]() for _ in range(3)]
     named_ends: dict[str, tuple[Facets, tuple[int, ...]]] = {}
@@ -143,12 +153,20 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Support
         )
         if held_in_plane:
             named_ends[name] = end, held_in_plane
-    parts = [np.unique(np.concatenate([np.empty(0, np.int32), *f])) for f in facets]
-    return Supports(meridian.axis, parts[0], parts[1], parts[2], named_ends, meridian)
+    facets_by_kind = [np.unique(np.concatenate([np.empty(0, np.int32), *f])) for f in facets]
+    return Supports(
+        meridian.axis, facets_by_kind[0], facets_by_kind[1], facets_by_kind[2], named_ends, meridian
+    )
 
 
 def _refuse_slanting(meridian: Meridian, name: str) -> None:
-    """Refuse a surface that does not cross the plane of an end at right angles."""
+    """Refuse a surface that does not cross the plane of a named end at right angles.
+
+    Raises
+    ------
+    MeshError
+        If the meridian at the end is not nearly parallel to e3.
+    """
     s, offset = (
         meridian.parameter(name),
         PLANARITY_TOLERANCE if meridian.begins(name) else -PLANARITY_TOLERANCE,
@@ -159,5 +177,6 @@ def _refuse_slanting(meridian: Meridian, name: str) -> None:
 
 
 def _zero(V: fem.FunctionSpace, facets: Facets, component: int) -> fem.DirichletBC:
+    """Return the condition that a component is zero at facets (points) of a meridian."""
     part = V.sub(component)
     return fem.dirichletbc(0.0, fem.locate_dofs_topological(part, 0, facets), part)

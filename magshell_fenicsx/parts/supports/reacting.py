@@ -20,28 +20,31 @@ Array = NDArray[np.float64]
 
 
 def columns(supports: Iterable[str]) -> tuple[str, ...]:
-    """Return the columns of supports: forces and moments along the axes."""
+    """Return the columns of supports in path.csv: forces and moments along the axes."""
     return tuple(f"{name}_{kind}{axis}" for name in supports for kind in "fm" for axis in "xyz")
 
 
 def motion_columns(loads: "Loads") -> dict[str, str]:
-    """Return amplitude of a motion -> the column of its reaction."""
+    """Return amplitude of each motion of supports -> the column of its reaction."""
     names = list(dict.fromkeys(move.motion.name for move in loads.moves))
     return {name: "reaction" if len(names) == 1 else f"reaction_{name}" for name in names}
 
 
 def motion_size(loads: "Loads", name: str) -> float:
-    """Return the sum of the lengths of an amplitude's translations, over R.
+    """Return the sum over supports of the lengths of a motion's translations, over R.
 
-    Without translations, it is the sum of its angles (rad).
+    Without translations it is the sum of the angles (rad). `name` is the motion's amplitude.
     """
     motions = [move.motion for move in loads.moves if move.motion.name == name for _ in move.names]
-    shifts = float(sum(np.linalg.norm(motion.shift) for motion in motions))
-    return shifts or float(sum(np.linalg.norm(motion.turn) for motion in motions))
+    sum_of_lengths = float(sum(np.linalg.norm(motion.shift) for motion in motions))
+    return sum_of_lengths or float(sum(np.linalg.norm(motion.turn) for motion in motions))
 
 
 def only_turns(loads: "Loads", name: str) -> bool:
-    """Return whether a motion has rotations alone, so that its reaction is a moment."""
+    """Return whether a motion has rotations alone, so that its reaction is a moment.
+
+    `name` is the motion's amplitude.
+    """
     return not any(m.motion.shift.any() for m in loads.moves if m.motion.name == name)
 
 
@@ -90,7 +93,10 @@ class ReactionsObservables(Observables):
         }
 
     def observe(self, view: ModelView, state: "State") -> dict[str, float]:
-        """Return amplitudes, reactions, forces and moments, in the case's units."""
+        """Return factors and reactions of motions, and reactions of supports, by column.
+
+        All are in the case's units.
+        """
         values: dict[str, float] = {}
         for name, column in motion_columns(view.loads).items():
             values |= {
@@ -108,8 +114,9 @@ class ReactionsObservables(Observables):
         return self._unit(view, name) if name in self.amplitudes(view.loads) else None
 
     def _unit(self, view: ModelView, name: str) -> float:
-        arm = view.length if only_turns(view.loads, name) else 1.0
-        return -motion_size(view.loads, name) / (view.force * arm * view.model.multiplicity)
+        """Return -dPi/dmu of the motion `name` for a reaction of one in the case's unit."""
+        lever_arm = view.length if only_turns(view.loads, name) else 1.0
+        return -motion_size(view.loads, name) / (view.force * lever_arm * view.model.multiplicity)
 
 
 def observed_reactions(
@@ -120,14 +127,16 @@ def observed_reactions(
     force: float,
     length: float,
 ) -> dict[str, float]:
-    """Return the values of `columns` of all supports, sorted by support; collective.
+    """Return column -> value of the forces and moments of all supports; collective.
 
     Parameters
     ----------
+    mirror
+        Mirror of a half model; None if all is modelled.
     frame
         The model's frame, see `mesh.mirror.rotation`.
     force, length
-        E h R and R in the case's units.
+        The units E h R and R in the case's units.
     """
     from magshell_fenicsx.parts.supports.reactions import (
         reactions,
@@ -143,6 +152,6 @@ def observed_reactions(
 
 
 def account(context: Context, loads: "Loads") -> Account:
-    """Describe the supports that move."""
+    """Return the line of `magshell check` on supports that move; empty without."""
     moving_supports = dict.fromkeys(name for move in loads.moves for name in move.names)
     return Account([f"supports that move: {', '.join(moving_supports)}"] if moving_supports else [])

@@ -26,9 +26,9 @@ class Reaction:
     Attributes
     ----------
     force, moment
-        (3,) over E h R and E h R^2, the moment about `point`.
+        (3,) over E h R, and (3,) over E h R^2 about `point`.
     point
-        (3,) over R: the middle of the support's bounding box, where the support is now.
+        (3,) over R: the middle of the bounding box of the support's present place.
     """
 
     force: Array
@@ -38,7 +38,12 @@ class Reaction:
     def image(self, S: Array, point: Array) -> "Reaction":
         """Return the reaction of the support's mirror image.
 
-        `S` (3, 3) mirrors vectors, and `point` (3,) is the image of the point.
+        Parameters
+        ----------
+        S
+            (3, 3) reflection of vectors.
+        point
+            (3,) the image of the point.
         """
         return Reaction(S @ self.force, -S @ self.moment, point)
 
@@ -54,11 +59,11 @@ class Reaction:
 def reactions(
     model: "ModelBase", state: State, mirror: Mirror | None = None
 ) -> dict[str, Reaction]:
-    """Return the reactions of all supports in the model's frame; collective.
+    """Return the reactions of all supports by name, in the model's frame; collective.
 
-    A point has the force of its node; edges and patches that hold a node together share it equally.
-    A clamped edge also makes a couple: its energy is invariant if shell and edge turn together, so
-    the couple is minus the moment of that energy's gradient.
+    A point has the force of its node; edges and patches that hold a node together share its force
+    equally. A clamped edge also makes a couple. Its energy is invariant if shell and edge turn
+    together, so the couple is minus the moment of that energy's gradient.
 
     Parameters
     ----------
@@ -94,10 +99,23 @@ def reactions(
 
 
 def weights(model: "ModelBase", name: str, direction: Array, mirror: Mirror | None = None) -> Array:
-    """e over owned unknowns: e . R of the residual R of all nodes is the force of a support along a
-    way (3,).
+    """Return weights e of the residual R, such that e . R is a support's force along a direction.
 
-    As in `reactions`, of the whole shell.
+    The force is that on the whole shell, as in `reactions`.
+
+    Parameters
+    ----------
+    name
+        Name of the support.
+    direction
+        (3,) in the model's frame.
+    mirror
+        Mirror of a half model; None if all is modelled.
+
+    Returns
+    -------
+    Array
+        (unknowns,) on this rank; the products must be summed over ranks.
     """
     if mirror and name in mirror.removed_edges:
         name, direction = mirror.removed_edges[name], mirror.reflection @ direction
@@ -112,29 +130,32 @@ def weights(model: "ModelBase", name: str, direction: Array, mirror: Mirror | No
 
 
 def _shares(model: "ModelBase") -> dict[str, Array]:
-    """Return the share that each support has in the force at the owned unknowns.
+    """Return each support's share in the force at each of this rank's unknowns.
 
     A point has the force of its node alone, edges and patches share it equally, and a mirror plane
     has what is left.
     """
     size = model.system.size
     shares = {name: np.zeros(size) for name in model.supports}
-    without_support = np.ones(size, dtype=bool)
+    is_unassigned = np.ones(size, dtype=bool)
     for kind in PRECEDENCE:
         names = [name for name, support in model.supports.items() if support.kind == kind]
         for name in names:
             dofs = model.supports[name].dofs
             shares[name][dofs[dofs < size]] = 1.0
-            shares[name] *= without_support
-        number = sum((shares[name] for name in names), np.zeros(size))
+            shares[name] *= is_unassigned
+        number_of_holders = sum((shares[name] for name in names), np.zeros(size))
         for name in names:
-            shares[name] /= np.maximum(number, 1.0)
-        without_support &= number == 0
+            shares[name] /= np.maximum(number_of_holders, 1.0)
+        is_unassigned &= number_of_holders == 0
     return shares
 
 
 def _of_whole(half: Mapping[str, Reaction], mirror: Mirror) -> dict[str, Reaction]:
-    """Return the reactions of the whole shell from those of a half."""
+    """Return the reactions of the whole shell from those of a half.
+
+    Supports on edges that are not modelled get the images of those that are.
+    """
     reactions_of_whole, S = dict(half), mirror.reflection
     for removed_edge, modelled_edge in mirror.removed_edges.items():
         if modelled_edge in half:
@@ -148,7 +169,10 @@ def _of_whole(half: Mapping[str, Reaction], mirror: Mirror) -> dict[str, Reactio
 
 
 def _box(places: Array, mirror: Mirror | None, comm: MPI.Comm) -> Array:
-    """Return corners (2, 3) of a box around places (n, 3) of all ranks and their mirror images."""
+    """Return the corners (2, 3) of the box around places (n, 3) of all ranks; collective.
+
+    With a mirror, the box also contains the images of the places.
+    """
     if mirror:
         places = mirror.with_images(places)
     corners = np.array([places.min(axis=0, initial=np.inf), places.max(axis=0, initial=-np.inf)])

@@ -56,17 +56,18 @@ class Support:
         *,
         kind: SupportKind = "part",
     ) -> "Support":
+        """Return the support that holds the unknowns of some conditions, each unknown once."""
         dofs = [bc.dof_indices()[0] for bc in conditions]
         return cls(np.unique(np.concatenate(dofs)).astype(np.int32), edge, turn, kind)
 
 
 def motions_of(loads: Loads, name: str) -> Sequence[RigidMotion]:
-    """Return the motions of a support, in the order of the loads."""
+    """Return the rigid motions that loads prescribe to a named support, in their order."""
     return [move.motion for move in loads.moves if name in move.names]
 
 
 def rotation_of(loads: Loads, name: str, V: fem.FunctionSpace) -> fem.Constant | None:
-    """Return a constant for the rotation of a clamped edge; None if no motion turns it."""
+    """Return a constant for the rotation matrix of a clamped edge; None if nothing turns it."""
     turns = any(motion.turns for motion in motions_of(loads, name))
     return fem.Constant(V.mesh, np.eye(3)) if turns else None
 
@@ -77,7 +78,17 @@ def moving(
     loads: Loads,
     edge_pressure: EdgePressure | None = None,
 ) -> PrescribedMotion | None:
-    """Return the prescribed motion of the supports' nodes; None without motions."""
+    """Return the prescribed motion of the supports' nodes; None if no load moves a support.
+
+    Parameters
+    ----------
+    r0
+        Undeformed placement of the nodes.
+    supports
+        Name -> unknowns that the support holds.
+    edge_pressure
+        Live pressure on the closing surfaces at moving edges; None without.
+    """
     motions_of_supports = {name: motions_of(loads, name) for name in supports}
     bodies = [
         RigidBody(motions_of_supports[name], s.dofs, s.edge, s.turn)
@@ -88,9 +99,15 @@ def moving(
 
 
 def enclosed(loads: Loads, free_edges: Iterable[str], without_potential: Collection[str]) -> bool:
-    """Return whether closing surfaces on moving edges close the shell.
+    """Return whether the shell and closing surfaces on its moving edges enclose a volume.
 
-    All edges must be held, move, or lie in planes of symmetry.
+    Parameters
+    ----------
+    free_edges
+        Names of the edges that may move, at which the pressed surface ends.
+    without_potential
+        Names of those of them at which a live pressure has no potential; with any, there is no
+        volume.
     """
     return (
         bool(loads.moves)
@@ -107,20 +124,22 @@ def pressed_edges(
     unit: float,
     closing: NDArray[np.float64] | None,
 ) -> EdgePressure:
-    """Return the live pressure on the closing surfaces at moving edges; collective.
+    """Return the live pressure on the closing surfaces (lids) at moving edges; collective.
 
-    Edges that move alike have one lid, if together they are closed or end on planes of symmetry.
+    Edges that move alike share one lid, if together they are closed or end on planes of symmetry.
 
     Parameters
     ----------
+    r0
+        Undeformed placement of the nodes.
     curves
-        Of the edges that move and of those on planes of symmetry, by name.
+        Name -> curve, of the edges that move and of those on planes of symmetry.
     planes
-        The names of these.
+        Names of the edges on planes of symmetry.
     unit
-        Of the pressure.
+        The pressure of an amplitude of one, p_c over E h/R.
     closing
-        A point (3,) of all planes of symmetry; None if they have none.
+        A point (3,) of all planes of symmetry, where lids have their tip; None if they have none.
     """
     comm, x = r0.function_space.mesh.comm, r0.x.array.reshape(-1, 3)
     edges_by_motion = dict[tuple[object, ...], list[str]]()
@@ -130,17 +149,19 @@ def pressed_edges(
                 (m.name, *(part.tobytes() for part in (m.shift, m.turn, m.centre))) for m in motions
             )
             edges_by_motion.setdefault(motion_key, []).append(name)
-    on_planes = np.concatenate(
+    corners_on_planes = np.concatenate(
         [np.empty(0, np.int64), *(curves[name].corners.ravel() for name in planes)]
     )
-    on_any = np.concatenate(comm.allgather(on_planes))
+    all_corners_on_planes = np.concatenate(comm.allgather(corners_on_planes))
     lids = []
     for names in edges_by_motion.values():
-        of_lid = [curves[name] for name in names]
-        open_at = end_corners(of_lid, comm)
-        if not len(open_at) or (closing is not None and np.isin(open_at, on_any).all()):
+        curves_of_lid = [curves[name] for name in names]
+        open_corners = end_corners(curves_of_lid, comm)
+        if not len(open_corners) or (
+            closing is not None and np.isin(open_corners, all_corners_on_planes).all()
+        ):
             origin = np.zeros(3) if closing is None else closing
-            lids.append(Lid.cone(of_lid, x, motions_of(loads, names[0]), origin, comm))
+            lids.append(Lid.cone(curves_of_lid, x, motions_of(loads, names[0]), origin, comm))
     return EdgePressure(
         PRESSURE, unit, lids, [curves[name] for names in edges_by_motion.values() for name in names]
     )

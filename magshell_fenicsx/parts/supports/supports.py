@@ -47,9 +47,18 @@ def held_on(
     axes: Iterable[int],
     nodes: NDArray[np.bool_] | None = None,
 ) -> list[fem.DirichletBC]:
-    """Return conditions that components are zero on entities of dimension `dim`.
+    """Return conditions that components of the displacement are zero on entities of a mesh.
 
-    With `nodes`, they hold at these nodes of the entities alone.
+    Parameters
+    ----------
+    V
+        The vector space of the displacement.
+    dim, entities
+        Dimension of the entities, and their local numbers.
+    axes
+        The components, from 0.
+    nodes
+        (nodes,) whether each local node may be held; None if all may.
     """
     V.mesh.topology.create_connectivity(dim, V.mesh.topology.dim)
     conditions = []
@@ -67,9 +76,16 @@ def held_at_vertex(
     axes: Iterable[int],
     cells_at_vertex: NDArray[np.bool_] | None = None,
 ) -> list[fem.DirichletBC]:
-    """Return conditions that components are zero at the node at a vertex x (3,).
+    """Return conditions that components of the displacement are zero at the node at a place.
 
-    `cells_at_vertex` are the cells that may have the node, None for all.
+    Parameters
+    ----------
+    x
+        Place (3,) of the vertex, in coordinates of the mesh.
+    axes
+        The components, from 0.
+    cells_at_vertex
+        (cells,) whether each local cell may have the node; None for all cells.
     """
     nodes_at_vertex = fem.locate_dofs_geometrical(
         V, lambda y: np.linalg.norm(y.T - x, axis=1) < 1e-9
@@ -89,18 +105,26 @@ def refuse_unknown(
     conditions: Mapping[str, Condition],
     loads: Loads,
 ) -> None:
-    """Refuse conditions and loads on edges, points and patches that do not exist.
+    """Refuse supports and loads on edges, points and patches that do not exist.
+
+    Parameters
+    ----------
+    edges, points, patches
+        Names that the surface has.
+    conditions
+        Name of an edge, a point or a patch -> its support.
 
     Raises
     ------
     MeshError
-        With the name and those that there are.
+        With the missing name and those that there are.
     """
     joint_of_edge = {
         edge: i for i, joint in enumerate(loads.joints) for edge in joint.edges if edge not in edges
     }
 
     def refuse_joined(key: str, name: str) -> None:
+        """Refuse the name of an edge that a joint has removed from the surface's edges."""
         if name in joint_of_edge and name not in patches:
             edge_names, number = ", ".join(sorted(edges)) or "none", joint_of_edge[name]
             raise MeshError(
@@ -144,14 +168,23 @@ def no_mirror(name: str) -> str:
 
 
 def plane_of(r0: fem.Function, facets: NDArray[np.int32], name: str) -> Mirror:
-    """Return the plane of an edge, or of a face of a solid; collective.
+    """Return the plane of an edge of a surface, or of a face of a solid; collective.
 
-    The surface crosses the plane of an edge at right angles.
+    The surface must cross the plane of an edge at right angles.
+
+    Parameters
+    ----------
+    r0
+        Undeformed placement of the nodes, over R.
+    facets
+        Local facets of the edge or the face.
+    name
+        Name of the edge, for the message.
 
     Raises
     ------
     MeshError
-        On every rank, if there is none.
+        On every rank, if there is no such plane.
     """
     V = r0.function_space
     on_edge = V.mesh.topology.dim == 2
@@ -170,19 +203,22 @@ def plane_of(r0: fem.Function, facets: NDArray[np.int32], name: str) -> Mirror:
         candidates = [*np.eye(3), *([upright] if upright.any() else []), fitted_normal]
     for normal in candidates:
         plane = Mirror.with_normal(normal, float(normal @ centre))
-        crossing = np.abs(conormals @ plane.normal).sum() / np.linalg.norm(conormals, axis=1).sum()
+        mean_cosine = (
+            np.abs(conormals @ plane.normal).sum() / np.linalg.norm(conormals, axis=1).sum()
+        )
         if (
             np.ptp(plane.signed_distance(places)) < PLANARITY_TOLERANCE
-            and crossing > MIN_CROSSING_COSINE
+            and mean_cosine > MIN_CROSSING_COSINE
         ):
             return plane
     raise MeshError(no_mirror(name))
 
 
 def put_in_plane(r0: fem.Function, facets: NDArray[np.int32]) -> None:
-    """Move the nodes of an edge into the plane of its vertices, if they are a little beside it.
+    """Move the nodes of an edge into the plane of its vertices if they are near; collective.
 
-    The vertices of a chart are exact, the cubic edges between them are not. Collective.
+    The vertices of a chart are exact, the cubic edges between them are not. The placement `r0` is
+    changed. Nodes stay where they are if the vertices do not define a plane, or are far from it.
     """
     V, domain = r0.function_space, r0.function_space.mesh
     ends = (
@@ -197,16 +233,19 @@ def put_in_plane(r0: fem.Function, facets: NDArray[np.int32]) -> None:
     ):
         return
     dofs, x = fem.locate_dofs_topological(V, 1, facets), r0.x.array.reshape(-1, 3)
-    off = (x[dofs] - centre) @ axes[2]
-    if domain.comm.allreduce(np.abs(off).max(initial=0.0), MPI.MAX) < MAX_OFFSET_FROM_PLANE:
-        x[dofs] -= np.outer(off, axes[2])
+    distance_from_plane = (x[dofs] - centre) @ axes[2]
+    if (
+        domain.comm.allreduce(np.abs(distance_from_plane).max(initial=0.0), MPI.MAX)
+        < MAX_OFFSET_FROM_PLANE
+    ):
+        x[dofs] -= np.outer(distance_from_plane, axes[2])
     r0.x.scatter_forward()
 
 
 def closing_point(planes: Sequence[Mirror]) -> Array | None:
-    """Return a point (3,) of all planes, from which enclosed volumes are measured.
+    """Return a point (3,) that lies on all planes of symmetry, from which volumes are measured.
 
-    None if the planes have no common point.
+    The origin without planes; None if the planes have no common point.
     """
     if not planes:
         return np.zeros(3)
@@ -218,7 +257,11 @@ def closing_point(planes: Sequence[Mirror]) -> Array | None:
 
 
 def _conormals(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
-    """Return outward conormals (n, 3) in the middle of edges, as long as these; collective."""
+    """Return outward conormals (n, 3) at the middles of edges of cells; collective.
+
+    Each is as long as its edge, tangent to the surface and normal to the edge. The result has those
+    of all ranks.
+    """
     V = r0.function_space
     topology = V.mesh.topology
     for dims in ((1, 2), (2, 1)):
@@ -228,6 +271,7 @@ def _conormals(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
         cell = topology.connectivity(1, 2).links(facet)[0]
         side = int(np.flatnonzero(topology.connectivity(2, 1).links(cell) == facet)[0])
         ends = np.delete(corners, side, axis=0)
+        # tangents a (2, 3) of the surface at the middle of the side
         table = V.element.basix_element.tabulate(1, ends.mean(axis=0)[None])[1:, 0, :, 0]
         a = table @ r0.x.array.reshape(-1, 3)[V.dofmap.list[cell]]
         tangent, outward = (ends[1] - ends[0]) @ a, (ends.mean(axis=0) - corners[side]) @ a
@@ -237,9 +281,12 @@ def _conormals(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
 
 
 def free_motion(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amplitudes) -> str:
-    """Describe a rigid motion of a piece of the shell that is left free; collective.
+    """Describe a rigid motion of a piece of the shell that nothing resists; collective.
 
-    The message is empty if there is none.
+    Returns
+    -------
+    str
+        A message such as "boundary: the shell is not held: ..."; empty if all motions are resisted.
     """
     x = r0.x.array[: system.size].reshape(-1, 3)
     pieces_of_shell = _nodes_of_pieces(system, r0)
@@ -247,10 +294,10 @@ def free_motion(system: FiniteElementSystem, r0: fem.Function, amplitudes: Ampli
         motions = _unresisted_motions(system, x, amplitudes, nodes_of_piece)
         if not len(motions):
             continue
-        total = system.comm.allreduce(int(nodes_of_piece.sum()))
-        shift = system.comm.allreduce(motions[0].reshape(-1, 3).sum(axis=0)) / total
-        is_translation = np.linalg.norm(shift) > 0.5 * np.sqrt(1 / total)
-        centre = system.comm.allreduce(x[nodes_of_piece].sum(axis=0)) / total
+        node_count = system.comm.allreduce(int(nodes_of_piece.sum()))
+        shift = system.comm.allreduce(motions[0].reshape(-1, 3).sum(axis=0)) / node_count
+        is_translation = np.linalg.norm(shift) > 0.5 * np.sqrt(1 / node_count)
+        centre = system.comm.allreduce(x[nodes_of_piece].sum(axis=0)) / node_count
         direction = (
             ", ".join(f"{c + 0.0:.2g}" for c in np.round(shift / np.linalg.norm(shift), 3))
             if is_translation
@@ -266,7 +313,10 @@ def free_motion(system: FiniteElementSystem, r0: fem.Function, amplitudes: Ampli
 
 
 def rigid_motions(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amplitudes) -> int:
-    """Return the number of rigid motions that nothing resists, of all pieces; collective."""
+    """Return the number of rigid motions that nothing resists, over all pieces; collective.
+
+    The pieces of a shell are its connected components; `r0` is the undeformed placement.
+    """
     x = r0.x.array[: system.size].reshape(-1, 3)
     return sum(
         len(_unresisted_motions(system, x, amplitudes, nodes_of_piece))
@@ -275,7 +325,10 @@ def rigid_motions(system: FiniteElementSystem, r0: fem.Function, amplitudes: Amp
 
 
 def _nodes_of_pieces(system: FiniteElementSystem, r0: fem.Function) -> list[NDArray[np.bool_]]:
-    """Return which nodes of this rank belong to each piece of the shell; collective."""
+    """Return for each connected piece of the shell the mask (nodes,) of its nodes; collective.
+
+    The nodes are those that this rank owns.
+    """
     piece_of_node = component_numbers(r0.function_space)[: system.size // 3]
     return [
         piece_of_node == n
@@ -286,12 +339,19 @@ def _nodes_of_pieces(system: FiniteElementSystem, r0: fem.Function) -> list[NDAr
 def _unresisted_motions(
     system: FiniteElementSystem, x: Array, amplitudes: Amplitudes, nodes_of_piece: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the rigid motions (k, unknowns) of a piece that nothing resists; collective.
+    """Return rigid motions (k, unknowns) of a piece of the shell that nothing resists; collective.
 
     The motion of the lowest energy is the first.
+
+    Parameters
+    ----------
+    x
+        Undeformed places (nodes, 3) of this rank's nodes, over R.
+    nodes_of_piece
+        (nodes,) whether each node belongs to the piece.
     """
-    total = system.comm.allreduce(int(nodes_of_piece.sum()))
-    centre = system.comm.allreduce(x[nodes_of_piece].sum(axis=0)) / total
+    node_count = system.comm.allreduce(int(nodes_of_piece.sum()))
+    centre = system.comm.allreduce(x[nodes_of_piece].sum(axis=0)) / node_count
     motions = np.zeros((6, *x.shape))
     for i, axis in enumerate(np.eye(3)):
         motions[i, :, i] = nodes_of_piece
@@ -326,6 +386,7 @@ def unresisted(
     Array
         (n, unknowns) combinations of length one, n at most k, the one of the lowest energy first.
     """
+    # the part of each motion that supports stop; its null combinations are free
     stopped = rigid - np.array([zero_at_supports(motion) for motion in rigid])
     _, squares, combinations = np.linalg.svd(comm.allreduce(stopped @ stopped.T))
     free_motions = combinations[squares < FREE_MOTION_TOLERANCE * max(squares.max(), 1.0)] @ rigid
@@ -341,6 +402,7 @@ def unresisted(
         energies.append(comm.allreduce(free_motions @ product.array))
     # what rounding leaves of an energy is a part of this, however stiff other shells are
     bounds = comm.allreduce((free_motions * _sums_of_rows(K)) @ free_motions.T)
+    # eigenvalues of the energies over these bounds, for combinations whose bound is one
     to_unit_bounds = np.linalg.inv(np.linalg.cholesky(bounds))
     values, vectors = np.linalg.eigh(to_unit_bounds @ np.array(energies) @ to_unit_bounds.T)
     unresisted_motions = vectors.T[values < ENERGY_TOLERANCE] @ to_unit_bounds @ free_motions
@@ -350,7 +412,7 @@ def unresisted(
 
 
 def _sums_of_rows(K: PETSc.Mat) -> Array:
-    """Return the sum of magnitudes in each row of this rank."""
+    """Return the sum of the magnitudes of the entries in each of this rank's rows of a matrix."""
     starts, _, values = K.getValuesCSR()
     rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
     return np.asarray(np.bincount(rows, np.abs(values), len(starts) - 1), dtype=np.float64)
@@ -359,9 +421,23 @@ def _sums_of_rows(K: PETSc.Mat) -> Array:
 def supports(
     body: BodyMesh, r0: fem.Function, conditions: Mapping[str, Condition]
 ) -> tuple[list[Constraint], list[Mirror], dict[str, Support]]:
-    """Return constraints, planes of symmetry and named supports of a solid; collective.
+    """Return the supports of a solid; collective.
 
-    The mirror plane of a half model is not among the planes.
+    Parameters
+    ----------
+    body
+        The mesh of the solid, with its named faces, patches and points.
+    conditions
+        Name of an edge, a patch or a point -> its support.
+
+    Returns
+    -------
+    constraints
+        Conditions that hold unknowns at zero, or along directions.
+    planes
+        Planes of symmetry of faces, without the mirror plane of a half model.
+    named_supports
+        Name -> the unknowns that the support holds.
 
     Raises
     ------
@@ -404,5 +480,5 @@ def supports(
 
 
 def in_middle(body: BodyMesh, V: fem.FunctionSpace) -> NDArray[np.bool_]:
-    """Return which nodes, ghosts included, lie in the middle of the thickness."""
+    """Return the mask (nodes,) of nodes in the middle of the thickness, ghosts included."""
     return np.asarray(np.abs(body.at_nodes(V, body.heights) - MIDSURFACE_HEIGHT) < ROUNDING)

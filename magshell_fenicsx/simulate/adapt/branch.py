@@ -29,17 +29,24 @@ from magshell_fenicsx.simulate.scene import Scene
 def branched(
     first: Adapted, comm: MPI.Comm, say: Say = lambda line: None, doing: Say = lambda what: None
 ) -> Adapted | None:
-    """Find the mesh of the larger model; None if the run does not go on in another one. Collective.
+    """Find the mesh of the larger model in which a branch is followed; collective.
 
     Parameters
     ----------
     first
-        The mesh of the first model.
+        The mesh that was found for the first model.
+    say, doing
+        Called with one line of text per round, and with a description of the next activity.
+
+    Returns
+    -------
+    Adapted or None
+        None if the run does not go on in another model.
 
     Raises
     ------
     NoResult
-        If it ends there at no single load, or is lost.
+        If the branch ends at no single load, or is lost.
     """
     doing("a mesh for the tolerance on the branch: the path on a coarse one")
     start_on_branch = _coarsest_branch(first, comm)
@@ -58,45 +65,73 @@ def branched(
 
 
 def branch_error(adapted: Adapted, record: Record) -> float:
-    """The estimated relative error of the result at the end of a branch on the mesh chosen for it;
-    collective.
+    """Return the estimated relative error of the result at the end of a branch; collective.
+
+    Parameters
+    ----------
+    adapted
+        The mesh that was found for the branch.
+    record
+        Last record of the branch.
 
     Raises
     ------
     NoResult
-        If it has no single load, or is not found with one degree more.
+        If the branch ends at no single load, or its end is not found with one degree more.
     """
-    scene, low = _ended(record)
+    scene, coarse_end = _ended(record)
     choice = adapted.choice
     finer = Choice(choice.degree + 1, choice.refinement, choice.size)
-    return estimated(low.value, _on_finer_mesh(scene.problem, finer, (scene, low))[1].value)
+    return estimated(
+        coarse_end.value, _on_finer_mesh(scene.problem, finer, (scene, coarse_end))[1].value
+    )
 
 
 def _coarsest_branch(first: Adapted, comm: MPI.Comm) -> tuple[Choice, Solved] | None:
-    """The branch on the coarsest mesh where it has a result; None without a branch."""
+    """Return the coarsest mesh on which the branch has a result, with scene and end; collective.
+
+    None without a branch in another model.
+
+    Parameters
+    ----------
+    first
+        The mesh that was found for the first model.
+
+    Raises
+    ------
+    NoResult
+        If the branch has no result on any mesh.
+    """
     failure = NoResult("no mesh is fine enough")
     if first.asked.body:
         raise NoResult("of a solid nothing is carried between meshes")
     for refinement in FIRST_REFINEMENTS:
         scene, choice = first.choice.scene(first.asked, comm), Choice(PATH_DEGREE, refinement)
         scene.remesh = choice.applied
-        last: Record | None = None
+        last_record: Record | None = None
         try:
             for record in follow(scene, search=False, remark=lambda text: None):
                 if record.branch and record.scene is scene:
                     break
                 if record.scene is not scene and record.label not in LOCATED:
-                    last = record
+                    last_record = record
         except Stopped as e:
             failure = NoResult(str(e))
             continue
-        if last is None:
+        if last_record is None:
             return None
-        return choice, _ended(last)
+        return choice, _ended(last_record)
     raise failure
 
 
 def _ended(record: Record) -> tuple[Scene, Ending]:
+    """Return the scene of a branch's last record, and the end there.
+
+    Raises
+    ------
+    NoResult
+        If the branch ends at no single load, or with another conjugate held.
+    """
     if record.amplitude in ("", "time"):
         raise NoResult("a motion ends at no single load")
     assert record.scene
@@ -107,6 +142,13 @@ def _ended(record: Record) -> tuple[Scene, Ending]:
 
 
 def _on_finer_mesh(problem: Problem, choice: Choice, neighbour: Solved) -> Solved:
+    """Return scene and end on another mesh, from those on a mesh near by; collective.
+
+    Raises
+    ------
+    NoResult
+        If there is no such mesh, or no end on it.
+    """
     try:
         scene = choice.scene(problem, neighbour[0].comm)
     except (CaseError, MeshError) as e:

@@ -25,15 +25,17 @@ STEPS = 8  # sizes per factor of two; coarse steps make the mesh independent of 
 
 @dataclass(frozen=True)
 class Sampled:
-    """The geometric mean of the sizes at the nearest points, weighted by their inverse distances.
+    """Sizes of elements as a function of the place in the chart, from sizes at points.
+
+    It is the geometric mean of the sizes at the nearest points, weighted by inverse distances.
 
     Attributes
     ----------
     points, sizes
         (n, 2) of the chart and (n,).
     precision
-        With which gmsh integrates them along edges: they have steps, and its 1e-9 would take 300
-        000 calls.
+        Precision with which gmsh integrates sizes along edges: they have steps, and its 1e-9 would
+        take 300 000 calls.
     """
 
     points: Array
@@ -41,19 +43,21 @@ class Sampled:
     precision: ClassVar[float] = 1e-6
 
     def __call__(self, x: Array) -> float:
+        """Return the size at a place (2,) of the chart."""
         distance, neighbours = self._tree.query(x, NEIGHBOURS)
         weight = 1 / (distance + 1e-12)
         return float(np.exp(weight @ np.log(self.sizes[neighbours]) / weight.sum()))
 
     @cached_property
     def _tree(self) -> "scipy.spatial.cKDTree":
+        """Search tree of the points."""
         return scipy.spatial.cKDTree(self.points)
 
 
 def equidistributed(
     old: Size, centres: Array, shares: Array, order: float, reduction: float, least_ratio: float
 ) -> tuple[Sampled, float]:
-    """Sizes for which all cells have equal shares in the error, and the error falls by a factor.
+    """Return sizes for which cells have equal shares in the error, which falls by a factor.
 
     Parameters
     ----------
@@ -68,10 +72,12 @@ def equidistributed(
 
     Returns
     -------
-    Sizes, and the factor of the number of cells.
+    sizes, factor
+        The size function, and the factor of the number of cells.
     """
-    wish = (np.exp(np.log(shares).mean()) / shares) ** (1 / (order + 2))
-    change = _smoothed(centres, np.clip(wish, 1 / LARGEST_CHANGE, LARGEST_CHANGE))
+    # the factor of the size that gives each cell the mean share
+    wished_change = (np.exp(np.log(shares).mean()) / shares) ** (1 / (order + 2))
+    change = _smoothed(centres, np.clip(wished_change, 1 / LARGEST_CHANGE, LARGEST_CHANGE))
     expected_ratio = shares @ change**order / shares.sum()  # a cell becomes change^-2 cells
     change *= np.clip(
         (reduction / expected_ratio) ** (1 / order), 1 / LARGEST_CHANGE, LARGEST_CHANGE
@@ -83,7 +89,7 @@ def equidistributed(
 
 
 def _smoothed(centres: Array, wish: Array) -> Array:
-    """Geometric mean of a cell and its neighbours."""
+    """Return the geometric means (n,) of `wish` over each cell and its neighbours."""
     neighbours = scipy.spatial.cKDTree(centres).query(centres, NEIGHBOURS + 2)[1]
     return np.asarray(np.exp(np.log(wish)[neighbours].mean(axis=1)))
 
@@ -92,8 +98,13 @@ def _smoothed(centres: Array, wish: Array) -> Array:
 class Choice:
     """A degree and a mesh; without `size` the elements have the default sizes over `refinement`.
 
-    With `size`, `refinement` only records the mean refinement relative to the default. `layers` are
-    those of a solid.
+    Attributes
+    ----------
+    size
+        Size function of the mesh; with it `refinement` only records the mean refinement relative to
+        the default.
+    layers
+        Number of layers of a solid; None of a shell.
     """
 
     degree: int
@@ -102,7 +113,7 @@ class Choice:
     layers: int | None = None
 
     def applied(self, requested: Problem) -> Problem:
-        """The problem on this mesh."""
+        """Return the problem with this degree and mesh."""
         mesh = {"mesh.degree": self.degree, "mesh.refinement": self.refinement}
         problem = requested.with_values(
             mesh | ({"solid.layers": self.layers} if self.layers else {})
@@ -110,12 +121,25 @@ class Choice:
         return replace(problem, size=self.size) if self.size else problem
 
     def scene(self, requested: Problem, comm: MPI.Comm) -> Scene:
+        """Return the scene of the problem with this degree and mesh; collective."""
         return Scene(self.applied(requested), comm)
 
 
 @dataclass(frozen=True)
 class AdaptiveRound:
-    """A mesh that was tried; `estimate` is the estimated relative error of the result."""
+    """A mesh that was tried, with its result.
+
+    Attributes
+    ----------
+    cells, dofs
+        Numbers of cells and unknowns.
+    result
+        Result of the run on this mesh (`Ending.value`).
+    estimate
+        Estimated relative error of the result.
+    layers
+        Number of layers of a solid; None of a shell.
+    """
 
     degree: int
     refinement: float
@@ -128,7 +152,7 @@ class AdaptiveRound:
 
 @dataclass(frozen=True)
 class Adapted:
-    """The result of all rounds.
+    """The mesh that was found for a tolerance, with all rounds.
 
     Attributes
     ----------
@@ -140,8 +164,8 @@ class Adapted:
     rounds
         All rounds in order.
     branch
-        The same of the larger model in which the run goes on; None if it does not, or no mesh is
-        found for it.
+        The mesh that was found for the larger model in which the run goes on; None if the run does
+        not, or no mesh is found.
     """
 
     asked: Problem
@@ -151,10 +175,10 @@ class Adapted:
     branch: "Adapted | None" = None
 
     def account(self, result: float | None, on_branch: float | None = None) -> dict[str, Any]:
-        """The entry of summary.json; without an estimate if the run ended at another result than
-        the rounds.
+        """Return the entry of summary.json on the tolerance.
 
-        The chosen mesh may be a cheaper one than that of the best estimate, which is there too.
+        It is without an estimate if the run ended at another result than the rounds. The chosen
+        mesh may be a cheaper one than that of the best estimate, which is there too.
 
         Parameters
         ----------
@@ -172,38 +196,44 @@ class Adapted:
             "best": {"result": best_round.result, "error_estimate": best_round.estimate}
             if is_same
             else None,
-            "rounds": [asdict(r) for r in self.rounds],
+            "rounds": [asdict(each_round) for each_round in self.rounds],
             **({"branch": self.branch.of_branch(on_branch)} if self.branch else {}),
         }
 
     def of_branch(self, estimate: float | None) -> dict[str, Any]:
-        """The part of the entry that is of the larger model."""
-        return {"error_estimate": estimate, "rounds": [asdict(r) for r in self.rounds]}
+        """Return the entry on the mesh of the larger model, with the estimated error at its end."""
+        return {
+            "error_estimate": estimate,
+            "rounds": [asdict(each_round) for each_round in self.rounds],
+        }
 
     def to_json(self) -> bytes:
-        """All except the problem, in full precision, so that a resumed run has the same mesh on any
-        number of ranks.
+        """Return all except the problem as JSON, in full precision.
+
+        So a resumed run has the same mesh on any number of ranks.
         """
         return json.dumps(self._as_data()).encode()
 
     def _as_data(self) -> dict[str, Any]:
+        """Return all except the problem as plain data, see `to_json`."""
         size = self.choice.size
         sizes = size and {"points": size.points.tolist(), "sizes": size.sizes.tolist()}
         content = {
             "best": self.rounds.index(self.best),
-            "rounds": [asdict(r) for r in self.rounds],
+            "rounds": [asdict(each_round) for each_round in self.rounds],
             "size": sizes,
         }
         return content | ({"branch": self.branch._as_data()} if self.branch else {})
 
     @classmethod
     def from_json(cls, requested: Problem, content: bytes) -> "Adapted":
-        """Read the content of `to_json` for the same problem."""
+        """Return the mesh from the content of `to_json`, for the same problem."""
         return cls._from_data(requested, json.loads(content))
 
     @classmethod
     def _from_data(cls, requested: Problem, values: dict[str, Any]) -> "Adapted":
-        rounds = [AdaptiveRound(**r) for r in values["rounds"]]
+        """Return the mesh from the data of `_as_data`, for the same problem."""
+        rounds = [AdaptiveRound(**round_data) for round_data in values["rounds"]]
         best, size = rounds[values["best"]], values["size"]
         sampled = Sampled(*(np.array(size[key]) for key in ("points", "sizes"))) if size else None
         branch = cls._from_data(requested, values["branch"]) if values.get("branch") else None

@@ -41,41 +41,55 @@ class NotCarried(RuntimeError):
 
 
 def carry(source: Scene, target: Scene, u: Vector) -> Vector:
-    """A displacement of `source` in the unknowns of `target`, zero at its supports; collective.
+    """Return a displacement of scene `source` in the unknowns of scene `target`; collective.
+
+    It is zero at the supports of `target`.
+
+    Parameters
+    ----------
+    u
+        Unknowns of `source` on this rank.
 
     Raises
     ------
     NotCarried
         On every rank, if a node of `target` is more than a tenth of a cell outside all cells of its
-        shell in `source`, or one of several shells has no chart.
+        shell in `source`, or if one of several shells has no chart.
     """
-    fields, comm, x, values = (
+    fields, comm, nodes_in_chart, values = (
         CellFields.of_scene(source),
         target.comm,
         _chart(target),
         values_of_all_cells(source, u),
     )
-    if x.shape[1] > target.model.V.mesh.topology.dim:
+    if nodes_in_chart.shape[1] > target.model.V.mesh.topology.dim:
         raise NotCarried("a mesh file has no chart")
-    transferred, worst = np.zeros((len(x), values.shape[2])), (0.0, list[float]())
+    transferred, farthest = np.zeros((len(nodes_in_chart), values.shape[2])), (0.0, list[float]())
     owned_cells = source.model.V.mesh.topology.index_map(
         source.model.V.mesh.topology.dim
     ).size_local
+    # each of several shells has its own chart
     for cells_here, nodes_of_shell in zip(
         cells_of_shells(source), nodes_of_shells(target), strict=True
     ):
         is_source_cell = np.concatenate(
             source.model.system.comm.allgather(cells_here[:owned_cells])
         )
-        cells, xi, distances = fields.subset(is_source_cell).places(x[nodes_of_shell])
+        cells, reference_points, distances = fields.subset(is_source_cell).places(
+            nodes_in_chart[nodes_of_shell]
+        )
         transferred[nodes_of_shell] = fields.evaluate(
-            values, np.flatnonzero(is_source_cell)[cells], xi
+            values, np.flatnonzero(is_source_cell)[cells], reference_points
         )
         if nodes_of_shell.any():
-            worst = max(
-                worst, (float(distances.max()), x[nodes_of_shell][np.argmax(distances)].tolist())
+            farthest = max(
+                farthest,
+                (
+                    float(distances.max()),
+                    nodes_in_chart[nodes_of_shell][np.argmax(distances)].tolist(),
+                ),
             )
-    largest_distance, place = max(comm.allgather(worst))
+    largest_distance, place = max(comm.allgather(farthest))
     if largest_distance > MAX_DISTANCE_IN_CELLS:
         raise NotCarried(
             f"the place {place} of the chart is {largest_distance:.2g} cells beside the other mesh"
@@ -84,13 +98,19 @@ def carry(source: Scene, target: Scene, u: Vector) -> Vector:
 
 
 def _chart(scene: Scene) -> Array:
-    """Coordinates (n, 1 or 2) of this rank's nodes in the chart, of several shells in their own."""
+    """Return coordinates (n, 1 or 2) of this rank's nodes in the chart of each shell."""
     return np.asarray(getattr(scene.model, "chart_by_shell", scene.model.chart)())
 
 
 def values_of_all_cells(scene: Scene, u: Vector) -> Array:
-    """Values (cells, nodes, components) of a displacement on the cells of all ranks, on every rank;
-    collective.
+    """Return values (cells, nodes, components) of a displacement on the cells of all ranks.
+
+    The result is the same on every rank. Collective.
+
+    Parameters
+    ----------
+    u
+        Unknowns of this rank.
     """
     system, V = scene.model.system, scene.model.V
     topology = V.mesh.topology
@@ -101,12 +121,14 @@ def values_of_all_cells(scene: Scene, u: Vector) -> Array:
 
 
 class CellFields:
-    """Cells in a chart, in which points can be located.
+    """Cells in a chart, in which points can be located and fields be evaluated.
 
     Parameters
     ----------
     nodes
-        (cells, nodes, 1 or 2) nodes of the map from the reference cell to the chart.
+        (cells, nodes, 1 or 2), nodes of the map from the reference cell to the chart.
+    element
+        Lagrange element of this map.
     """
 
     def __init__(self, nodes: Array, element: basix.finite_element.FiniteElement) -> None:
@@ -115,7 +137,7 @@ class CellFields:
 
     @classmethod
     def of_scene(cls, scene: Scene) -> "CellFields":
-        """The cells of all ranks; collective."""
+        """Return the cells of all ranks; collective."""
         model, V = scene.model, scene.model.V
         if model.midsurface:  # cells beside a seam keep their own chart
             own_nodes = model.midsurface.chart_coordinates_by_shell(V)[
@@ -123,61 +145,98 @@ class CellFields:
             ]
             nodes = np.concatenate(scene.comm.allgather(own_nodes))
         else:
-            x = chart(scene)
+            chart_places = chart(scene)
             nodes = values_of_all_cells(
-                scene, np.pad(x, ((0, 0), (0, V.dofmap.bs - x.shape[1]))).ravel()
-            )[..., : x.shape[1]]
+                scene,
+                np.pad(chart_places, ((0, 0), (0, V.dofmap.bs - chart_places.shape[1]))).ravel(),
+            )[..., : chart_places.shape[1]]
         return cls(nodes, scene.model.V.element.basix_element)
 
     def subset(self, cells: NDArray[np.bool_]) -> "CellFields":
-        """Some of the cells alone."""
+        """Return some of the cells alone.
+
+        Parameters
+        ----------
+        cells
+            (cells,), whether a cell is taken.
+        """
         return self if cells.all() else CellFields(self.nodes[cells], self._element)
 
     @property
     def centres(self) -> Array:
-        """(cells, 1 or 2)."""
+        """Centres (cells, 1 or 2) of the cells, means of their corners."""
         return np.asarray(self._corners.mean(axis=1))
 
     def evaluate(self, values: Array, cells: NDArray[np.int64], xi: Array) -> Array:
-        """Values (n, components) of a field of `values_of_all_cells` at positions found by
-        `places`.
+        """Return values (n, components) of a field at positions in reference cells.
+
+        Parameters
+        ----------
+        values
+            (cells, nodes, components), see `values_of_all_cells`.
+        cells, xi
+            Cell (n,) and position in its reference cell (n, 1 or 2) of each point, see `places`.
         """
         return np.asarray(np.einsum("np,npc->nc", self.table(0, xi)[0], values[cells]))
 
     def places(self, x: Array) -> tuple[NDArray[np.int64], Array, Array]:
-        """Locate points x (n, 1 or 2) of the chart.
+        """Locate points of the chart in the cells.
+
+        Parameters
+        ----------
+        x
+            Points (n, 1 or 2) of the chart.
 
         Returns
         -------
-        The cells (n,), the nearest for a point outside all cells; the positions (n, 1 or 2) in the
-        reference cell; and the distances (n,) from the cells, in cells, zero inside.
+        cells
+            (n,), the cell of each point; the nearest cell for a point outside all cells.
+        xi
+            (n, 1 or 2), the positions in the reference cell.
+        distances
+            (n,), the distances from the cells, in cells; zero inside.
         """
-        count = min(CANDIDATES, len(self.nodes))
-        candidates = self._near.query(x, count)[1].reshape(len(x), count)
-        straight = np.stack(
+        candidate_count = min(CANDIDATES, len(self.nodes))
+        candidates = self._near.query(x, candidate_count)[1].reshape(len(x), candidate_count)
+        distances_if_straight = np.stack(
             [_distance_to_cell(self._as_if_straight(x, cells)) for cells in candidates.T]
         )
-        cells = candidates[np.arange(len(x)), straight.argmin(axis=0)]
+        # first guess: the candidate that is nearest with straight edges
+        cells = candidates[np.arange(len(x)), distances_if_straight.argmin(axis=0)]
         xi, distances = self._in_cells(x, cells)
-        enough = INSIDE_TOLERANCE
+        accepted_distance = INSIDE_TOLERANCE
         # a large cell may have a distant centre
-        while len(far_points := np.flatnonzero(distances > enough)):
-            candidates = self._near.query(x[far_points], count)[1].reshape(len(far_points), count)
-            for tried in candidates.T:
-                xi_tried, off = self._in_cells(x[far_points], tried)
-                better = far_points[off < distances[far_points]]
-                cells[better], xi[better], distances[better] = (
-                    a[off < distances[far_points]] for a in (tried, xi_tried, off)
+        while len(far_points := np.flatnonzero(distances > accepted_distance)):
+            candidates = self._near.query(x[far_points], candidate_count)[1].reshape(
+                len(far_points), candidate_count
+            )
+            for cells_tried in candidates.T:
+                xi_tried, distances_tried = self._in_cells(x[far_points], cells_tried)
+                improved_points = far_points[distances_tried < distances[far_points]]
+                cells[improved_points], xi[improved_points], distances[improved_points] = (
+                    array[distances_tried < distances[far_points]]
+                    for array in (cells_tried, xi_tried, distances_tried)
                 )
-            if count == len(self.nodes):
+            if candidate_count == len(self.nodes):
                 break
-            enough = INSIDE_TOLERANCE if count <= CANDIDATES else MAX_DISTANCE_IN_CELLS
-            count = min(WIDER * count, len(self.nodes))
+            accepted_distance = (
+                INSIDE_TOLERANCE if candidate_count <= CANDIDATES else MAX_DISTANCE_IN_CELLS
+            )
+            candidate_count = min(WIDER * candidate_count, len(self.nodes))
         return cells, xi, np.where(distances > INSIDE_TOLERANCE, distances, 0.0)
 
     def _in_cells(self, x: Array, cells: NDArray[np.int64]) -> tuple[Array, Array]:
-        """Positions of points in the reference cells of given cells, and distances; inf if Newton's
-        method fails.
+        """Return positions of points in the reference cells of given cells, and distances.
+
+        Newton's method inverts the map of a cell with curved edges. A distance is inf if the method
+        fails, or if the point is far from the cell. Distances are in cells.
+
+        Parameters
+        ----------
+        x
+            Points (n, 1 or 2) of the chart.
+        cells
+            (n,), the cell of each point.
         """
         xi = self._as_if_straight(x, cells)
         distances = np.full(len(x), np.inf)
@@ -187,8 +246,8 @@ class CellFields:
         x, nodes, reference_points = x[near_cells], self.nodes[cells[near_cells]], xi[near_cells]
         for _ in range(NEWTON_STEPS):
             table = self.table(1, reference_points)
-            rest = x - np.einsum("np,npd->nd", table[0], nodes)
-            step = _solve(np.einsum("jnp,npd->ndj", table[1:], nodes), rest)
+            residuals = x - np.einsum("np,npd->nd", table[0], nodes)
+            step = _solve(np.einsum("jnp,npd->ndj", table[1:], nodes), residuals)
             reference_points = reference_points + step
         xi[near_cells], distances[near_cells] = (
             reference_points,
@@ -201,25 +260,33 @@ class CellFields:
         return xi, distances
 
     def table(self, derivatives: int, xi: Array) -> Array:
-        """Shape functions and derivatives (derivative, n, nodes) at points of a reference cell."""
+        """Return shape functions (derivative, n, nodes) at points of the reference cell.
+
+        Parameters
+        ----------
+        derivatives
+            Highest order of the derivatives.
+        """
         return np.asarray(self._element.tabulate(derivatives, xi)[..., 0])
 
     @property
     def _corners(self) -> Array:
+        """Corners (cells, 2 or 3, 1 or 2) of the cells, which are their first nodes."""
         return self.nodes[:, : self.nodes.shape[2] + 1]
 
     def _as_if_straight(self, x: Array, cells: NDArray[np.int64]) -> Array:
-        """Positions in the reference cells, as if the cells had straight edges."""
+        """Return positions of points in the reference cells, as if the cells had straight edges."""
         corners = self._corners[cells]
         return _solve(np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2), x - corners[:, 0])
 
 
 def _distance_to_cell(xi: Array) -> Array:
-    """Distance of positions (n, 1 or 2) from the reference cell; negative inside."""
+    """Return the distance of positions (n, 1 or 2) from the reference cell; negative inside."""
     return np.asarray(np.maximum(-xi.min(axis=1), xi.sum(axis=1) - 1))
 
 
 def _solve(matrices: Array, right: Array) -> Array:
+    """Return solutions (n, k) of linear systems with matrices (n, k, k) and right sides (n, k)."""
     return np.asarray(np.linalg.solve(matrices, right[..., None])[..., 0])
 
 
@@ -229,19 +296,21 @@ class NoResult(RuntimeError):
 
 @dataclass(frozen=True)
 class Ending:
-    """The end of a run.
+    """The end of a run: its scalar result, with the state and the tangent there.
 
     Attributes
     ----------
     kind
-        A fold or a target can be computed directly; a target with another conjugate held ("held")
-        and another instability need the path.
+        "fold" and "target" can be computed directly on another mesh. "held", a target with another
+        conjugate held, and "instability", any other instability, need the path.
     name
         The amplitude that varied.
     value
         The result of the run: the amplitude at an instability. At a target, the amplitude if the
         conjugate displacement is prescribed (force at a depth, pressure at a volume), else the
         conjugate displacement.
+    state
+        State at the end.
     tangent
         Tangent of the path in u; at a fold the null vector. It is the weight of an error of u in
         the value.
@@ -259,10 +328,22 @@ class Ending:
 
 @dataclass
 class History:
-    """The records of a run that its end depends on.
+    """The records of a run on which its end depends; records of branches do not count.
 
-    `begins` are the last ones before each step, `begin` that before the last one,
-    `last` the last one that is no instability, `end` the last one of all, `first` the first one.
+    Attributes
+    ----------
+    last
+        Last record that is no instability.
+    end
+        Last record of all.
+    begin
+        Last record before the last step.
+    located
+        Folds and bifurcations.
+    begins
+        Number of a step -> last record before it.
+    first
+        First record.
     """
 
     last: Record | None = None
@@ -273,6 +354,7 @@ class History:
     first: Record | None = None
 
     def add(self, record: Record) -> None:
+        """Take the next record of the run."""
         if record.branch:
             return
         self.first, self.end = self.first or record, record
@@ -286,10 +368,18 @@ class History:
             self.last = record
 
     def ending(self, scene: Scene, stopped: str | None) -> Ending:
-        """The first instability; the last one with `until: bifurcation`; the last target with a
-        target.
+        """Return the end of the run.
 
-        Of a run that goes on in another model, or along a branch, the bifurcation where it begins.
+        It is the first instability, with `until: bifurcation` the last one, and with a target the
+        last target. Of a run that goes on in another model, or along a branch, it is the
+        bifurcation where this begins.
+
+        Parameters
+        ----------
+        scene
+            The first scene of the run.
+        stopped
+            Reason why the run stopped before its target; None if it did not.
 
         Raises
         ------
@@ -316,28 +406,43 @@ class History:
                 else ""
             )
             raise NoResult(stopped or no_instability or "the case has neither a load nor a field")
-        in_last = [record for record in self.located if record.step == self.located[-1].step]
+        located_in_last_step = [
+            record for record in self.located if record.step == self.located[-1].step
+        ]
         departures = [
-            record for record in self._departures(scene) if record.step == in_last[0].step
+            record
+            for record in self._departures(scene)
+            if record.step == located_in_last_step[0].step
         ]
         return _instability(
-            departures[0] if departures else in_last[-1 if until == "bifurcation" else 0]
+            departures[0]
+            if departures
+            else located_in_last_step[-1 if until == "bifurcation" else 0]
         )
 
     @property
     def handed_over(self) -> bool:
-        """Whether the last record is of another model than the first one."""
+        """Whether the run has gone on in another model than the first one."""
         return bool(self.first and self.end) and self.end.scene is not self.first.scene  # type: ignore[union-attr]
 
     def _departures(self, scene: Scene) -> list[Record]:
-        """The bifurcations of steps that leave the path there."""
+        """Return the bifurcations at which a step leaves its path for a branch or a snap."""
         steps = scene.problem.programme
         return [
-            r for r in self.located if r.label == "bifurcation" and leaves_path(steps[r.step - 1])
+            record
+            for record in self.located
+            if record.label == "bifurcation" and leaves_path(steps[record.step - 1])
         ]
 
 
 def _instability(end: Record) -> Ending:
+    """Return the end of a run at the record of an instability.
+
+    Raises
+    ------
+    NoResult
+        If its step has no single load.
+    """
     if end.amplitude not in end.point.state.mu:
         raise NoResult("an instability of a turning field is not a single load")
     own_fold = end.label == "fold" and not end.mode
@@ -348,7 +453,7 @@ def _instability(end: Record) -> Ending:
 
 
 def by_path(scene: Scene) -> Ending:
-    """The end of a scene by computing its whole history.
+    """Return the end of a scene, by computing its whole history; collective.
 
     Raises
     ------
@@ -367,8 +472,14 @@ def by_path(scene: Scene) -> Ending:
 
 
 def from_near(scene: Scene, source: Scene, neighbour: Ending) -> Ending:
-    """The end of a scene by Newton's method from the end on another mesh; if this fails, by the
-    path.
+    """Return the end of a scene, by Newton's method from the end on another mesh, else by the path.
+
+    Collective.
+
+    Parameters
+    ----------
+    source, neighbour
+        Scene on the other mesh, and its end.
 
     Raises
     ------
@@ -379,13 +490,24 @@ def from_near(scene: Scene, source: Scene, neighbour: Ending) -> Ending:
 
 
 def near_by(scene: Scene, source: Scene, neighbour: Ending) -> Ending | None:
-    """The end of a scene by Newton's method from the end on another mesh; None if it fails, or
-    needs a path.
+    """Return the end of a scene, by Newton's method from the end on another mesh; collective.
+
+    Parameters
+    ----------
+    source, neighbour
+        Scene on the other mesh, and its end.
+
+    Returns
+    -------
+    Ending or None
+        None if Newton's method fails, or if this kind of end needs a path.
     """
     if neighbour.kind in ("held", "instability"):
         return None
     try:
-        u, tangent = (carry(source, scene, v) for v in (neighbour.state.u, neighbour.tangent))
+        u, tangent = (
+            carry(source, scene, vector) for vector in (neighbour.state.u, neighbour.tangent)
+        )
     except NotCarried:
         return None
     guess = with_cuts_here(scene, State(u, dict(neighbour.state.mu)))
@@ -396,13 +518,18 @@ def near_by(scene: Scene, source: Scene, neighbour: Ending) -> Ending | None:
             if is_fold
             else _equilibrium(scene, guess, neighbour)
         )
-        if end is None or (own_result := with_own_contact(scene, end.state)) is None:
+        # cuts and penalties of shells that touch change until they are fit
+        if end is None or (state_with_own_contact := with_own_contact(scene, end.state)) is None:
             return end
-        guess, tangent = own_result, end.tangent
+        guess, tangent = state_with_own_contact, end.tangent
     return None
 
 
 def _fold(scene: Scene, guess: FoldGuess, name: str) -> Ending | None:
+    """Return the end at the fold near a guess; None if there is none, or it is not the first.
+
+    With other unstable directions a fold is not the first instability.
+    """
     try:
         fold = find_fold(scene.newton, guess, name)
     except FoldLost:
@@ -411,6 +538,10 @@ def _fold(scene: Scene, guess: FoldGuess, name: str) -> Ending | None:
 
 
 def _equilibrium(scene: Scene, guess: State, neighbour: Ending) -> Ending | None:
+    """Return the end at an equilibrium near a guess; None if Newton's method fails.
+
+    It is at the same load, or the same conjugate displacement, as the end on another mesh.
+    """
     newton, system, name, held_value = (
         scene.newton,
         scene.newton.system,
@@ -433,7 +564,7 @@ def _equilibrium(scene: Scene, guess: State, neighbour: Ending) -> Ending | None
 
 
 def at_target(scene: Scene, record: Record) -> Ending:
-    """The end of a run at a target of the record's step, or of a branch after so many points."""
+    """Return the end of a run at a target of the record's step, or at the end of a branch."""
     system, state, step = (
         scene.newton.system,
         record.point.state,
@@ -448,7 +579,7 @@ def at_target(scene: Scene, record: Record) -> Ending:
         else None
     )
     kind: Literal["target", "held"] = (
-        "held" if any(how != "load" for how in step.hold.values()) else "target"
+        "held" if any(law != "load" for law in step.hold.values()) else "target"
     )
     return Ending(
         kind, name, _value(system, state, name, held_value), state, record.point.du, held_value
@@ -456,4 +587,5 @@ def at_target(scene: Scene, record: Record) -> Ending:
 
 
 def _value(system: System, state: State, name: str, held_value: float | None) -> float:
+    """Return the result at a target: the amplitude at a held conjugate, else the conjugate."""
     return state.mu[name] if held_value is not None else -system.potential(state.u, state.mu, name)

@@ -68,7 +68,7 @@ Solved = tuple[Scene, Ending]
 def indicators(
     coarse_solution: tuple[Scene, Ending], fine_solution: tuple[Scene, Ending]
 ) -> tuple[Array, Array]:
-    """Share of each cell in the error of the result, up to a common factor; collective.
+    """Return the share of each cell in the error of the result, up to a common factor; collective.
 
     The result J of a run is an amplitude on a path of stationary points, or its conjugate
     displacement. Its first variation with the residual is therefore the path's tangent z: J - J_h =
@@ -84,36 +84,61 @@ def indicators(
 
     Returns
     -------
-    Centres of the cells (n, 2) in the chart, in an order independent of the number of ranks, and
-    shares (n,).
+    centres
+        (n, 2), centres of the cells in the chart, in an order independent of the number of ranks.
+    shares
+        (n,), the share of each cell.
     """
-    (scene, low), (richer, high) = coarse_solution, fine_solution
-    cells, comm = CellFields.of_scene(richer), richer.newton.system.comm
-    u, z = (carry(scene, richer, v) for v in (low.state.u, low.tangent))
-    scale = dot(comm, z, high.tangent) / dot(comm, z, z)  # null vectors have no scale
-    energy = _TangentEnergy(richer, cells, high.state.u)
-    shares = np.sqrt(energy(high.state.u - u) * energy(high.tangent - scale * z))
+    (scene, coarse_end), (fine_scene, fine_end) = coarse_solution, fine_solution
+    cells, comm = CellFields.of_scene(fine_scene), fine_scene.newton.system.comm
+    u, z = (carry(scene, fine_scene, vector) for vector in (coarse_end.state.u, coarse_end.tangent))
+    scale = dot(comm, z, fine_end.tangent) / dot(comm, z, z)  # null vectors have no scale
+    energy_of_cells = _TangentEnergy(fine_scene, cells, fine_end.state.u)
+    shares = np.sqrt(
+        energy_of_cells(fine_end.state.u - u) * energy_of_cells(fine_end.tangent - scale * z)
+    )
     order = np.lexsort(cells.centres.round(9).T)
     return cells.centres[order], shares[order]
 
 
 class _TangentEnergy:
-    """Membrane and bending energy of the linearised strains of a variation, cell by cell: half the
-    second derivative.
+    """Energy of the linearised strains of a variation, cell by cell: half the second derivative.
 
     With the deformed a_i, n and a_i,j: dE_ij = sym(a_i . v,_j), dK_ij = n . (v,_ij - G^k_ij v,_k).
+    It has membrane and bending energy.
+
+    Parameters
+    ----------
+    scene
+        Scene of a surface.
+    cells
+        Its cells on all ranks.
+    u
+        Displacement about which strains are linearised, unknowns of this rank.
     """
 
     def __init__(self, scene: Scene, cells: CellFields, u: Vector) -> None:
+        """Compute what does not depend on a variation: bases, metrics and stresses; collective."""
         model, self._scene = scene.model, scene
+        # indices of arrays: n cells, q points, p nodes; i, j, k of the reference cell, c of space
         points, self._weights = basix.make_quadrature(basix.CellType.triangle, 2 * model.degree)
         self._table = cells.table(2, points)
         r0 = self._derivatives(model.r0.x.array[: model.system.size])
-        first, second = (a + b for a, b in zip(r0, self._derivatives(u), strict=True))
-        metric0, metric = (np.einsum("...ic,...jc->...ij", a, a) for a in (r0[0], first))
-        normal = np.cross(first[..., 0, :], first[..., 1, :])
+        first_derivatives, second_derivatives = (
+            undeformed_part + displacement_part
+            for undeformed_part, displacement_part in zip(r0, self._derivatives(u), strict=True)
+        )
+        metric0, metric = (
+            np.einsum("...ic,...jc->...ij", undeformed_part, undeformed_part)
+            for undeformed_part in (r0[0], first_derivatives)
+        )
+        normal = np.cross(first_derivatives[..., 0, :], first_derivatives[..., 1, :])
         self._normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
-        self._a, self._raise, self._strain = first, np.linalg.inv(metric0), (metric - metric0) / 2
+        self._a, self._raise, self._strain = (
+            first_derivatives,
+            np.linalg.inv(metric0),
+            (metric - metric0) / 2,
+        )
         places = np.einsum(
             "qp,npc->nqc",
             self._table[0],
@@ -121,42 +146,74 @@ class _TangentEnergy:
         )
         a1, a2 = r0[0][..., 0, :], r0[0][..., 1, :]
         material_directions = None
-        if (made_of := getattr(model, "cell_materials", None)) is not None:
-            rows = made_of.x.array.reshape(-1, 4)[
-                : made_of.function_space.dofmap.index_map.size_local
+        if (material_field := getattr(model, "cell_materials", None)) is not None:
+            directions_here = material_field.x.array.reshape(-1, 4)[
+                : material_field.function_space.dofmap.index_map.size_local
             ]
-            material_directions = np.concatenate(scene.comm.allgather(rows))
+            material_directions = np.concatenate(scene.comm.allgather(directions_here))
         self._law = scene.problem.material.law_in(material_directions).at_point(
             places, a1, a2, np.cross(a1, a2)
         )
-        self._gamma = np.einsum("...ijc,...kc->...ijk", second, np.linalg.solve(metric, first))
+        self._gamma = np.einsum(
+            "...ijc,...kc->...ijk", second_derivatives, np.linalg.solve(metric, first_derivatives)
+        )
         self._area = np.sqrt(np.linalg.det(metric0))
 
     def __call__(self, v: Vector) -> Array:
-        """(cells,), over E h R^2."""
+        """Return the energy (cells,) of a variation, over E h R^2; collective.
+
+        Parameters
+        ----------
+        v
+            The variation, unknowns of this rank.
+        """
         law = self._law
-        first, second = self._derivatives(v)
-        E = np.einsum("...ic,...jc->...ij", self._a, first)
-        covariant_derivative = second - np.einsum("...ijk,...kc->...ijc", self._gamma, first)
+        first_derivatives, second_derivatives = self._derivatives(v)
+        E = np.einsum("...ic,...jc->...ij", self._a, first_derivatives)
+        covariant_derivative = second_derivatives - np.einsum(
+            "...ijk,...kc->...ijc", self._gamma, first_derivatives
+        )
         K = np.einsum("...c,...ijc->...ij", self._normal, covariant_derivative)
         E, K = ((S + np.swapaxes(S, -1, -2)) / 2 for S in (E, K))
-        slope = work(law.stress(self._strain + 1j * STEP * E, self._raise), E).imag / STEP
+        # the derivative of the stress along E, by a complex step
+        membrane_second_derivative = (
+            work(law.stress(self._strain + 1j * STEP * E, self._raise), E).imag / STEP
+        )
         # without what is linear, of plies
-        bent = (law.bending(self._strain, S, self._raise) for S in (K, -K))
-        density = slope / 2 + sum(bent) / 2
+        bending_energies = (law.bending(self._strain, S, self._raise) for S in (K, -K))
+        density = membrane_second_derivative / 2 + sum(bending_energies) / 2
         return np.asarray((density * self._area) @ self._weights)
 
     def _derivatives(self, v: Vector) -> tuple[Array, Array]:
-        """First (cells, points, i, 3) and second (cells, points, i, j, 3) in the reference cell."""
-        d = np.einsum("jqp,npc->jnqc", self._table, values_of_all_cells(self._scene, v))
+        """Return first and second derivatives of a vector field in the reference cells; collective.
+
+        Their shapes are (cells, points, i, 3) and (cells, points, i, j, 3).
+        """
+        by_order = np.einsum("jqp,npc->jnqc", self._table, values_of_all_cells(self._scene, v))
+        # basix orders derivatives as 0, x, y, xx, xy, yy
         second = np.stack(
-            [np.stack([d[3], d[4]], axis=-2), np.stack([d[4], d[5]], axis=-2)], axis=-3
+            [
+                np.stack([by_order[3], by_order[4]], axis=-2),
+                np.stack([by_order[4], by_order[5]], axis=-2),
+            ],
+            axis=-3,
         )
-        return np.stack([d[1], d[2]], axis=-2), second
+        return np.stack([by_order[1], by_order[2]], axis=-2), second
 
 
 def adapted_solid(problem: Problem, comm: MPI.Comm, say: Say, doing: Say) -> Adapted:
-    """Find the mesh of a solid; see `adapted`."""
+    """Find refinement and layers of a solid for its tolerance; collective.
+
+    Parameters
+    ----------
+    say, doing
+        See `adapted`.
+
+    Raises
+    ------
+    NoResult
+        If no mesh has a result, or the first mesh is too large.
+    """
     tolerance, tried = problem.mesh.tolerance, list[tuple[AdaptiveRound, Choice]]()
     assert tolerance is not None
     refinement, layers = (
@@ -166,7 +223,7 @@ def adapted_solid(problem: Problem, comm: MPI.Comm, say: Say, doing: Say) -> Ada
     while len(tried) < MOST_ROUNDS:
         doing(f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}")
         try:
-            judged, plane, thickness_error = _round(problem, comm, refinement, layers)
+            round_result, size_error, thickness_error = _round(problem, comm, refinement, layers)
         except NoResult:
             if tried or refinement == FIRST_REFINEMENTS[-1]:
                 raise
@@ -174,19 +231,20 @@ def adapted_solid(problem: Problem, comm: MPI.Comm, say: Say, doing: Say) -> Ada
             continue
         except CaseError:  # too large
             break
-        tried.append((judged, Choice(SOLID_DEGREE, refinement, layers=layers)))
+        tried.append((round_result, Choice(SOLID_DEGREE, refinement, layers=layers)))
         say(
-            f"tolerance {tolerance:g}: refinement {refinement:g}, layers {layers}, {judged.dofs} "
+            f"tolerance {tolerance:g}: refinement {refinement:g}, layers {layers}, "
+            f"{round_result.dofs} "
             "unknowns: "
-            f"result {judged.result:.9g}, estimated error {plane:.1e} by the size and "
+            f"result {round_result.result:.9g}, estimated error {size_error:.1e} by the size and "
             f"{thickness_error:.1e} by the layers"
         )
-        if judged.estimate <= tolerance or refinement >= FINEST:
+        if round_result.estimate <= tolerance or refinement >= FINEST:
             break
-        if plane > ERROR_SHARE * tolerance:
+        if size_error > ERROR_SHARE * tolerance:
             refinement = round(
                 refinement
-                * float(np.clip((plane / (ERROR_SHARE * tolerance)) ** 0.5, SLOWEST, FASTEST)),
+                * float(np.clip((size_error / (ERROR_SHARE * tolerance)) ** 0.5, SLOWEST, FASTEST)),
                 3,
             )
             refinement = min(refinement, FINEST)
@@ -199,17 +257,23 @@ def adapted_solid(problem: Problem, comm: MPI.Comm, say: Say, doing: Say) -> Ada
             f"warning: no mesh was found for the tolerance; the least estimated error is "
             f"{best.estimate:.1e}"
         )
-    return Adapted(problem, choice, best, [r for r, _ in tried])
+    return Adapted(problem, choice, best, [judged_round for judged_round, _ in tried])
 
 
 def _round(
     problem: Problem, comm: MPI.Comm, refinement: float, layers: int
 ) -> tuple[AdaptiveRound, float, float]:
-    """The result on one mesh, and the relative errors by the size of its elements and by its
-    layers.
+    """Return the result on one mesh of a solid, with its two errors; collective.
+
+    Returns
+    -------
+    round, size_error, thickness_error
+        The round, and the relative errors by the size of elements and by the number of layers. Both
+        errors count as falling with the square of the size.
     """
 
     def result(refinement: float, layers: int) -> tuple[float, int, int]:
+        """Return the result, and the numbers of cells and of unknowns."""
         scene = Choice(SOLID_DEGREE, refinement, layers=layers).scene(problem, comm)
         return by_path(scene).value, scene.cells, scene.model.system.dofs
 
@@ -219,13 +283,13 @@ def _round(
         result(refinement, layers + 1)[0],
     )
     scale = max(abs(finer), np.finfo(float).tiny)
-    plane = abs(finer - value) / scale / (1 - FINER**-2)
+    size_error = abs(finer - value) / scale / (1 - FINER**-2)
     thickness_error = abs(thicker - value) / scale / (1 - (layers / (layers + 1)) ** 2)
     return (
         AdaptiveRound(
-            SOLID_DEGREE, refinement, cells, dofs, value, plane + thickness_error, layers
+            SOLID_DEGREE, refinement, cells, dofs, value, size_error + thickness_error, layers
         ),
-        plane,
+        size_error,
         thickness_error,
     )
 
@@ -268,70 +332,84 @@ def rounds(
     doing: Say,
     suffix: str = "",
 ) -> Adapted:
-    """Rounds from a coarse mesh and the end there; collective.
+    """Find a mesh by rounds of error estimation and remeshing, from a coarse one; collective.
 
     Parameters
     ----------
+    choice, coarse_solution
+        Degree and size of the coarse mesh, and the scene on this mesh with its end.
     transferred
-        Computes the end on another mesh from one near by.
+        Function that computes scene and end on another mesh, from those on a mesh near by.
+    say, doing
+        See `adapted`.
     suffix
-        Of what, in the lines of the rounds.
+        Words in the lines of the rounds that say which part of the run they are about.
     """
     tolerance = problem.mesh.tolerance
     assert tolerance is not None
     for degree in range(PATH_DEGREE + 1, _degree(tolerance) + 1):
         choice = Choice(degree, choice.refinement)
         coarse_solution = transferred(problem, choice, coarse_solution)
-    tried: list[tuple[AdaptiveRound, Choice]] = []
+    tried_rounds: list[tuple[AdaptiveRound, Choice]] = []
     while True:
         doing(
-            f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree "
+            f"a mesh for the tolerance {tolerance:g}: round {len(tried_rounds) + 1}, degree "
             f"{choice.degree}, estimating"
         )
         fine_solution = transferred(
             problem, Choice(choice.degree + 1, choice.refinement, choice.size), coarse_solution
         )
-        judged = _judged(choice, coarse_solution, fine_solution)
-        tried.append((judged, choice))
+        round_result = _judged(choice, coarse_solution, fine_solution)
+        tried_rounds.append((round_result, choice))
         say(
-            f"tolerance {tolerance:g}{suffix}: degree {judged.degree}, {judged.cells} cells, "
-            f"{judged.dofs} unknowns: "
-            f"result {judged.result:.9g}, estimated error {judged.estimate:.1e}"
+            f"tolerance {tolerance:g}{suffix}: degree {round_result.degree}, {round_result.cells} "
+            "cells, "
+            f"{round_result.dofs} unknowns: "
+            f"result {round_result.result:.9g}, estimated error {round_result.estimate:.1e}"
         )
         # what is cheap is not made worse
         least_ratio = 0.0 if coarse_solution[0].problem.axisymmetric else MIN_REDUCTION * tolerance
-        if least_ratio <= judged.estimate <= tolerance or len(tried) == MOST_ROUNDS:
+        if least_ratio <= round_result.estimate <= tolerance or len(tried_rounds) == MOST_ROUNDS:
             break
-        another = _remeshed(
-            choice, coarse_solution, fine_solution, AIM * tolerance / judged.estimate
+        next_choice = _remeshed(
+            choice, coarse_solution, fine_solution, AIM * tolerance / round_result.estimate
         )
-        if another is None:
+        if next_choice is None:
             break
         doing(
-            f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}, degree "
-            f"{another.degree}, solving"
+            f"a mesh for the tolerance {tolerance:g}: round {len(tried_rounds) + 1}, degree "
+            f"{next_choice.degree}, solving"
         )
-        choice, coarse_solution = another, transferred(problem, another, fine_solution)
-    rounds_within = [t for t in tried if t[0].estimate <= tolerance]
+        choice, coarse_solution = next_choice, transferred(problem, next_choice, fine_solution)
+    rounds_within = [t for t in tried_rounds if t[0].estimate <= tolerance]
     best, choice = (
         min(rounds_within, key=lambda t: t[0].dofs)
         if rounds_within
-        else min(tried, key=lambda t: t[0].estimate)
+        else min(tried_rounds, key=lambda t: t[0].estimate)
     )
     if not rounds_within:
         say(
             f"warning: no mesh was found for the tolerance{suffix}; the least estimated error is "
             f"{best.estimate:.1e}"
         )
-    return Adapted(problem, choice, best, [r for r, _ in tried])
+    return Adapted(problem, choice, best, [judged_round for judged_round, _ in tried_rounds])
 
 
 def _degree(tolerance: float) -> int:
+    """Return the degree of elements that is the fastest for a tolerance."""
     return next(degree for least_tolerance, degree in DEGREES if tolerance >= least_tolerance)
 
 
 def _coarsest_path(problem: Problem, comm: MPI.Comm) -> tuple[Choice, Solved]:
-    """The whole path on the coarsest mesh where it has a result."""
+    """Return the coarsest of the first meshes on which the path has a result, with scene and end.
+
+    Collective.
+
+    Raises
+    ------
+    NoResult
+        If no first mesh has a result.
+    """
     for refinement in FIRST_REFINEMENTS:
         choice = Choice(PATH_DEGREE, refinement)
         scene = choice.scene(problem, comm)
@@ -343,28 +421,47 @@ def _coarsest_path(problem: Problem, comm: MPI.Comm) -> tuple[Choice, Solved]:
 
 
 def _on_other_mesh(problem: Problem, choice: Choice, neighbour: Solved) -> Solved:
+    """Return scene and end on another mesh, from those on a mesh near by; collective."""
     scene = choice.scene(problem, neighbour[0].comm)
     return scene, from_near(scene, *neighbour)
 
 
 def _judged(choice: Choice, coarse_solution: Solved, fine_solution: Solved) -> AdaptiveRound:
-    (scene, low), (_, high) = coarse_solution, fine_solution
-    estimate = estimated(low.value, high.value)
+    """Return the round of a mesh, with its error by a solution of one degree more."""
+    (scene, coarse_end), (_, fine_end) = coarse_solution, fine_solution
+    estimate = estimated(coarse_end.value, fine_end.value)
     return AdaptiveRound(
-        choice.degree, choice.refinement, scene.cells, scene.model.system.dofs, low.value, estimate
+        choice.degree,
+        choice.refinement,
+        scene.cells,
+        scene.model.system.dofs,
+        coarse_end.value,
+        estimate,
     )
 
 
 def estimated(low: float, high: float) -> float:
-    """The relative error of a result, from the same of one degree more."""
+    """Return the relative error of the result `low`, from the result `high` of one degree more."""
     return SAFETY * abs(high - low) / max(abs(high), np.finfo(float).tiny)
 
 
 def _remeshed(
     choice: Choice, coarse_solution: Solved, fine_solution: Solved, reduction: float
 ) -> Choice | None:
-    """Return the choice of another mesh of the same degree, with the error times `reduction`; None
-    if there is no other mesh.
+    """Return another mesh of the same degree with a given change of the error; collective.
+
+    Meridians, mesh files and grids are refined uniformly. Other surfaces get cells with equal
+    shares in the error.
+
+    Parameters
+    ----------
+    reduction
+        Factor of the error.
+
+    Returns
+    -------
+    Choice or None
+        None if there is no other mesh, or it would not fit into memory.
     """
     scene, degree = coarse_solution[0], choice.degree
     order = 2 * degree - 2  # of convergence of an energy
@@ -373,11 +470,11 @@ def _remeshed(
         or scene.problem.mesh_file
         or isinstance(scene.problem.shape, Grid)
     ):
-        change = np.clip(reduction, 1e-3, 1e3) ** (-1 / order)
+        size_factor = np.clip(reduction, 1e-3, 1e3) ** (-1 / order)
         if reduction < 1 and not scene.problem.axisymmetric:
-            change = max(change, LINES)
-        finer = np.clip(choice.refinement * change, COARSEST, FINEST)
-        refinement = round(float(finer), 3)
+            size_factor = max(size_factor, LINES)
+        new_refinement = np.clip(choice.refinement * size_factor, COARSEST, FINEST)
+        refinement = round(float(new_refinement), 3)
         return Choice(degree, refinement) if refinement != choice.refinement else None
     if reduction > 1 and scene.cells <= MIN_CELLS_TO_COARSEN:
         return None
@@ -392,7 +489,7 @@ def _remeshed(
 
 
 def _fits(scene: Scene, unknowns: float) -> bool:
-    """Whether a finer mesh fits into the memory of all ranks; collective."""
+    """Return whether a mesh with so many unknowns fits into the memory of all ranks; collective."""
     try:
         refuse_beyond_memory(
             replace(scene.problem, unknowns=unknowns), scene.comm.size, scene.comm.size

@@ -1,1 +1,1 @@
-"""Gradients of results: an adjoint, and what it contracts."""
+"""Gradients of results by amplitudes, numbers of a case and fields, each from one adjoint."""

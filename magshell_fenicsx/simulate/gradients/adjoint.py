@@ -57,27 +57,33 @@ NO_BEGINS: Begins = MappingProxyType({})
 
 @dataclass(frozen=True)
 class AdjointState:
-    """A state at which w . R + c Pi + sum_i c_i dPi/dmu_i, functions of (u, mu; p), are
-    differentiated by p.
+    """A place of an adjoint: one state with the multipliers of its equations.
+
+    Here w . R + c Pi + sum_i c_i dPi/dmu_i, a function of (u, mu; p), is differentiated by p.
 
     Attributes
     ----------
+    state
+        State of the model, with the displacement of moved supports.
     w
         Multiplier of the residual R; at supports that of a reaction, otherwise zero there.
     rows
-        c_i of the rows of the device: of amplitudes that are unknown there, as their conjugates are
-        held.
-    energy, potentials
-        c, and the part of c_i that J itself contains.
+        Amplitude that is unknown at this place, as its conjugate is held -> c_i of the equation
+        (row of the device) that holds it.
+    energy
+        The factor c of Pi.
+    potentials
+        Amplitude -> the part of c_i that J itself contains.
     follows
-        Amplitudes of the rows whose conjugates are those of a later place.
+        Amplitudes of `rows` whose conjugates the step holds as they were at its begin, which is a
+        later place of the adjoint.
     steps
-        How many steps of the programme led to this place, where a later step began; None: all of
-        the record's.
-    driven
-        Amplitudes that have changed since.
+        How many steps of the programme led to this place, where a later step began; None: all steps
+        of the record.
+    driven_amplitudes
+        Amplitudes that steps after this place have changed.
     gas
-        Whether the conjugate of a gas is held there.
+        Whether the conjugate of a gas is held here.
     """
 
     state: State
@@ -92,23 +98,27 @@ class AdjointState:
 
     @property
     def conjugates(self) -> dict[str, float]:
-        """All c_i."""
+        """Amplitude -> c_i, the sum of its factors in `rows` and in `potentials`."""
         names = {**self.rows, **self.potentials}
         return {name: self.rows.get(name, 0.0) + self.potentials.get(name, 0.0) for name in names}
 
 
 @dataclass(frozen=True)
 class EnergyDirection:
-    """A vector phi whose energies at the first place are differentiated by p, times factors.
+    """A vector phi whose energies enter J, with the factors of these energies.
+
+    The energies are those at the first place of an `Adjoint`; they are differentiated by p.
 
     Attributes
     ----------
+    phi
+        Unknowns on this rank: of the space of waves, or of the displacement.
     wave
-        m of phi, which is in the space of waves; None of a displacement.
+        Number m of waves around a meridian; None: phi is a displacement.
     stiffness
         Factor of the second variation Q_m(phi) of a wave.
     inertia
-        Factor of phi . M phi.
+        Factor of phi . M phi, with the mass matrix M.
     """
 
     phi: Vector
@@ -119,38 +129,40 @@ class EnergyDirection:
 
 @dataclass(frozen=True)
 class Adjoint:
-    """Adjoint of a result J: dJ/dp is J_p plus the contracted derivatives of the equations at all
-    places.
+    """Adjoint of a result J, a number of a solved state.
+
+    dJ/dp is J_p plus the derivatives of the equations at all places, times their multipliers.
 
     Attributes
     ----------
     places
-        The first is the state itself.
+        The first place is the state of J itself; the others are states where steps began.
     by_mu
-        dJ/dmu_i where J contains the amplitude itself.
+        Amplitude -> dJ/dmu_i where J contains the amplitude itself.
     by_itself
-        What J of a scene and a state is by p alone; None if energies and potentials of the places
-        say it.
+        Function of a scene and a state with the value of J, for the explicit derivative J_p; None
+        where energies and potentials of the places contain it.
     directions
         Vectors whose energies J contains.
     value
         J.
     gas
-        Whether a conjugate is that of a gas, whose law has numbers of the case.
-    free
-        The amplitude that J is; "" where it is given.
+        Whether the conjugate of a gas is held, whose law has numbers of the case.
+    free_amplitude
+        The amplitude that J is, as at a fold; "" where J is another number.
     scale
         Name of the unit (`Quantity.scale`) in which `derivative` gives dJ/dp; "" without a unit.
-    left
-        Amplitudes that are loads as an earlier step has left them, which was not controlled by
-        them.
+    left_loads
+        Amplitudes that act as loads with the value that an earlier step has left, and that did not
+        control this step.
     slope
-        What J is of a room, with its own derivatives by a field.
+        The observable of a part that J is, with its own derivatives by a field; None for other
+        results.
     forms, deflections
         As of a `Functional`.
-    about
-        The state about which contact between shells is a polynomial at all places; None: about each
-        place's own.
+    contact_state
+        State about which contact between shells is expanded into a polynomial at all places; None:
+        at each place about its own state.
     """
 
     scene: Scene
@@ -180,21 +192,31 @@ class Adjoint:
 
     @property
     def state(self) -> State:
+        """The state of J, that of the first place."""
         return self.places[0].state
 
 
 def adjoint_of_instability(
     scene: Scene, record: Record, fold: Fold | None = None, begins: Begins = NO_BEGINS
 ) -> Adjoint:
-    """The adjoint of the amplitude where a fold or a neutral wave is.
+    """Return the adjoint of the amplitude at a fold, or where a wave is neutral; collective.
 
-    A fold takes no factorisation but its own, a wave one of the tangent and one of its second
-    variation; a conjugate that the step holds takes one where the step began.
+    A fold takes no factorisation but its own; a wave takes one of the tangent and one of its second
+    variation. A conjugate that the step holds takes one more where the step began.
+
+    Parameters
+    ----------
+    record
+        Row of the history at the instability.
+    fold
+        The located fold; None: it is located again from the record.
+    begins
+        Number of a step -> the last record before it.
 
     Raises
     ------
     CaseError
-        If the record is another instability, or what it holds has no derivative.
+        If the record is another instability, or a conjugate that its step holds has no derivative.
     """
     if record.mode.startswith(WAVE):
         return _of_wave(scene, record)
@@ -220,6 +242,16 @@ def adjoint_of_instability(
 
 
 def _of_wave(scene: Scene, record: Record) -> Adjoint:
+    """Return the adjoint of the amplitude at which waves around a meridian are neutral; collective.
+
+    With Q the second variation of the neutral wave phi, and dQ/dmu its rate along the path, phi has
+    the factor -1/(dQ/dmu), and w solves K w = -Q_u and has the same factor.
+
+    Raises
+    ------
+    CaseError
+        If the step holds a conjugate, shells touch, or the meridian has a T-junction.
+    """
     model, m = scene.model, int(record.mode.removeprefix(WAVE))
     if record.step and scene.problem.programme[record.step - 1].load.hold:
         raise CaseError(f"instability: {record.mode}: not while a conjugate is held")
@@ -253,11 +285,22 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
 def variation(
     model: MeridianModel, state: State, phi: Vector, m: int, names: Iterable[str]
 ) -> Functional:
-    """Q_m(phi) of a wave, with its derivatives by u and by some amplitudes."""
+    """Return the second variation Q_m(phi) of a wave as a functional of the state; collective.
+
+    Its derivatives are those by u and by the amplitudes `names`.
+
+    Parameters
+    ----------
+    phi
+        The wave, in the unknowns of the space of waves.
+    m
+        Number of waves around the meridian.
+    """
     terms, system, mu = model.waves.energies_along(phi, m), model.system, state.mu
     rates = {name: by_amplitude(model, terms, name, mu) for name in names}
 
-    def present() -> Functional:
+    def functional_here() -> Functional:
+        """Return the functional at the present displacement of the model."""
         by_u = np.zeros(system.size)
         for term in terms:
             term.add_residual(by_u, factor_of(term.amplitude, mu))
@@ -268,28 +311,42 @@ def variation(
         }
         return Functional(value, system.zero_at_supports(by_u), by_mu)
 
-    return system.at_state(state).evaluate(present)
+    return system.at_state(state).evaluate(functional_here)
 
 
 def by_amplitude(
     model: ModelBase, terms: Sequence[FormTerm], name: str, mu: Mapping[str, float]
 ) -> list[tuple[FormTerm, float]]:
-    """The derivatives of energies by an amplitude that multiplies some of them and may enter
-    others; with factors.
+    """Return energies whose weighted sum is the derivative of a sum of energies by an amplitude.
+
+    Parameters
+    ----------
+    terms
+        Each stands in the sum with its own amplitude as a factor.
+    name
+        The amplitude. It may multiply terms, and may enter their forms as a constant.
+    mu
+        Values of all amplitudes.
+
+    Returns
+    -------
+    list of (term, factor)
+        A term that the amplitude multiplies, with 1; the derivative of a form by the constant, with
+        the term's own amplitude.
     """
-    factors = [(term, 1.0) for term in terms if term.amplitude == name]
-    p = model.system.parameters[name].constant if name in model.system.parameters else None
+    weighted_terms = [(term, 1.0) for term in terms if term.amplitude == name]
+    constant = model.system.parameters[name].constant if name in model.system.parameters else None
     for term in terms:
-        if p in term.form.constants():
-            slope = FormTerm(
+        if constant in term.form.constants():
+            derivative = FormTerm(
                 f"{term.name} by {name}",
-                derived(term.form, p),
+                derived(term.form, constant),
                 model.u,
                 KernelLog(),
                 term.amplitude,
             )
-            factors.append((slope, factor_of(term.amplitude, mu)))
-    return factors
+            weighted_terms.append((derivative, factor_of(term.amplitude, mu)))
+    return weighted_terms
 
 
 def adjoint(
@@ -299,13 +356,28 @@ def adjoint(
     hold: Mapping[str, str] | None = None,
     begins: Begins = NO_BEGINS,
 ) -> Adjoint:
-    """The adjoint of a result at a regular state; one factorisation and one solve, and these of a
-    step's begin again.
+    """Return the adjoint of a result at a regular state; collective.
+
+    It takes one factorisation and one solve, and again as many where a step began on which it
+    depends.
+
+    Parameters
+    ----------
+    record
+        Row of the history at whose state the result is read.
+    of
+        Column of path.csv, also in units; or a target shape, whose mean square distance is the
+        result.
+    hold
+        Amplitude -> "load" or "conjugate", what stays as p changes; None: as the record's step
+        holds.
+    begins
+        Number of a step -> the last record before it.
 
     Raises
     ------
     CaseError
-        If the scene has no such result, or what the step holds has no derivative.
+        If the scene has no such result, or a held conjugate has no derivative.
     """
     state = scene.model.system.with_moved_supports(record.point.state)
     column, scale = in_units(scene, state, of) if isinstance(of, str) else (of, "")
@@ -318,6 +390,7 @@ def adjoint(
             f"{free_amplitudes[0]}: is a load here, which no parameter changes: hold its conjugate"
         )
     w, rows = solved(scene, state, result, held_conjugates)
+    # where J is c Pi, the energy of the place gives J_p
     by_itself = None if result.energy else lambda there, at: functional(there, at, column).value
     if result.reaction is not None:
         unit = force_unit(scene)
@@ -340,25 +413,32 @@ def adjoint(
 
 
 def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
-    """An adjoint at a record with the places where steps began whose state it depends on;
-    collective.
+    """Return an adjoint at a record with further places, where steps began; collective.
 
-    It depends on conjugates that a step holds, and on loads as a step has left them by which it was
-    not controlled.
+    The adjoint depends on the state where a step began in two ways: by a conjugate that the step
+    holds, and by a load that the step has left with a value and was not controlled by.
+
+    Parameters
+    ----------
+    adjoint
+        Adjoint with the record's state as its only place.
+    begins
+        Number of a step -> the last record before it. The loop goes back from step to step.
 
     Raises
     ------
     CaseError
-        If it is not known where a step began.
+        If a held conjugate needs a step's begin that `begins` lacks, or the model changed in
+        between.
     """
     scene, places, left_loads = adjoint.scene, list(adjoint.places), set[str]()
-    part: Adjoint | None = adjoint
+    newest_adjoint: Adjoint | None = adjoint
     place_number = 0  # of the place at the record
     # dJ/dmu of loads as earlier steps have left them
     loads, driven_amplitudes = dict[str, float](), set[str]()
     while record.step:
         place, step, system = (
-            part.places[0] if part else None,
+            newest_adjoint.places[0] if newest_adjoint else None,
             scene.problem.programme[record.step - 1],
             scene.model.system,
         )
@@ -372,7 +452,11 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
                     "this step"
                 )
             break
-        begin, c, by_mu = begins[record.step], dict[str, float](), dict[str, float]()
+        begin, potentials_at_begin, by_mu = (
+            begins[record.step],
+            dict[str, float](),
+            dict[str, float](),
+        )
         if begin.scene and begin.scene is not scene:
             if held_conjugates or loads:
                 names = ", ".join({*held_conjugates, *loads})
@@ -382,34 +466,40 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
             break
         state_before = system.with_moved_supports(begin.point.state)
         held_before = held_at(scene, begin, state_before)
-        if part and place:
+        if newest_adjoint and place:
             reused_amplitudes = _amplitudes_of_steps(earlier) & place.state.mu.keys()
             for name in reused_amplitudes - place.rows.keys() - driven_amplitudes:
-                loads[name] = loads.get(name, 0.0) + by_load(part, name)
+                loads[name] = loads.get(name, 0.0) + by_load(newest_adjoint, name)
         if place:
-            c, by_mu = _terms_of_held(scene, step, place.state, state_before, held_conjugates)
+            potentials_at_begin, by_mu = _terms_of_held(
+                scene, step, place.state, state_before, held_conjugates
+            )
+        # a load that is unknown at the begin, as its conjugate was held there, gets its multiplier
+        # here
         for name in loads.keys() & held_before.keys():
             by_mu[name] = by_mu.get(name, 0.0) + loads.pop(name)
             left_loads.add(name)
         if place and held_conjugates:
             places[place_number] = replace(place, follows=frozenset(held_conjugates))
-        part = None
-        if c or any(by_mu.values()):
-            slope_u = _sum_of_loads(scene, state_before, c)
-            w, rows = solved(scene, state_before, Functional(0.0, slope_u, by_mu, c), held_before)
+        newest_adjoint = None
+        if potentials_at_begin or any(by_mu.values()):
+            by_u = _sum_of_loads(scene, state_before, potentials_at_begin)
+            w, rows = solved(
+                scene, state_before, Functional(0.0, by_u, by_mu, potentials_at_begin), held_before
+            )
             gas = with_gas(held_before)
             place_at_begin = AdjointState(
                 state_before,
                 w,
                 rows,
-                potentials=c,
+                potentials=potentials_at_begin,
                 steps=begin.step,
                 driven_amplitudes=frozenset(driven_amplitudes),
                 gas=gas,
             )
             place_number = len(places)
             places.append(place_at_begin)
-            part = Adjoint(scene, [place_at_begin])
+            newest_adjoint = Adjoint(scene, [place_at_begin])
         record = begin
     return replace(adjoint, places=places, left_loads=frozenset(left_loads))
 
@@ -423,7 +513,7 @@ def _sum_of_loads(scene: Scene, state: State, factors: Mapping[str, float]) -> V
 
 
 def _rows_of_held(step: ProgrammeStep, place: AdjointState) -> dict[str, float]:
-    """Return amplitude whose conjugate a step holds -> adjoint of that equation, where not zero."""
+    """Return amplitude whose conjugate a step holds -> nonzero multiplier of that equation."""
     return {name: place.rows[name] for name in held_by_step(step) if place.rows.get(name)}
 
 
@@ -446,25 +536,26 @@ def _terms_of_held(
     state, state_before
         The states at the place, and where the step began.
     rows
-        Amplitude whose conjugate is held -> adjoint of the equation that holds it.
+        Amplitude whose conjugate is held -> multiplier of the equation that holds it.
 
     Returns
     -------
     c, by_mu
-        Amplitude -> factor of dPi/dmu of the state before, and derivative by its amplitude.
+        Amplitude -> factor of dPi/dmu at the state before, and amplitude -> derivative by its value
+        there.
 
     Raises
     ------
     CaseError
-        If one is not held from the state before on.
+        If a conjugate at the place differs from that of the state before.
     """
     system, c, by_mu = scene.model.system, dict[str, float](), dict[str, float]()
     for name, row in rows.items():
         law = step.load.hold[name]
         if isinstance(law, Gas):
             gas = enclosed_gas(scene, law.gas, state_before)
-            share, slope = gas.by_begin(state.mu[name])
-            c[name], by_mu[name] = -row * share, row * slope
+            potential_factor, rate_by_amplitude = gas.by_begin(state.mu[name])
+            c[name], by_mu[name] = -row * potential_factor, row * rate_by_amplitude
             continue
         potential = system.potential(state.u, state.mu, name)
         change = potential - system.potential(state_before.u, state_before.mu, name)
@@ -479,12 +570,15 @@ def _terms_of_held(
 
 
 def _driven_amplitudes(step: ProgrammeStep, mu: Mapping[str, float]) -> set[str]:
-    """The amplitudes that a step changes as it is given."""
+    """Return the amplitudes that a step changes along its course."""
     return step.load.changes(step.name, mu)
 
 
 def by_load(adjoint: Adjoint, name: str) -> float:
-    """dJ/dmu of an amplitude that is given at all places where it is the same."""
+    """Return dJ/dmu of an amplitude that is prescribed, with one value at all places; collective.
+
+    Places where the amplitude is an unknown, or where a later step still changes it, do not count.
+    """
     scene, system, total = adjoint.scene, adjoint.scene.model.system, adjoint.by_mu.get(name, 0.0)
     for place in adjoint.places:
         if name in place.rows or name in place.driven_amplitudes:
@@ -492,38 +586,57 @@ def by_load(adjoint: Adjoint, name: str) -> float:
         u, mu = place.state.u, place.state.mu
         total += dot(system.comm, place.w, system.load(u, mu, name, constrained=False))
         total += place.energy and place.energy * system.potential(u, mu, name)
-        total += sum(c * system.curvature(u, mu, i, name) for i, c in place.conjugates.items())
+        total += sum(
+            factor_in_J * system.curvature(u, mu, i, name)
+            for i, factor_in_J in place.conjugates.items()
+        )
     if adjoint.directions:
         mu = adjoint.state.mu
         terms = [
-            (slope, c * factor)
-            for term, c in energies_along(scene, adjoint)
-            for slope, factor in by_amplitude(scene.model, [term], name, mu)
+            (slope, factor_in_J * factor_of_derivative)
+            for term, factor_in_J in energies_along(scene, adjoint)
+            for slope, factor_of_derivative in by_amplitude(scene.model, [term], name, mu)
         ]
         energy_rate = system.at_state(adjoint.state).evaluate(
-            lambda: sum(c * term.energy() for term, c in terms)
+            lambda: sum(factor_in_J * term.energy() for term, factor_in_J in terms)
         )
         total += system.comm.allreduce(energy_rate)
     return float(total)
 
 
 def held_by_step(step: ProgrammeStep) -> list[str]:
-    """The amplitudes whose conjugates a step holds as they are where it begins."""
-    return [name for name, how in step.load.hold.items() if how != "load" and name != step.name]
+    """Return the amplitudes whose conjugates a step holds at the values where it begins."""
+    return [name for name, law in step.load.hold.items() if law != "load" and name != step.name]
 
 
 Held: TypeAlias = Mapping[str, float | Conjugate]  # amplitude -> its conjugate
 
 
 def with_gas(held_conjugates: Held) -> bool:
-    """Whether a conjugate is that of a gas."""
+    """Return whether a held conjugate is that of a gas, which is a function of its amplitude."""
     return any(callable(q) for q in held_conjugates.values())
 
 
 def solved(
     scene: Scene, state: State, functional: Functional, held_conjugates: Held
 ) -> tuple[Vector, dict[str, float]]:
-    """w of a number, and of the rows of the device; one factorisation and one solve."""
+    """Return the multipliers of a functional J at a state; collective.
+
+    They solve K^T x = -J_x with one factorisation, with K of the system under the loading device.
+
+    Parameters
+    ----------
+    functional
+        J with its derivatives.
+    held_conjugates
+        Amplitude that is unknown -> its conjugate; empty: all amplitudes are loads.
+
+    Returns
+    -------
+    w, rows
+        Multiplier of the residual, and amplitude -> multiplier of the equation that holds its
+        conjugate.
+    """
     system: System = scene.model.system
     device = (
         Device(system, held_conjugates, dict.fromkeys(held_conjugates, system.length))
@@ -534,33 +647,42 @@ def solved(
     factors = (scene.newton.for_system(device) if device else scene.newton).factor_at(
         extended_state
     )
-    slope = functional.by_u
+    # J_x: dJ/du, and dJ/dmu of the unknown amplitudes
+    by_unknowns = functional.by_u
     if device:
-        slope = device.gradient(
+        by_unknowns = device.gradient(
             functional.by_u,
             {
                 name: functional.by_mu.get(name, 0.0) + mixed(scene, state, functional, name)
                 for name in held_conjugates
             },
         )
-    w = factors.solve_transposed(-slope) if factors.skewed else factors.solve(-slope)
-    return np.array(device.displacement(w) if device else w), device.rates(w) if device else {}
+    multipliers = (
+        factors.solve_transposed(-by_unknowns) if factors.skewed else factors.solve(-by_unknowns)
+    )
+    return np.array(device.displacement(multipliers) if device else multipliers), device.rates(
+        multipliers
+    ) if device else {}
 
 
 def mixed(scene: Scene, state: State, functional: Functional, name: str) -> float:
-    """Return the derivative of the potentials and the reaction in J by an amplitude."""
+    """Return the derivative by an amplitude of those parts of J that contain derivatives of Pi.
+
+    They are potentials, sum_i c_i dPi/dmu_i; a reaction, e . R; and the energy, c Pi. Collective.
+    """
     system = scene.model.system
-    changes = sum(
-        c * system.curvature(state.u, state.mu, i, name) for i, c in functional.potentials.items()
+    derivative = sum(
+        potential_factor * system.curvature(state.u, state.mu, i, name)
+        for i, potential_factor in functional.potentials.items()
     )
     if functional.reaction is not None:
-        changes += dot(
+        derivative += dot(
             system.comm,
             functional.reaction,
             system.load(state.u, state.mu, name, constrained=False),
         )
     return float(
-        changes
+        derivative
         + (functional.energy and functional.energy * system.potential(state.u, state.mu, name))
     )
 
@@ -568,33 +690,55 @@ def mixed(scene: Scene, state: State, functional: Functional, name: str) -> floa
 def held_at(
     scene: Scene, record: Record, state: State, hold: Mapping[str, str] | None = None
 ) -> dict[str, float | Conjugate]:
-    """Amplitude -> its conjugate, of those that are unknown."""
+    """Return amplitude -> its conjugate, for the amplitudes that are unknown at a record.
+
+    Collective.
+
+    Parameters
+    ----------
+    hold
+        Amplitude -> "load" or "conjugate"; None: as the record's step holds.
+
+    Raises
+    ------
+    CaseError
+        If `hold` has another amplitude or word.
+    """
     held_conjugates = dict[str, float | Conjugate]()
     step = scene.problem.programme[record.step - 1] if record.step else None
     if hold is None and step:
         held_conjugates |= held_conjugates_of_step(scene, step, state)
         if step.load.by_conjugate(at_target=record.label == "target"):
             held_conjugates[step.name] = -scene.model.system.potential(state.u, state.mu, step.name)
-    for name, how in (hold or {}).items():
-        if name not in state.mu or how not in ("load", "conjugate"):
+    for name, kind in (hold or {}).items():
+        if name not in state.mu or kind not in ("load", "conjugate"):
             raise CaseError(
-                f"hold: {name}: {how}: allowed are load and conjugate of {', '.join(state.mu)}"
+                f"hold: {name}: {kind}: allowed are load and conjugate of {', '.join(state.mu)}"
             )
-        if how == "conjugate":
+        if kind == "conjugate":
             held_conjugates[name] = -scene.model.system.potential(state.u, state.mu, name)
     return held_conjugates
 
 
 def energies_along(scene: Scene, adjoint: Adjoint) -> list[tuple[FormTerm, float]]:
-    """The energies of the directions, and their factors."""
+    """Return the energies of an adjoint's directions with their factors, on the forms of a scene.
+
+    Directions that are displacements are transferred to the mesh of `scene`, which may be another
+    scene than that of the adjoint.
+    """
     model, energies = scene.model, list[tuple[FormTerm, float]]()
-    for d in adjoint.directions:
-        phi = d.phi if d.wave is not None else transfer(adjoint.scene, scene, d.phi)
-        if d.stiffness:
+    for direction in adjoint.directions:
+        phi = (
+            direction.phi
+            if direction.wave is not None
+            else transfer(adjoint.scene, scene, direction.phi)
+        )
+        if direction.stiffness:
             assert model.axisymmetric
             energies += [
-                (term, d.stiffness) for term in model.waves.energies_along(phi, d.wave or 0)
+                (term, direction.stiffness)
+                for term in model.waves.energies_along(phi, direction.wave or 0)
             ]
-        if d.inertia:
-            energies.append((mass_along(model, phi, d.wave), d.inertia))
+        if direction.inertia:
+            energies.append((mass_along(model, phi, direction.wave), direction.inertia))
     return energies

@@ -1,9 +1,9 @@
-"""Derivatives by a field, at the nodes of all cells at once, and as densities per area; those of
-the mass.
+"""Derivatives by a field, at the nodes of all cells at once, and as densities per area; mass.
 
 Each field is a coefficient of the terms' forms, or a part of one: the remanence, a factor of its
 magnitude, the factor of the thickness, the natural curvature in the case's frame, and a deviation
-w0 of the drawn shape along the normal of the perfect one. Of a deviation see `shape`.
+w0 of the drawn shape along the normal of the perfect one. For a deviation see `shape`. The mass has
+derivatives by the same fields.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -54,14 +54,15 @@ MASS = "mass"
 
 @dataclass(frozen=True)
 class Kind:
-    """A field that results are differentiated by.
+    """A field by which results are differentiated.
 
     Attributes
     ----------
     coefficient
-        Its name in the terms.
+        Name of the coefficient in the forms of the terms.
     project
-        From the coefficient's components to the field's own; None: they are the same.
+        Function from derivatives by the coefficient's components to those by the field's own; None:
+        they are the same.
     """
 
     coefficient: str
@@ -69,22 +70,27 @@ class Kind:
 
 
 def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> FieldGradient:
-    """The derivatives by a field of `FIELDS`; collective.
+    """Return the derivatives of a result J by a field of `FIELDS`; collective.
 
     Parameters
     ----------
+    adjoint
+        J with the multipliers of its equations.
+    name
+        Name of the field, a key of `FIELDS`.
     origin
-        The same in the scene that was solved, if it is another one.
+        Adjoint in the scene that was solved, if `adjoint` is on another scene with the field as a
+        coefficient; None: it is the same scene.
 
     Raises
     ------
     CaseError
-        If no result of the scene depends on it.
+        If no result of the scene depends on the field, or the result has no derivative by it.
     """
     scene = adjoint.scene
-    other = _with_field(adjoint, name)
-    if other is not scene:
-        return by_field(_transferred(adjoint, other), name, adjoint)
+    scene_with_field = _with_field(adjoint, name)
+    if scene_with_field is not scene:
+        return by_field(_transferred(adjoint, scene_with_field), name, adjoint)
     model, kind = scene.model, FIELDS[name]
     slope = adjoint.slope
     if slope and name in ("thickness", "deviation"):
@@ -100,27 +106,35 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
         )
 
     def over_all_places(coefficient_or_name: str | PlacementField) -> tuple[fem.Function, Array]:
-        parts = [
+        """Return a field and its gradient (own cells, nodes, components), summed over places."""
+        fields_and_gradients = [
             model.system.at_state(place.state).evaluate(
                 partial(_field_at_place, adjoint, origin, name, number, place, coefficient_or_name)
             )
             for number, place in enumerate(adjoint.places)
         ]
-        return parts[-1][0], np.sum(
-            [gradient_at_place for _, of_place in parts for gradient_at_place in of_place], axis=0
+        return fields_and_gradients[-1][0], np.sum(
+            [
+                gradient_at_place
+                for _, gradients_at_place in fields_and_gradients
+                for gradient_at_place in gradients_at_place
+            ],
+            axis=0,
         )
 
     f, forces = over_all_places(kind.coefficient)
-    places, normals = (v[: len(forces)] for v in places_of(scene, f))
+    places, normals = (nodal_vectors[: len(forces)] for nodal_vectors in places_of(scene, f))
     if name == "deviation":
         places, normals = _perfect(scene, places, normals)
     if kind.project:
         forces = kind.project(scene, f, forces, places, normals)
     if model.thin and name == "deviation":
+        # dJ/df : df/dw0 for the fields f that follow from the placement
         for field in _placement_fields(adjoint, name, normals):
-            _, by_rate = over_all_places(field)
+            _, by_dependent_field = over_all_places(field)
             contracted = (
-                np.sum(by_rate * rate, axis=(1, 2)) for rate in rates(model, field, normals)
+                np.sum(by_dependent_field * rate, axis=(1, 2))
+                for rate in rates(model, field, normals)
             )
             forces = forces + np.stack(list(contracted), axis=1)[..., None]
     return FieldGradient(f, forces, places, normals)
@@ -134,17 +148,33 @@ def _field_at_place(
     place: AdjointState,
     coefficient_or_name: str | PlacementField,
 ) -> tuple[fem.Function, list[Array]]:
-    """Return a field, and its gradients that a place gives, whose state is set.
+    """Return a field, and the parts of its gradient that come from one place; collective.
+
+    The system must be at the state of this place.
 
     Parameters
     ----------
-    origin, name
+    name, origin
         See `by_field`.
+    number, place
+        Index of the place in `adjoint.places`, and the place itself.
     coefficient_or_name
         The field, or its name in the terms.
+
+    Returns
+    -------
+    f, gradients
+        The coefficient, and arrays (own cells, nodes, components) whose sum is the gradient.
+
+    Raises
+    ------
+    CaseError
+        If no term has the field.
     """
     scene, model, slope = adjoint.scene, adjoint.scene.model, adjoint.slope
-    knowing = [term for term in model.system.terms if isinstance(term, FieldDifferentiable)]
+    self_differentiating_terms = [
+        term for term in model.system.terms if isinstance(term, FieldDifferentiable)
+    ]
     if origin:
         expand_shell_contact(origin.scene, scene, origin.places[number].state)
     shares, w = _shares(adjoint, number, place, name), _contracted(scene, place)
@@ -153,18 +183,19 @@ def _field_at_place(
     )
     f = next(
         (
-            c
-            for s in shares
-            for c in s.term.form.coefficients()
-            if c is coefficient_or_name or c.name == coefficient_or_name
+            candidate
+            for share in shares
+            for candidate in share.term.form.coefficients()
+            if candidate is coefficient_or_name or candidate.name == coefficient_or_name
         ),
         None,
     )
     known_gradients = [
         field_and_gradient
-        for term in knowing
+        for term in self_differentiating_terms
         if (field_and_gradient := _known_gradient(term, place, w, coefficient))
     ]
+    # terms that provide their own derivatives may be the only ones with the field
     f = f or next((field_and_gradient for field_and_gradient, _ in known_gradients), None)
     if f is None and slope and slope.field is not None and coefficient == slope.field.name:
         f = slope.field
@@ -172,33 +203,33 @@ def _field_at_place(
         raise CaseError(f"{name}: the case has no such field: no result depends on it")
     if model.thin and coefficient_or_name == "r0":
         shares += of_measures(model, shares, w)
-    forces = [gradient_at_points for _, gradient_at_points in known_gradients] + [
+    gradients = [gradient_at_points for _, gradient_at_points in known_gradients] + [
         summed(shares, f, model.u, w, model.kernels)
     ]
     if slope and slope.by_field is not None and slope.field is not None and not number:
-        forces += [slope.by_field] if coefficient == slope.field.name else []
+        gradients += [slope.by_field] if coefficient == slope.field.name else []
     if (
         model.thin
         and coefficient_or_name == "r0"
         and (by_vertices := of_widths(model, shares, w)) is not None
     ):
-        forces[-1][:, : by_vertices.shape[1]] += by_vertices  # vertices are the first nodes
+        gradients[-1][:, : by_vertices.shape[1]] += by_vertices  # vertices are the first nodes
     if coefficient_or_name == "r0":
-        forces[-1] += of_normals(adjoint, place, first=not number)
+        gradients[-1] += of_normals(adjoint, place, first=not number)
     if name == "thickness" and scene.problem.loads.contacts:
-        forces.append(_of_starts(scene, shares, f, w))
-    return f, forces
+        gradients.append(_of_starts(scene, shares, f, w))
+    return f, gradients
 
 
 def _placement_fields(adjoint: Adjoint, name: str, normals: Array) -> Iterator[PlacementField]:
-    """Yield the fields of an adjoint's terms that change with the placement; collective.
+    """Yield the fields of an adjoint's terms that change as the shape does; collective.
 
     Parameters
     ----------
     name
         See `by_field`.
     normals
-        Directions in which places move.
+        (own cells, nodes, 3), directions in which places move.
     """
     scene, model = adjoint.scene, adjoint.scene.model
     assert model.thin
@@ -213,27 +244,44 @@ def _placement_fields(adjoint: Adjoint, name: str, normals: Array) -> Iterator[P
 
 
 def _shares(adjoint: Adjoint, number: int, place: AdjointState, name: str) -> list[WeightedTerm]:
-    """Return the terms that contribute at a place, with their weights."""
+    """Return the terms that contribute to a gradient at a place, with their weights; collective.
+
+    Parameters
+    ----------
+    number, place
+        Index of the place in `adjoint.places`, and the place itself.
+    name
+        Name of the field, a key of `FIELDS`.
+    """
     scene, c, mu = adjoint.scene, place.conjugates, place.state.mu
-    acts = scene.comm.allreduce(bool(place.w.any())) or any(c.values())
-    of_terms = [(t, factor_of(t.amplitude, mu)) for t in _terms(scene, place.state, name)]
+    # whether the residual counts at this place, on any rank
+    has_multipliers = scene.comm.allreduce(bool(place.w.any())) or any(c.values())
+    terms_with_factors = [
+        (term, factor_of(term.amplitude, mu)) for term in _terms(scene, place.state, name)
+    ]
     shares = [
-        WeightedTerm(t, place.energy * m + c.get(t.amplitude or "", 0.0), m if acts else 0.0)
-        for t, m in of_terms
+        WeightedTerm(
+            term,
+            place.energy * factor + c.get(term.amplitude or "", 0.0),
+            factor if has_multipliers else 0.0,
+        )
+        for term, factor in terms_with_factors
     ]
     shares += _of_parameters(scene, place, name)
-    # as many of its unit
+    # a held load is a fixed multiple of its unit, which depends on the size of the shell
     for held_amplitude in place.rows.keys() & scene.model.load_sizes.keys() - place.follows:
         share = (
             -c[held_amplitude]
             * scene.model.system.potential(place.state.u, mu, held_amplitude)
             / scene.model.load_size[held_amplitude]
         )
-        shares += [WeightedTerm(t, share, 0.0) for t in scene.model.size_terms(held_amplitude)]
+        shares += [
+            WeightedTerm(term, share, 0.0) for term in scene.model.size_terms(held_amplitude)
+        ]
     if not number:
         shares += [
-            WeightedTerm(t, c * factor_of(t.amplitude, mu), 0.0)
-            for t, c in (*energies_along(scene, adjoint), *adjoint.forms)
+            WeightedTerm(term, c * factor_of(term.amplitude, mu), 0.0)
+            for term, c in (*energies_along(scene, adjoint), *adjoint.forms)
         ]
     return shares
 
@@ -241,48 +289,74 @@ def _shares(adjoint: Adjoint, number: int, place: AdjointState, name: str) -> li
 def _known_gradient(
     term: FieldDifferentiable, place: AdjointState, w: fem.Function, name: str
 ) -> tuple[fem.Function, Array] | None:
-    """Return the contribution of a term that provides its own derivatives by a field; None without
-    one.
+    """Return the contribution of a term that provides its own derivatives by a field; collective.
+
+    Parameters
+    ----------
+    w
+        The vector along which residuals are taken.
+    name
+        Name of the field in the terms.
+
+    Returns
+    -------
+    tuple or None
+        The field and its gradient (own cells, nodes, components); None if the term has no such
+        field.
     """
-    mu = factor_of(term.amplitude, place.state.mu)
+    factor = factor_of(term.amplitude, place.state.mu)
     return term.by_field(
-        name, w, place.energy * mu + place.conjugates.get(term.amplitude or "", 0.0), mu
+        name, w, place.energy * factor + place.conjugates.get(term.amplitude or "", 0.0), factor
     )
 
 
 def _transferred(adjoint: Adjoint, other: Scene) -> Adjoint:
-    """Transfer an adjoint to another scene on the same mesh."""
+    """Return an adjoint with states and multipliers of another scene on its mesh; collective."""
     mu = dict.fromkeys(other.unloaded().mu, 1.0)  # of a natural curvature of zero
     places = []
     for place in adjoint.places:
-        u, w = (transfer(adjoint.scene, other, v) for v in (place.state.u, place.w))
+        u, w = (transfer(adjoint.scene, other, vector) for vector in (place.state.u, place.w))
         places.append(replace(place, state=State(u, mu | dict(place.state.mu)), w=w))
     directions = [
-        d if d.wave is not None else replace(d, phi=transfer(adjoint.scene, other, d.phi))
-        for d in adjoint.directions
+        direction
+        if direction.wave is not None
+        else replace(direction, phi=transfer(adjoint.scene, other, direction.phi))
+        for direction in adjoint.directions
     ]
     return replace(adjoint, scene=other, places=places, directions=directions)
 
 
 def _of_parameters(scene: Scene, place: AdjointState, name: str) -> list[WeightedTerm]:
-    """The shares of the conjugates of free parameters of terms."""
-    system, c, shares = scene.model.system, place.conjugates, list[WeightedTerm]()
-    for parameter in c.keys() & system.parameters.keys():
-        for slope in system.parameters[parameter].slopes:
-            if isinstance(slope, ParameterDerivative) and not slope.density.on_edges:
-                slope = _as_form(scene, slope)
-            if not isinstance(slope, FormTerm):
+    """Return the terms of a place that contain conjugates of free parameters, with weights.
+
+    The conjugate of a free parameter is an integral of its own, the derivative of energies by it.
+
+    Raises
+    ------
+    CaseError
+        If such a derivative has no form.
+    """
+    system, conjugates, shares = scene.model.system, place.conjugates, list[WeightedTerm]()
+    for parameter in conjugates.keys() & system.parameters.keys():
+        for derivative in system.parameters[parameter].slopes:
+            if isinstance(derivative, ParameterDerivative) and not derivative.density.on_edges:
+                derivative = _as_form(scene, derivative)
+            if not isinstance(derivative, FormTerm):
                 raise CaseError(
                     f"{name}: the conjugate of {parameter} has no gradient by this field"
                 )
             shares.append(
-                WeightedTerm(slope, c[parameter] * factor_of(slope.amplitude, place.state.mu), 0.0)
+                WeightedTerm(
+                    derivative,
+                    conjugates[parameter] * factor_of(derivative.amplitude, place.state.mu),
+                    0.0,
+                )
             )
     return shares
 
 
 def _as_form(scene: Scene, slope: ParameterDerivative) -> FormTerm:
-    """A derivative at points as a form."""
+    """Return a derivative of energies by a parameter, known at points, as a term with a form."""
     assert scene.model.thin
     domain = scene.model.domain
     energy = domain.integral(slope.density, domain.jet(scene.model.u))
@@ -292,15 +366,29 @@ def _as_form(scene: Scene, slope: ParameterDerivative) -> FormTerm:
 def _of_starts(
     scene: Scene, shares: Sequence[WeightedTerm], f: fem.Function, w: fem.Function
 ) -> Array:
-    """Derivative by the thickness where bodies start from the shell's face, which lifts them;
-    collective.
+    """Return the derivative by the thickness where bodies start from the shell's face; collective.
 
-    To lift a body is to lower the whole shell for this body alone.
+    A thicker shell lifts such a body. This is the same as to lower the whole shell for this body
+    alone.
+
+    Parameters
+    ----------
+    shares
+        Terms with their weights in a gradient.
+    f
+        The factor of the thickness.
+    w
+        The vector along which residuals are taken.
+
+    Returns
+    -------
+    Array
+        (own cells, nodes of f, 1).
     """
     model, domain = scene.model, f.function_space.mesh
     assert model.thin  # on which no bodies press
     axes = model.axes
-    slopes = np.zeros(
+    gradient = np.zeros(
         (
             domain.topology.index_map(domain.topology.dim).size_local,
             f.function_space.element.space_dimension,
@@ -315,18 +403,25 @@ def _of_starts(
         forces = domain.comm.allreduce(
             summed(of_body, model.u, model.u, w, model.kernels).sum(axis=(0, 1))
         )
-        if (at_start := _basis_at(model, f, contact.start[axes])) is not None:
-            slopes[at_start[0]] -= float(forces @ contact.lift[axes]) * at_start[1]
-    return slopes[..., None]
+        if (cell_and_basis := _basis_at(model, f, contact.start[axes])) is not None:
+            gradient[cell_and_basis[0]] -= float(forces @ contact.lift[axes]) * cell_and_basis[1]
+    return gradient[..., None]
 
 
 def _basis_at(
     model: "ShellModel | MeridianModel", f: fem.Function, x: Array
 ) -> tuple[int, Array] | None:
-    """The cell of a place of the surface and its basis functions' values there; None on other
-    ranks; collective.
+    """Return the cell nearest to a place of the surface, with its basis functions' values there.
 
-    In the cell it is the nearest place on the plane of the corners.
+    The nearest place in a cell is on the plane of its corners. Collective: all ranks but the
+    nearest one get None.
+
+    Parameters
+    ----------
+    f
+        Function whose element has the basis.
+    x
+        Place (2,) or (3,) over R, undeformed.
     """
     element, nodes = f.function_space.element.basix_element, model.V.element.basix_element.points
     corners = [
@@ -335,14 +430,16 @@ def _basis_at(
     ]
     topology, comm = f.function_space.mesh.topology, f.function_space.mesh.comm
     cells = model.V.dofmap.list[: topology.index_map(topology.dim).size_local, corners]
-    first, *others = np.moveaxis(model.r0.x.array.reshape(-1, len(x))[cells], 1, 0)
-    sides = np.stack([other - first for other in others], axis=-1)  # (cells, components, dimension)
-    barycentric = np.einsum("cdi,ci->cd", np.linalg.pinv(sides), x - first)
+    origin, *other_corners = np.moveaxis(model.r0.x.array.reshape(-1, len(x))[cells], 1, 0)
+    sides = np.stack(
+        [corner_place - origin for corner_place in other_corners], axis=-1
+    )  # (cells, components, dimension)
+    barycentric = np.einsum("cdi,ci->cd", np.linalg.pinv(sides), x - origin)
     distance_outside = np.maximum(
         0.0, np.maximum(-barycentric.min(axis=1), barycentric.sum(axis=1) - 1)
     )
     distances = distance_outside + np.linalg.norm(
-        np.einsum("cid,cd->ci", sides, barycentric) - (x - first), axis=1
+        np.einsum("cid,cd->ci", sides, barycentric) - (x - origin), axis=1
     )
     least_of_ranks = comm.allgather(float(distances.min(initial=np.inf)))
     if comm.rank != int(np.argmin(least_of_ranks)):
@@ -352,20 +449,28 @@ def _basis_at(
 
 
 def _contracted(scene: Scene, place: AdjointState) -> fem.Function:
-    """The vector along which residuals are taken, with what the supports that move add."""
+    """Return the vector along which residuals are taken, with the motion of supports; collective.
+
+    It is w of the place. A conjugate c_i of moving supports is a residual along the rate of their
+    motion, times c_i.
+    """
     model, system = scene.model, scene.model.system
     direction = fem.Function(model.V)
     direction.x.array[: system.size] = place.w
     direction.x.scatter_forward()
     if system.moving:
-        c = place.conjugates
-        for motion in c.keys() & system.moving.names:
-            direction.x.array[:] += c[motion] * system.moving.rate(place.state.mu, motion)
+        conjugates = place.conjugates
+        for motion in conjugates.keys() & system.moving.names:
+            direction.x.array[:] += conjugates[motion] * system.moving.rate(place.state.mu, motion)
     return direction
 
 
 def _with_field(adjoint: Adjoint, name: str) -> Scene:
-    """The scene, or one in whose terms a number that is the same everywhere is a field."""
+    """Return the scene, or one whose terms have a field in place of a uniform number; collective.
+
+    Another scene is built where the thickness, a natural curvature or, for waves, the remanence is
+    no coefficient of the terms so far.
+    """
     scene, problem = adjoint.scene, adjoint.scene.problem
     if not scene.model.thin:
         return scene
@@ -373,12 +478,12 @@ def _with_field(adjoint: Adjoint, name: str) -> Scene:
         return Scene(replace(problem, thickness=Thickness()), scene.comm)
     loads, natural = problem.loads, problem.loads.natural
     if name == "curvature" and (natural is None or natural.curvature is None):
-        bent = Natural(
+        with_curvature = Natural(
             np.zeros(3),
             natural.stretch if natural else None,
             frame(scene.problem.context, problem.azimuth),
         )
-        return Scene(replace(problem, loads=replace(loads, natural=bent)), scene.comm)
+        return Scene(replace(problem, loads=replace(loads, natural=with_curvature)), scene.comm)
     magnetic = loads.magnetic
     if (
         adjoint.directions
@@ -386,20 +491,24 @@ def _with_field(adjoint: Adjoint, name: str) -> Scene:
         and magnetic
         and not callable(magnetic.remanent)
     ):
-        uniform = replace(magnetic, remanent=Uniform(np.asarray(magnetic.remanent)))
-        return Scene(replace(problem, loads=replace(loads, magnetic=uniform)), scene.comm)
+        with_uniform_field = replace(magnetic, remanent=Uniform(np.asarray(magnetic.remanent)))
+        return Scene(
+            replace(problem, loads=replace(loads, magnetic=with_uniform_field)), scene.comm
+        )
     return scene
 
 
 def _terms(scene: Scene, state: State, name: str) -> list[FormTerm]:
-    """The terms with the field as a coefficient; a remanence that is the same everywhere is no
-    field in the model's.
+    """Return the terms with forms, in which the field is a coefficient.
+
+    A uniform remanence is a constant in the model's own terms. They are replaced by terms with a
+    field.
     """
-    parts = (
+    forms_of_terms = (
         (term.forms if isinstance(term, LinearTerm) else (term,))
         for term in scene.model.system.terms
     )
-    terms: list[Term] = [term for terms_of_part in parts for term in terms_of_part]
+    terms: list[Term] = [term for terms_of_part in forms_of_terms for term in terms_of_part]
     magnetic = scene.model.loads.magnetic
     if FIELDS[name].coefficient == "Br" and magnetic and not callable(magnetic.remanent):
         terms = list(
@@ -411,14 +520,17 @@ def _terms(scene: Scene, state: State, name: str) -> list[FormTerm]:
 
 
 def places_of(scene: Scene, f: fem.Function) -> tuple[Array, Array]:
-    """Nodes of every cell of a field and normals there, as the field's pattern is given them."""
+    """Return the nodes of every cell of a field, and the normals there, both (cells, nodes, 3).
+
+    They are slightly inside of the cells, as the places at which a field by formula is evaluated.
+    """
     model, nodes = scene.model, f.function_space.element.basix_element.points
     places, normals = model.places(nodes)
     return spatial_fields.inside_cells(places), normals
 
 
 def _lengths(scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array) -> Array:
-    """Derivative by a factor of the vector at each place."""
+    """Return the derivative by a factor of the vector at each place; a `Projection`."""
     Q = f.function_space
     vectors = f.x.array.reshape(-1, Q.dofmap.bs)[Q.dofmap.list[: len(forces)]]
     return np.asarray(np.sum(forces * vectors, axis=-1, keepdims=True))
@@ -427,8 +539,9 @@ def _lengths(scene: Scene, f: fem.Function, forces: Array, places: Array, normal
 def _curvatures(
     scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array
 ) -> Array:
-    """Derivative by kappa_11, kappa_22 and kappa_12 in the frame of the natural shape, from that by
-    the tensor in space.
+    """Return the derivative by kappa_11, kappa_22, kappa_12 of the natural shape; a `Projection`.
+
+    Components of `forces` are those by the tensor in space; the frame is that of the natural shape.
     """
     natural = scene.problem.loads.natural
     assert natural
@@ -436,13 +549,17 @@ def _curvatures(
 
 
 def _outwards(scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array) -> Array:
-    """Derivative by the deviation w0, from that by the place."""
+    """Return the derivative by the deviation w0, the normal part of that by the place.
+
+    A `Projection`.
+    """
     return np.asarray(np.sum(forces * normals[..., scene.model.axes], axis=-1, keepdims=True))
 
 
 def _perfect(scene: Scene, places: Array, normals: Array) -> tuple[Array, Array]:
-    """The places of the perfect shell, of which deviations are functions, and its normals, from the
-    drawn one's.
+    """Return places and normals (cells, nodes, 3) of the perfect shell, from the drawn one's.
+
+    Deviations are functions of the perfect places.
     """
     model, outward = scene.model, scene.problem.outward
     assert model.thin
@@ -466,28 +583,34 @@ FIELDS = {
 
 
 def mass(scene: Scene) -> Adjoint:
-    """The mass over that of the same shell with the thickness h."""
+    """Return the mass over that of the same shell with the thickness h, as an adjoint; collective.
+
+    It does not depend on displacements, so its only place is the undeformed state without
+    multipliers.
+    """
     state = scene.unloaded()
 
     def thickness_ratio(scene_there: Scene) -> tuple[float, list[tuple[FormTerm, float]]]:
-        t, thickness_integral, log, u = (
+        """Return the ratio in a scene, and its terms with factors for derivatives by fields."""
+        thickness_factor, thickness_integral, log, u = (
             scene_there.model.thickness,
             scene_there.model.over_area(),
             scene_there.model.kernels,
             scene_there.model.u,
         )
-        if t is None:
+        if thickness_factor is None:
             return 1.0, []
-        rho = (
-            fem.Constant(t.function_space.mesh, 1.0)
+        density_ratio = (
+            fem.Constant(thickness_factor.function_space.mesh, 1.0)
             if scene_there.model.cell_materials is None
             else scene_there.model.cell_materials[2]
         )
         terms = (
-            FormTerm("mass", thickness_integral(rho * t[0]), u, log),
-            FormTerm("area", thickness_integral(rho * 1.0), u, log),
+            FormTerm("mass", thickness_integral(density_ratio * thickness_factor[0]), u, log),
+            FormTerm("area", thickness_integral(density_ratio * 1.0), u, log),
         )
         value, area = (scene.comm.allreduce(term.energy()) for term in terms)
+        # derivatives of the quotient by its numerator and its denominator
         return value / area, [(terms[0], 1 / area), (terms[1], -value / area**2)]
 
     value, forms = thickness_ratio(scene)
@@ -502,8 +625,7 @@ def mass(scene: Scene) -> Adjoint:
 
 
 def density(scene: Scene, gradient: FieldGradient) -> Array:
-    """dJ per area over R^2 (per volume of a solid) at the nodes of V on this rank, (nodes,
-    components); collective.
+    """Return dJ per area over R^2 (per volume of a solid) at the nodes of V, from a gradient.
 
     With the derivatives f by a field at the nodes of the cells and the hat functions H_v of the
     vertices,
@@ -512,6 +634,12 @@ def density(scene: Scene, gradient: FieldGradient) -> Array:
 
     is what J changes by where the field changes by one over a unit of area, averaged over about a
     cell. The sum of g_v int(H_v dA) is the derivative by a field that changes alike everywhere.
+    Collective.
+
+    Returns
+    -------
+    Array
+        (nodes, components) of this rank, with its ghosts.
     """
     V, nodes = scene.model.V, gradient.field.function_space.element.basix_element.points
     H = fem.functionspace(V.mesh, ("Lagrange", 1))
@@ -523,21 +651,22 @@ def density(scene: Scene, gradient: FieldGradient) -> Array:
     fem.assemble_vector(area.x.array, form)
     _added(area)
     shares = np.einsum("cnk,nv->cvk", gradient.forces, hat.tabulate(0, nodes)[0, :, :, 0])
-    at_vertices = []
-    for component in np.moveaxis(shares, -1, 0):
+    density_at_vertices = []
+    for forces_of_component in np.moveaxis(shares, -1, 0):
         g = fem.Function(H)
-        np.add.at(g.x.array, H.dofmap.list[:count], component)
+        np.add.at(g.x.array, H.dofmap.list[:count], forces_of_component)
         _added(g)
-        at_vertices.append(g.x.array / area.x.array / scene.model.multiplicity)
-    in_cells = np.stack(at_vertices, axis=-1)[H.dofmap.list[:count]]
-    table = hat.tabulate(0, V.element.basix_element.points)[0, :, :, 0]
-    map_ = V.dofmap.index_map
-    values = np.zeros((map_.size_local + map_.num_ghosts, shares.shape[-1]))
-    values[V.dofmap.list[:count]] = np.einsum("nv,cvk->cnk", table, in_cells)
+        density_at_vertices.append(g.x.array / area.x.array / scene.model.multiplicity)
+    in_cells = np.stack(density_at_vertices, axis=-1)[H.dofmap.list[:count]]
+    hats_at_nodes = hat.tabulate(0, V.element.basix_element.points)[0, :, :, 0]
+    node_map = V.dofmap.index_map
+    values = np.zeros((node_map.size_local + node_map.num_ghosts, shares.shape[-1]))
+    # linear in each cell, so that nodes of two cells agree
+    values[V.dofmap.list[:count]] = np.einsum("nv,cvk->cnk", hats_at_nodes, in_cells)
     return values
 
 
 def _added(f: fem.Function) -> None:
-    """Add what other ranks have of shared vertices."""
+    """Add contributions of other ranks at shared vertices, and update ghosts; collective."""
     f.x.scatter_reverse(InsertMode.add)
     f.x.scatter_forward()

@@ -47,6 +47,13 @@ Gradient: TypeAlias = float | FieldGradient
 
 
 def by_amplitude(adjoint: Adjoint, name: str) -> float:
+    """Return the derivative of a result by an amplitude that is prescribed at its places.
+
+    Raises
+    ------
+    CaseError
+        If the amplitude is unknown, as its conjugate is held, or is left by an earlier step.
+    """
     if name in adjoint.places[0].follows or all(
         name in {*place.rows, *place.driven_amplitudes} for place in adjoint.places
     ):
@@ -59,11 +66,24 @@ def by_amplitude(adjoint: Adjoint, name: str) -> float:
 
 
 def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = None) -> float:
-    """Derivative by a number of the case: a central difference of the contracted equations on the
-    same mesh, without a solve.
+    """Return the derivative of a result J by a number of the case, without a solve; collective.
 
-    `others` keeps the scenes with other values of this number, for further results of the same
-    scene.
+    It is a central difference of J and of the contracted equations on the same mesh.
+
+    Parameters
+    ----------
+    adjoint
+        J with the multipliers of its equations.
+    key
+        Key of the number in the case.
+    others
+        Value of the number -> scene with this value. The dictionary is filled, for further results
+        of the same scene.
+
+    Raises
+    ------
+    CaseError
+        If the number has no derivative here.
     """
     others = {} if others is None else others
     scene = adjoint.scene
@@ -81,10 +101,11 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
         )
 
     def contracted(p: float) -> float:
+        """Return J plus equations times multipliers, at fixed states, for a value of the number."""
         if p != value and p not in others:
             others[p] = perturbed_scene(scene, key, p)
-        other = scene if p == value else others[p]
-        first, total = adjoint.places[0], 0.0
+        scene_at_value = scene if p == value else others[p]
+        first_place, contracted_sum = adjoint.places[0], 0.0
         for place in reversed(adjoint.places):  # the last one, whose state stays, is the first
             own_amplitudes = {
                 *place.rows,
@@ -93,49 +114,64 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
             }
             state = state_with_new_loads(
                 scene,
-                other,
-                _transferred_state(scene, other, place.state),
+                scene_at_value,
+                _transferred_state(scene, scene_at_value, place.state),
                 own_amplitudes,
                 place.steps,
             )
-            state = other.model.system.with_moved_supports(state)
-            if other is not scene:
-                expand_contact(scene, other, place.state)
-            total += _residual_at(scene, other, place, state) + (
-                0.0 if adjoint.by_itself and place is first else _own_value(other, place, state)
+            state = scene_at_value.model.system.with_moved_supports(state)
+            if scene_at_value is not scene:
+                expand_contact(scene, scene_at_value, place.state)
+            contracted_sum += _residual_at(scene, scene_at_value, place, state) + (
+                0.0
+                if adjoint.by_itself and place is first_place
+                else _own_value(scene_at_value, place, state)
             )
         if adjoint.by_itself:
-            total += adjoint.by_itself(other, state)
+            contracted_sum += adjoint.by_itself(scene_at_value, state)
         terms = [
-            (c * factor_of(t.amplitude, state.mu), t) for t, c in energies_along(other, adjoint)
+            (factor * factor_of(term.amplitude, state.mu), term)
+            for term, factor in energies_along(scene_at_value, adjoint)
         ]
-        energies = other.model.system.at_state(state).evaluate(
-            lambda: sum(c * t.energy() for c, t in terms)
+        energies = scene_at_value.model.system.at_state(state).evaluate(
+            lambda: sum(factor * term.energy() for factor, term in terms)
         )
-        return float(total + other.model.system.comm.allreduce(energies))
+        return float(contracted_sum + scene_at_value.model.system.comm.allreduce(energies))
 
     return _slope(contracted, value, scale_at_key(scene.problem.context, key))
 
 
 def _slope(f: Callable[[float], float], value: float, size: float) -> float:
-    """df/dp at a value by a difference of numbers that are allowed; a change is small against
-    `size`.
+    """Return df/dp at a value, by a difference between values that are allowed.
 
     At a held displacement an energy or a pressing body is far stiffer in a number than the
     equilibrium: by a natural stretch e the energy changes by E h R^2 of e^2, and its derivative may
     be 1e-4 of that. A difference of second order then has the third derivative in it. Where the
-    values are not straight over a step, it is one of fourth order.
+    values are not straight over a step, the difference is of fourth order.
+
+    Parameters
+    ----------
+    f
+        Function of the number; it raises `CaseError` at a value that is not allowed.
+    size
+        Scale of the number: the step is `STEP` times it.
+
+    Raises
+    ------
+    CaseError
+        If no difference has allowed values alone.
     """
-    step, refused, value_at = STEP * size, list[CaseError](), cache(f)
+    step, refusals, value_at = STEP * size, list[CaseError](), cache(f)
 
     def difference(nodes: Sequence[int]) -> float:
-        values = [value_at(value + i * step) for i in nodes]
+        """Return the difference quotient with values at multiples `nodes` of the step."""
+        values = [value_at(value + node * step) for node in nodes]
         powers = np.vander(np.array(nodes, dtype=float), increasing=True).T
         weights = np.linalg.solve(powers, np.eye(len(nodes))[1])  # exact of polynomials
         return float(weights @ values) / step
 
     try:
-        low, high = (value_at(value + i * step) for i in BOTH)
+        low, high = (value_at(value + node * step) for node in BOTH)
         if abs(low - 2 * value_at(value) + high) <= STRAIGHT * abs(high - low):
             return difference(BOTH)
     except CaseError:
@@ -144,47 +180,74 @@ def _slope(f: Callable[[float], float], value: float, size: float) -> float:
         try:
             return difference(nodes)
         except CaseError as e:
-            refused.append(e)
-    raise refused[0]
+            refusals.append(e)
+    raise refusals[0]
 
 
 def size_by_number(adjoint: Adjoint, key: str) -> float:
-    """The derivative of the unit of the result: one p_c is more pascals on a thicker shell."""
+    """Return the derivative of the unit of a result by a number of the case.
+
+    For example, one p_c is more pascals on a thicker shell. It is 0 for a result without a unit.
+    """
     if not adjoint.scale:
         return 0.0
     problem = adjoint.scene.problem
-    value, size = number_at_key(problem.context, key), scale_at_key(problem.context, key)
+    value, scale = number_at_key(problem.context, key), scale_at_key(problem.context, key)
     return _slope(
         lambda p: sizes_of(problem.with_values({key: p}).context).by_unit[adjoint.scale],
         value,
-        size,
+        scale,
     )
 
 
 def _transferred_state(scene: Scene, other: Scene, state: State) -> State:
+    """Return a state with its displacement in the unknowns of another scene on the same mesh."""
     return State(transfer(scene, other, state.u), state.mu)
 
 
 def _residual_at(scene: Scene, other: Scene, place: AdjointState, state: State) -> float:
-    """The residual and the rows of a place in another scene; what is held stays the same number of
-    its unit.
+    """Return residual and rows of a place in another scene, times multipliers; collective.
+
+    A held conjugate stays the same number in its unit, which may differ between the scenes.
+
+    Parameters
+    ----------
+    scene, other
+        Scene of the adjoint, and the other scene.
+    place
+        State in `scene` with its multipliers.
+    state
+        The same state in the unknowns and with the loads of `other`.
     """
     system, own_state = other.model.system, place.state
-    change = dot(system.comm, transfer(scene, other, place.w), system.forces(state.u, state.mu))
+    contracted_sum = dot(
+        system.comm, transfer(scene, other, place.w), system.forces(state.u, state.mu)
+    )
     targets = target_ratios(scene, other, "conjugate", place.steps)
-    for name, c in place.rows.items():
+    for name, multiplier in place.rows.items():
         held_value = -scene.model.system.potential(own_state.u, own_state.mu, name)
-        unit = other.conjugate_unit(name) / scene.conjugate_unit(name) * targets.get(name, 1.0)
-        unit_ratio = 1.0 if name in place.follows else unit
-        change += c * (system.potential(state.u, state.mu, name) + unit_ratio * held_value)
-    return float(change)
+        ratio_of_units = (
+            other.conjugate_unit(name) / scene.conjugate_unit(name) * targets.get(name, 1.0)
+        )
+        unit_ratio = 1.0 if name in place.follows else ratio_of_units
+        contracted_sum += multiplier * (
+            system.potential(state.u, state.mu, name) + unit_ratio * held_value
+        )
+    return float(contracted_sum)
 
 
 def _own_value(other: Scene, place: AdjointState, state: State) -> float:
-    """Return the part of J that depends on a place directly, through potentials and energy."""
+    """Return the part of J that a place contains through potentials and energy; collective.
+
+    Parameters
+    ----------
+    other, state
+        A scene, and the state of the place in its unknowns.
+    """
     system = other.model.system
     value = sum(
-        c * system.potential(state.u, state.mu, name) for name, c in place.potentials.items()
+        potential_factor * system.potential(state.u, state.mu, name)
+        for name, potential_factor in place.potentials.items()
     )
     if place.energy:
         value += place.energy / other.model.multiplicity * sum(other.energies(state).values())
@@ -251,14 +314,22 @@ def gradient(
 
 
 def derivative(adjoint: Adjoint, by: str, others: dict[float, Scene] | None = None) -> Gradient:
-    """The derivative by one parameter, in the unit of the result; see `gradient`, and `by_number`
-    for `others`.
+    """Return the derivative of a result by one parameter, in the unit of the result; collective.
+
+    Parameters
+    ----------
+    by
+        Amplitude, key of a number in the case, or field; see `gradient`.
+    others
+        See `by_number`.
     """
-    size = adjoint.size
+    unit_size = adjoint.size
     with contact_expanded_about(adjoint.scene, adjoint.contact_state):
         if by in FIELDS:
-            of_field = by_field(adjoint, by)
-            return replace(of_field, forces=size * of_field.forces)
+            field_gradient = by_field(adjoint, by)
+            return replace(field_gradient, forces=unit_size * field_gradient.forces)
         if by in adjoint.state.mu:
-            return size * by_amplitude(adjoint, by)
-        return size * by_number(adjoint, by, others) + adjoint.value * size_by_number(adjoint, by)
+            return unit_size * by_amplitude(adjoint, by)
+        return unit_size * by_number(adjoint, by, others) + adjoint.value * size_by_number(
+            adjoint, by
+        )

@@ -29,16 +29,23 @@ MAX_INSTABILITIES = 5  # and at most so many
 
 
 class LostResult(RuntimeError):
-    """The path of a case has no such result."""
+    """The path of a case has no such result; the message has the reason."""
 
 
 def located(records: Sequence[Record], amplitude: str) -> list[Record]:
-    """Return the records at which the path loses its stability under growth of an amplitude."""
-    in_amplitude = [r for r in records if r.amplitude == amplitude and not r.branch]
+    """Return the records at which the path loses its stability as an amplitude grows.
+
+    They are folds, and bifurcations before which no direction is unstable; those of branches do not
+    count.
+    """
+    records_in_amplitude = [
+        record for record in records if record.amplitude == amplitude and not record.branch
+    ]
     return [
-        r
-        for r in in_amplitude
-        if r.label == "fold" or (r.label == "bifurcation" and not r.point.negative_pivots)
+        record
+        for record in records_in_amplitude
+        if record.label == "fold"
+        or (record.label == "bifurcation" and not record.point.negative_pivots)
     ]
 
 
@@ -58,35 +65,42 @@ def load(record: Record, amplitude: str) -> float:
 
 
 def refuse_unitless(scene: Scene, result: str) -> None:
-    """Check that a case has the units of a result of `FOLDS`.
+    """Check that a case has the unit of a result of `FOLDS`.
 
     Raises
     ------
     CaseError
-        If it has none.
+        If the result has a unit, and the case does not have this unit.
     """
     sizes = scene.sizes
     if result in SCALES and (
         SCALES[result] not in sizes.by_unit or (result.endswith("_mT") and sizes.field != "mT")
     ):
-        bare = next(name for name, amplitude in FOLDS.items() if amplitude == FOLDS[result])
-        raise CaseError(f"{result}: the case has no such unit; {bare} has none")
+        name_without_unit = next(
+            name for name, amplitude in FOLDS.items() if amplitude == FOLDS[result]
+        )
+        raise CaseError(f"{result}: the case has no such unit; {name_without_unit} has none")
 
 
 def refuse_moving(scene: Scene, end: Record, result: str | Target) -> None:
     """Check that a result is not read at a point that moves along the path when parameters vary.
 
+    Parameters
+    ----------
+    end
+        Last record of the path.
+
     Raises
     ------
     LostResult
-        If the path ends at an instability: there the amplitude alone has a gradient.
+        If the path ends at an instability, and the result is not its amplitude.
     """
     column = in_units(scene, end.point.state, result)[0] if isinstance(result, str) else ""
-    load = end.amplitude in FOLDS.values() and column in (
+    is_load = end.amplitude in FOLDS.values() and column in (
         end.amplitude,
         quantities.amplitude(end.amplitude).column,
     )
-    if end.label in ("fold", "bifurcation") and not load:
+    if end.label in ("fold", "bifurcation") and not is_load:
         allowed = (
             ", ".join(name for name, amplitude in FOLDS.items() if amplitude == end.amplitude)
             or "none"
@@ -98,7 +112,13 @@ def refuse_moving(scene: Scene, end: Record, result: str | Target) -> None:
 
 
 def as_asked(adjoint: Adjoint, result: object) -> Adjoint:
-    """Return the adjoint with the unit of the requested result."""
+    """Return an adjoint whose result has the unit of the requested name.
+
+    Raises
+    ------
+    CaseError
+        If the case does not have this unit.
+    """
     if result not in SCALES:
         return adjoint
     refuse_unitless(adjoint.scene, str(result))
@@ -112,20 +132,29 @@ def instabilities(
     max_count: int = MAX_INSTABILITIES,
     begins: Begins = NO_BEGINS,
 ) -> list[tuple[str, Adjoint]]:
-    """The instabilities of a path by name, the lowest first, and what their derivatives are
-    contracted with.
+    """Return the instabilities of a path by name, the lowest first, with their adjoints.
 
     Parameters
     ----------
+    records
+        Records of the path in order.
     result
         One of `FOLDS`.
+    max_count
+        Largest number of instabilities.
     begins
         Number of a step -> the last record before it, where steps hold conjugates.
+
+    Returns
+    -------
+    list of (name, adjoint)
+        Mode or label of the record, and the adjoint of its amplitude. Those above `MAX_LOAD_RATIO`
+        times the lowest amplitude, and those without a gradient, are left out. Collective.
 
     Raises
     ------
     LostResult, FoldLost
-        If there is none, or the lowest one has no gradient.
+        If there is no instability, or the lowest one has no gradient.
     """
     amplitude = FOLDS[result]
     ascending = sorted(

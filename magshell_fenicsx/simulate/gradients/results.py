@@ -51,7 +51,7 @@ def refuse_no_barrier(problem: Problem) -> None:
     Raises
     ------
     CaseError
-        If it does not.
+        If its last step has not `until: zero`.
     """
     if not problem.programme or problem.programme[-1].until != "zero":
         raise CaseError("barrier: needs a last step with until: zero")
@@ -60,19 +60,26 @@ def refuse_no_barrier(problem: Problem) -> None:
 def adjoint_of_barrier(
     scene: Scene, begin: Record | None, end: Record, begins: Begins = NO_BEGINS
 ) -> Adjoint:
-    """The adjoint of the barrier between the begin and the end of the last step.
+    """Return the adjoint of the energy barrier between begin and end of the last step; collective.
 
-    Both are in equilibrium without the probing force, so that the energy changes by p alone,
+    Both states are in equilibrium without the probing force, so that the energy changes by p alone,
 
         dJ/dp = Pi_p(end) - Pi_p(begin) + sum_i (mu_i(end) - mu_i(begin)) dq_i/dp,
 
-    with the conjugates q_i that the probing holds: they are those of its begin, where one solve is
-    for them.
+    with the conjugates q_i that the step holds. They are those of its begin, where one solve gives
+    their multipliers.
+
+    Parameters
+    ----------
+    begin, end
+        Last record before the step, and its last record.
+    begins
+        Number of a step -> the last record before it.
 
     Raises
     ------
     CaseError
-        If the last step passes none, or holds a gas.
+        If the last step does not end at zero force, or holds a gas.
     """
     refuse_no_barrier(scene.problem)
     if begin is None:
@@ -85,51 +92,67 @@ def adjoint_of_barrier(
     state_before, state_after = (
         system.with_moved_supports(record.point.state) for record in (begin, end)
     )
-    held_conjugates, change = held_at(scene, end, state_after), dict[str, float]()
+    held_conjugates, amplitude_changes = held_at(scene, end, state_after), dict[str, float]()
     for name, conjugate in held_conjugates.items():
         if callable(conjugate):
             raise CaseError(f"barrier: {name}: no gradient while a gas is held")
-        change[name] = multiplicity * (state_after.mu[name] - state_before.mu[name])
-    slope = -np.sum(
-        [c * system.load(state_before.u, state_before.mu, name) for name, c in change.items()],
+        amplitude_changes[name] = multiplicity * (state_after.mu[name] - state_before.mu[name])
+    by_u = -np.sum(
+        [
+            amplitude_change * system.load(state_before.u, state_before.mu, name)
+            for name, amplitude_change in amplitude_changes.items()
+        ],
         axis=0,
     )
-    q = {name: -c for name, c in change.items()}
+    potential_factors = {
+        name: -amplitude_change for name, amplitude_change in amplitude_changes.items()
+    }
     w, rows = 0.0 * state_before.u, dict[str, float]()
-    if change:
+    if amplitude_changes:
         w, rows = solved(
             scene,
             state_before,
-            Functional(0.0, slope, potentials=q),
+            Functional(0.0, by_u, potentials=potential_factors),
             held_at(scene, begin, state_before),
         )
-    at_begin = AdjointState(state_before, w, rows, -multiplicity, q, steps=begin.step)
-    earlier = with_begins(Adjoint(scene, [at_begin]), begin, begins)
-    zero_vector, unknown = 0.0 * state_after.u, dict.fromkeys(held_conjugates, 0.0)
-    ends = [
-        AdjointState(state_after, zero_vector, unknown, multiplicity),
-        AdjointState(state_before, zero_vector, unknown, -multiplicity),
+    at_begin = AdjointState(
+        state_before, w, rows, -multiplicity, potential_factors, steps=begin.step
+    )
+    adjoint_of_conjugates = with_begins(Adjoint(scene, [at_begin]), begin, begins)
+    zero_vector, zero_rows = 0.0 * state_after.u, dict.fromkeys(held_conjugates, 0.0)
+    places_at_ends = [
+        AdjointState(state_after, zero_vector, zero_rows, multiplicity),
+        AdjointState(state_before, zero_vector, zero_rows, -multiplicity),
     ]
     # loads as earlier steps have left them
-    adjoint_with_begins = with_begins(Adjoint(scene, ends), end, begins)
-    places = [ends[0], *earlier.places, *adjoint_with_begins.places[2:]]
-    value, names = (
+    adjoint_with_begins = with_begins(Adjoint(scene, places_at_ends), end, begins)
+    # the places of `ends` come first, then those where earlier steps began
+    places = [places_at_ends[0], *adjoint_of_conjugates.places, *adjoint_with_begins.places[2:]]
+    value, left_loads = (
         barrier(scene, step, state_before, state_after),
-        earlier.left_loads | adjoint_with_begins.left_loads,
+        adjoint_of_conjugates.left_loads | adjoint_with_begins.left_loads,
     )
-    return Adjoint(scene, places, value=value, left_loads=names)
+    return Adjoint(scene, places, value=value, left_loads=left_loads)
 
 
 def refuse_no_result(
     scene: Scene, results: Iterable[str], key: str, *, extra_results: Sequence[str] = ()
 ) -> None:
-    """Check, before a history is computed, that the results at a key have gradients;
-    `extra_results` are allowed too.
+    """Check, before a history is computed, that results of a scene have gradients.
+
+    Parameters
+    ----------
+    results
+        Names of results.
+    key
+        Key of the case that has them, for messages.
+    extra_results
+        Further names that are allowed.
 
     Raises
     ------
     CaseError
-        With those that have.
+        With the names that are allowed.
     """
     start = scene.unloaded()
     columns = differentiable(scene, start)
@@ -150,8 +173,19 @@ def refuse_no_result(
 def adjoint_at_end(
     scene: Scene, history: History, result: str | Target, hold: Mapping[str, str] | None = None
 ) -> tuple[str, Adjoint]:
-    """The kind of a result ("" of most) at the last point of a history, and its adjoint;
-    collective.
+    """Return the kind of a result at the end of a history, and its adjoint; collective.
+
+    The kind is "" but for vibrations, see `Vibration.kind`.
+
+    Parameters
+    ----------
+    scene
+        The first scene of the history; the end may be in another one.
+    result
+        Name of a column, a vibration or the barrier; or a target shape.
+    hold
+        Amplitude -> "load" or "conjugate", what stays as parameters change; None: as the last step
+        holds.
 
     Raises
     ------
@@ -168,12 +202,14 @@ def adjoint_at_end(
 
 
 def vibration_at_end(scene: Scene, history: History, result: str) -> float | None:
-    """The frequency of a name; None of another result; collective.
+    """Return the frequency of a name at the end of a history; collective.
+
+    None if the name is not one of a vibration, such as "omega2_1".
 
     Raises
     ------
     LostResult
-        If it cannot be computed.
+        If the frequency cannot be computed.
     """
     if not NAMES.fullmatch(result):
         return None
@@ -186,26 +222,25 @@ def vibration_at_end(scene: Scene, history: History, result: str) -> float | Non
 
 
 class NamesOnlyScene(Scene):
-    """A stand-in for a scene without mesh and model, which knows the names of amplitudes and
-    results.
-    """
+    """A stand-in for a scene, without mesh and model: it has names of amplitudes and results."""
 
     def __init__(self, problem: Problem) -> None:
+        """Put names alone in place of a model: a value of 1 says that a name exists."""
         loads = problem.loads
-        size = {name: 1.0 for name, several in loads.dead.items() if forces(several)}
-        highest = ["pole"] if isinstance(problem.context.shell, MeshSurface) else []
+        unit_load_sizes = {name: 1.0 for name, several in loads.dead.items() if forces(several)}
+        highest_point = ["pole"] if isinstance(problem.context.shell, MeshSurface) else []
         model = SimpleNamespace(
             loads=loads,
-            normals=dict.fromkeys([*problem.points, *highest]),
+            normals=dict.fromkeys([*problem.points, *highest_point]),
             contacts=dict.fromkeys(contact.amplitude for contact in loads.contacts),
-            load_size=size,
+            load_size=unit_load_sizes,
             force_unit=1.0,
             system=SimpleNamespace(history={}),
         )
         vars(self).update(problem=problem, model=model)
 
     def unloaded(self) -> State:
-        """The amplitudes, of no displacement."""
+        """Return all amplitudes with value zero, and a displacement without unknowns."""
         loads = self.problem.loads
         field = loads.magnetic
         components = TRANSVERSE_AMPLITUDES[: len(field.across)] if field else ()
@@ -233,12 +268,12 @@ def refuse_unknown_results(problem: Problem, designed: Mapping[str, str]) -> Non
     Parameters
     ----------
     designed
-        Results of the design, and the keys that name them.
+        Result of the design -> key of the case that names it.
 
     Raises
     ------
     CaseError
-        If one is not.
+        If a name is unknown.
     """
     if not (problem.gradients or designed):
         return

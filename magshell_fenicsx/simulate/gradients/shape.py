@@ -35,84 +35,118 @@ STEP = 1e-4  # of h: of a node
 def of_measures(
     model: ShellModel | MeridianModel, shares: Sequence[WeightedTerm], w: fem.Function
 ) -> list[WeightedTerm]:
-    """Return the terms that come from the derivative of an integral by which other terms are
-    divided; collective.
+    """Return further terms for loads that are divided by an integral, such as an area; collective.
+
+    They are the derivatives of this integral, which changes with the field as well.
+
+    Parameters
+    ----------
+    shares
+        Terms with their weights in a gradient; those without such an integral add nothing.
+    w
+        The vector along which residuals are taken.
     """
-    added, comm, v = list[WeightedTerm](), model.V.mesh.comm, fem.Function(model.V)
+    measure_terms, comm, direction = list[WeightedTerm](), model.V.mesh.comm, fem.Function(model.V)
     for share in shares:
         if share.term.over is None:
             continue
-        v.x.array[:] = share.energy * model.u.x.array + share.work * w.x.array
+        direction.x.array[:] = share.energy * model.u.x.array + share.work * w.x.array
         numerator = model.kernels.compile(
-            f"{share.term.name} along", ufl.replace(share.term.form, {model.u: v})
+            f"{share.term.name} along", ufl.replace(share.term.form, {model.u: direction})
         )
         measure = FormTerm(f"{share.term.name} over", share.term.over, model.u, model.kernels)
-        value, size = (
+        value, integral_value = (
             comm.allreduce(integral)
             for integral in (fem.assemble_scalar(numerator), measure.energy())
         )
-        added.append(WeightedTerm(measure, -value / size, 0.0))
-    return added
+        measure_terms.append(WeightedTerm(measure, -value / integral_value, 0.0))
+    return measure_terms
 
 
 def of_widths(
     model: ShellModel | MeridianModel, shares: Sequence[WeightedTerm], w: fem.Function
 ) -> Array | None:
-    """The derivatives (cells, vertices, 3) by the vertices of flat cells, whose widths are in
-    energies of edges.
+    """Return derivatives (cells, vertices, 3) by the vertices of flat cells; collective.
+
+    The widths of flat cells are in the penalty energies on edges. So the forms are replaced by ones
+    with vertices that move. None of a meridian, or where no form has a width.
+
+    Parameters
+    ----------
+    shares
+        Terms with their weights in a gradient.
+    w
+        The vector along which residuals are taken.
     """
     if model.axisymmetric:  # where the placement says how wide they are
         return None
     domain = model.V.mesh
-    x = fem.Function(fem.functionspace(domain, ("Lagrange", 1, (3,))), name="x")
-    x.interpolate(lambda places: places)
-    jet, (volume, side) = kin.jet(x, domain), (ufl.CellVolume(domain), ufl.FacetArea(domain))
+    vertices = fem.Function(fem.functionspace(domain, ("Lagrange", 1, (3,))), name="x")
+    vertices.interpolate(lambda places: places)
+    jet, (volume, side) = kin.jet(vertices, domain), (ufl.CellVolume(domain), ufl.FacetArea(domain))
     length = kin.conormal(jet, kin.facet_covector(domain))[2]
     moved_measures = {volume: volume * kin.area_ratio(jet), side: side * length}
     widened_terms = list[WeightedTerm]()
     for share in shares:
         form = share.term.form
         on_edges = any(integral.integral_type() != "cell" for integral in form.integrals())
-        if on_edges and (other := ufl.replace(form, moved_measures)) != form:
+        if on_edges and (moved_form := ufl.replace(form, moved_measures)) != form:
             widened_terms.append(
                 WeightedTerm(
-                    FormTerm(share.term.name, other, model.u, model.kernels),
+                    FormTerm(share.term.name, moved_form, model.u, model.kernels),
                     share.energy,
                     share.work,
                 )
             )
-    return summed(widened_terms, x, model.u, w, model.kernels) if widened_terms else None
+    return summed(widened_terms, vertices, model.u, w, model.kernels) if widened_terms else None
 
 
 def of_normals(adjoint: Adjoint, place: AdjointState, *, first: bool) -> Array | float:
-    """The derivatives (own cells, nodes, 3) by normals at points, along which forces and
-    deflections are.
+    """Return derivatives (own cells, nodes, 3) by the placement, from normals at points.
+
+    Point forces act along such a normal, and J may contain the deflection along one. 0.0 of a model
+    without a mid-surface, where the normals stay. Collective.
+
+    Parameters
+    ----------
+    place
+        State with its multipliers.
+    first
+        Whether this is the first place of the adjoint, whose deflections J contains.
     """
-    model, mu, c = adjoint.scene.model, place.state.mu, place.conjugates
+    model, mu, conjugates = adjoint.scene.model, place.state.mu, place.conjugates
     if not model.midsurface:  # on the axis of a meridian they stay
         return 0.0
     deflected_points = (
         [(point, factor, 0.0) for point, factor in adjoint.deflections.items()] if first else []
     )
     for name, force in model.loads.forces.items():
-        energy = place.energy * mu[name] + c.get(name, 0.0)
+        energy = place.energy * mu[name] + conjugates.get(name, 0.0)
         deflected_points.append(
             (force.point, model.force_unit * energy, model.force_unit * mu[name])
         )
-    total: Array | float = 0.0
-    for point, of_u, of_w in deflected_points:
-        v = of_u * model.displacement(place.state.u, point) + of_w * model.displacement(
-            place.w, point
+    gradient: Array | float = 0.0
+    # weights of the deflections of u and of w at the point
+    for point, weight_of_u, weight_of_w in deflected_points:
+        displacement = weight_of_u * model.displacement(
+            place.state.u, point
+        ) + weight_of_w * model.displacement(place.w, point)
+        location = (
+            model.midsurface.points[point],
+            displacement,
+            model.midsurface.cells_of_point(point),
         )
-        location = model.midsurface.points[point], v, model.midsurface.cells_of_point(point)
-        total = total + by_vertex_normal(model.r0, *location)
-    return total
+        gradient = gradient + by_vertex_normal(model.r0, *location)
+    return gradient
 
 
 def fields_of_placement(terms: Sequence[FormTerm]) -> list[PlacementField]:
-    """The fields in terms that follow from the placement."""
+    """Return the fields in terms that follow from the placement, each once."""
     coefficients = (
-        c for term in terms for c in term.form.coefficients() if isinstance(c, PlacementField)
+        coefficient
+        for term in terms
+        for coefficient in term.form.coefficients()
+        if isinstance(coefficient, PlacementField)
     )
     return list(dict.fromkeys(coefficients))
 
@@ -120,23 +154,35 @@ def fields_of_placement(terms: Sequence[FormTerm]) -> list[PlacementField]:
 def rates(
     model: ShellModel | MeridianModel, field: PlacementField, normals: Array
 ) -> Iterator[Array]:
-    """Derivative of a field (own cells, nodes, size) by a motion of each node of all cells along
-    its normal; collective.
+    """Yield the derivatives of a field by a motion of nodes along the normal; collective.
 
-    `normals` (own cells, nodes, 3) are those of own cells.
+    One array (own cells, nodes of the field, components) for each local number of a node of the
+    model: in every cell this node moves at once, and the field in the cell follows from its own
+    nodes.
+
+    Parameters
+    ----------
+    normals
+        (own cells, nodes, 3) at the nodes of the model.
     """
     V, step = model.V, STEP * model.material.h
-    r = fem.Function(broken_space(V))
-    nodes = r.x.array.reshape(-1, V.dofmap.bs)
+    placement = fem.Function(broken_space(V))
+    nodes = placement.x.array.reshape(-1, V.dofmap.bs)
     coordinates = model.r0.x.array.reshape(-1, V.dofmap.bs)[V.dofmap.list]
-    node_dofs, dofs = r.function_space.dofmap.list, field.function_space.dofmap.list[: len(normals)]
-    for k in range(coordinates.shape[1]):
+    node_dofs, dofs = (
+        placement.function_space.dofmap.list,
+        field.function_space.dofmap.list[: len(normals)],
+    )
+    for node_number in range(coordinates.shape[1]):
         values = list[Array]()
+        # central difference, in cells that share no nodes
         for sign in (1, -1):
             moved_coordinates = coordinates.copy()
-            moved_coordinates[: len(normals), k] += sign * step * normals[:, k][:, model.axes]
+            moved_coordinates[: len(normals), node_number] += (
+                sign * step * normals[:, node_number][:, model.axes]
+            )
             nodes[node_dofs] = moved_coordinates
             values.append(
-                field.rebuild(r).x.array.reshape(-1, field.function_space.dofmap.bs)[dofs]
+                field.rebuild(placement).x.array.reshape(-1, field.function_space.dofmap.bs)[dofs]
             )
         yield np.asarray((values[0] - values[1]) / (2 * step))

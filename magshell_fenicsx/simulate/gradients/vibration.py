@@ -64,12 +64,14 @@ DEGENERACY_TOLERANCE = (
 
 @dataclass(frozen=True)
 class Vibration:
-    """A natural frequency, or the mean of several that are as good as equal.
+    """A natural frequency, or the mean of several frequencies that are as good as equal.
 
     Attributes
     ----------
-    value
-        omega^2 rho R^2/E.
+    modes
+        Modes of these frequencies.
+    numbers
+        Their numbers among all vibrations, from 1, ascending.
     """
 
     modes: tuple[ShellMode, ...]
@@ -77,6 +79,7 @@ class Vibration:
 
     @property
     def value(self) -> float:
+        """omega^2 rho R^2/E, the mean over the modes."""
         return float(np.mean([mode.eigenvalue for mode in self.modes]))
 
     @property
@@ -89,12 +92,17 @@ class Vibration:
 
 
 def refuse_no_vibration(problem: Problem, result: str) -> None:
-    """Check that a case has a frequency in hertz.
+    """Check that a case has the unit of a frequency in hertz, if one is asked for.
+
+    Parameters
+    ----------
+    result
+        Name such as "omega2_1" or "hertz_1".
 
     Raises
     ------
     CaseError
-        If it has no density.
+        If the frequency is in hertz and the case has no density.
     """
     if result.startswith("hertz") and problem.time_unit is None:
         raise CaseError(
@@ -104,27 +112,28 @@ def refuse_no_vibration(problem: Problem, result: str) -> None:
 
 
 def vibration(scene: Scene, state: State, result: str) -> Vibration:
-    """The vibration of a name such as "omega2_1"; see `vibrations`."""
+    """Return the vibration of a name such as "omega2_1"; see `vibrations`."""
     return vibrations(scene, state, result)[0]
 
 
 def vibrations(
     scene: Scene, state: State, result: str, *, max_ratio: float = 1.0, max_count: int = 1
 ) -> list[Vibration]:
-    """The vibration of a name such as "omega2_1", and the next ones; collective. Overwrites the
-    model's tangent.
+    """Return the vibration of a name such as "omega2_1" and the next higher ones; collective.
+
+    The model's tangent is overwritten.
 
     Parameters
     ----------
     max_ratio
-        The next ones have at most this multiple of its eigenvalue.
+        Largest eigenvalue of a next one, over that of the first.
     max_count
-        At most so many are returned.
+        Largest number of vibrations.
 
     Raises
     ------
     LostResult
-        If it cannot be computed.
+        If the model is a sector, or the vibration cannot be computed.
     """
     if mode_space(scene.model).model is not scene.model:
         raise LostResult(
@@ -142,11 +151,11 @@ def vibrations(
             raise LostResult(f"no frequencies here: {e}") from None
         if number > len(modes):
             raise LostResult(f"the model has {len(modes)} vibrations")
-        groups = [g for g in _groups(modes) if g.numbers[-1] >= number]
+        groups = [group for group in _groups(modes) if group.numbers[-1] >= number]
         groups_near_lowest = [
-            g
-            for g in groups
-            if g.value <= max(max_ratio, 1 + DEGENERACY_TOLERANCE) * groups[0].value
+            group
+            for group in groups
+            if group.value <= max(max_ratio, 1 + DEGENERACY_TOLERANCE) * groups[0].value
         ][:max_count]
         # the last group is complete
         if groups_near_lowest[-1].numbers[-1] < len(modes) or len(modes) < count:
@@ -154,30 +163,44 @@ def vibrations(
 
 
 def _groups(modes: Sequence[ShellMode]) -> list[Vibration]:
-    """Modes of one label whose frequencies are equal, ascending by their first."""
+    """Return modes of one label whose frequencies are equal as one vibration; ascending.
+
+    Parameters
+    ----------
+    modes
+        Modes with ascending frequencies.
+    """
     groups = list[list[int]]()
     for i, mode in enumerate(modes):
-        matching_groups = [g for g in groups if _is_degenerate(modes[g[0]], mode)]
+        matching_groups = [group for group in groups if _is_degenerate(modes[group[0]], mode)]
         if matching_groups:
             matching_groups[-1].append(i)
         else:
             groups.append([i])
-    return [Vibration(tuple(modes[i] for i in g), tuple(i + 1 for i in g)) for g in groups]
+    return [
+        Vibration(tuple(modes[i] for i in group), tuple(i + 1 for i in group)) for group in groups
+    ]
 
 
 def _is_degenerate(a: ShellMode, b: ShellMode) -> bool:
+    """Return whether two modes have one label, and frequencies that are as good as equal."""
     return a.label == b.label and abs(a.eigenvalue - b.eigenvalue) <= DEGENERACY_TOLERANCE * abs(
         b.eigenvalue
     )
 
 
 def frequency(problem: Problem, result: str, omega2: float) -> float:
-    """The result of a name: omega^2 rho R^2/E itself, or hertz.
+    """Return the result of a name: omega^2 rho R^2/E itself, or the frequency in hertz.
+
+    Parameters
+    ----------
+    omega2
+        omega^2 rho R^2/E.
 
     Raises
     ------
     LostResult
-        If the state is unstable: it does not vibrate.
+        If a frequency in hertz is asked for at an unstable state, which does not vibrate.
     """
     if result.startswith("omega2"):
         return omega2
@@ -196,23 +219,36 @@ def adjoints_of_vibrations(
     max_count: int = 1,
     begins: Begins = NO_BEGINS,
 ) -> list[tuple[str, Adjoint]]:
-    """The kinds of vibrations about a regular state, and their adjoints: one factorisation more for
-    each.
+    """Return the kinds of vibrations about a regular state, with their adjoints; collective.
+
+    Each takes one factorisation more.
 
     Parameters
     ----------
+    record
+        Row of the history at the state.
+    result
+        Name such as "omega2_1".
+    hold
+        Amplitude -> "load" or "conjugate", what stays as parameters change; None: as the record's
+        step holds.
     max_ratio, max_count
-        As of `vibrations`.
+        See `vibrations`.
     begins
         Number of a step -> the last record before it.
+
+    Returns
+    -------
+    list of (kind, adjoint)
+        Words for the vibration, see `Vibration.kind`, and the adjoint of its result.
 
     Raises
     ------
     LostResult
         If the state has no such vibration.
     CaseError
-        If the mode leaves the symmetry of the model, a body touches the shell, or it is a wave
-        where shells touch.
+        If the mode leaves the symmetry of the model, a body touches the shell, or the mode is a
+        wave where shells touch.
     """
     state = stiffened_equilibrium(scene, scene.model.system.with_moved_supports(record.point.state))
     if bodies := touching_bodies(scene, state):
@@ -240,9 +276,20 @@ def adjoints_of_vibrations(
 def _adjoint(
     scene: Scene, state: State, result: str, vibration: Vibration, held_conjugates: Held
 ) -> Adjoint:
+    """Return the adjoint of one vibration; collective.
+
+    Each mode adds displaced states u + e phi, as places whose residuals are contracted with phi:
+    their differences are the derivatives of phi . K phi.
+
+    Parameters
+    ----------
+    held_conjugates
+        Amplitude that is unknown -> its conjugate.
+    """
     value = frequency(scene.problem, result, vibration.value)
     rate = 1.0 if result.startswith("omega2") else value / (2 * vibration.value)
-    c = rate / len(vibration.modes)
+    # factor of the eigenvalue of each mode in J
+    factor = rate / len(vibration.modes)
     contact_state = state if any(deep > 0 for _, deep in shell_penetrations(scene, state)) else None
     if contact_state and _wave(vibration.modes[0]) is not None:
         refuse_touching_shells(scene, state, f"{result}: {vibration.modes[0].label}")
@@ -252,8 +299,8 @@ def _adjoint(
             _slopes(scene, state, mode, list(held_conjugates), largest_step)
             for mode in vibration.modes
         ]
-    by_u = np.sum([s.by_u for s in slopes], axis=0) * c
-    by_mu = {name: c * sum(s.by_mu[name] for s in slopes) for name in held_conjugates}
+    by_u = np.sum([slope.by_u for slope in slopes], axis=0) * factor
+    by_mu = {name: factor * sum(slope.by_mu[name] for slope in slopes) for name in held_conjugates}
     # nothing displaces a shell that nothing loads, whatever changes
     w, rows = (
         (0.0 * by_u, {})
@@ -264,7 +311,7 @@ def _adjoint(
     for mode in vibration.modes:
         if (m := _wave(mode)) is not None:
             directions.append(
-                EnergyDirection(mode.vector, m, stiffness=c, inertia=-c * mode.eigenvalue)
+                EnergyDirection(mode.vector, m, stiffness=factor, inertia=-factor * mode.eigenvalue)
             )
             continue
         step = scene.model.system.step_along(mode.vector, largest_step)
@@ -272,10 +319,10 @@ def _adjoint(
             displaced_state = State(state.u + offset * step * mode.vector, state.mu)
             places.append(
                 AdjointState(
-                    displaced_state, c * weight / step * mode.vector, dict.fromkeys(rows, 0.0)
+                    displaced_state, factor * weight / step * mode.vector, dict.fromkeys(rows, 0.0)
                 )
             )
-        directions.append(EnergyDirection(mode.vector, None, inertia=-c * mode.eigenvalue))
+        directions.append(EnergyDirection(mode.vector, None, inertia=-factor * mode.eigenvalue))
     by_itself = lambda there, _: frequency(there.problem, result, vibration.value)  # noqa: E731
     gas = with_gas(held_conjugates)
     return Adjoint(
@@ -290,6 +337,7 @@ def _adjoint(
 
 
 def _wave(mode: ShellMode) -> int | None:
+    """Return the number of waves of a mode around a meridian; 0 of torsion, None of other modes."""
     if mode.label == TORSION:
         return 0
     return int(mode.label.removeprefix(WAVE)) if mode.label.startswith(WAVE) else None
@@ -298,7 +346,15 @@ def _wave(mode: ShellMode) -> int | None:
 def _slopes(
     scene: Scene, state: State, mode: ShellMode, held_names: list[str], largest_step: float
 ) -> Functional:
-    """phi . K phi with its derivatives by u and by amplitudes that are unknown."""
+    """Return phi . K phi of a mode, with derivatives by u and by unknown amplitudes; collective.
+
+    Parameters
+    ----------
+    held_names
+        Amplitudes that are unknown.
+    largest_step
+        Largest displacement e phi of a difference, over h.
+    """
     system, phi = scene.model.system, mode.vector
     if (m := _wave(mode)) is not None:
         assert scene.model.axisymmetric
@@ -313,12 +369,15 @@ def _slopes(
         dict.fromkeys(held_names, 0.0),
     )
     for offset, weight in DIFFERENCE_WEIGHTS.items():
-        u, part = state.u + offset * step * phi, weight / step
+        u, difference_factor = state.u + offset * step * phi, weight / step
         K = symmetric_part(system.tangent(u, state.mu))
         x, y = K.createVecs()
         x.array[:] = phi
         K.mult(x, y)
-        by_u += part * y.array_r
+        # differences of K phi between displaced states
+        by_u += difference_factor * y.array_r
         for name in held_names:
-            by_mu[name] += float(part * dot(system.comm, phi, system.load(u, state.mu, name)))
+            by_mu[name] += float(
+                difference_factor * dot(system.comm, phi, system.load(u, state.mu, name))
+            )
     return Functional(mode.eigenvalue, system.zero_at_supports(by_u), by_mu)

@@ -37,6 +37,7 @@ class CoilSection(SourceSection):
 
     @model_validator(mode="after")
     def _one_shape(self) -> Self:
+        """Refuse a coil without exactly one shape, or a polygon that repeats a corner."""
         if (self.diameter is None) == (self.vertices is None):
             raise ValueError("give diameter or vertices")
         if self.vertices and any(
@@ -46,6 +47,7 @@ class CoilSection(SourceSection):
         return self
 
     def field(self, key: str, R: float) -> FieldOfSource:
+        """Return the field of the wire in its own axes, see `SourceSection`."""
         current, currents = self.turns * self.current, magpylib(key).current
         if self.vertices is not None:
             corners = np.array(self.vertices)
@@ -64,9 +66,10 @@ class CoilSection(SourceSection):
 
 
 def to_polygon(x: Array, corners: Array) -> Array:
-    """The distance (n,) of places (n, 3) from the nearest of the lines between corners (m, 3)."""
+    """Return the distance (n,) of places x (n, 3) from a polygon through `corners` (m, 3)."""
     distance = np.full(len(x), np.inf)
     for a, segment in zip(corners, np.diff(corners, axis=0), strict=False):
+        # where the foot of each place is along the segment, from 0 to 1
         position = np.clip((x - a) @ segment / np.sum(segment**2), 0.0, 1.0)
         distance = np.minimum(distance, np.linalg.norm(x - a - position[:, None] * segment, axis=1))
     return distance

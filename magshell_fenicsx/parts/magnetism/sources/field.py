@@ -1,5 +1,7 @@
-"""The whole applied field where it is known by its values: formulas, sources, and what is uniform
-beside these.
+"""The whole applied field where it is known by its values: formulas, sources, and a uniform part.
+
+Fields are `FieldInSpace`: functions of places over R that return B over |B^a| with its first and
+second derivatives.
 """
 
 from collections.abc import Callable, Sequence
@@ -19,28 +21,30 @@ from magshell_fenicsx.parts.magnetism.source_step import SourceStep
 from magshell_fenicsx.parts.magnetism.sources.source import Array, PlacedSource
 from magshell_fenicsx.parts.step import ProgrammeStep
 
-HALFWAY = 0.371  # of a motion: no symmetric place
+HALFWAY = 0.371  # fraction of a motion, at no symmetric place
 
 
 @dataclass(frozen=True)
 class Linear:
-    """A field b + G x."""
+    """The field B = b + G x with its derivatives, a `FieldInSpace`."""
 
     b: Array
     G: Array
 
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return B (n, 3) at places x (n, 3) with its first and second derivatives."""
         n = len(x)
         return self.b + x @ self.G.T, np.broadcast_to(self.G, (n, 3, 3)), np.zeros((n, 3, 3, 3))
 
 
 @dataclass(frozen=True)
 class FieldSum:
-    """The sum of some fields, perhaps of none."""
+    """The sum of some fields, each a `FieldInSpace`; zero of none."""
 
     parts: Sequence[FieldInSpace]
 
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return B (n, 3) at places x (n, 3) with its first and second derivatives."""
         n = len(x)
         B, G, H = np.zeros((n, 3)), np.zeros((n, 3, 3)), np.zeros((n, 3, 3, 3))
         for part in self.parts:
@@ -50,7 +54,9 @@ class FieldSum:
 
 
 def placed_sources(context: Context, turn: float = 0.0) -> list[PlacedSource]:
-    """Return the sources of a case, in a frame turned by `turn` about e3 (rad).
+    """Return the sources of a case, each at its place in the frame of a model.
+
+    `turn` is the azimuth of that frame about e3 in radians.
 
     Raises
     ------
@@ -76,6 +82,7 @@ def placed_sources(context: Context, turn: float = 0.0) -> list[PlacedSource]:
 
 
 def _applied(context: Context) -> AppliedSection | None:
+    """Return the section of the applied field; None without one."""
     magnetic = context.section_of(MagneticSection)
     return magnetic.applied if magnetic else None
 
@@ -83,7 +90,8 @@ def _applied(context: Context) -> AppliedSection | None:
 def turns(context: Context, turn: float = 0.0) -> tuple[RigidMotion, ...]:
     """Return the rotations of the whole field about the origin, one for each step that rotates it.
 
-    There are none for a uniform field, which has components instead.
+    A uniform field has none: its components are amplitudes instead. `turn` is the azimuth of the
+    model's frame about e3 in radians.
     """
     applied = _applied(context)
     if applied is None or not (applied.components or applied.sources or applied.gradient):
@@ -104,9 +112,16 @@ def turns(context: Context, turn: float = 0.0) -> tuple[RigidMotion, ...]:
 def in_space(
     context: Context, turn: float = 0.0
 ) -> tuple[FieldInSpace | None, tuple[MovingField, ...]]:
-    """Return the field at rest, None if it is uniform or linear, and the moving fields.
+    """Return the field that is known by values, at rest and moving, in the frame of a model.
 
-    Both are in a frame turned by `turn` about e3 (rad).
+    `turn` is the azimuth of that frame about e3 in radians.
+
+    Returns
+    -------
+    at_rest
+        The field that no amplitude moves; None if all of it is uniform or linear.
+    moving_fields
+        Fields with the amplitudes that move or multiply them.
 
     Raises
     ------
@@ -121,21 +136,21 @@ def in_space(
     rotations = turns(context, turn)
     if not applied.sources and not rotations:
         return by_formula, ()
-    parts = list[FieldInSpace]()
+    fields_at_rest = list[FieldInSpace]()
     if applied.has_field_beside_sources:
         G = Q @ np.array(applied.gradient or np.zeros((3, 3))) @ Q.T
-        parts.append(by_formula or Linear(applied.uniform * applied.vector(turn), G))
+        fields_at_rest.append(by_formula or Linear(applied.uniform * applied.vector(turn), G))
     moving_fields = list[MovingField]()
     for number, source in enumerate(placed_sources(context, turn)):
         moving_field = _moving_source(applied, context.steps, number, source, rotations, Q)
         if moving_field.names:
             moving_fields.append(moving_field)
         else:
-            parts.append(source)
+            fields_at_rest.append(source)
     if rotations:
-        moving_fields += [MovingField(part, rotations) for part in parts]
-        parts = []
-    return FieldSum(parts), tuple(moving_fields)
+        moving_fields += [MovingField(field_at_rest, rotations) for field_at_rest in fields_at_rest]
+        fields_at_rest = []
+    return FieldSum(fields_at_rest), tuple(moving_fields)
 
 
 def _moving_source(
@@ -146,9 +161,20 @@ def _moving_source(
     rotations: Sequence[RigidMotion],
     Q: Array,
 ) -> MovingField:
-    """Return a source with the amplitudes of its steps.
+    """Return a source as a field with the amplitudes of all steps that move it.
 
     Rotations about its own position come before all other motions.
+
+    Parameters
+    ----------
+    steps
+        Steps of the programme.
+    number
+        Number of the source in the list of sources.
+    rotations
+        Rotations of the whole field, see `turns`.
+    Q
+        Rotation (3, 3) from the frame of the case to that of the model.
     """
     spins, moves, factors, zero = (
         list[RigidMotion](),
@@ -177,6 +203,7 @@ def _moving_source(
             factors[name] = load.strength - 1
         else:
             end = np.array(load.move or load.to) / source.length
+            # where all motions before this step have taken the source
             begin = apply_motions(
                 moves, dict.fromkeys((m.name for m in moves), 1.0), source.position[None]
             ).x[0]
@@ -185,9 +212,10 @@ def _moving_source(
 
 
 def values(context: Context) -> list[Callable[[Array], Array]]:
-    """Return functions of places (n, 3) -> B over |B^a|, for sources at several amplitudes.
+    """Return functions of places x (n, 3) over R that give B (n, 3) over |B^a|.
 
-    The first is for the sources as they begin; the others have one amplitude changed each.
+    The first is the field as it begins. Each further one has one amplitude changed, halfway or to
+    one. The list is empty for a uniform or linear field.
     """
     field_at_rest, moving_fields = in_space(context)
     if field_at_rest is None:

@@ -20,9 +20,11 @@ class FormulaSource(SourceSection):
     """What the components are over; 1 T by default"""
 
     def words(self) -> str:
+        """Return the formulas, for the account of what is built."""
         return f"formulas ({', '.join(self.components)})"
 
     def field(self, key: str, R: float) -> FieldOfSource:
+        """Return the field of the formulas in the source's own axes, see `SourceSection`."""
         formulas = FormulasInSpace(
             [formula_with_derivatives(text) for text in self.components], np.eye(3)
         )

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 PLACES, FIELD = ("x", "y", "z"), ("Bx", "By", "Bz")
 VTK, DEGREE = (".vtk", ".vti", ".vtr", ".vts"), 3
-PLACE_TOLERANCE = 1e-6  # of the distance between places: rounding of a table
+PLACE_TOLERANCE = 1e-6  # over the distance between places: rounding of a table
 _grids: dict[tuple[Path, str], tuple[list[Array], Array]] = {}  # a run plans its case several times
 
 
@@ -42,7 +42,7 @@ class GridSection(FileKeys, SourceSection):
         return f"grid of {self.file}"
 
     def field(self, key: str, R: float) -> FieldOfSource:
-        """Return the field of the spline, see `SourceSection`.
+        """Return the field of the spline in the source's own axes, see `SourceSection`.
 
         Raises
         ------
@@ -74,25 +74,27 @@ class GridSection(FileKeys, SourceSection):
 
 
 def _spline(axes: list[Array], values: Array) -> "scipy.interpolate.NdBSpline":
-    """The tensor product of the cubic splines along each axis, of values (nx, ny, nz, 3)."""
+    """Return the tensor-product cubic spline of values (nx, ny, nz, 3) on three axes."""
     import scipy
 
     knots = []
     for i, axis in enumerate(axes):
         spline = scipy.interpolate.make_interp_spline(axis, values, DEGREE, axis=i)
         knots.append(spline.t)
+        # coefficients along one axis are the values for the next
         values = np.moveaxis(spline.c, 0, i)
     return scipy.interpolate.NdBSpline(tuple(knots), values, DEGREE, extrapolate=False)
 
 
 def read(file: Path, digest: str | None, files: Files) -> tuple[list[Array], Array]:
-    """The places along each axis in m, and B (nx, ny, nz, 3) in T. A file is read again if its
-    `digest` has changed.
+    """Return the places along each axis in m, and B (nx, ny, nz, 3) in T, of a file.
+
+    Grids are cached; a file is read again if its `digest` has changed, or is None.
 
     Raises
     ------
     TableError
-        If it cannot be read, or is no rectilinear grid.
+        If the file cannot be read, or is no rectilinear grid.
     """
     if digest is None or (file, digest) not in _grids:
         if len(_grids) > 3:
@@ -103,26 +105,42 @@ def read(file: Path, digest: str | None, files: Files) -> tuple[list[Array], Arr
 
 
 def _gridded(x: Array, B: Array) -> tuple[list[Array], Array]:
-    """The places along each axis, and the values (nx, ny, nz, 3), of rows in any order."""
+    """Return the places along each axis, and the values (nx, ny, nz, 3), of rows in any order.
+
+    `x` (n, 3) are the places and `B` (n, 3) the values of the rows.
+
+    Raises
+    ------
+    TableError
+        If the places make no rectilinear grid, or have too few along an axis.
+    """
     axes = [_places(x[:, i]) for i in range(3)]
     shape = tuple(len(axis) for axis in axes)
     if min(shape) <= DEGREE:
         raise TableError(
             f"has {' x '.join(map(str, shape))} places: a cubic spline needs four along each axis"
         )
-    values = np.full((len(x), 3), np.nan)
+    values_on_grid = np.full((len(x), 3), np.nan)
     if len(x) == prod(shape):  # scattered places have far more places along the axes than rows
-        where = tuple(_nearest(axis, x[:, i]) for i, axis in enumerate(axes))
-        values[np.ravel_multi_index(where, shape)] = B
-    if not np.isfinite(values).all():
+        grid_numbers = tuple(_nearest(axis, x[:, i]) for i, axis in enumerate(axes))
+        # each row goes to the node of the grid nearest to its place
+        values_on_grid[np.ravel_multi_index(grid_numbers, shape)] = B
+    if not np.isfinite(values_on_grid).all():
         raise TableError(
             f"is no rectilinear grid of finite numbers: {len(x)} rows with "
             f"{' x '.join(map(str, shape))} different places along the axes"
         )
-    return axes, values.reshape(*shape, 3)
+    return axes, values_on_grid.reshape(*shape, 3)
 
 
 def _table_rows(file: Path, files: Files) -> tuple[Array, Array]:
+    """Return places (n, 3) in m and B (n, 3) in T, the rows of a .csv or .npz file.
+
+    Raises
+    ------
+    TableError
+        If a column is missing, or arrays differ in length.
+    """
     columns, units = read_table(file, files)
     if missing := [name for name in (*PLACES, *FIELD) if name not in columns]:
         raise TableError(
@@ -130,7 +148,8 @@ def _table_rows(file: Path, files: Files) -> tuple[Array, Array]:
         )
     axes = [columns[name] for name in PLACES]
     on_axes = file.suffix == ".npz" and columns["Bx"].ndim == 3 and {a.ndim for a in axes} == {1}
-    if on_axes and columns["Bx"].size == prod(a.size for a in axes):  # the places along each axis
+    # arrays hold the places along each axis
+    if on_axes and columns["Bx"].size == prod(a.size for a in axes):
         columns |= dict(zip(PLACES, np.meshgrid(*axes, indexing="ij"), strict=True))
     rows = [columns[name].ravel() * _size(units[name], name) for name in (*PLACES, *FIELD)]
     if len({len(column) for column in rows}) > 1:
@@ -139,11 +158,19 @@ def _table_rows(file: Path, files: Files) -> tuple[Array, Array]:
 
 
 def _size(unit: str | None, name: str) -> float:
+    """Return the factor of a column's unit: to m for places, to T for B."""
     base_unit = "metre" if name in PLACES else "tesla"
     return column_size(name, unit or base_unit, base_unit)
 
 
 def _vtk_rows(file: Path, files: Files) -> tuple[Array, Array]:
+    """Return places (n, 3) in m and B (n, 3) in T, the points of a VTK file.
+
+    Raises
+    ------
+    TableError
+        If the file cannot be read, or has no vector B.
+    """
     try:
         data = read_vtk(files.content(file), file.suffix)
     except (OSError, ValueError) as e:
@@ -154,7 +181,7 @@ def _vtk_rows(file: Path, files: Files) -> tuple[Array, Array]:
 
 
 def _places(coordinates: Array) -> Array:
-    """Different places, sorted; those that differ by rounding are one."""
+    """Return the different coordinates, sorted; those that differ by rounding are one."""
     distinct = np.unique(coordinates)
     mean_distance = np.ptp(distinct) / len(distinct) if len(distinct) > 1 else 1.0
     first = np.concatenate([[True], np.diff(distinct) > PLACE_TOLERANCE * mean_distance])
@@ -162,5 +189,6 @@ def _places(coordinates: Array) -> Array:
 
 
 def _nearest(axis: Array, coordinates: Array) -> NDArray[np.int64]:
+    """Return the number of the place on a sorted axis nearest to each coordinate."""
     middle = (axis[1:] + axis[:-1]) / 2
     return np.asarray(np.searchsorted(middle, coordinates))

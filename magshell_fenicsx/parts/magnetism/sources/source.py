@@ -41,13 +41,13 @@ class FieldOfSource:
     ----------
     values
         Places (n, 3) in m -> B in T with its first and second derivatives; not finite where there
-        is none.
+        is no field.
     lines
-        Its outline: places (n, 3) along lines, in m.
+        Outline of the source: places (n, 3) along lines, in m.
     nowhere
-        What a place without a field is.
+        Words for a place without a field, such as "inside".
     solid
-        Its faces with its poles, in m; None of what is no magnet.
+        Faces of a magnet with its poles, in m; None for other sources.
     """
 
     values: FieldInSpace
@@ -73,11 +73,12 @@ class SourceSection(Section):
 
     @property
     def axes(self) -> Array:
-        """Axes of the source as columns (3, 3)."""
+        """Axes of the source as columns (3, 3), in the frame of the case."""
         (sp, cp), (sa, ca), (ss, cs) = (
             (np.sin(t), np.cos(t))
             for t in np.radians([self.axis.polar, self.axis.azimuth, self.spin])
         )
+        # rotations by azimuth about z, polar about y, and spin about z
         about_z = np.array([[ca, -sa, 0.0], [sa, ca, 0.0], [0.0, 0.0, 1.0]])
         about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
         return np.asarray(
@@ -85,13 +86,18 @@ class SourceSection(Section):
         )
 
     def words(self) -> str:
-        """Describe the source in the account of what is built."""
+        """Return the source in words, for the account of what is built."""
         return f"{self.kind} at ({', '.join(f'{1e3 * x:g}' for x in self.position)}) mm"
 
     def field(self, key: str, R: float) -> FieldOfSource:
-        """Return the field in the source's axes.
+        """Return the field in the source's own axes.
 
-        `key` is the source's key, and R (m) is the unit of places in formulas.
+        Parameters
+        ----------
+        key
+            Key of the source in the case file, for messages.
+        R
+            Reference length in m, the unit of places in formulas.
 
         Raises
         ------
@@ -118,7 +124,10 @@ class MagnetSection(SourceSection):
 
     @abstractmethod
     def values(self, magnets: ModuleType) -> Values:
-        """Return B at places in m, by the magnet of magpylib."""
+        """Return the function from places (n, 3) in m to B (n, 3) in T, in the magnet's own axes.
+
+        `magnets` is the module of magpylib with its magnets.
+        """
 
     @abstractmethod
     def distance(self, x: Array) -> Array:
@@ -126,13 +135,14 @@ class MagnetSection(SourceSection):
 
     @abstractmethod
     def lines(self) -> list[Array]:
-        """Return the outline: places (n, 3) along lines, in m."""
+        """Return the outline for pictures: places (n, 3) along lines, in m."""
 
     @abstractmethod
     def solid(self) -> Solid:
-        """Return the faces, in m."""
+        """Return the faces for pictures, in m."""
 
     def field(self, key: str, R: float) -> FieldOfSource:
+        """Return the field of the magnet in its own axes, see `SourceSection`."""
         values = Harmonic(self.values(magpylib(key).magnet), self.distance)
         solid = self.solid().magnetised(
             self.strength * self.vector, self.name or f"{self.kind} magnet"
@@ -143,7 +153,8 @@ class MagnetSection(SourceSection):
 def to_box(outside_by: Array) -> Array:
     """Return the distance (n,) of places from a box; negative inside.
 
-    `outside_by` (n, m) is how far places are beyond the faces in each direction.
+    `outside_by` (n, m) is how far places are beyond the faces in each direction, negative within
+    them.
     """
     return np.asarray(
         np.linalg.norm(np.maximum(outside_by, 0.0), axis=1)
@@ -163,10 +174,12 @@ class PlacedSource:
         (3,) over R, in the model's frame.
     axes
         (3, 3) the source's own axes as columns, in the same frame.
-    length, factor
-        R in m; what multiplies B in T.
+    length
+        R in m.
+    factor
+        Number that multiplies B in T.
     key
-        Of the case file.
+        Key of the source in the case file.
     """
 
     own: FieldOfSource
@@ -177,6 +190,7 @@ class PlacedSource:
     key: str
 
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return B (n, 3) over |B^a| at places x (n, 3) over R, with both derivatives."""
         Q, R = self.axes, self.length
         B, G, H = self.own.values(R * (x - self.position) @ Q)
         return (
@@ -217,12 +231,12 @@ class PlacedSource:
 
 
 def magpylib(key: str) -> ModuleType:
-    """The package, imported where a case has a source that needs it.
+    """Return the package magpylib; only cases with magnets or coils need it.
 
     Raises
     ------
     CaseError
-        With the command that installs it.
+        If the package is missing, with the command that installs it.
     """
     try:
         import magpylib
@@ -236,7 +250,7 @@ def magpylib(key: str) -> ModuleType:
 
 @dataclass(frozen=True)
 class Harmonic:
-    """A field outside its sources with its derivatives, of its values alone.
+    """A field outside its sources with its derivatives, from its values alone.
 
     There B has neither a divergence nor a curl, so around any place it is the gradient of a series
     of harmonic polynomials. The values at the place itself, at six points on the axes and at eight
@@ -258,6 +272,10 @@ class Harmonic:
     distance: Values
 
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
+        """Return B (n, 3) at places x (n, 3) with its first and second derivatives.
+
+        All are nan inside a magnet and where the distance is not finite.
+        """
         d = self.distance(x)
         outside = np.isfinite(d) & (d > 0)
         B, G, H = (np.full((len(x), *shape), np.nan) for shape in ((3,), (3, 3), (3, 3, 3)))
@@ -275,11 +293,17 @@ class Harmonic:
 
 @cache
 def stencil() -> tuple[Array, Array, Array]:
-    """Points (m, 3) at the distance 0 or 1, and what makes derivatives of the values there: (3 m,
-    9) and (3 m, 27).
+    """Return the points of `Harmonic` and the weights that give derivatives of values there.
 
     The gradients of the powers (a . x)^l of null vectors a are those of all harmonic polynomials of
     degree l.
+
+    Returns
+    -------
+    points
+        (m, 3) at the distance 0 or 1.
+    first_weights, second_weights
+        (3 m, 9) and (3 m, 27): from values at the points to first and second derivatives at 0.
     """
     axes, diagonals = (
         np.vstack([np.eye(3), -np.eye(3)]),
@@ -289,8 +313,10 @@ def stencil() -> tuple[Array, Array, Array]:
     values, first, second = list[Array](), list[Array](), list[Array]()
     for degree in range(1, DEGREE + 1):
         for t in 2 * np.pi * np.arange(2 * degree + 1) / (2 * degree + 1):
+            # null vector: a . a = 0, so that powers of a . x are harmonic
             a = np.array([np.cos(t), np.sin(t), 1j])
             power = np.ones(len(points)) if degree == 1 else (points @ a) ** (degree - 1)
+            # derivatives at 0 of the gradient of (a . x)^l
             by_x = 2.0 * (degree == 2) * np.outer(a, a).ravel()
             by_x_twice = 6.0 * (degree == 3) * np.einsum("i,j,k->ijk", a, a, a).ravel()
             for part in (np.real, np.imag):
