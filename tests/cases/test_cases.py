@@ -83,6 +83,19 @@ def test_dimple_buckling(
     assert len(kernels) == len(set(kernels)), "a kernel was made twice"
 
 
+def test_bistable_dome() -> None:
+    """Snap in at a fold, that of the half shell within its mesh; back at a bifurcation with two waves.
+
+    The numbers are those of README.
+    """
+    found = result("bistable_dome.yaml")
+    snap_in, *_, back = found.limit_points
+    half = result("bistable_dome.yaml", "symmetry=half", "loading.until=limit")
+    assert snap_in["value"] == pytest.approx(half.limit_points[0]["value"], rel=1e-3)
+    assert (snap_in["kind"], round(snap_in["applied_mT"])) == ("fold", -363)
+    assert (back["mode"], round(back["applied_mT"])) == ("m = 2", 169)
+
+
 def test_excluded_mode_that_cannot_be_located_is_told(monkeypatch: pytest.MonkeyPatch) -> None:
     """Newton failing while an excluded instability is located ends the run with a message, after
     the whole path.
