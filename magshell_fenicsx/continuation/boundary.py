@@ -199,11 +199,11 @@ class Boundary:
                         f"at {current.p:.6g}, load {current.state.mu[self.name]:.6g}: {point}"
                     )
                 continue
-            step = self._distance(current, point, length)
-            yield from self._events_between(current, point, step)
             if not ends[0] < point.p < ends[1]:  # the prediction had not shown it
                 length /= 2
                 continue
+            step = self._distance(current, point, length)
+            yield from self._events_between(current, point, step)
             yield "point", point
             straight = self.inner(current.way, point.way) > GROWTH_COSINE
             previous, current = (current, step), point
