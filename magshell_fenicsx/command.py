@@ -1,7 +1,7 @@
 """Common parts of all commands: options, completion in the shell, messages, exit codes.
 
 Typer is imported without rich where no help is asked for: the import of rich takes 0.15 s of every
-command.
+command. A rank is a process of MPI; rank 0 prints. The shell is here that of the command line.
 """
 
 import sys
@@ -176,6 +176,7 @@ def picture_options(
     CaseError
         If a camera or a range cannot be read.
     """
+    # at the end what was not given is left out, so that the case's own options stay
     keys: dict[str, Any] = {"width": width, "dpi": dpi, "font_size": font_size}
     keys["formats"] = formats.split(",") if formats else None
     if camera:
@@ -232,7 +233,7 @@ def failure(message: str, code: int) -> typer.Exit:
         comm.Abort(code)  # the other ranks would wait for this one for ever
     if comm.rank:
         # mpirun ends the job at the first failing rank, and may lose the message of rank 0
-        return typer.Exit()
+        return typer.Exit()  # with code 0
     with suppress(OSError):  # a full disk: the exit code says it
         print(message, file=sys.stderr, flush=True)
     return typer.Exit(code)
@@ -250,7 +251,7 @@ def _all_fail(comm: Any) -> bool:
 
     other_ranks = [rank for rank in range(comm.size) if rank != comm.rank]
     deadline = time.monotonic() + MAX_DELAY_OF_ERRORS
-    for rank in other_ranks:
+    for rank in other_ranks:  # one byte: that this rank fails
         comm.Isend(bytearray(1), rank, FAILURE_TAG)
     # no collective: others may be in one
     requests = [comm.Irecv(bytearray(1), rank, FAILURE_TAG) for rank in other_ranks]

@@ -1,7 +1,8 @@
 """Commands that solve nothing.
 
 They draw pictures and the report of a run, say what a case means, and print examples, the schema
-and versions.
+and versions. Functions with `@app.command()` are commands; their docstrings are the help texts. An
+option's name is that of its parameter.
 """
 
 from collections.abc import Iterator
@@ -75,7 +76,7 @@ def plot(  # noqa: PLR0913 - what a user gives
     """
     from magshell_fenicsx.output.pictures.plot import plot_folders
 
-    if world().rank:
+    if world().rank:  # rank 0 draws alone
         return
     with exit_codes(stopped=(OSError,)):
         options = picture_options(formats, width, dpi, font_size, camera, range_ or [])

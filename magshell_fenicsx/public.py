@@ -1,6 +1,7 @@
 """Functions that programs call: a run and a scene of a problem, or of what makes one.
 
-That is a case, a mapping like a case file, or the path of a file.
+That is a case, a mapping like a case file, or the path of a file. A problem has all that is
+computed; a scene is a problem with its finite element model. The processes are those of MPI.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -80,7 +81,7 @@ class Scene(SceneOfProblem):
     plan
         The name of a problem in earlier versions.
     terms
-        See `problem_of`.
+        User-defined energies besides those of the case.
     """
 
     def __init__(
@@ -140,9 +141,19 @@ def boundary(
     """Follow the instability at the end of a case file in a second key; see
     `studies.boundary.boundary`.
 
-    `start` is another one: "DIR:POINT", a fold or bifurcation of the run in a folder. With two
-    keys, it is followed in the first for each value of the second:
+    With two keys in `over` it is followed in the first key for each value of the second, see
     `studies.boundary_map.boundary_map`.
+
+    Parameters
+    ----------
+    over
+        "KEY=A:B", the key that varies and its range; or two such texts, the second one
+        "KEY=A:B:COUNT".
+    settings
+        Texts "KEY=VALUE" that replace keys of the case.
+    start
+        "DIR:POINT": the fold or bifurcation at a point of the run in a folder, which is followed
+        instead. None: the instability at the end of the case.
     """
     from magshell_fenicsx.studies.boundary_map import boundary_map
 

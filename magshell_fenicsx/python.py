@@ -2,6 +2,11 @@
 
 They say what the sections of a case file say, in the same words and with the same messages; values
 may be NumPy's, and where a formula may stand, a dolfinx function on the shell's mesh may stand too.
+
+A case file is YAML: sections by key, each with keys of its own. `Keys` is such a section as a
+dictionary. A part of a problem is a section or a step of the programme, the list of loadings; its
+keys are made when the shell is known, on whose mesh functions are. A member shell is one of several
+shells. An `OwnTerm` is an energy that a program defines.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -105,6 +110,7 @@ class Shell:
         geometry = surface if isinstance(surface, str) else "mesh"
         if geometry not in SHAPES:
             raise CaseError(f"{NAME}: {geometry}: {unknown(geometry, SHAPES, 'geometry')}")
+        # names that are arguments here rather than keys of a case
         of_mesh = ("edges", "patches", "facet_tags", "cell_tags") if geometry == "mesh" else ()
         refuse_unknown(
             keys, SHAPES[geometry], f"{NAME}: shell", ("name", *self._member_keys, *of_mesh)
@@ -128,6 +134,7 @@ class Shell:
             raise CaseError(f"{NAME}: shell.{unfit}: the surface is the mesh; leave it out")
         self.user_mesh = UserMesh(surface)
         triangles = self.user_mesh.triangles(edges or {}, patches or {}, facet_tags, cell_tags)
+        # the case names a file, which is never read: its content is given
         self.files.given[Path(MESH).absolute()] = triangles
         self._keys |= {"geometry": "mesh", "file": MESH}
         has_units = isinstance(keys.get("thickness"), str)
@@ -263,7 +270,7 @@ def Step(kind: str, **keys: Any) -> ProblemPart:
     CaseError
         If a case has no such kind, or the step has no such key.
     """
-    kind = dict(FORMER_KINDS).get(kind, kind)
+    kind = dict(FORMER_KINDS).get(kind, kind)  # a name of earlier versions
     if kind not in STEPS:
         raise CaseError(f"{NAME}: {kind}: {unknown(kind, STEPS, 'kind of step')}")
     refuse_unknown(keys, STEPS[kind], f"{NAME}: loading")
@@ -380,7 +387,7 @@ def _refuse_metres(
         "thickness": (thickness, MIN_EXTENT_OVER_THICKNESS, MAX_EXTENT_OVER_THICKNESS),
     }
     for name, (length, least, most) in limits.items():
-        metres = _in_metres(length)
+        metres = _in_metres(length)  # None: not given, or refused elsewhere
         if metres and not least <= extent / metres <= most:
             raise CaseError(
                 f"{NAME}: shell.unit: is not given, so the mesh is {bounds} m, "
@@ -405,12 +412,16 @@ def _in_metres(length: Any) -> float | None:
 
 
 def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys:
-    """Return a remanence or an applied field as a case has it under `magnetic`.
+    """Return the keys of a remanence or an applied field in a case's section `magnetic`.
+
+    Numbers become a direction (polar and azimuth angle) and a magnitude; formulas become
+    components.
 
     Parameters
     ----------
     value
-        See `Field`.
+        Vector of three numbers or formulas, function on the mesh, name of a kind such as "radial",
+        or all keys of the section.
     key
         "magnetic.remanent" or "magnetic.applied".
     dimensionless
@@ -426,6 +437,7 @@ def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys
         """Return the key of a magnitude in tesla; no key in a dimensionless problem."""
         return {} if dimensionless else {"flux_density": f"{tesla!r} T"}
 
+    # an applied field has no kinds
     expression_kind = {"kind": "expression"} if key.endswith("remanent") else {}
     if isinstance(value, Mapping):
         return {name: shell.plain_value(item, f"{key}.{name}") for name, item in value.items()}
@@ -433,6 +445,7 @@ def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys
         return {"kind": value}
     if isinstance(value, fem.Function):
         field = shell.user_field(value, key)
+        # the largest magnitude, over which components are given; 1.0 for a field of zero
         magnitude = 1.0 if dimensionless else float(np.linalg.norm(field.largest)) or 1.0
         return {
             **expression_kind,
@@ -491,6 +504,7 @@ def Problem(
     """
     member_shells = list(shell) if isinstance(shell, list | tuple) else []
     if member_shells:
+        # any of them turns values into plain ones: none has a mesh, and so no functions
         shell = member_shells[0]
         _refuse_unfit_shells(member_shells)
     if not isinstance(shell, Shell):
@@ -596,7 +610,7 @@ def _join(data: Keys, key: str, added: Keys) -> None:
     CaseError
         If a key is given already, with another value.
     """
-    section = data.get(key, {})
+    section = data.get(key, {})  # a user may have given something else under this key
     if not isinstance(section, dict):
         raise CaseError(f"{NAME}: {key}: {section!r}: must be a section, with keys below it")
     for name, value in added.items():
@@ -608,7 +622,11 @@ def _join(data: Keys, key: str, added: Keys) -> None:
 
 
 def _on_mesh(term: OwnTerm, shell: Shell) -> OwnTerm:
-    """Return a user-defined energy whose functions of parameters are known in all triangles."""
+    """Return a user-defined energy with `UserField`s in place of functions as its parameters.
+
+    A field has the function's values in all triangles of the mesh. An energy without functions is
+    returned itself.
+    """
     parameters = tuple(
         shell.user_field(p, f"terms.{term.name}") if isinstance(p, fem.Function) else p
         for p in term.parameters

@@ -3,6 +3,11 @@
 Element matrices of cells and of pairs of cells are contractions of Hessians at points with shape
 functions. They multiply vectors here, or are scattered into a sparse matrix (`scatter`). Theory:
 docs/tangent.md.
+
+W is a density, an energy per area as a function of vectors z_i at a point: a field's value and
+derivatives (`shape_tables`). Its Hessian consists of (3, 3) blocks for pairs i, j of vectors,
+stored as a symmetric part of six components and a skew part of three. An entity is a cell or an
+edge; an edge has one or two sides, its cells. Local edges of a triangle are numbered 0 to 2.
 """
 
 from collections.abc import Iterator
@@ -88,6 +93,7 @@ def cell_batches(V: fem.FunctionSpace, degree: int, mask: CellMask = None) -> li
         (local cells,): which cells count; None: all.
     """
     points, weights = cell_rule(degree)
+    # one side; cells have no geometry of their own
     rule = EntityRule((points,), (ShapeTable.tabulate(V.element.basix_element, points),), weights)
     cells = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)
     counted = cells if mask is None else cells[mask[cells]]
@@ -97,6 +103,9 @@ def cell_batches(V: fem.FunctionSpace, degree: int, mask: CellMask = None) -> li
 
 def interior_batches(V: fem.FunctionSpace, degree: int, mask: CellMask = None) -> list[EntityBatch]:
     """Return batches of the owned interior edges, with two sides.
+
+    Edges of one batch have the same local numbers in both cells and the same relative orientation,
+    so that they share the quadrature points.
 
     Parameters
     ----------
@@ -126,7 +135,7 @@ def boundary_batches(
 def _masked(
     cells: NDArray[np.int32], kinds: NDArray[np.int32], mask: CellMask
 ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-    """Return the rows of cells and kinds (n, ...) of edges that count with one of their cells."""
+    """Return the rows of cells and kinds (n, ...) of edges with at least one counted cell."""
     rows = slice(None) if mask is None else mask[cells].any(axis=1)
     return cells[rows], kinds[rows]
 
@@ -149,6 +158,7 @@ def interior_edges(
         # edges with two cells
         np.diff(cells_of_edges.offsets[: topology.index_map(1).size_local + 1]) == 2
     ).astype(np.int32)
+    # the two cells of a facet follow one another in the flat array
     cells = cells_of_edges.array[cells_of_edges.offsets[facets][:, None] + np.arange(2)]
     edges = np.column_stack([_local_edges(V, facets, cells[:, side]) for side in range(2)])
     starts = [_corner(V, cells[:, side], edges[:, side]) for side in range(2)]
@@ -195,11 +205,13 @@ def _edge_batches(
     """
     sides = cells.shape[1]
     for kind in np.unique(kinds, axis=0):
+        # the points on the second side run backwards where its cell runs in opposite direction
         reversed_sides = (False, bool(kind[-1]))[:sides]
         rules = [
             edge_rule(degree, int(edge), is_reversed)
             for edge, is_reversed in zip(kind[:sides], reversed_sides, strict=True)
         ]
+        # all sides have the same weights
         points_of_sides, weights = tuple(points for points, _ in rules), rules[0][1]
         tables = tuple(ShapeTable.tabulate(V.element.basix_element, x) for x in points_of_sides)
         rule = EntityRule(points_of_sides, tables, weights)
@@ -252,7 +264,7 @@ def edge_width(
 ) -> NDArray[np.float64]:
     """Return the mean area of the cells at each edge over the edge's length, (n,).
 
-    This is their width in the flat mesh.
+    It is about half the height of the triangles over the edge, in the flat mesh.
 
     Parameters
     ----------
@@ -288,6 +300,7 @@ class Contraction:
 
     def __init__(self, rule: EntityRule, pairs: BlockPairs) -> None:
         w, tables = rule.weights, rule.tables
+        # products of shape functions, for each side and between the sides
         self._symmetric = [table.symmetric(w, pairs.within_side) for table in tables]
         self._skew = [table.skew(w, pairs.skew) for table in tables] if pairs.skew else []
         self._cross = tables[0].cross(w, tables[1], pairs.cross) if pairs.cross else None
@@ -351,7 +364,8 @@ class HessianBlocks:
         Parameters
         ----------
         values
-            As `point_hessian` returns them; they are overwritten.
+            (points, columns) from a kernel of `point_hessian`: for each side the symmetric and the
+            skew parts, then the cross blocks. They are overwritten.
         pairs
             The pairs of vectors whose blocks this term has.
         """
@@ -415,14 +429,14 @@ Ints = NDArray[np.int32]
 
 
 def add_cell_products(y: Array, K: Array, nodes: Ints, x: Array) -> None:
-    """Add the products of the element matrices of cells with a vector to another one.
+    """Add the products of the element matrices of cells with a vector x to a vector y.
 
     Parameters
     ----------
     y, x
         (nodes, 3): the result, which is changed, and the vector.
     K
-        (cells, 9, pairs a <= b), see `BlockMatrix.add_cells`.
+        (cells, 9, pairs a <= b of functions): six symmetric components, then three skew ones.
     nodes
         (cells, functions): local nodes of each cell.
     """
@@ -442,16 +456,17 @@ def add_cell_products(y: Array, K: Array, nodes: Ints, x: Array) -> None:
 
 
 def add_coupling_products(y: Array, K: Array, rows: Ints, columns: Ints, x: Array) -> None:
-    """Add the products of blocks that couple two cells with a vector to another one.
+    """Add the products of blocks that couple two cells with a vector x to a vector y.
 
-    The transposed blocks are added too.
+    The products of the transposed blocks are added too.
 
     Parameters
     ----------
     y, x
         (nodes, 3): the result, which is changed, and the vector.
     K
-        (pairs of cells, 9, functions^2), see `BlockMatrix.add_coupling`.
+        (pairs of cells, 9, functions^2): components (3, 3), row by row, of a function on the first
+        cell and one on the second.
     rows, columns
         (pairs of cells, functions): nodes of the first and the second cell.
     """

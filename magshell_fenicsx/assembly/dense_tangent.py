@@ -7,6 +7,12 @@ the sparse matrix mostly serves (`continuation.krylov_correction`). The sum is a
 with all entries, whose factorisation, inertia, limit points and modes are those of any system. Its
 memory and the cost of its factorisation grow with the square and the cube of the number of
 unknowns. Theory: docs/theory.md, interaction of the magnetisation with its own field.
+
+The matrix is K + D: K sparse, D the correction, a sum of Hessians times factors. Near blocks are
+the stored ones, far entries all others; left out are the entries that K has already. A tangent is
+inexact, or lagged, if it belongs to an earlier state. Vectors are ordered by nodes, three unknowns
+each; every rank has the rows of its own nodes and all columns. Ghosts are local nodes that other
+ranks own.
 """
 
 from collections.abc import Sequence
@@ -137,7 +143,10 @@ class BlockProducts:
         self._ffi, self._lib = load_native(source, C_DECLARATIONS, comm)
 
     def times(self, A: bsr_array | SinglePrecisionBlocks, v: Array) -> Array:
-        """Return A v, both over the unknowns of nodes (3 nodes,)."""
+        """Return A v, both over the unknowns of nodes (3 nodes,).
+
+        The C code for full rows takes v three times; the one for an upper triangle takes it once.
+        """
         pointer, lib = self._ffi.from_buffer, self._lib
         if isinstance(A, SinglePrecisionBlocks):
             starts, columns = A.starts, A.columns
@@ -283,6 +292,7 @@ class DenseTangent:
         """
         n, first_column, column_count = 3 * self._owned, 3 * self._first, 3 * self._count
         kind = PETSc.IntType
+        # PETSc stores a matrix as two, in compressed rows with all columns; a rank may have no rows
         inner, outer = np.zeros((n, n)), np.zeros((n, column_count - n))
         inner_starts = np.arange(0, n * n + 1, n or 1, dtype=kind)[: n + 1]
         if column_count > n:
@@ -326,6 +336,7 @@ class DenseTangent:
         -------
         K with the correction D; its lagged part is the whole tangent of the terms.
         """
+        # all entries of the terms, then without the ones that K takes
         starts, columns, values = K.getValuesCSR()
         scaled = [self.scaled_hessian(factor, term, inexact=inexact) for factor, term in terms]
         remainders = list[ScaledHessian]()
@@ -349,12 +360,13 @@ class DenseTangent:
         starts, columns
             The pattern in compressed sparse rows, of own unknowns.
         """
+        # contact changes the pattern from state to state
         latest = self._latest_common
         if latest is not None and latest[0] is part.near_blocks:
             common = latest[1]
             if np.array_equal(common.indices, columns) and np.array_equal(common.indptr, starts):
                 return common
-        rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
+        rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))  # of each entry
         own_fixed, all_fixed = self.fixed
         free = ~(own_fixed[rows] | all_fixed[columns])
         values = np.where(free, _entries(part.near_blocks, rows, columns), 0.0)
@@ -375,6 +387,7 @@ class DenseTangent:
         for part in parts:
             rows += part.factor * self._all_rows(part)
         rows[own_fixed], rows[:, all_fixed] = 0.0, 0.0
+        # the sparse matrix is added last: at supports it has the identity
         starts, columns, values = K.getValuesCSR()
         rows[np.repeat(np.arange(n), np.diff(starts)), columns] += values
         if self.comm.size > 1:
@@ -399,12 +412,14 @@ class DenseTangent:
         blocks = self._blocks_of_terms.get(term.name)
         if blocks is None or blocks[0] is not hessian:
             near_blocks = self._sum_blocks(hessian.near_blocks)
+            # on one rank the matrix is square and symmetric
             single = SinglePrecisionBlocks.from_blocks(near_blocks, upper=self.comm.size == 1)
             blocks = self._blocks_of_terms[term.name] = hessian, near_blocks, single
-        return ScaledHessian(factor, *blocks[1:], hessian)
+        _, near_blocks, single = blocks
+        return ScaledHessian(factor, near_blocks, single, hessian)
 
     def rows(self, term: DenseTerm) -> Array:
-        """Return the rows (own unknowns, all) of a term's Hessian, supports too. Collective."""
+        """Return the rows (own unknowns, all) of a term's Hessian, with supports. Collective."""
         return self._all_rows(self.scaled_hessian(1.0, term))
 
     def product(self, parts: Sequence[ScaledHessian], x: Array, *, single: bool = False) -> Array:
@@ -456,6 +471,7 @@ class DenseTangent:
         rows = part.near_blocks.toarray() - left_out
         for first_column in range(0, 3 * self._count, PRODUCT_COLUMNS):
             count = min(PRODUCT_COLUMNS, 3 * self._count - first_column)
+            # the unit vectors of `count` columns from the first one on
             unit_vectors = np.eye(3 * self._count, count, -first_column)
             far = part.hessian.times_far(unit_vectors).reshape(-1, 3, count)
             rows[:, first_column : first_column + PRODUCT_COLUMNS] += self._sum_rows(far).reshape(

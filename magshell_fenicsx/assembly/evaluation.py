@@ -3,6 +3,13 @@
 MAGSHELL_NOISE="1e-14 3" adds noise of relative size 1e-14 with the seed 3 to residual and tangent,
 which imitates the rounding of another processor. Each evaluation draws new numbers. The noise of a
 matrix is symmetric. No noise depends on the distribution of unknowns over ranks.
+
+The energy is a sum of terms mu_i Pi_i(u); mu_i are amplitudes (load parameters, and numbers as
+prescribed positions) by name, factors their values. Coordinates are the amplitudes that do not just
+multiply terms: `moving` ones move supports, free parameters p enter the terms, with dPi/dp as
+`slopes`. A lid is a surface that closes a moving edge under a live pressure; the volume that it
+sweeps belongs to the pressure's potential. Dense terms couple all unknowns. Own nodes belong to
+this rank, ghosts to others.
 """
 
 import os
@@ -80,6 +87,7 @@ class Evaluation:
         """
         system, mu = self._system_at_state, self._mu
         potentials = {t.name: float(system.comm.allreduce(t.energy())) for t in system.terms}
+        # without amplitudes supports do not move
         pressure = system.edge_pressure
         if mu and pressure and pressure.load in potentials:
             potentials[pressure.load] += system.lid_potential(mu, pressure.load)
@@ -130,7 +138,7 @@ class Evaluation:
         Parameters
         ----------
         inexact
-            Whether forces of dense terms may be extrapolated, see `InexactSystem`.
+            Whether forces of dense terms may be extrapolated from earlier states.
         """
         system = self._system_at_state
         factors = system._factors(self._mu)
@@ -140,6 +148,7 @@ class Evaluation:
                 system.nan_terms = self._nan_terms(factors)
         else:
             dofmap = system.u.function_space.dofmap
+            # each term has noise of its own, so that it is of the size of rounding in large terms
             first_unknown = dofmap.index_map.local_range[0] * dofmap.index_map_bs
             gradients = [
                 system._summed(system._gradient({name: factor})) for name, factor in factors.items()
@@ -179,6 +188,7 @@ class Evaluation:
         """
         system, mu = self._system_at_state, self._mu
         local = system._gradient({name: 1.0} if name else system._factors(mu))
+        # the live pressure acts on moving edges, too
         if system.moving and system.edge_pressure and not name:
             pressure = mu.get(system.edge_pressure.load, 0.0)
             local += pressure * system.moving.edge_forces(system.u.x.array)
@@ -192,6 +202,7 @@ class Evaluation:
         system = self._system
         step, product = system.step_along(v, DIFFERENCE_STEP), np.zeros(system.size)
         for multiple, weight in DIFFERENCE_WEIGHTS.items():
+            # the state again, so that nodes that move have their displacement
             system._put(self._u, self._mu)
             system.u.x.array[: system.size] += multiple * step * v
             system.u.x.scatter_forward()
@@ -223,6 +234,7 @@ class Evaluation:
         moving = system.moving
         if moving and name in moving.names:
             local = float(system._gradient(system._factors(mu)) @ moving.rate(mu, name))
+            # the normal of a clamped edge turns too; `edge` is the name of the edge's term
             for edge, A in moving.turning(mu, name):
                 spin = moving.spin_displacement(A, system.u.x.array)
                 local += float(system._gradient({edge: 1.0}) @ spin)
@@ -240,9 +252,11 @@ class Evaluation:
         system, mu = self._system_at_state, self._mu
         moving = system.moving
         if moving and {name, other} & moving.names:
+            # False sorts first: the last one of the pair moves supports
             pair = sorted((name, other), key=moving.names.__contains__)
             local = system._motion_curvature(moving, mu, *pair)
             return float(system.comm.allreduce(local)) + system.lid_potential(mu, name, other)
+        # from here on `name` is a free parameter
         if name not in system.parameters:
             name, other = other, name
         parameter, local = system.parameters[name], 0.0
@@ -251,6 +265,7 @@ class Evaluation:
             second = system.parameters[other]
             derivatives = parameter.second_derivatives(second.constant)
             local += sum(factor_of(d.amplitude, mu) * d.energy() for d in derivatives)
+            # a term whose amplitude is the first parameter
             local += sum(slope.energy() for slope in second.slopes if slope.amplitude == name)
         return float(system.comm.allreduce(local))
 
@@ -261,7 +276,17 @@ class Evaluation:
         *,
         inexact: bool = False,
     ) -> PETSc.Mat | CorrectedTangent | SkewedTangent:
-        """Assemble d2Pi/du2 at the state, see `FiniteElementSystem.tangent`. Collective."""
+        """Assemble d2Pi/du2 at the state. Collective.
+
+        Parameters
+        ----------
+        stress
+            Weighted displacements of own nodes, whose stress replaces that of u.
+        times
+            Term name -> further factor of its tangent; None: no further factors.
+        inexact
+            Whether dense terms may have the tangent of an earlier state.
+        """
         system = self._system
         with system.assembly:
             stress_of = [(weight, system.with_ghosts(v, self._mu)) for weight, v in stress]
@@ -310,6 +335,7 @@ class Noise:
         first
             Global number of this rank's first entry.
         """
+        # global numbers, so that the noise does not depend on the distribution; the column is 0
         rows = first + np.arange(len(b), dtype=np.uint64)
         return b * self._factors(rows, np.zeros(1, dtype=np.uint64))
 

@@ -1,6 +1,10 @@
 """Derivatives of energies by all values of a field at once.
 
 Theory: docs/theory.md, derivatives of results.
+
+A term is an energy Pi(u; f) with a field f, such as a thickness or a placement, beside the
+displacement u. dPi/du[w] is the work of the term's forces along a vector w. Derivatives are kept by
+cell, (cells, nodes, components), so that a change may be constant in a cell or in a patch.
 """
 
 from collections.abc import Iterable
@@ -103,8 +107,8 @@ def derivatives_by_field(
 ) -> Array:
     """Return the sum of the weighted terms' derivatives by a field f. Collective.
 
-    A field that is continuous, such as a placement, changes in each cell alone: the sum over cells
-    that share a node is the derivative by the node's own value.
+    Even a continuous field, such as a placement, is changed in each cell on its own. The sum over
+    the cells that share a node is the derivative by the node's value.
 
     Parameters
     ----------
@@ -129,7 +133,7 @@ def derivatives_by_field(
             continue
         # order 0 is the energy itself, order 1 its derivative along w
         for order, factor in enumerate((weighted.energy, weighted.work)):
-            if not domain.comm.allreduce(abs(factor)):
+            if not domain.comm.allreduce(abs(factor)):  # zero on all ranks: no kernel is needed
                 continue
             functional = ufl.derivative(energy, u, w) if order else energy
             weight = fem.Constant(domain, float(factor))

@@ -3,6 +3,15 @@
 A state is evaluated, never visited: what `FiniteElementSystem.at_state` returns is a function of
 the state alone. History variables stand in the state too; `FiniteElementSystem.advance` updates
 them when a path accepts it. Theory: docs/theory.md, equilibrium and continuation.
+
+The energy is a sum of terms mu_i Pi_i(u); mu are amplitudes, that is load parameters and numbers
+such as positions of supports, by name. Coordinates are amplitudes that do not just multiply terms:
+they move supports by the displacement E(mu), or are free parameters in the terms. Factors of terms
+are their amplitudes' values. Settings are numbers in the forms that a state sets. Dense terms
+couple all unknowns; inexact ones belong to an earlier state or are extrapolated. A clamped edge has
+a term that holds its normal, which turns by a rotation Q where the support turns. A lid is a
+surface that closes a moving edge under a live pressure. Own nodes belong to this rank, ghosts to
+others.
 """
 
 import itertools
@@ -87,7 +96,7 @@ class FiniteElementSystem:
     pattern
         The term with the widest coupling; it determines the sparsity of the tangent.
     length
-        See `System`.
+        A displacement that counts as of order one.
     assembler
         Computes the tangent with the same supports, instead of the terms' forms; None: the forms
         do.
@@ -105,7 +114,7 @@ class FiniteElementSystem:
     nan_terms
         Names of the terms that were not numbers at the latest residual that was none.
     coordinates
-        See `System`.
+        Names of the amplitudes that move supports or are free parameters.
     """
 
     def __init__(
@@ -119,6 +128,11 @@ class FiniteElementSystem:
         gradients: ResidualAssembler | None = None,
         variables: SystemVariables | None = None,
     ) -> None:
+        """Request the kernels of all terms, and create the matrices. Collective.
+
+        The terms' own forms give the tangent only without `assembler`; then `_K` has supports, and
+        `_K_free`, for motions of supports, does not.
+        """
         variables = variables or SystemVariables()
         moving = variables.moving
         V = u.function_space
@@ -130,6 +144,7 @@ class FiniteElementSystem:
         self.parameters = variables.parameters
         self.moving, self.edge_pressure = moving, moving.edge_pressure if moving else None
         self._angle_terms = [t for t in terms if isinstance(t, AngleTerm)]
+        # the reference angle of each edge under a moment is a number of the state, zero at first
         reference_angles = {t.turn: (t, 0.0) for t in self._angle_terms}
         self.history: dict[str, Setting] = {**variables.history, **reference_angles}
         constants = {name: parameter.constant for name, parameter in self.parameters.items()}
@@ -163,6 +178,7 @@ class FiniteElementSystem:
         oblique = [constraint for constraint in supports if isinstance(constraint, ObliqueSupport)]
         self.projection = Projection(V, oblique, self.clamped) if oblique else None
         no_dofs = np.empty(0, dtype=np.int32)
+        # an empty array first: there may be no conditions
         fixed_dofs = np.unique(
             np.concatenate([no_dofs, *(bc.dof_indices()[0] for bc in self.clamped)])
         )
@@ -180,6 +196,7 @@ class FiniteElementSystem:
         value
             Its value in all states without that name.
         """
+        # its matrix is its own: both systems may be in use at once
         system = copy(self)
         system._settings = {name: (number, value)} | self._settings
         if self._assembler is None:
@@ -237,21 +254,18 @@ class FiniteElementSystem:
         return local
 
     def residual(self, u: Vector, mu: Amplitudes, *, inexact: bool = False) -> Vector:
-        """Return dPi/du, see `System` and `InexactSystem`. Collective."""
+        """Return R = dPi/du at own unknowns; if `inexact`, with extrapolated forces. Collective."""
         return Evaluation(self, u, mu).residual(inexact=inexact)
 
     def extrapolation_holds_along(self, u: Vector, mu: Amplitudes, du: Vector) -> bool:
-        """Return whether extrapolated forces are accurate along du. Collective.
-
-        See `continuation.system.InexactSystem`.
-        """
+        """Return whether extrapolated forces of dense terms are accurate along du. Collective."""
         step = self.with_ghosts(du)
         terms = self.dense_terms.terms if self.dense_terms else ()
         evaluation = self.at_state(State(u, dict(mu)))
         return all(evaluation.evaluate(lambda: [t.extrapolation_holds_along(step) for t in terms]))
 
     def forces(self, u: Vector, mu: Amplitudes, name: str = "") -> Vector:
-        """Return dPi/du at all nodes, see `Evaluation.forces`. Collective.
+        """Return dPi/du at all own nodes, with the forces of the supports on the shell. Collective.
 
         Parameters
         ----------
@@ -297,12 +311,13 @@ class FiniteElementSystem:
         *,
         inexact: bool = False,
     ) -> PETSc.Mat | CorrectedTangent | SkewedTangent:
-        """Assemble d2Pi/du2, see `System` and `InexactSystem`. Collective.
+        """Assemble d2Pi/du2, or dR/du where a load has no potential. Collective.
 
         Parameters
         ----------
         stress
-            Weighted displacements whose stress replaces that of u, see `System.tangent`.
+            Weighted displacements whose stress replaces that of u, which small errors of a guess
+            spoil.
         times
             Term name -> further factor of its tangent; None: no further factors.
         inexact
@@ -361,11 +376,13 @@ class FiniteElementSystem:
         pressure = self.edge_pressure
         if pressure is None:
             return 0.0
+        # p V is linear in p: at most one of the amplitudes may be that of the pressure
         motions = [name for name in names if name != pressure.load]
         if len(names) - len(motions) > 1:
             return 0.0
         by_pressure = len(motions) < len(names)
         factor = pressure.unit if by_pressure else pressure.unit * mu.get(pressure.load, 0.0)
+        # V or its first or second derivative, by as many motions
         derivatives = pressure.swept_volume, pressure.volume_slope, pressure.volume_curvature
         return factor * derivatives[len(motions)](mu, *motions)
 
@@ -379,10 +396,11 @@ class FiniteElementSystem:
         other, name
             The two amplitudes; `name` moves supports, `other` may do so.
         """
-        # by the displacement of the moving nodes
+        # by the displacement E(mu) of the moving nodes, whose rate is dE/dmu
         curvature = moving.rate(mu, name) @ self._column(mu, other)
         if other not in moving.names:
             return float(curvature)
+        # both move supports: the other order of node and normal, and the curvature of E
         residual, u = self._gradient(self._factors(mu)), self.u.x.array
         curvature += (
             moving.rate(mu, other) @ self._turning_column(mu, name)
@@ -404,6 +422,7 @@ class FiniteElementSystem:
         The amplitude `name` moves supports, is a free parameter, or multiplies terms.
         """
         if self.moving and name in self.moving.names:
+            # by the moving nodes, K dE/dmu, and by the normals that turn
             rate = self.moving.rate(mu, name)
             product = self._tangent_product(rate, self._factors(mu))
             return product + self._turning_column(mu, name)
@@ -435,6 +454,9 @@ class FiniteElementSystem:
     def _turned_column(self, edge: str, A: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the change of a clamped edge's forces as its normal turns, this rank's part.
 
+        The energy depends on the normal through Q^T r alone, r the place: a turn acts like the
+        displacement A r, and turns the forces.
+
         Parameters
         ----------
         edge
@@ -462,7 +484,7 @@ class FiniteElementSystem:
         if self._assembler:
             product = self._assembler.times(v, factors)
         else:
-            K = self._assemble_forms(self._K_free, factors, [])
+            K = self._assemble_forms(self._K_free, factors, [])  # without supports
             x, product = K.createVecRight(), np.zeros_like(v)
             x.array[:] = v[: self.size]
             product[: self.size] = (K * x).array
@@ -486,7 +508,7 @@ class FiniteElementSystem:
         factors
             Term name -> factor of its tangent.
         stress
-            As in `System.tangent`; the displacements have ghosts.
+            Weighted displacements, with ghosts, whose stress replaces that of u; empty: its own.
         inexact
             Whether the dense terms may have the tangent of an earlier state.
         """
@@ -506,7 +528,7 @@ class FiniteElementSystem:
                     present_product=self._dense_product(dense_factors, inexact=False),
                     extrapolated_product=self._dense_product(dense_factors, inexact=True),
                 )
-            if N or self.projection or self.noise:
+            if N or self.projection or self.noise:  # these need all entries of K + D
                 K = symmetric_part(K)
         if self.projection:
             K = self.projection.tangent(K)
@@ -532,6 +554,7 @@ class FiniteElementSystem:
 
         def times(v: Vector) -> Vector:
             """Return the product with v, zero at supports, by a central difference."""
+            # the system's u is changed, and restored at the end
             step, direction = self.step_along(v, DENSE_DIFFERENCE_STEP), self.with_ghosts(v)
             present, product = np.array(self.u.x.array), np.zeros(self.size)
             for sign in (1.0, -1.0):
@@ -600,6 +623,7 @@ class FiniteElementSystem:
         """
         with self.assembly:
             b: NDArray[np.float64] = np.zeros_like(self.u.x.array)
+            # terms that `gradients` computes, then those with forms of their own
             if self.gradients and factors:
                 self.gradients.add(b, factors)
             weighted = [(factors.get(t.name, 0.0), t) for t in self._terms_with_residual]

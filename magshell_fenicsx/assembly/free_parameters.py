@@ -8,6 +8,10 @@ added that grow:
 Displacements are measured from r0, the shape without stress. All terms depend on it; their
 derivatives by such an amplitude are differences of fourth order over steps of h/200, exact to about
 1e-9. Theory: docs/theory.md, free parameters and growing imperfections.
+
+Terms are energies mu_i Pi_i(u; p) with amplitudes mu_i (load parameters); a derivative by p keeps
+the amplitude of its term. A slope is dPi_i/dp as a term. h is the thickness. A constant is a number
+of UFL in forms; `value` is its present value.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -67,9 +71,9 @@ class FreeParameter:
     slopes
         dPi_i/dp as terms with the amplitudes mu_i.
     differentiate_slopes
-        Called with another parameter q in the terms, or with p itself. It returns the derivatives
-        of the slopes by it. Where q is no constant but has a method `second_derivatives`, that
-        method is called instead.
+        Called with another constant q in the terms, or with p itself. It returns the derivatives of
+        the slopes by it. Where q is a `PlacementAmplitude`, its method `second_derivatives` is
+        called instead, since forms cannot be differentiated by it.
     """
 
     constant: SettableNumber
@@ -117,6 +121,7 @@ def make_parameters(
             if p in term.form.constants()
         ]
 
+    # residuals of slopes are needed from the start, second derivatives only on request
     parameters = {}
     for name, p in constants.items():
         slopes = derivatives(p, form_terms, f"by {name}")
@@ -154,6 +159,7 @@ class PlacementAmplitudes:
     """
 
     def __init__(self, r0: fem.Function, shapes: Mapping[str, fem.Function], length: float) -> None:
+        """Copy the placement, and choose the step of each amplitude's differences. Collective."""
         self._r0, self.initial_placement = r0, r0.copy()
         self._values = dict.fromkeys(shapes, 0.0)
         self._shapes = {name: np.array(shape.x.array) for name, shape in shapes.items()}
@@ -186,7 +192,7 @@ class PlacementAmplitudes:
             The amplitude.
         function
             Called with a weight, once at each placement of the difference. It returns the weight
-            times the value there.
+            times the value there; the sum is the derivative.
         """
         value, step = self._values[name], self.steps[name]
         derivative = 0.0
@@ -203,6 +209,8 @@ class PlacementAmplitudes:
         gradients: ResidualAssembler | None = None,
     ) -> dict[str, FreeParameter]:
         """Return the amplitudes as free parameters of the terms, by name.
+
+        They have the interface of constants in forms, though only differences give derivatives.
 
         Parameters
         ----------
@@ -314,6 +322,7 @@ class _PlacementDerivative:
 
     def add_residual(self, b: Array, factor: float) -> None:
         """Add factor times the gradient of the derivative to the local vector b."""
+        # terms without a name are derivatives, which have a residual of their own
         assembled = self.gradients.names if self.gradients else frozenset[str]()
         names = [name for term in self.terms if (name := getattr(term, "name", "")) in assembled]
         others = [term for term in self.terms if getattr(term, "name", "") not in assembled]

@@ -2,6 +2,8 @@
 
 Terms that couple any two cells, such as contact and magnetic interaction, need all cells on each
 rank. Nodes are numbered globally as in the index map of their space.
+
+Own nodes and cells belong to this rank; ghosts are local copies of nodes and cells of other ranks.
 """
 
 from dataclasses import dataclass
@@ -39,6 +41,7 @@ class GlobalCells:
         local_nodes = V.dofmap.list[:count]
         flat_nodes = local_nodes.ravel().astype(np.int32)
         nodes = index_map.local_to_global(flat_nodes).reshape(local_nodes.shape)
+        # cells of lower ranks come before
         first_cell = sum(comm.allgather(count)[: comm.rank])
         all_nodes = np.concatenate(comm.allgather(nodes)).astype(np.intp)
         return cls(all_nodes, range(first_cell, first_cell + count), comm)
@@ -98,18 +101,21 @@ def component_numbers(V: fem.FunctionSpace) -> NDArray[np.int32]:
         (local nodes, ghosts included): numbers of components, the same on all ranks.
     """
     comm, index_map, cells = V.mesh.comm, V.dofmap.index_map, V.dofmap.list
+    # edges from the first node of each cell to all of its nodes
     count, local_labels = _graph_components(
         np.repeat(cells[:, 0], cells.shape[1]),
         cells.ravel(),
         index_map.size_local + index_map.num_ghosts,
     )
     counts = comm.allgather(count)
+    # labels of different ranks differ
     labels = local_labels + sum(counts[: comm.rank])
     # Where two ranks share a node, their components are one: the owner's label tells which.
     owner_labels = fem.Function(V)
     nodal = owner_labels.x.array.reshape(-1, V.dofmap.bs)
     nodal[:] = labels[:, None]
     owner_labels.x.scatter_forward()
+    # edges of a graph whose nodes are the labels of all ranks
     links = np.unique(np.column_stack([labels, nodal[:, 0].astype(np.int64)]), axis=0)
     all_links = np.concatenate(comm.allgather(links))
     _, merged_labels = _graph_components(all_links[:, 0], all_links[:, 1], sum(counts))

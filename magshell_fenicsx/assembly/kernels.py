@@ -7,6 +7,10 @@ end, are compiled first.
 Two scenes that differ only in numbers have the same forms. A process compiles each form once and
 keeps it under the signature of the form that it is derived from: for the next scene UFL neither
 differentiates nor signs the derivative.
+
+A form is an integral in UFL; its arguments are test and trial functions, its fields and constants
+the data. It is bound to a mesh when it gets the data. A form derived from another, the origin, is
+known by the origin's signature, so that it need not be built to be found.
 """
 
 import ctypes
@@ -105,7 +109,7 @@ class DerivedForm:
         if not isinstance(origin, ufl.Form) or origin.empty() or len(origin.ufl_domains()) != 1:
             return None
         if self.u is None:
-            return origin.signature(), self.derivation, -1
+            return origin.signature(), self.derivation, -1  # no position
         position = _position(self.u, origin.coefficients())
         return None if position is None else (origin.signature(), self.derivation, position)
 
@@ -123,6 +127,7 @@ class DerivedForm:
             A compiled form with the same key.
         """
         fields, constants = self.origin.coefficients(), self.constants
+        # the origin has its own arguments; a derivative's are in the space of `u`
         if self.u is None:
             spaces = [argument.ufl_function_space() for argument in self.origin.arguments()]
         else:
@@ -216,7 +221,7 @@ def _print_to_stderr() -> Callable[[str], None]:
 
     The function drops a line that comes less than `REPEAT_SECONDS` after the last one.
     """
-    last = -REPEAT_SECONDS
+    last = -REPEAT_SECONDS  # time of the last line: the first one is printed at once
 
     def tell(line: str) -> None:
         nonlocal last
@@ -248,6 +253,7 @@ class Status:
         if not libraries:
             return
         begin = time.perf_counter()
+        # the first report comes after `SILENT_SECONDS`, whatever the count
         last_count, last_time = 0, begin + SILENT_SECONDS - PROGRESS_SECONDS
         self.requested += len(libraries)
 
@@ -343,6 +349,7 @@ class KernelLog:
         """
         requests = [self.request_form(name, form) for name, form in forms.items()]
         origins = [form.origin for form in forms.values()]
+        # an empty form has no mesh, and so no communicator
         integrals = [form for form in origins if isinstance(form, ufl.Form) and not form.empty()]
         if integrals:
             self.compile_requested(_domain_of(integrals[0]).ufl_cargo().comm)
@@ -358,6 +365,7 @@ class KernelLog:
         """
         start, key = time.perf_counter(), form.key
         try:
+            # the derived form is not even made if this process has it
             if key in _compiled_forms:
                 compiled = form.bind(_compiled_forms[key])
                 return lambda: compiled
@@ -372,6 +380,7 @@ class KernelLog:
                 FORM_OPTIONS,
                 _tensor_size(ufl_form),
             )
+            # loaded at the first call, when all requests are compiled together
             return cache(lambda: self._load_form(form, ufl_form, library()))
         finally:
             self._note(name, start)
@@ -395,7 +404,7 @@ class KernelLog:
         name
             Name of the kernel in the log.
         key
-            Determines the source and the options; see `Library`.
+            Determines the source and the options: libraries with one key are one.
         source
             Returns the C source.
         options
@@ -416,7 +425,10 @@ class KernelLog:
     def _request_library(
         self, key: str, source: Callable[[], str], options: tuple[str, ...], size: int
     ) -> Callable[[], ctypes.CDLL]:
-        """Request a library without a note in the log; see `request_library`."""
+        """Request a library without a note in the log.
+
+        Parameters as in `request_library`. Two requests with one key share the library.
+        """
         library = Library(key, source, options)
         request = self._requested.setdefault(library.file, _RequestedLibrary(library, size))
 

@@ -99,7 +99,7 @@ class PointField(fem.Function):  # type: ignore[misc]  # dolfinx has no types
         function
             Returns the values (local cells, q, size).
         inputs
-            Returns the arrays and numbers on which they depend, see `Memo`.
+            Returns the arrays and numbers on which they depend.
         """
         self._memo = Memo(lambda: self._put(function()), inputs)
 
@@ -149,6 +149,7 @@ def at_quadrature(field: fem.Function, points: Array) -> Array:
     values = np.asarray(shape @ field.x.array.reshape(-1, components)[V.dofmap.list])
     if components != 2:
         return values
+    # the plane of a meridian has the axes e1 and e3
     in_space = np.zeros((*values.shape[:2], 3))
     in_space[..., ::2] = values
     return in_space

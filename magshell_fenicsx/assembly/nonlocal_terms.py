@@ -5,6 +5,11 @@ the sparse matrix has a pattern of its own, with room for entries that are expec
 pattern and the symbolic factorisation are reused until an entry falls outside. Where a term couples
 all unknowns, its tangent is dense (`assembly.dense_tangent.DenseTangent`). Theory: docs/theory.md,
 contact between shells and interaction of the magnetisation with its own field.
+
+An entry of a matrix is a global row, a global column and a value; unknowns are numbered by nodes,
+three each. Room is the pattern of entries that may come. Each rank has the rows of its own
+unknowns; fixed unknowns are clamped. The factor of a term is the value of its amplitude (load
+parameter).
 """
 
 from collections.abc import Mapping, Sequence
@@ -226,12 +231,14 @@ class NonlocalEntries:
         added = _owned_rows(self._comm, self._ranges, self._fixed, (rows, columns, values))
         if not self._comm.allreduce(added.nnz):
             return K
+        # the room is made anew where the terms expect other entries, or K is another object
         keys = tuple((t.name, t.pattern_key) for t in self._terms if factors.get(t.name, 0.0))
         if self._sum is None or self._pattern_keys != keys or self._sum.sparse.handle != K.handle:
             self._sum = _MatrixSum(K, self._expected_pattern(factors), self._own.start)
             self._pattern_keys = keys
         if self._comm.allreduce(self._sum.has_room_for(added), MPI.MIN):
             return self._sum.update(added)
+        # an unexpected entry: a matrix for this state alone
         return _MatrixSum(K, _pattern_of(added), self._own.start).update(added)
 
     def times(self, v: Array, factors: Factors) -> Array:
@@ -251,6 +258,7 @@ class NonlocalEntries:
         pairs = [t.coupled_pairs() for t in self._terms if factors.get(t.name, 0.0)]
         rows, columns = (np.concatenate(nodes) for nodes in zip(*pairs, strict=True))
         count = len(self._fixed) // self._block_size
+        # each pair of nodes once, as the number row * count + column
         rows, columns = np.divmod(np.unique(rows * count + columns), count)
         i, j = (
             self._block_size * nodes[:, None, None] + np.arange(self._block_size)
@@ -284,6 +292,7 @@ class _MatrixSum:
         union = csr_array((ones, columns, starts), room.shape) + 2 * room
         self._at_sparse, self._at_room = (np.flatnonzero(union.data & bit) for bit in (1, 2))
         self._room_keys = _entry_keys(room)
+        # PETSc stores columns of own unknowns apart from the others
         self._is_own = (union.indices >= first) & (union.indices < first + room.shape[0])
         self._values = np.zeros(union.nnz)
         kind = PETSc.IntType
@@ -311,6 +320,7 @@ class _MatrixSum:
             (own unknowns, all): the entries.
         """
         keys = _entry_keys(added)
+        # a key that is missing would be inserted before another one, or at the end
         positions = np.searchsorted(self._room_keys, keys)
         if positions.max(initial=0) >= len(self._room_keys):
             return False
@@ -321,6 +331,7 @@ class _MatrixSum:
 
         It is always the same object.
         """
+        # into the union of both patterns; PETSc sees the same memory on one rank
         self._values[:] = 0.0
         self._values[self._at_sparse] = self.sparse.getValuesCSR()[2]
         positions = np.searchsorted(self._room_keys, _entry_keys(added))
@@ -374,6 +385,7 @@ def _owned_rows(
     free = ~(fixed[rows] | fixed[columns])
     selected = rows[free], columns[free], values[free]
     if comm.size > 1:
+        # the last rank whose first unknown is not beyond the row
         owner = np.searchsorted(ranges, selected[0], side="right") - 1
         sent = [tuple(array[owner == rank] for array in selected) for rank in range(comm.size)]
         received = comm.alltoall(sent)

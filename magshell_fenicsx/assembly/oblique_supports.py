@@ -3,6 +3,9 @@
 With the projector P of every supported node, u is replaced by P u. The residual becomes P b and the
 tangent P K P + (I - P), whose number of negative eigenvalues is that of K for admissible
 displacements. Theory: docs/theory.md, mirror planes in any direction.
+
+A node with a support along n has P = I - n n^T, in general the projector onto the complement of all
+its directions. Own nodes belong to this rank, ghosts to others.
 """
 
 from collections.abc import Sequence
@@ -54,7 +57,7 @@ def support_along(
         (3,): the direction, a unit vector.
     """
     axis = int(np.argmax(np.abs(normal)))
-    if np.delete(normal, axis).any():
+    if np.delete(normal, axis).any():  # not along an axis
         return ObliqueSupport(fem.locate_dofs_topological(V, dim, entities), normal)
     component = V.sub(axis)
     dofs = fem.locate_dofs_topological(component, dim, entities)
@@ -122,6 +125,7 @@ class Projection:
         if self._P_matrix is None:
             self._P_matrix = self._block_diagonal(self._P, 1.0)
             self._complement = self._block_diagonal(np.eye(3) - self._P, 0.0)
+        # PETSc reuses the last product for the same pattern
         is_same = self._unprojected is not None and self._unprojected.handle == K.handle
         self._projected = K.ptap(self._P_matrix, self._projected if is_same else None)
         self._unprojected = K
@@ -157,7 +161,7 @@ class Projection:
         n, first_row = 3 * self._owned, 3 * self._first
         matrix = PETSc.Mat().createAIJ(((n, None), (n, None)), nnz=(3, 0), comm=self._comm)
         local = self._nodes < self._owned
-        if elsewhere:
+        if elsewhere:  # zeros need not be stored
             other_nodes = np.setdiff1d(np.arange(self._owned), self._nodes[local])
             for i in (3 * other_nodes[:, None] + np.arange(3)).ravel():
                 matrix.setValue(first_row + i, first_row + i, elsewhere)

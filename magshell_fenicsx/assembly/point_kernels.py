@@ -4,6 +4,11 @@ A density is a function of a few vectors that vary between points. Its kernels d
 mesh, degree or quadrature. The points are represented as cells of an interval, and the vectors as
 functions that are constant in each. A kernel is a function in C of operations on scalars
 (`scalar_graph`), for many points in one call and four points at once. Theory: docs/tangent.md.
+
+W is a density as an expression of UFL, z a field of vectors by which it is differentiated. A graph
+has the operations on scalars as nodes, which are numbers; a list of nodes stands for the components
+of an expression or of a result. A kernel is kept under a key, a hash of all that its code depends
+on; the log requests compilation. Vectors of z are counted by i, j and their components by c, d.
 """
 
 import ctypes
@@ -65,9 +70,10 @@ class PointStorage:
         return copied
 
     def evaluate(self, kernel: "PointKernel", count: int) -> Array:
-        """Return the values (count, components) of a kernel at the first points.
+        """Return the values (count, components) of a kernel at the first `count` points.
 
-        The array is reused by the next call.
+        The constants get the present values of their originals before. The array is reused by the
+        next call.
         """
         for copied, original in self._constants:
             np.copyto(copied, original)
@@ -101,6 +107,7 @@ class PointKernel:
         constants: Sequence[fem.Constant],
         size: int,
     ) -> None:
+        """Take the addresses of the inputs' arrays, which the C function reads."""
         self._library, self.size = library, size
         # Views of the arrays, whose values may change.
         self._constants = [c.value for c in constants]
@@ -151,6 +158,7 @@ def _kernel(
     log
         Requests the compiled library.
     """
+    # the graph is only made where the key or the code is not known
     fields, constants, labels = terminals_of(expressions, ufl.Coefficient, ufl.Constant, Label)
     translate = cache(lambda: _graph(expressions, fields, constants))
     structure = (task, *_structures(expressions, fields, constants, labels))
@@ -181,6 +189,7 @@ def _cached_key(structure: tuple[str, ...], compute_key: Callable[[], str]) -> s
         Computes the key of an unknown structure.
     """
     if structure not in _KEYS:
+        # a new generator of code, or a new UFL, makes other keys
         inputs = repr((_version(), ufl.__version__, structure))
         name = f"magshell_key_{hashlib.sha256(inputs.encode()).hexdigest()[:40]}"
         cached = load_cached(name)
@@ -200,6 +209,7 @@ def _structures(expressions: Sequence[Expr], *inputs: Sequence[Any]) -> list[str
     inputs
         Fields, constants and labels, each in its order.
     """
+    # all meshes count as one
     numbers = {terminal: i for terminals in inputs for i, terminal in enumerate(terminals)}
     numbers |= {domain: 0 for e in expressions for domain in extract_domains(e)}
     return [compute_expression_signature(e, numbers) for e in expressions]
@@ -269,11 +279,13 @@ def point_gradient(
         Pairs of a density W and the field z by which it is differentiated; all z have the same
         size.
     """
-    size = sums[0][1].ufl_shape[0]
+    _, first_field = sums[0]
+    size = first_field.ufl_shape[0]
 
     def gradient(graph: ScalarGraph, nodes: list[list[int]]) -> list[int]:
         """Return the nodes of the sum's components."""
         sum_nodes = [graph.zero] * size
+        # lists of nodes alternate: the density's only node, then the components of its field
         for (W,), z in zip(nodes[::2], nodes[1::2], strict=True):
             slopes, _ = graph.derivatives(W, z, second=False)
             sum_nodes = [
@@ -354,7 +366,7 @@ def point_hessian(
         For each side the symmetric parts (6, pairs) then the skew parts (3, skew pairs); after them
         the cross blocks (9, pairs).
     """
-    sides = z.ufl_shape[0] // (3 * vectors)
+    sides = z.ufl_shape[0] // (3 * vectors)  # 1 or 2
 
     def hessian(graph: ScalarGraph, nodes: list[list[int]]) -> list[int]:
         """Return the nodes of the kernel's results, in their order."""
@@ -364,6 +376,7 @@ def point_hessian(
         def entry(i: int, j: int, c: int, d: int) -> int:
             """Return the second derivative by component c of vector i and d of vector j."""
             row, column = inputs[3 * i + c], inputs[3 * j + d]
+            # second derivatives are known by the pair with the smaller node first; others are zero
             return second.get((min(row, column), max(row, column)), graph.zero)
 
         def mean(a: int, b: int) -> int:
@@ -374,6 +387,7 @@ def point_hessian(
         for first_vector in range(0, sides * vectors, vectors):
             within = [(first_vector + i, first_vector + j) for i, j in pairs.within_side]
             skew = [(first_vector + i, first_vector + j) for i, j in pairs.skew]
+            # symmetric parts of the blocks, then skew ones
             outputs += [
                 mean(entry(i, j, c, d), entry(i, j, d, c)) for c, d in COMPONENTS for i, j in within
             ]
@@ -394,7 +408,10 @@ def point_hessian(
 
 
 def full_hessian(name: str, W: Expr, z: fem.Function, log: KernelLog) -> PointKernel:
-    """Return the kernel of d2W/dz2 at z = 0: the upper triangle, row by row."""
+    """Return the kernel of d2W/dz2 at z = 0: the upper triangle, row by row.
+
+    All components of z count, not blocks of vectors.
+    """
     size = z.ufl_shape[0]
 
     def hessian(graph: ScalarGraph, nodes: list[list[int]]) -> list[int]:
@@ -463,6 +480,7 @@ def point_code(graph: ScalarGraph, outputs: Sequence[int]) -> str:
         result_positions.setdefault(node, []).append(k)
     for node in graph.dependencies(outputs):
         operator, *arguments = graph.operations[node]
+        # a number is written in place, in parentheses; any other node becomes a variable
         if operator == "number":
             names[node] = f"({arguments[0]!r})"
         else:
@@ -516,6 +534,7 @@ def _c_expression(
         return f"~{operands[0]}"
     if operation in INFIX_OPERATIONS:
         left, right = operands
+        # a number on the left becomes a vector, so that the result is a mask
         if operation in MASK_OPERATIONS and left[0] == "(":
             left = f"(none + {left})"
         return f"{left} {operation} {right}"

@@ -7,6 +7,11 @@ edges too. The potential of the pressure is the volume that the surface sweeps w
 straight to their places. An edge that moves sweeps a volume as well. With a lid on the edge, which
 moves as rigidly, the two volumes add up to the change of the enclosed volume, whatever the shape of
 the lid: here it is a cone. Theory: docs/theory.md, live pressure and moving supports.
+
+mu are amplitudes of rigid motions by name; each motion of a body has one. E(mu) is the displacement
+of the nodes that move, A = Q dQ^T/dmu the spin of a clamped edge with the rotation Q. R is the
+reference length. A side is a cell's side on the edge; y is a place counted from a lid's origin, n
+the normal. Local vectors have the nodes of this rank with ghosts, which other ranks own.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -83,10 +88,12 @@ class EdgeCurve:
         for dims in ((dim - 1, dim), (dim, dim - 1), (dim, 0)):
             topology.create_connectivity(*dims)
         facets = facets[facets < topology.index_map(dim - 1).size_local]
+        # exact for the product of a place, a place and a slope
         rule = basix.make_quadrature(basix.CellType.interval, 3 * element.degree)
         points, weights = (np.asarray(array) for array in rule)
-        values, slopes = {}, {}
+        values, slopes = {}, {}  # for each side of the reference cell
         for number, (first_place, last_place, _) in sides.items():
+            # [0] the shape functions, [1:] their derivatives by reference coordinates
             tabulated = element.tabulate(1, first_place + points * (last_place - first_place))[
                 ..., 0
             ]
@@ -101,6 +108,7 @@ class EdgeCurve:
             for cell, facet in zip(cells, facets, strict=True)
         ]
         vertices_of_cells = topology.connectivity(dim, 0)
+        # [2] are the numbers of both corners in the cell
         corners = [
             vertices_of_cells.links(cell)[list(sides[number][2])]
             for cell, number in zip(cells, numbers, strict=True)
@@ -146,6 +154,7 @@ def level_sides(height: float) -> dict[int, CellSide]:
     corners = np.array(
         [[0.0, 0.0, height], [1.0, 0.0, height], [0.0, 1.0, height], [1.0, 1.0, height]]
     )
+    # faces 0 and 5 are the bottom and the top; the lines run around the hexahedron
     corners_of_faces = {1: (0, 1), 3: (1, 3), 4: (3, 2), 2: (2, 0)}
     return {i: (corners[a], corners[b], (a, b)) for i, (a, b) in corners_of_faces.items()}
 
@@ -191,6 +200,9 @@ class Lid:
         comm: MPI.Comm,
     ) -> "Lid":
         """Return the cone over curves through nodes, as lid. Collective.
+
+        Its area and moment are integrals of y x dy/2 and y (y x dy)^T/3 along the curves. They are
+        negative, since the lid lies on the right of a curve, the surface on the left.
 
         Parameters
         ----------
@@ -238,6 +250,7 @@ class Lid:
         turn = total_rotation(self.motions, mu)
         place = apply_motions(self.motions, mu, self.origin[None])
         # The displacement is u = G y + s; (G, s) here and of each derivative.
+        # Rows of `turn` and `place` are images, so matrices are transposed.
         displacement = turn.x.T - np.eye(3), place.x[0] - self.origin
         rates = {name: (turn.slopes[name].T, place.slopes[name][0]) for name in turn.slopes}
         second_rates = {
@@ -248,7 +261,8 @@ class Lid:
             dict.fromkeys(rates, 0.0),
             dict.fromkeys(second_rates, 0.0),
         )
-        # cof F is quadratic in tau: two Gauss points integrate exactly
+        # cof F is quadratic in tau: two Gauss points, of weight 1/2 each, integrate exactly. The
+        # product rule gives the derivatives; the slope of cof F is 2 cof(F, dF), bilinear.
         for tau in GAUSS_POINTS:
             F = np.eye(3) + tau * displacement[0]
             flux = self._flux(*displacement)
@@ -365,8 +379,8 @@ class RigidBody:
 class PrescribedMotion:
     """The displacement E(mu) of all nodes that move; vectors are local, with ghosts.
 
-    The energy of a clamped edge depends on its normal through Q^T r alone, Q the edge's rotation.
-    So its derivatives by Q are those by the displacement along A r, with A = Q dQ^T.
+    The energy of a clamped edge depends on its normal through Q^T r alone, with the edge's rotation
+    Q and the place r = r0 + u. So a change of Q acts like the displacement A r, A = Q dQ^T.
 
     Parameters
     ----------
@@ -391,6 +405,10 @@ class PrescribedMotion:
         bodies: Sequence[RigidBody],
         edge_pressure: EdgePressure | None = None,
     ) -> None:
+        """Find the places of the prescribed components, and the cells with nodes that move.
+
+        A degree of freedom is numbered by node, then component: two in a meridian, three in space.
+        """
         self.edge_pressure = edge_pressure
         self._axes = list(AXES_OF_COMPONENTS[r0.function_space.dofmap.index_map_bs])
         self._r0, self._bodies = r0, bodies
@@ -411,7 +429,10 @@ class PrescribedMotion:
             u[body.dofs] = self._components(body, displacement)
 
     def turn(self, mu: Amplitudes) -> None:
-        """Write the rotations Q^T into the terms of clamped edges; missing amplitudes are zero."""
+        """Write the rotations Q^T into the terms of clamped edges; missing amplitudes are zero.
+
+        The terms measure the normal in the frame that turns with the edge.
+        """
         for body in self._bodies:
             if body.turn is not None:
                 amplitudes = dict.fromkeys(body.names, 0.0) | dict(mu)

@@ -2,6 +2,9 @@
 
 Moving supports and moving magnetic sources are described by them. Theory: docs/theory.md, moving
 supports.
+
+mu is the amplitude of a motion, R the reference length. Points are rows, so matrices act on them
+from the right, transposed.
 """
 
 from collections.abc import Mapping, Sequence
@@ -48,6 +51,7 @@ class RigidMotion:
     def rotation(self, mu: float) -> tuple[Array, Array, Array]:
         """Return Rot(mu turn) (3, 3) and its first two derivatives by mu (Rodrigues' formula)."""
         angle = float(np.linalg.norm(self.turn))
+        # N is the matrix of the cross product with the axis; without a turn it is zero
         x, y, z = self.turn / (angle or 1.0)
         N = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         NN, c, s = N @ N, np.cos(mu * angle), np.sin(mu * angle)
@@ -92,6 +96,7 @@ def apply_motions(motions: Sequence[RigidMotion], mu: Mapping[str, float], x: Ar
     slopes: dict[str, Array] = {}
     curvatures: dict[AmplitudePair, Array] = {}
     for motion in motions:
+        # the transposed rotation and its derivatives by this amplitude
         Q, Q1, Q2 = (matrix.T for matrix in motion.rotation(mu[motion.name]))
         name, arm = motion.name, x - motion.centre
         # this motion turns all derivatives by earlier amplitudes; then come those by its own

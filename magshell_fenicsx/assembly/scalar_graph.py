@@ -2,6 +2,9 @@
 
 Each operation occurs once. A node is the number of an operation; the operands of a node have
 smaller numbers. Inputs are the components of fields and constants. Theory: docs/tangent.md.
+
+A node that is simplified may be another one than the operation asked for, such as a for a + 0. A
+derivative is a node too; one that is missing is zero.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -95,6 +98,7 @@ class ScalarGraph:
         if y is not None:
             a, b, x = b, a, y
         if x is not None:
+            # two numbers in a product become one
             name, *factors = self.operations[b]
             if name == "*" and (number_in_b := self.value(factors[0])) is not None:
                 return self.times(self.number(x * number_in_b), factors[1])
@@ -120,6 +124,7 @@ class ScalarGraph:
         exponent = self.value(b)
         if exponent is None:
             return self.node("pow", a, b)
+        # neither a whole nor a half power, or too large
         if 2 * exponent != int(2 * exponent) or abs(exponent) > MAX_PRODUCT_POWER:
             return self.node("pow", a, b)
         product = self.one if exponent == int(exponent) else self.node("sqrt", a)
@@ -144,6 +149,7 @@ class ScalarGraph:
         Operands come first, each shortly before it is needed.
         """
         order, visited = list[int](), set[int]()
+        # depth first; a node comes back as done after its operands
         stack = [(node, False) for node in reversed(list(nodes))]
         while stack:
             node, operands_done = stack.pop()
@@ -171,6 +177,7 @@ class ScalarGraph:
             Input -> the node that replaces it.
         """
         new_nodes = dict(replacements)
+        # operands first, so that each operation is applied to known nodes
         for node in self.dependencies(nodes):
             if node in new_nodes:
                 continue
@@ -216,6 +223,7 @@ class ScalarGraph:
         lowered = apply_algebra_lowering(expression)
         if has_type(lowered, classes.Derivative):
             lowered = apply_derivatives(lowered)
+        # the components of each field and constant, as operations without operands
         inputs: dict[Expr, list[Operation]] = {}
         for number, f in enumerate(fields):
             inputs[f] = [("field", number, k) for k in range(prod(f.ufl_shape))]
@@ -266,6 +274,7 @@ class ScalarGraph:
         if isinstance(e, classes.IndexSum):
             a, label = e.ufl_operands
             axis = len(a.ufl_shape) + a.ufl_free_indices.index(label[0].count())
+            # the summed index becomes the last axis
             summands = np.moveaxis(operands[0], axis, -1)
             sums = [self.sum(flat(row)) for row in summands.reshape(-1, summands.shape[-1])]
             return np.array(sums).reshape(summands.shape[:-1])
@@ -291,7 +300,7 @@ class ScalarGraph:
             name = COMPARISONS[type(e)]
             return lambda a, b: self.node(name, a, b)
         if isinstance(e, classes.MathFunction):
-            name = {"ln": "log"}.get(e._name, e._name)
+            name = {"ln": "log"}.get(e._name, e._name)  # names in C
             return lambda a: self.node(name, a)
         if isinstance(e, classes.BesselJ | classes.BesselY):
             name = "jn" if isinstance(e, classes.BesselJ) else "yn"
@@ -336,11 +345,13 @@ class ScalarGraph:
         Input -> first derivative, and pair of inputs, the smaller one first -> second derivative.
         """
         ends = set(inputs)
+        # active nodes depend on an input
         ascending = sorted(self.dependencies([f]))
         active = set(ends)
         for node in ascending:
             if any(operand in active for operand in self.operands(node)):
                 active.add(node)
+        # derivatives of f by a node, and by two nodes (in both orders)
         adjoints, pairs = {f: self.one}, dict[int, dict[int, int]]()
 
         def couple(j: int, k: int, value: int) -> None:
@@ -362,6 +373,7 @@ class ScalarGraph:
             for other_node, value in mixed.items():
                 pairs[other_node].pop(node)
                 for j, slope in slopes.items():
+                    # a pair of equal nodes stands for two mixed derivatives
                     multiplicity = self.number(2.0 if j == other_node else 1.0)
                     couple(j, other_node, self.times(multiplicity, self.times(slope, value)))
             # pairs of operands: from the second derivative by the node, and from its curvature
@@ -410,6 +422,7 @@ class ScalarGraph:
             if operand not in active:
                 continue
             slopes[operand] = self.add(slopes.get(operand, self.zero), rule_slopes[i])
+            # each pair once, the smaller node first; an operand may occur twice
             for k in range(len(operands) if second else 0):
                 if operands[k] >= operand and operands[k] in active:
                     pair = operand, operands[k]
@@ -420,12 +433,14 @@ class ScalarGraph:
     def _rules(
         self, node: int, name: str, operands: list[int]
     ) -> tuple[list[int], list[list[int]]]:
-        """Return the first and second derivatives of an operation by its operands.
+        """Return the first and second derivatives of an operation by its operands, as nodes.
+
+        The operands count as different and independent of each other.
 
         Parameters
         ----------
         node
-            The node of the operation.
+            The node of the operation, whose value some derivatives contain.
         name, operands
             Its name and the nodes of its operands.
 
@@ -463,6 +478,7 @@ class ScalarGraph:
             mixed = self.add(times(y, y), self.minus(times(x, x)))
             return [x, self.minus(y)], [[bend, mixed], [mixed, self.minus(bend)]]
         if name in ("jn", "yn"):
+            # J_n' = (J_(n-1) - J_(n+1))/2; None asks for the second derivative
             down, up, further = (self._bessel(name, a, b, k) for k in (-1, 1, None))
             slope = times(number(0.5), self.add(down, self.minus(up)))
             return [zero, slope], [[zero, zero], [zero, further]]
@@ -576,7 +592,7 @@ def terminals_of(expressions: Iterable[Expr], *kinds: type) -> tuple[list[Any], 
 def _indexed(value: Nodes, e: Expr) -> Nodes:
     """Return the nodes of A[i, 0, ...] from those of A.
 
-    An index that is free in A too makes a diagonal.
+    An index that is free in A too makes a diagonal, as i in A_i[i].
 
     Parameters
     ----------
@@ -592,7 +608,8 @@ def _indexed(value: Nodes, e: Expr) -> Nodes:
         fixed.append(int(index) if is_fixed else slice(None))
         labels += [] if is_fixed else [index.count()]
     labels += tensor.ufl_free_indices
-    numbers = {label: i for i, label in enumerate(dict.fromkeys(labels))}  # einsum knows 52
+    # labels are numbered anew: einsum takes numbers below 52 alone
+    numbers = {label: i for i, label in enumerate(dict.fromkeys(labels))}
     axes = [numbers[label] for label in labels]
     free_axes = [numbers[label] for label in e.ufl_free_indices]
     return np.asarray(np.einsum(value[tuple(fixed)], axes, free_axes))
@@ -616,5 +633,6 @@ def _aligned(value: Nodes, operand: Expr, e: Expr) -> Nodes:
     present = [axis for axis in axes if axis is not None]
     ordered = np.transpose(value, [*range(len(shape)), *present])
     sizes = [1 if axis is None else value.shape[axis] for axis in axes]
+    # a scalar operand has no axes of the shape: ones take their place
     padding = (1,) * (len(e.ufl_shape) - len(shape))
     return ordered.reshape((*padding, *shape, *sizes))

@@ -1,7 +1,10 @@
 """The sparse matrix of a vector field, assembled from element matrices of cells and edges.
 
-The sparsity pattern consists of (3, 3) blocks; every
-rank has the rows of its own nodes. Theory: docs/tangent.md.
+The sparsity pattern consists of (3, 3) blocks, one for each pair of coupled nodes; every rank has
+the rows of its own nodes. Ghosts are local nodes that other ranks own: what a rank computes in
+their rows is sent to the owner. Local nodes are numbered own ones first, then ghosts. A block has a
+number, in the order of the pattern; its nine values have places in the array of values. Functions
+are the shape functions of a cell, one for each of its nodes. Theory: docs/tangent.md.
 """
 
 from collections.abc import Iterable, Iterator, Sequence
@@ -67,7 +70,8 @@ class SparsityPattern:
         sent = in_ghost_rows.row[order] + n, in_ghost_rows.col[order]
         self._sent_counts = np.bincount(ranks, minlength=comm.size)
         self._received_counts = np.array(comm.alltoall(list(self._sent_counts)))
-        received = tuple(self._exchange(numbers[local], 1) for local in sent)
+        # global rows and columns of the blocks that others send
+        received = tuple(self._exchange(numbers[local], size=1) for local in sent)
         is_foreign = (received[1] < first_node) | (received[1] >= first_node + n)
         # all nodes of other ranks in own columns; columns are numbered by their position here
         self.others = np.unique(np.concatenate([numbers[n:], received[1][is_foreign]]))
@@ -80,7 +84,7 @@ class SparsityPattern:
         received_blocks = self._row(received[0] - first_node, received_columns), received_columns
         all_positions = zip(self._position(i, j), received_blocks, strict=True)
         rows, columns = (np.concatenate(arrays, dtype=np.int32) for arrays in all_positions)
-        del i, j
+        del i, j  # large
         blocks = _unique_positions(rows, columns, (2 * n + ghosts, self._width))
         self.starts, self.columns = blocks.indptr, blocks.indices
         # keys row * width + column ascend, so that a search finds each block
@@ -108,7 +112,9 @@ class SparsityPattern:
         values
             (9 blocks,): the values in the order of the pattern, which are changed.
         """
-        np.add.at(values, self._received_entries, self._exchange(values[self._sent_entries], 9))
+        np.add.at(
+            values, self._received_entries, self._exchange(values[self._sent_entries], size=9)
+        )
 
     def csr(self, first: int, last: int) -> tuple[Ints, Ints]:
         """Return rows of blocks, from `first` up to `last`, as scalar compressed sparse rows.
@@ -142,6 +148,7 @@ class SparsityPattern:
 
     def _find(self, rows: Any, columns: Any) -> Ints:
         """Return the numbers of the blocks at rows and columns; -1 for a missing block."""
+        # a key beyond all others is compared with the last one
         keys = rows * np.int64(self._width) + columns
         positions = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
         return np.where(self._keys[positions] == keys, positions, -1).astype(np.int32)
@@ -151,6 +158,8 @@ class SparsityPattern:
 
         A row of b blocks has three scalar rows of 3 b values each.
         """
+        # 9 values for each block before the row, then 3 for each earlier block of its first scalar
+        # row: 9 start + 3 (block - start)
         row_start = self.starts[rows].astype(np.int64)
         width = 3 * (self.starts[rows + 1] - self.starts[rows])
         components = np.arange(3)
@@ -348,7 +357,7 @@ class BlockMatrix:
             yield columns, rows
 
     def _clamped_entries(self, is_clamped: NDArray[np.bool_]) -> tuple[Longs, Longs]:
-        """Return where this rank stores entries that clamped unknowns fix.
+        """Return where this rank stores entries that clamped unknowns fix at 0 or 1.
 
         Parameters
         ----------
@@ -361,7 +370,7 @@ class BlockMatrix:
         """
         count, owned = len(is_clamped), self._pattern.owned
         partly, own_nodes = np.array(is_clamped.any(axis=1)), np.arange(owned, dtype=np.int32)
-        # a pair i, j of nodes as the number i * count + j
+        # a pair i, j of nodes as the number i * count + j; first the diagonal blocks of own nodes
         keys = [own_nodes[partly[own_nodes]] * (count + np.int64(1))]
         for i, j in self._free_pairs():
             has_clamped = partly[i] | partly[j]

@@ -2,6 +2,10 @@
 
 Fields are evaluated at the same points of all cells, and integrated back to nodes, by matrix
 products. Theory: docs/tangent.md.
+
+A jet is a field's value with its first and second derivatives by the reference coordinates X, Y.
+D_i[a] is derivative i (0 to 5, the value is 0) of shape function a. An entity is a cell or an edge;
+an edge may have two sides, its cells.
 """
 
 from collections.abc import Sequence
@@ -78,11 +82,15 @@ class ShapeTable:
         """
         a, b = self.triangle
         D = self.values
+        # (i < j) is 1 for two different derivatives
         products = [D[:, i, a] * D[:, j, b] + (i < j) * D[:, j, a] * D[:, i, b] for i, j in pairs]
         return _flat(w, products)
 
     def skew(self, w: Array, pairs: tuple[IndexPair, ...]) -> Array:
-        """Return w (D_i[a] D_j[b] - D_j[a] D_i[b]) of functions a <= b; see `symmetric`."""
+        """Return w (D_i[a] D_j[b] - D_j[a] D_i[b]) of functions a <= b.
+
+        The shape is (points * pairs, functions (functions + 1)/2).
+        """
         a, b = self.triangle
         D = self.values
         return _flat(w, [D[:, i, a] * D[:, j, b] - D[:, j, a] * D[:, i, b] for i, j in pairs])
@@ -143,6 +151,7 @@ def edge_rule(degree: int, edge: int, is_reversed: bool) -> tuple[Array, Array]:
     Points (q, 2), and weights (q,) that sum to one.
     """
     x, weights = basix.make_quadrature(basix.CellType.interval, degree)
+    # backwards if reversed
     start, end = CORNERS[list(EDGES[edge][:: -1 if is_reversed else 1])]
     return start + np.asarray(x) * (end - start), np.asarray(weights)
 
@@ -158,6 +167,7 @@ def edge_covector(edge: int) -> Array:
     start, end = CORNERS[list(EDGES[edge])]
     tangent = end - start
     covector = np.array([tangent[1], -tangent[0]])
+    # outward: negative towards the centre
     return covector if covector @ (CORNERS.mean(axis=0) - start) < 0 else -covector
 
 
@@ -175,6 +185,7 @@ def cell_frames(domain: mesh.Mesh) -> Array:
     corners = domain.geometry.x[compat.geometry_dofs(domain)]
     first_edge, second_edge = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
     length = np.linalg.norm(first_edge, axis=1)
+    # along x; y is normal to it in the plane of the triangle
     direction = first_edge / length[:, None]
     second_along_first = np.einsum("ci,ci->c", second_edge, direction)
     height = np.linalg.norm(second_edge - second_along_first[:, None] * direction, axis=1)

@@ -1,4 +1,11 @@
-"""Energy terms: a potential Pi(u) with its amplitude, its energy, residual and tangent."""
+"""Energy terms: a potential Pi(u) with its amplitude, its energy, residual and tangent.
+
+The potential of a system is the sum of mu Pi(u) over its terms; mu is an amplitude (load parameter)
+by name, or 1. Residual and tangent are the first and second derivative by u; a dead load has no
+tangent. A form is an integral in UFL, whose kernel the log requests and compiles on first use. A
+load without potential has a virtual work in place of an energy. Each rank computes its own part of
+a sum.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -172,6 +179,7 @@ class FormTerm:
         -------
         A function that returns the compiled form.
         """
+        # the form under whose signature the compiled one is kept
         origin = self.form if self._work is None else self._work
         description = kind if self._work is None else f"{kind} of work"
         derived = DerivedForm(origin, description, make, self._u, (self._factor,))
@@ -367,7 +375,7 @@ class TangentAssembler(Protocol):
         factors
             Term name -> factor of its tangent; others are left out.
         stress
-            As in `System.tangent`, of displacements with ghosts.
+            Weighted displacements, with ghosts, whose stress replaces that of u; empty: its own.
         """
 
     def times(self, v: NDArray[np.float64], factors: Mapping[str, float]) -> NDArray[np.float64]:

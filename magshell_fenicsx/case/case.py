@@ -1,4 +1,11 @@
-"""The whole case: its sections and what they must have in common."""
+"""The whole case: its sections and what they must have in common.
+
+An ability is a section that adds something to a problem, such as a field or a joint. The programme
+is the sequence of load steps. A patch is a named part of the surface, a dimple an imperfection with
+a rim. A case with `shells` is rewritten as a case of one mesh file with all of them; `several`
+keeps them. R, h and E are reference length, thickness and Young's modulus. The origin of a case has
+its plain data (the mapping in its file), and where each key stands in the file.
+"""
 
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from copy import deepcopy
@@ -168,6 +175,7 @@ class Case(WithParts):
         sections = {member.name: member.section for member in parts}
         copied = self.model_copy(update={"shell": shell, "shells": sections})
         copied._several = several
+        # the "file" of this shell is the mesh of all shells, in memory
         shell.files.given[shell.path] = several.assembly
         return copied
 
@@ -190,6 +198,7 @@ class Case(WithParts):
         if several and isinstance(section.shell, MeshSurface):
             section._several = several
             section.shell.files.given[section.shell.path] = several.assembly
+        # a shell with units accepts lengths without: they are in metres
         if isinstance(data, dict) and not section.shell.with_units:
             for key in section._with_units(data):
                 raise ValueError(
@@ -257,7 +266,7 @@ class Case(WithParts):
                 f"mesh.{size_keys[0]}: not with geometry: mesh, whose elements are those of the "
                 "file"
             )
-        if self.model == "shell":
+        if self.model == "shell":  # the rules that follow are those of a solid
             if self.solid:
                 raise ValueError("solid belongs to model: solid")
             return self
@@ -278,6 +287,7 @@ class Case(WithParts):
         """Sections, units and steps of the case, in the form that its parts read."""
         sections = {key: getattr(self, key) for key in type(self).model_fields}
         sections["imperfections"] = self.imperfections
+        # load steps are planned with the rest of the context, which comes first
         is_programme, is_solid = isinstance(self.loading, list), self.model == "solid"
         without_steps = Context(
             self.shell, self.points, sections, is_programme=is_programme, solid=is_solid
@@ -300,13 +310,14 @@ class Case(WithParts):
     def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
         """Return a copy with some sections changed; its parts read the copy, not the original."""
         copied = super().model_copy(update=update, deep=deep)
-        copied.__dict__.pop("context", None)
+        copied.__dict__.pop("context", None)  # the cached one has the sections of the original
         return copied
 
     @property
     def imperfections(self) -> dict[str, ImperfectionSection]:
         """Key below `shell` -> section of each imperfection; `defect` is one of them."""
         shell = self.shell
+        # the short form of a single imperfection, which these shapes have
         if isinstance(shell, ShellSection | CapSurface | RevolutionSurface) and shell.defect:
             return {"defect": shell.defect}
         sections = dict[str, ImperfectionSection]()
@@ -401,7 +412,7 @@ class Case(WithParts):
         CaseError
             See `load`; for a mapping the message begins with the key.
         """
-        if not isinstance(source, Source):
+        if not isinstance(source, Source):  # a mapping has no file: messages begin with the key
             source = Source("case", dict(source))
         try:
             context = {"folder": source.folder, "files": source.files}

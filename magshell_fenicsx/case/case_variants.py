@@ -1,7 +1,10 @@
 """A case as programs give it, the same case with other values, and the case of its perfect shell.
 
-On several ranks, all ranks have the files as rank 0 reads them. The data of a changed case are
-changed too, so that a run writes down the case that it solves.
+On several ranks, all ranks have the files as rank 0 reads them. The plain data of a case are the
+mapping that its file contains; its origin keeps them. The data of a changed case are changed too,
+so that a run writes down the case that it solves. A key path names a value, such as "mesh.degree".
+A case of several shells has a case of its own for each, a `MemberCase`. A reader is a section that
+names a file.
 """
 
 from collections.abc import Mapping, Sequence
@@ -70,6 +73,7 @@ def with_same_files(case: Case, comm: "MPI.Comm") -> Case:
         On every rank, if the ranks have different cases.
     """
     readers = case.readers
+    # nothing to do on one rank, or where an earlier call has shared the files
     if comm.size == 1 or (readers and all(reader.files.shared for reader in readers.values())):
         return case
     case_json = case.model_dump_json()
@@ -119,8 +123,7 @@ def case_with_values(case: Case, values: Mapping[str, Any]) -> Case:
 def _case_with_value(case: Case, key: str, value: Any) -> Case:
     """Return a copy of a case with another value at a key path, also in its plain data.
 
-    A key of the shell changes numbers that other keys are relative to, so the loading is made
-    again.
+    A key of the shell changes numbers over which loads are given, so the loading is made again.
     """
     case_data = case.origin.data
     if case.several and key.split(".")[0] in ("shells", "mesh"):  # all shells are meshed anew
@@ -129,7 +132,7 @@ def _case_with_value(case: Case, key: str, value: Any) -> Case:
     if case_data is None:
         return replaced
     data = _data_with_value(case, case_data, key, value)  # which the next change builds on
-    if key.startswith("shell."):  # no other number is one that others are given over
+    if key.startswith("shell."):  # numbers of other sections are no units of further keys
         remade = _validated(data, case, key)
         replaced = replaced.model_copy(update={"shell": remade.shell, "loading": remade.loading})
     return replaced.written_as(replace(case.origin, data=data))
@@ -155,6 +158,7 @@ def _remade_case(case: Case, key: str, value: Any) -> Case:
     kept_sections["mesh"] = remade.mesh.model_copy(update={"tolerance": tolerance})
     if key.startswith("shells."):  # targets are over its numbers
         kept_sections["loading"] = remade.loading
+    # remanences of shells have been merged into the section `magnetic`
     if any(section.remanent for section in (remade.shells or {}).values()):
         kept_sections["magnetic"] = remade.magnetic
     return remade.model_copy(update=kept_sections).written_as(replace(case.origin, data=data))
@@ -178,7 +182,9 @@ def _data_with_value(case: Case, data: Mapping[str, Any], key: str, value: Any) 
         section[index] = value
         return new_data
     size_of_unit, current = si_size(unit), _number_at(case, key)
-    if current and float(number):  # over h or a width, an imperfection is no number in SI units
+    # the validated number may be over h or a width: the unit's size is found from the current
+    # value, or where that is zero from a trial with the value 1
+    if current and float(number):
         size_of_unit = current / float(number)
     elif current is not None:
         section[index] = f"1 {unit}"
@@ -230,7 +236,8 @@ def _with_value(part: Any, key: str, value: Any) -> Any:
             for name, item in part.items()
         }
     inner_section = getattr(part, first_key)
-    if inner_section is None and further_keys:  # a section that the case leaves out
+    if inner_section is None and further_keys:
+        # a section that the case leaves out: the first class of "Section | None", with defaults
         inner_section = get_args(type(part).model_fields[first_key].annotation)[0]()
     return part.model_copy(update={first_key: _with_value(inner_section, further_keys, value)})
 
@@ -286,7 +293,9 @@ def _without_imperfections(shell: Surface | ShellSection) -> Surface | ShellSect
 def _to_the_limit(case: Case) -> Any:
     """Return the loading of the perfect shell, which ends at its first instability.
 
-    None if no load of the case remains.
+    None if no load of the case remains. `on_perfect` gives a step for the perfect shell, or None
+    where it has none, as the growth of an imperfection; with `last` the step goes to the first
+    instability.
     """
     loading = case.loading
     if not isinstance(loading, list):

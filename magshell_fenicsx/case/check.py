@@ -1,4 +1,10 @@
-"""Description of a case, as `magshell check` prints it."""
+"""Description of a case, as `magshell check` prints it.
+
+A problem is a case that is planned but not built: loads, supports and element sizes. The patch is
+its triangulation, a named patch a part of the surface. A live pressure follows the surface as it
+deforms; at a moving edge it may have no potential. h, R and E are thickness, reference length and
+Young's modulus, p_c is the classical buckling pressure of a sphere.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,6 +49,7 @@ def _description(case: Case, problem: Problem) -> str:
 
     Raises CaseError if nothing holds the shell or the memory is too small.
     """
+    # with a tolerance the mesh, and so the memory, is known in the run alone
     memory_warning = None if case.mesh.tolerance else refuse_beyond_memory(problem)
     _refuse_unsupported(problem)
     lines = _number_lines(case, problem)
@@ -69,7 +76,7 @@ def _description(case: Case, problem: Problem) -> str:
         )
     lines += ["built:", *(f"  {item}" for item in problem.included)]
     lines += ["left out:", *(f"  {item}" for item in left_out or ["nothing"])]
-    unresolved: list[str] = []
+    unresolved: list[str] = []  # formulas with details that are narrower than the cells
     if patch and (formulas := case_formulas(problem.context)):
         cells = cells_of_patch(patch, degree_of(problem.context))
         unresolved = unresolved_formulas(formulas, cells, problem.azimuth, problem.material.h)
@@ -83,7 +90,8 @@ def _refuse_unsupported(problem: Problem) -> None:
     unsupported = all(
         condition in ("free", "symmetry") for condition in problem.conditions.values()
     )
-    springs_may_hold = bool(problem.loads.user_terms)  # a run asks its tangent
+    # springs may be among user-defined energies: a run finds out from its tangent matrix
+    springs_may_hold = bool(problem.loads.user_terms)
     if unsupported and not (problem.at_rest or problem.moves_freely or springs_may_hold):
         raise CaseError(
             "boundary: nothing is held: clamp an edge or a patch, or hold points, for instance"
@@ -138,13 +146,13 @@ def _in_units(case: Case, without: str) -> list[str]:
     There are none for a case without units.
     """
     sizes = sizes_of(case.context)
-    words_and_units = {
+    words_and_units = {  # scale -> words and unit of its size
         "h": ("h", "mm"),
         "p_c": ("p_c", "Pa"),
         "2πD/R": ("2 pi D/R", "N"),
         "λ_m": ("applied field", sizes.field),
     }
-    factor = {"λ_m": case.lambda_m}
+    factor = {"λ_m": case.lambda_m}  # the size of this scale is the field of lambda_m = 1
     shown_scales = {
         scale: words
         for scale, words in words_and_units.items()
@@ -162,17 +170,20 @@ def _edges_without_potential(problem: Problem, patch: PatchMesh | None) -> tuple
     `patch` is the triangulation, if it is made already.
     """
     span = problem.meridian
-    if span is None:
+    if span is None:  # a triangulated surface, or else a meridian
         return open_edges(
             patch or problem.triangulated(), problem.conditions, problem.loads.pressed_sides
         )
-    return ring_openings(span.ends(), problem.conditions, problem.loads.pressed_sides)[1]
+    _, without_potential = ring_openings(
+        span.ends(), problem.conditions, problem.loads.pressed_sides
+    )
+    return without_potential
 
 
 def _surface_lines(patch: PatchMesh) -> list[str]:
     """Return lines on what a mesh file contains, so that its author can see how it was read."""
     places = patch.embedding(patch.nodes)
-    a, b, c = places[patch.cells[0, :3]]
+    a, b, c = places[patch.cells[0, :3]]  # corners of the first triangle
     normal = np.cross(b - a, c - a)
     extent, place = np.ptp(places, axis=0), (a + b + c) / 3
     unit_normal = normal / np.linalg.norm(normal)
@@ -202,11 +213,14 @@ def _count(problem: Problem, patch: PatchMesh | None) -> tuple[int, int]:
         joined_count = sum(first == second for first, second in chart.joints)
         piece_count = max(len(chart.shell_meridians) - joined_count, 1)
         count = len(meridian_vertices(problem)) - piece_count
+        # two components, at the nodes of cells and one more for each piece
         return count, 2 * (degree * count + piece_count)
     cells, corners = patch.corners, len(np.unique(patch.corners))
     sides = len(np.unique(np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0))
     if problem.body:  # three hexahedra a layer above each triangle
         count = len(problem.body.layer_bounds) - 1
+        # three components; nodes of degree two: of a triangle in three quadrilaterals there are
+        # three within each side and seven inside, in two planes for each layer and one more
         return 3 * len(cells) * count, 3 * (2 * count + 1) * (corners + 3 * sides + 7 * len(cells))
     # three components at corners, within sides and within cells
     inner_nodes = (degree - 1) * (degree - 2) // 2

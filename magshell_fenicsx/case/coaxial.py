@@ -1,7 +1,11 @@
 """Meridians of several shells of revolution with one axis, along one common parameter.
 
-The common parameter runs through the shells one after the other, over the R of the first shell. The
-axis is e3.
+The common parameter s runs through the shells one after the other, over the reference length R of
+the first shell. The axis is e3. Each shell also has a meridian of its own, with its own parameter,
+length and frame. A `MeridianChart` is a meridian with its embedding, which maps pairs (parameter,
+0), called charts (n, 2), to places in the plane of e1 and e3. The foot of a place is the nearest
+place of a shell. At a T-junction an edge of one shell stands on another shell. A pose (`ShellPose`)
+is position, orientation and scale of a shell.
 """
 
 from collections.abc import Mapping, Sequence
@@ -72,13 +76,17 @@ class CoaxialShell:
 
     @property
     def wave_measure(self) -> float:
-        """Measure of the largest wave number around e3, see `shells.waves.Waves`."""
+        """Measure of the largest wave number around e3, see `shells.waves.Waves`.
+
+        Buckles are about as long as the root of thickness over curvature. So their number grows
+        with the largest distance from the axis over that length.
+        """
         reach = max(1.0, float(self.chart.sample()[:, 0].max()))
         return reach * float(np.sqrt(self.chart.curvature / self.problem.material.h))
 
     def own_parameter(self, s: Array) -> Array:
         """Return the shell's own parameters, clipped to its meridian, from common ones (n,)."""
-        t = (s - self.start) / self.place.scale
+        t = (s - self.start) / self.place.scale  # from the start of the shell
         return np.clip(t if self.upright else self.chart.length - t, 0.0, self.chart.length)
 
     def parameter(self, own_parameter: Array) -> Array:
@@ -107,7 +115,7 @@ class CoaxialShell:
 
     def foot(self, x: Array) -> tuple[float, float]:
         """Return common parameter and azimuth (rad) of the shell's place nearest to x (3,)."""
-        in_shell_frame = self.place.to_shell_frame(np.asarray(x)[:3])
+        in_shell_frame = self.place.to_shell_frame(np.asarray(x)[:3])  # without a shell's number
         own_s, _ = self.chart.locate(self.outline.inverse(in_shell_frame))
         return float(self.parameter(np.array(own_s))), float(np.arctan2(x[1], x[0]))
 
@@ -117,6 +125,7 @@ class CoaxialShell:
         `body_contacts` are pairs of element size and reach where bodies press.
         """
         scale = self.place.scale
+        # the mesh is made in the shell's own length
         own_contacts = tuple((size / scale, reach / scale) for size, reach in body_contacts)
         body_contacts = (*self.problem.body_contacts, *own_contacts)
         own_s = meridian_vertices(replace(self.problem, body_contacts=body_contacts))
@@ -163,7 +172,8 @@ class CoaxialEmbedding:
     shells
         The shells, ascending along the common parameter.
     begins
-        Beginning of the parameters that belong to each shell.
+        (shells,) beginning of the parameters that belong to each shell: half of the gap before it
+        is its own, so that every parameter belongs to a shell.
     """
 
     shells: Sequence[CoaxialShell]
@@ -181,7 +191,10 @@ class CoaxialEmbedding:
         return self._values(chart, "deviation", 1)[:, 0]
 
     def _values(self, chart: Array, name: str, size: int) -> Array:
-        """Return the values (n, size) of method `name` of the shell to which each chart belongs."""
+        """Return the values (n, size) of method `name` of the shell to which each chart belongs.
+
+        `name` is a method of `CoaxialShell` with parameters (n,) as its argument.
+        """
         s, values = chart[:, 0], np.empty((len(chart), size))
         # the last shell that begins before the parameter, up to rounding
         shell_numbers = np.searchsorted(self.begins, s + ROUNDING, side="right") - 1
@@ -204,6 +217,7 @@ def meridians(several: "SeveralShells") -> MeridianChart | str:
     CaseError, MeshError
         If a shell alone cannot be planned; the message begins with its key.
     """
+    # for each joint the names of its two shells
     joined_shells = [{several.shell_of(name) for name in names} for names in several.joints]
     if any(set(pair) in joined_shells for pair in several.pairs):
         return "contact: shells that are joined to each other are modelled with their circumference"
@@ -211,13 +225,25 @@ def meridians(several: "SeveralShells") -> MeridianChart | str:
     for member in several.parts:
         place, outline = several.place(member), reference_shell_of(member.case.shell).perfect
         key = member.refused("place")
+        # distance of the origin from e3, and slope of the shell's own axis
         if max(np.hypot(*place.position[:2]), np.hypot(*place.Q[:2, 2])) > ROUNDING:
             return f"{key}: its axis is not e3 through the origin"
         problem = _problem_of(member)
         if isinstance(problem, str):
             return member.refused(problem)
         assert problem.meridian
-        shells.append(CoaxialShell(member.name, 0.0, problem, problem.meridian, place, outline))
+        # each begins at 0 until its place in the common parameter is known
+        meridian = problem.meridian
+        shells.append(
+            CoaxialShell(
+                member.name,
+                start=0.0,
+                problem=problem,
+                chart=meridian,
+                place=place,
+                outline=outline,
+            )
+        )
     successors = _successors(shells, several.joints)
     if isinstance(successors, str):
         return successors
@@ -244,9 +270,9 @@ def _successors(
     """
     # name of an end -> 0 for the first or 1 for the last one, its place, its shell
     ends = {
-        name: (end, begin_place, shell)
+        name: (end, place, shell)
         for shell in shells
-        for end, (name, begin_place) in enumerate(shell.places)
+        for end, (name, place) in enumerate(shell.places)
     }
     samples = [shell.places_at(shell.end * np.arange(101.0) / 100) for shell in shells]
     extent = np.ptp(np.vstack(samples), axis=0).max()
@@ -260,7 +286,7 @@ def _successors(
         (begin, begin_place, next_shell), (end, end_place, previous_shell) = sorted(
             (ends[name] for name in names), key=lambda end: end[0]
         )
-        if (begin, end) != (0, 1):
+        if (begin, end) != (0, 1):  # two beginnings, or two ends
             return f"{key}: the normals of {edge_words} point to opposite sides"
         if np.linalg.norm(begin_place - end_place) > MEETING_TOLERANCE * extent:
             return f"{key}: {edge_words} do not meet"
@@ -273,7 +299,11 @@ def _with_feet(shell: CoaxialShell, feet: Sequence[Array]) -> CoaxialShell:
 
     `feet` are the places (3,) of these edges.
     """
-    parameters = [float(shell.own_parameter(np.array(shell.foot(foot)[0]))) for foot in feet]
+    parameters = []
+    for place in feet:
+        common_parameter, _ = shell.foot(place)
+        parameters.append(float(shell.own_parameter(np.array(common_parameter))))
+    # a jump of the curvature always has a vertex, so a foot is listed as one
     new_jumps = [s for s in parameters if np.abs(shell.chart.knots - s).min() > ROUNDING]
     chart = replace(shell.chart, curvature_jumps=(*shell.chart.curvature_jumps, *new_jumps))
     return replace(shell, problem=replace(shell.problem, meridian=chart), chart=chart)
@@ -295,6 +325,7 @@ def _in_chains(shells: Sequence[CoaxialShell], successors: Mapping[str, str]) ->
         list[CoaxialShell](),
         -PARAMETER_GAP,
     )
+    # a chain begins with a shell that follows none
     for name in (shell.name for shell in shells if shell.name not in successors.values()):
         end, next_name = end + PARAMETER_GAP, name or None
         while next_name:
@@ -332,6 +363,7 @@ def _joined_chart(shells: Sequence[CoaxialShell], several: "SeveralShells") -> M
     """
     joints, names = several.joints, [member.name for member in several.parts]
     by_name = {shell.name: shell for shell in shells}
+    # of joints end to end; at a T-junction the second name is that of a shell
     joined_ends = {name for joint in joints if joint[1] not in by_name for name in joint}
     begins = []
     for shell in shells:
@@ -347,6 +379,7 @@ def _joined_chart(shells: Sequence[CoaxialShell], several: "SeveralShells") -> M
         if len(x) > len("xyz"):
             return by_name[names[round(float(x[-1]))]].foot(x)
         in_plane = np.array([np.hypot(x[0], x[1]), 0.0, x[2]])
+        # of a place the nearest foot on any shell counts
         feet = [shell.foot(x) for shell in shells]
         distances = [
             np.linalg.norm(shell.places_at(np.array([s]))[0] - in_plane)
@@ -368,7 +401,8 @@ def _joined_chart(shells: Sequence[CoaxialShell], several: "SeveralShells") -> M
         """Return the common parameter of an edge, or of the place of `foot` on a shell."""
         if edge in parameters:
             return parameters[edge]
-        return by_name[edge].foot(places[foot])[0]
+        foot_parameter, _ = by_name[edge].foot(places[foot])  # `edge` is the name of a shell
+        return foot_parameter
 
     chart = MeridianChart(
         shells[-1].end,
@@ -380,6 +414,7 @@ def _joined_chart(shells: Sequence[CoaxialShell], several: "SeveralShells") -> M
         shell_meridians=tuple(shell.shell_meridian for shell in shells),
         joints=tuple((parameters[foot], parameter_of(edge, foot)) for foot, edge in joints),
     )
+    # the curvature of all meridians is set so that the measure of waves is the largest of any shell
     reach, h = max(1.0, float(chart.sample()[:, 0].max())), shells[0].problem.material.h
     waves = max(shell.wave_measure for shell in shells)
     return replace(chart, curvature=h * (waves / reach) ** 2)

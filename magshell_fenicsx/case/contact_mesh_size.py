@@ -1,6 +1,8 @@
 """Mesh sizes at contact: elements are small where shells that may touch are nearest.
 
-Distances are those of the undeformed shells.
+Distances are those of the undeformed shells. A place (3,) is in space, a chart (2,) the pair of
+coordinates of a place on its surface. The gap of two places is the distance of the faces there:
+that of the mid-surfaces less half of both thicknesses. h and R are thickness and reference length.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -38,7 +40,7 @@ class ContactPlace:
         `growth` is the increase of the element size per distance from it.
         """
         x, y = map(float, self.place)
-        length = sqrt(sizing.h)
+        length = sqrt(sizing.h)  # sqrt(R h) over R, the width of a boundary layer
         size = CONTACT_CELL_SIZE * length / sizing.refinement
         return [DiscFeature((x, y), CONTACT_REGION * length, size, growth)]
 
@@ -52,8 +54,8 @@ def contact_places(
 ) -> dict[str, list[Array]]:
     """Return the places where other shells are nearest and the mesh is to be refined.
 
-    A shell gets a place only where its nearest places to another shell are close together, and no
-    extended area.
+    A shell gets a place only where its nearest places to another shell are close together. Where
+    they are an extended area, the contact may begin anywhere, and no place is better than others.
 
     Parameters
     ----------
@@ -101,6 +103,7 @@ def contact_places(
             similar_places = places[name][
                 gaps_between[name][0] < gaps.min() + GAP_TOLERANCE * mean_thickness[name]
             ]
+            # all of them count as one place
             if (
                 np.linalg.norm(similar_places - nearest_places[name], axis=1).max()
                 < one_place_distance[name]
@@ -140,11 +143,11 @@ def _gaps(x: Array, y: Array, half_x: Array, half_y: Array) -> tuple[Array, NDAr
     numbers
         (n,) of the places y with these nearest faces.
     """
-    distances, candidates = scipy.spatial.KDTree(y).query(
-        x, k=range(1, 1 + min(FACE_CANDIDATES if np.ptp(half_y) else 1, len(y)))
-    )
+    # of a uniform thickness the nearest mid-surface has the nearest face
+    candidate_count = min(FACE_CANDIDATES if np.ptp(half_y) else 1, len(y))
+    distances, candidates = scipy.spatial.KDTree(y).query(x, k=range(1, 1 + candidate_count))
     gaps = distances - half_y[candidates] - half_x[:, None]
-    nearest = np.arange(len(x)), gaps.argmin(axis=1)
+    nearest = np.arange(len(x)), gaps.argmin(axis=1)  # index of the least gap in each row
     return gaps[nearest], candidates[nearest]
 
 
@@ -159,7 +162,8 @@ class ChartedShell:
     place, to_own_frame
         Maps of places from its own frame to the common frame, and back.
     half
-        Half the thickness at its own places (n, 3), over the common length; None if uniform.
+        Function from its own places (n, 3) to half the thickness there, over the common length;
+        None if the thickness is uniform.
     """
 
     outline: Outline
@@ -204,6 +208,7 @@ def _nearest(x: Array, y: Array, of_x: ChartedShell, of_y: ChartedShell) -> tupl
         return float(np.linalg.norm(ends[0] - ends[1])) - of_x.depth(ends[0]) - of_y.depth(ends[1])
 
     start = np.concatenate([of_x.chart(x), of_y.chart(y)])
+    # a varying thickness enters the gap; otherwise the distance alone is a least-squares problem
     if of_x.half or of_y.half:
         charts = scipy.optimize.minimize(gap, start).x
     else:

@@ -23,6 +23,7 @@ def examples() -> dict[str, Path]:
 def title(file: Path) -> str:
     """Return the title of a case file: the first line of its comment, up to a colon."""
     comment = _text(file).partition("\n")[0].removeprefix("# ")
+    # a space, so that a colon at the end of the line counts too
     return (comment + " ").partition(": ")[0].strip().removesuffix(".")
 
 
@@ -76,6 +77,7 @@ def _contents(source: Path, target: Path) -> dict[Path, bytes]:
     """
     text, case_data = _text(source), read_source(source).data
     mesh, data_file = (case_data.get("shell") or {}).get("file"), source.with_suffix(".csv")
+    # only an example of `identify` has data: a table with its own name
     if data_file.exists():
         predicted = (case_data.get("identify") or {}).get("predict") or {}
         names = list[str]()
@@ -89,7 +91,7 @@ def _contents(source: Path, target: Path) -> dict[Path, bytes]:
         }
     if mesh is None:
         return {target: text.encode()}
-    mesh_name = Path(mesh).name
+    mesh_name = Path(mesh).name  # the example names it in another folder, the copy beside itself
     return {
         target: text.replace(mesh, mesh_name).encode(),
         target.parent / mesh_name: (source.parent / mesh).read_bytes(),

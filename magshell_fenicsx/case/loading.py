@@ -1,4 +1,11 @@
-"""The programme of a case: its load steps, rules that all of them share, and names of patches."""
+"""The programme of a case: its load steps, rules that all of them share, and names of patches.
+
+The programme is the sequence of load steps that a run follows. A step drives an amplitude: a load
+parameter, by name. The conjugate of an amplitude is the displacement on which it does work (of a
+pressure the volume). During a step other loads are held: the load itself stays, or its conjugate,
+or a gas is enclosed. A limit is the first instability on a path; with `until: limit` a step ends
+there.
+"""
 
 from collections.abc import Collection, Iterable, Sequence
 from typing import TYPE_CHECKING, Annotated, Any, TypeAlias, Union
@@ -48,7 +55,7 @@ def programme(loading: Step | Sequence[Step] | None, context: Context) -> tuple[
         The rest of the case.
     """
     implied_steps: list[tuple[str, Step]] = []
-    if not isinstance(loading, Sequence):
+    if not isinstance(loading, Sequence):  # in a list the author has written all steps
         implied_steps = [
             pair
             for kind in KINDS_BEFORE_LOAD
@@ -59,7 +66,7 @@ def programme(loading: Step | Sequence[Step] | None, context: Context) -> tuple[
     steps = []
     for number, (key, load) in enumerate(keyed_loads, 1):
         name = load.name_in(context, loads)
-        # loads of one kind at different places have amplitudes with numbers
+        # loads of one kind at different places have amplitudes with numbers: force, force_2, ...
         if name is None:
             places = places_of_amplitude.setdefault(load.amplitude, [])
             if load.place not in places:
@@ -81,7 +88,7 @@ def refuse_unfit_steps(context: Context) -> None:
     for step in context.steps:
         load, key = step.load, step.key
         load.refuse_unfit(step, context)
-        goal = load.target or load.limit_target
+        goal = load.target or load.limit_target  # (what is prescribed, its value at the end)
         if step.name not in context.driven_before(step.number) and goal and goal[1] == 0:
             raise ValueError(
                 f"{key}: the target must not be zero (at least {LEAST_TARGET:g} in size): the "
@@ -102,11 +109,13 @@ def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> N
 
     `steps` are all steps of the programme, whose amplitudes a step may hold.
     """
+    # amplitude -> its step; a pressure can be held even where no step applies one
     holdable_loads: dict[str, Step | None] = {"pressure": None}
     holdable_loads |= {any_step.name: any_step.load for any_step in steps if any_step.load.holdable}
-    if step.load.in_time:
+    if step.load.in_time:  # its amplitude is the time
         holdable_loads.pop(step.name)
     to_limit = step.until == "limit"
+    # a step that ends at an instability may hold the conjugate of its own amplitude
     names = sorted(set(holdable_loads) - (set() if to_limit else {step.name}))
     allowed = ", ".join(names) or "none"
     for name, manner in step.load.hold.items():
@@ -125,12 +134,13 @@ def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> N
                 f"{key}: a gas holds the pressure, not {name}; allowed: load, conjugate"
             )
         load = holdable_loads[name]
-        if not holds_conjugate or load is None:
+        if not holds_conjugate or load is None:  # a load, or the pressure, can always be held
             continue
         if not load.held_conjugate:
             raise ValueError(
                 f"{key}: conjugate: nothing that can be held is conjugate to it; allowed: load"
             )
+        # `released` is the reason why a moving step cannot hold it
         if load.released and (step.load.in_time or step.load.released_by):
             raise ValueError(f"{key}: conjugate: {load.released}")
 

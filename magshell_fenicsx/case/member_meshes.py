@@ -1,4 +1,11 @@
-"""The meshes of several shells, whole or halved by a plane in which each shell is its own image."""
+"""The meshes of several shells, whole or halved by a plane in which each shell is its own image.
+
+A `Mirror` is a symmetry plane; the half on the side of its normal is modelled, and edges of the
+other half are removed. A `Sector` lies between two planes through e3. A shell is held if a support
+fixes it. Each shell has its own frame and length; its pose (`ShellPose`) maps them to the common
+frame, in which lengths are over the R of the first shell. A chart is the pair of coordinates on a
+surface.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -45,7 +52,7 @@ class MemberMeshes:
 
         Raises CaseError or MeshError, beginning with the key of the shell.
         """
-        return [self._member(part, None) for part in self._several.parts]
+        return [self._member(part, plane=None) for part in self._several.parts]
 
     def halved(self, plane: Mirror) -> MultiShellMesh:
         """Return the mesh of the halves of all shells on one side of a plane, or of their sectors.
@@ -59,6 +66,7 @@ class MemberMeshes:
                 return [self._sector(member, plane) for member in members]
             return [self._member(member, self._plane_of_shell(member, plane)) for member in members]
 
+        # the digest of the mesh tells halves at different planes apart
         waves = f" {plane.waves}" if isinstance(plane, Sector) else ""
         return replace(
             assembly,
@@ -82,11 +90,12 @@ class MemberMeshes:
             return mirrors
         members = self._several.parts
         for plane in self._candidates(vectors, loosely):
-            for side in (plane, plane.reversed):
+            for side in (plane, plane.reversed):  # either half may be the one that is modelled
                 own_mirrors = [self._mirror_of_shell(member, side, loosely) for member in members]
                 is_known = any(side.is_plane_of(known_plane) for known_plane in mirrors)
                 if is_known or not all(own_mirrors):
                     continue
+                # names in the common mesh: those of a shell after its own name
                 removed_edges = dict[str, str]()
                 for member, mirror in zip(members, own_mirrors, strict=True):
                     for a, b in mirror.removed_edges.items() if mirror else ():
@@ -104,10 +113,12 @@ class MemberMeshes:
             )
             in_shell_frame, nodes = place.to_shell_frame(x), perfect.nodes
             chart = perfect.inverse(in_shell_frame)
+            # of a mesh file all nodes are compared, of other shapes the nearest place alone
             feet = perfect.embedding(chart[None]) if nodes is None else nodes[:, :3]
             distance = place.scale * float(np.linalg.norm(feet - in_shell_frame, axis=1).min())
             distances_and_normals.append((distance, place.Q @ perfect.normal_near(chart)))
-        return min(distances_and_normals, key=lambda entry: entry[0])[1]
+        _, nearest_normal = min(distances_and_normals, key=lambda entry: entry[0])
+        return nearest_normal
 
     def _member(self, part: "MemberCase", plane: Mirror | None) -> MemberShell:
         """Return the mesh of a shell, or of its half or sector at a plane in the shell's frame.
@@ -136,6 +147,7 @@ class MemberMeshes:
         )
         is_round = reference_shell_of(part.case.shell).perfect.round
         is_closed = is_round or isinstance(part.case.shell, MeshSurface)
+        # the order in which the shell's own sector begins and ends at them
         for begin, end in ((first_plane, second_plane), (second_plane, first_plane)):
             own_sector = Sector.from_azimuth(begin.azimuth, sector.waves)
             has_planes = own_sector.is_plane_of(begin) and own_sector.second_plane.is_plane_of(end)
@@ -150,6 +162,7 @@ class MemberMeshes:
         member = self._member(part, own_sector)
         if begin is first_plane:
             return member
+        # in the other order: the edges at the two planes exchange their names
         other_edge = {SYMMETRY_EDGE: SECOND_SYMMETRY_EDGE, SECOND_SYMMETRY_EDGE: SYMMETRY_EDGE}
         edges = {other_edge.get(name, name): pairs for name, pairs in member.patch.edges.items()}
         return replace(member, patch=replace(member.patch, edges=edges))
@@ -159,6 +172,7 @@ class MemberMeshes:
 
         The edges that the half loses have the shell's own names.
         """
+        # names in the common mesh begin with the shell's name
         place, start = self._several.place(part), f"{part.name}_"
         offset = float(plane.offset - plane.normal @ place.position) / place.scale
         own_plane = Mirror.with_normal(place.Q.T @ plane.normal, offset)
@@ -197,8 +211,8 @@ class MemberMeshes:
         ]
         for point, axis in axes:
             distances = [other_point - point for other_point, _ in axes]
-            # planes through the axis and another axis or a coordinate direction
-            for direction in (*vectors, *distances, np.eye(3)[0], np.eye(3)[1], np.eye(3)[2]):
+            # planes through the axis and another axis, a given vector or a coordinate direction
+            for direction in (*vectors, *distances, *np.eye(3)):
                 normal = np.cross(axis, direction)
                 if np.linalg.norm(normal) > ROUNDING:
                     unit = Mirror.with_normal(normal).normal
@@ -229,19 +243,20 @@ class MemberMeshes:
             h, place = 1 / member.case.shell.R_over_h, several.place(member)
             sample, scale = reference_shell.perfect.sample(), place.scale
 
+            # the defaults keep this shell's values, which change in the loop
             def half(
                 x: Array, reference_shell: ReferenceShell = reference_shell, scale: float = scale
             ) -> Array:
                 """Return half the thickness (n,) over the common length, at own places (n, 3)."""
                 return np.asarray(scale * reference_shell.half_thickness(x))
 
-            varies = half if reference_shell.thickness_factor else None
+            varies = half if reference_shell.thickness_factor else None  # None: it is uniform
             places[member.name], one_place_distance[member.name] = (
                 place(sample),
                 ONE_PLACE_DISTANCE * sqrt(h) * scale,
             )
             thickness[member.name] = 2 * varies(sample) if varies else h * scale
-            if reference_shell.perfect.chart_samples() is not None:
+            if reference_shell.perfect.chart_samples() is not None:  # a mesh file has no chart
                 charted[member.name] = ChartedShell(
                     reference_shell.perfect, place, place.to_shell_frame, varies
                 )

@@ -3,6 +3,10 @@
 A shell, its imperfections, supports, fields and loads each preserve some symmetry, a
 `SymmetryConstraint`. From these follows the smallest part that has the whole solution. The model's
 frame is turned about e3 so that the part's symmetry plane is its plane y = 0.
+
+An outline is the surface of a shell with its edges; it is round if it is a surface of revolution
+about e3. A `Mirror` is a symmetry plane, a `Sector` the part between two planes through e3. An
+imperfection grows if a load step multiplies it.
 """
 
 from collections.abc import Sequence
@@ -103,9 +107,10 @@ def modelled_part(
     is_axisymmetric = False
     if plane is None:
         is_axisymmetric, plane = _symmetry(case, outline, constraints)
+    # only a surface of revolution looks the same in a turned frame
     if plane is None or not (outline.round and plane.through_e3):
-        return ModelledPart(is_axisymmetric, plane, 0.0, plane)
-    # the frame is turned into the plane
+        return ModelledPart(is_axisymmetric, plane, turn=0.0, mirror=plane)
+    # the frame is turned so that the plane is y = 0, or the first plane of the sector
     waves = plane.waves if isinstance(plane, Sector) else None
     mirror = Y0_PLANE if waves is None else Sector.from_azimuth(0.0, waves)
     return ModelledPart(is_axisymmetric, plane, plane.azimuth, mirror)
@@ -144,6 +149,7 @@ def own_mirror(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | 
     """
     reference_shell = reference_shell_of(case.shell)
     perfect = reference_shell.perfect
+    # if patches have names, each imperfection must be its own image, no other's
     imperfections, one_by_one = (
         imperfection_geometries(case.imperfections, reference_shell),
         bool(case.patches),
@@ -155,11 +161,11 @@ def own_mirror(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | 
     if plies := ShellLaminate.from_context(case.context):
         constraints += plies.symmetry_constraints(case.context, perfect)
     vectors = [unit(v) for constraint in constraints for v in constraint.vectors]
-    if perfect.round and plane.through_e3:
+    if perfect.round and plane.through_e3:  # then the surface allows every such plane
         candidates: Sequence[Mirror] = [plane]
     else:
         candidates = perfect.mirrors(plane.in_plane_vectors, loosely)
-    for candidate in candidates:
+    for candidate in candidates:  # a mirror plane holds all directions of the constraints
         has_vectors = all(abs(candidate.normal @ v) < ROUNDING for v in vectors)
         if not candidate.is_plane_of(plane) or not has_vectors:
             continue
@@ -170,6 +176,7 @@ def own_mirror(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | 
 
 def edge_conditions(boundary: BoundarySection, turn: float) -> dict[str, Condition]:
     """Return edge -> condition in the model's terms, in a frame turned about e3 (rad)."""
+    # words of the case file -> of the model, in which "symmetry" is the plane of a half alone
     terms: dict[EdgeCondition, Condition] = {
         "hinged": "simply supported",
         "symmetry": "plane",
@@ -191,6 +198,7 @@ def _turned_components(components: tuple[int, ...], turn: float) -> list[int]:
     The frame is turned about e3 by `turn` (rad), into which the components turn as a whole.
     """
     axes = np.eye(3)[list(components)] @ rotation(turn).T
+    # the held directions span a turned axis, or are across it: squares are 1 or 0 but for rounding
     return [i for i in range(3) if axes[:, i] @ axes[:, i] > 0.5]
 
 
@@ -209,15 +217,16 @@ def _symmetry(
     The plane is None for a meridian and for a full model. Raises CaseError if the symmetry that the
     case asks for is not there; the message says why.
     """
-    reason = why_not_axisymmetric(constraints)
+    reason = why_not_axisymmetric(constraints)  # None if all constraints are axisymmetric
     if reason and case.symmetry == "axisymmetric":
         raise CaseError(f"symmetry: axisymmetric: {reason}")
     if reason is None and case.symmetry in ("auto", "axisymmetric") and case.model == "shell":
         return True, None
-    if isinstance(case.symmetry, int):
+    if isinstance(case.symmetry, int):  # a number of waves
         return False, _sector(case, outline, constraints, case.symmetry)
     if case.symmetry not in ("auto", "half"):
         return False, None
+    # a half that is asked for need not map the triangles of a mesh file onto each other
     plane = common_mirror(constraints, outline, loosely=case.symmetry == "half")
     if case.symmetry == "half" and plane is None:
         if name := energy_without_mirror(constraints, outline):
@@ -243,6 +252,7 @@ def _sector(
 
     Raises CaseError if there are no such planes.
     """
+    # named points must lie in the sector, because the mesh has no other vertices for them
     places = [np.array(x) for x in case.points.values()]
     if sector := common_sector(constraints, outline, waves, places):
         return sector

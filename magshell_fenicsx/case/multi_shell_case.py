@@ -1,6 +1,10 @@
 """A case with several shells, rewritten as a case of one mesh file.
 
-Edges, points and patches get the names that they have in the common mesh.
+Edges, points and patches get the names that they have in the common mesh: `upper.rim` in the case
+file becomes `upper_rim`. Plain data are the mapping that a case file contains, before pydantic
+validates it; wrong entries are passed on here, and refused by the validation later. A `MemberCase`
+is one shell with its section and a case of its own, in which it is planned and meshed alone. A
+function `_refuse_...` raises ValueError with the key and what is allowed.
 """
 
 import re
@@ -63,9 +67,11 @@ def merge_shells(
     for key in REPLACED_KEYS:
         if data.get(key) is not None:
             raise ValueError(f"shells: each has its own {key}: leave out {key}, or shells")
+    # a copy without what pydantic adds while it validates the whole case
     context_keys = (
         {key: context[key] for key in ("folder", "files") if key in context} if context else {}
     )
+    # each validation gets a copy of the context, which it may change
     sections = _ShellsAlone.model_validate(
         {"shells": data["shells"]}, context={**context_keys}
     ).shells
@@ -149,7 +155,7 @@ def _case(name: str, section: OneOfShells, data: Keys, context: Keys, case: "typ
     ValueError
         With the key in the whole case.
     """
-    shell_data = data["shells"][name]
+    shell_data = data["shells"][name]  # a mapping, or a section from a program
     if isinstance(shell_data, BaseModel):
         shell_data = shell_data.model_dump(exclude_unset=True)
     own_data: Keys = {
@@ -160,6 +166,7 @@ def _case(name: str, section: OneOfShells, data: Keys, context: Keys, case: "typ
     mesh = data.get("mesh") or {}
     mesh_data = {key: mesh[key] for key in ("degree", "size", "refinement") if key in mesh}
     for key, value in (shell_data.get("mesh") or {}).items():
+        # a shell's refinement comes on top of the common one, other keys replace it
         mesh_data[key] = value * mesh_data.get(key, 1.0) if key == "refinement" else value
     # loads that mesh sizes follow
     points = own_data["points"] if isinstance(own_data["points"], dict) else {}
@@ -173,7 +180,7 @@ def _case(name: str, section: OneOfShells, data: Keys, context: Keys, case: "typ
             {**own_data, "mesh": mesh_data, "symmetry": "none"}, context=context
         )
     except ValidationError as e:
-        error = e.errors()[0]
+        error = e.errors()[0]  # the first one is told
         message, key = error["msg"].removeprefix("Value error, "), ".".join(map(str, error["loc"]))
         raise ValueError(f"shells.{name}.{f'{key}: ' if key else ''}{message}") from None
     keys_with_units = [*numbers_with_units(section.place, shell_data.get("place"), "place")]
@@ -199,9 +206,10 @@ def _forces_on(name: str, data: Keys) -> list[Keys]:
         point = place.get("point") if isinstance(place, dict) else None
         if not isinstance(point, str) or not point.startswith((f"{name}.", f"{name}_")):
             continue
+        # "upper.tip", or "upper_tip" as in the common mesh
         own_point = point.split(".", 1)[1] if "." in point else point.removeprefix(f"{name}_")
         force: Keys = {"kind": "indentation"}
-        if "depth" not in load:
+        if "depth" not in load:  # some force: mesh sizes follow the place, not the amount
             force |= {"control": "load", "force": 1.0}
         force |= {key: load[key] for key in FORCE_KEYS if key in load}
         forces.append(force | {"at": {"point": own_point}})
@@ -233,6 +241,7 @@ def _common_shell(parts: Sequence[MemberCase]) -> Keys:
     first_member, shell = parts[0], parts[0].case.shell
     for member in parts:
         _refuse_unfit_shell(member, first_member)
+    # numbers become texts with units if the case has units
     unit = _unit if shell.with_units else (lambda value, unit: value)
     keys: Keys = {
         "radius": unit(shell.reference, "m"),
@@ -262,12 +271,13 @@ def _refuse_unfit_shell(part: MemberCase, first: MemberCase) -> None:
         )
     if isinstance(shell.thickness_factor, UserField):
         raise ValueError(part.refused("shell.thickness_factor: of several shells a formula"))
+    # a strip or a hemisphere has a modulus in units alone, so its lengths need them too
     without_units = isinstance(shell, ShellSection) and not shell.with_units
     if without_units and shell.youngs_modulus is not None:
         raise ValueError(
             part.refused("shell.youngs_modulus: has a unit: give radius and thickness theirs")
         )
-    for key in COMMON_KEYS:
+    for key in COMMON_KEYS:  # one value for all, also if it is absent
         if getattr(shell, key) != getattr(first_shell, key):
             raise ValueError(
                 part.refused(
@@ -275,6 +285,7 @@ def _refuse_unfit_shell(part: MemberCase, first: MemberCase) -> None:
                     "common; their law, youngs_modulus, poisson_ratio and density are their own"
                 )
             )
+    # all shells have a modulus or none, and the same of a density: results are over the first one's
     for key, name in (("modulus", "youngs_modulus"), ("density", "density")):
         value_of_first, value = getattr(first_shell, key), getattr(shell, key)
         if (value_of_first is None) != (value is None):
@@ -344,9 +355,8 @@ def _with_remanences(magnetic: Any, several: SeveralShells) -> Any:
     for member in several.parts:
         patches |= _remanences_of(member, several, flux_density)
     density_key = {} if flux_density is None else {"flux_density": f"{flux_density!r} T"}
-    # whole shells before their parts, which take their place
     shells = {member.name for member in several.parts}
-    # whole shells come before their patches
+    # whole shells come before their patches, whose remanence replaces theirs
     ordered = dict(sorted(patches.items(), key=lambda item: item[0] not in shells))
     return {**section, "remanent": {"kind": "patches", "patches": ordered, **density_key}}
 
@@ -370,6 +380,7 @@ def _remanences_of(part: MemberCase, several: SeveralShells, size: float | None)
     if size is not None and remanent.flux_density is not None:
         factor = remanent.flux_density / size
     patches: dict[str, Any] = {}
+    # a remanence without patches is that of the whole shell, here of the name ""
     for name, remanence in (remanent.patches or {"": remanent}).items():
         section = (
             remanence

@@ -4,6 +4,14 @@ A case has sections, units and a programme of load steps. The symmetry that all 
 preserve chooses which part of the shell is modelled. Loads, bodies, imperfections and formulas
 choose the element sizes. The contributions of all parts are added up to the loads of one model.
 docs/theory.md has the sizes and the symmetry.
+
+An ability is a section that adds something to a problem: a field, a joint, a support. An outline is
+the surface of a shell with its edges, a chart (2 | 3,) the coordinates of a place on it (three for
+a mesh file). An amplitude is a load parameter, by name; a step that drives it has its name, and of
+steps with one name the last one counts. An imperfection has a deviation w0 from the perfect
+surface, which grows if a step multiplies it, and may have a rim. The model's frame is turned about
+e3 by an angle `turn` from that of the case. h and R are thickness and reference length; lengths are
+over R.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -117,6 +125,7 @@ def make_problem(
     """
     if terms:
         case = case.with_terms([*case.own_terms, *terms])
+    # each needs what is before it: outline, samples at details of formulas, symmetry, part, mesh
     shell = _ImperfectShell.of_case(case)
     load_places = _load_places(case, shell.outline)
     for section in case.context.abilities:
@@ -181,7 +190,7 @@ def _problem(
     loads: Loads,
     constraints: list[SymmetryConstraint],
 ) -> Problem:
-    """Assemble the `Problem` from the results of the other functions of this module.
+    """Return the `Problem`, put together from the results of the other functions of this module.
 
     Parameters
     ----------
@@ -204,9 +213,10 @@ def _problem(
     context, outline = case.context, mesh.outline
     conditions = edge_conditions(case.boundary, part.turn)
     supports = tuple(name for name, condition in conditions.items() if condition != "free")
+    # with planes of symmetry, and without edges of the half that is not modelled
     conditions = part.conditions(conditions)
     meridian = outline.meridian if part.axisymmetric else None
-    if meridian:
+    if meridian:  # its ends are the only edges and points
         refuse_unfit_ends([name for name in meridian.names if name], mesh.points, conditions, loads)
     included, left_out = describe_model(
         context, loads, part.name(case.model), part.plane, mesh.rim_count
@@ -217,8 +227,9 @@ def _problem(
         if imperfection.account
     ]
     included += [f"own energy: {term.name}" for term in case.own_terms]
+    # of a mesh file there are no samples before it is read
     places = shell.sample if len(shell.sample) else outline.sample()
-    unknowns = 0.0
+    unknowns = 0.0  # an estimate, for the memory; a meridian needs little
     if not meridian:
         unknowns = unknowns_of(context, _cells(mesh.shape, mesh.size, part.plane))
     return Problem(
@@ -231,6 +242,7 @@ def _problem(
         meridian=meridian,
         mirror=part.mirror,
         azimuth=part.turn,
+        # whether all is axisymmetric, whatever is modelled
         turns=why_not_axisymmetric(constraints) is None,
         shape=mesh.shape,
         embedding=outline.embedding if meridian else outline.embedding_of(mesh.shape),
@@ -276,8 +288,9 @@ def _pending_modes(case: Case) -> PendingModes | None:
 
     Returns
     -------
-    Their number, and functions that make the problem of the perfect shell and the problem with the
-    modes. None if no imperfection waits for modes.
+    Their number, and two functions: one makes the problem of the perfect shell, which has these
+    modes, the other takes the modes and makes the problem of the case. None if no imperfection
+    waits for modes.
     """
     several = case.several
     member_shells = list(several.parts) if several else []
@@ -297,6 +310,7 @@ def _pending_modes(case: Case) -> PendingModes | None:
         Raises CaseError if no mode with an amplitude moves one of several shells.
         """
         for i, key, section in pending_sections:
+            # one of several shells takes its own part of the modes
             name_and_place = (
                 (member_shells[i].name, several.place(member_shells[i])) if several else ()
             )
@@ -307,7 +321,10 @@ def _pending_modes(case: Case) -> PendingModes | None:
         problem = make_problem(case.with_shells(several.parts) if several else case)
 
         def remade(values: Mapping[str, Any]) -> Problem:
-            """Return the problem with other values of keys, and with the same modes."""
+            """Return the problem with other values of keys, and with the same modes.
+
+            The modes are put in again if the change makes imperfections wait for them.
+            """
             changed_problem = problem.with_values(values)
             return (
                 changed_problem.pending_modes.with_modes(modes)
@@ -354,6 +371,7 @@ class _ImperfectShell:
     @classmethod
     def of_case(cls, case: Case) -> "_ImperfectShell":
         """Return the shell of a case, with imperfections sorted into growing and constant ones."""
+        # the reference shell, on which imperfections are placed, has none yet
         material, reference = _material(case), reference_shell_of(case.shell)
         imperfections = imperfection_geometries(case.imperfections, reference)
         last_steps = {step.name: step for step in case.programme}
@@ -361,7 +379,7 @@ class _ImperfectShell:
             key for step in last_steps.values() for key in step.load.multiplies(step, case.context)
         }
         constant = {*imperfections} - growing_keys
-        outline = _imperfect_outline(reference.perfect, imperfections, constant, 0.0)
+        outline = _imperfect_outline(reference.perfect, imperfections, constant, turn=0.0)
         sample = np.zeros((0, 3)) if isinstance(case.shell, MeshSurface) else outline.sample()
         reference = replace(reference, imperfect=outline)
         return cls(reference, imperfections, constant, material, sample)
@@ -407,13 +425,13 @@ def _imperfect_outline(
 ) -> Outline:
     """Return an outline with the constant imperfections, in a frame turned about e3 (rad).
 
-    The chart's division into cells follows all `imperfections`, the growing ones too. The deviation
-    has those with keys in `constant` alone.
+    Element sizes follow all `imperfections`, because growing ones need small elements too. The
+    deviation consists of those with keys in `constant` alone.
     """
     if not imperfections:
         return perfect
     geometries = imperfections.values()
-    circles: tuple[float, ...] = ()
+    circles: tuple[float, ...] = ()  # radii around the pole at which the curvature jumps
     if perfect.disc:
         circles = tuple(geometry.reach for geometry in geometries if geometry.rim)
     deviations = tuple(
@@ -477,7 +495,7 @@ def _constraints(
 
     The parts are shape, abilities, load steps, named points, `energies`, imperfections and bodies.
     """
-    one_by_one = bool(case.patches)
+    one_by_one = bool(case.patches)  # named patches: each imperfection must be its own image
     constraints = symmetry_constraints(case, outline, energies)
     constraints += imperfection_constraints(
         shell.imperfections, shell.perfect, one_by_one=one_by_one
@@ -533,7 +551,8 @@ class _VertexPoints:
         for name, (step, place) in load_places.items():
             chart = step.load.chart_of(place, outline, part.turn, half=part.is_symmetric)
             chart = on_features(chart, outline, charts)
-            # a load at the pole or at the place of an earlier load shares that point
+            # a load at the pole or at the place of an earlier load shares that point; a new point
+            # has the name of its step, with "load" for "force"
             candidates = (point for point in ("pole", *of_steps.values()) if point in charts)
             at_same_place = (point for point in candidates if np.array_equal(charts[point], chart))
             of_steps[name] = next(at_same_place, name.replace("force", "load"))
@@ -551,7 +570,7 @@ class _VertexPoints:
             for step in case.programme
             for point in step.load.named_points()
         ]
-        for point in dict.fromkeys(self.of_steps.values()):
+        for point in dict.fromkeys(self.of_steps.values()):  # each point once, with all its loads
             loads_there = [
                 step.load for step in case.programme if self.of_steps.get(step.name) == point
             ]
@@ -622,6 +641,7 @@ def _mesh_plan(
     local: list[LocalImperfection] = []
     if not isinstance(case.shell, MeshSurface):
         local = local_imperfections(shell.imperfections.items(), shell.perfect, part.turn)
+    # contacts are in the model's frame, zones of contact are found with the sampled outline
     bodies = _body_contacts(case, replace(shell.reference, turn=part.turn))
     sampled_shell = replace(shell.reference, imperfect=outline)
     contact_regions = [
@@ -636,6 +656,7 @@ def _mesh_plan(
         ContactPlace(chart_of(rotation(part.turn) @ x, outline, half=part.is_symmetric))
         for x in contact_places
     ]
+    # squares where formulas need small elements, and a limit everywhere
     varying, largest = _size_limits(case, shell, outline, part, formulas)
     refined: list[Refined] = [*local, *contact_regions, *charted_places]
     size = grading(
@@ -701,7 +722,7 @@ def _shape(
     """
     shape = outline.chart(part.mirror, size)
     is_grid = isinstance(shape, Grid)
-    if part.sector and not is_grid:  # a ring has no tip
+    if part.sector and not is_grid:  # of a sector a grid is a part of a ring, which has no tip
         size = towards_tip(size, part.sector)
         shape = outline.chart(part.sector, size)
     if isinstance(shape, Grid) and part.mirror and not part.sector:
@@ -721,6 +742,7 @@ def _refuse_unfit_sector(case: Case, part: ModelledPart, rims: Sequence[Array]) 
     """Raise CaseError for a sector of a shell with a T-junction, or with rims beside the axis."""
     if part.sector is None:
         return
+    # at a T-junction the second of the two names is that of a shell, not of an edge
     if any(joint.edges[1] in (case.shells or ()) for joint in case.joints):
         raise CaseError(f"symmetry: {case.symmetry}: not with a T-junction: take symmetry: half")
     if rims:
@@ -735,7 +757,9 @@ def towards_tip(size: Grading, sector: Sector) -> Grading:
 
     Without that, triangles beside the axis of a disc would be thin.
     """
-    tip = DiscFeature((0.0, 0.0), 0.0, MIN_SIZE_AT_TIP * size.largest, sector.angle)
+    # from a least size at the tip, sizes grow by the sector's angle (rad) per distance: its width
+    least_size = MIN_SIZE_AT_TIP * size.largest
+    tip = DiscFeature(centre=(0.0, 0.0), radius=0.0, size=least_size, growth=sector.angle)
     return replace(size, features=[*size.features, tip])
 
 
@@ -753,6 +777,7 @@ def _with_rims(
     size
         Element sizes; on a disc they choose which circles are drawn.
     """
+    # radii around the origin at which the curvature jumps, each once
     circles = tuple(
         dict.fromkeys(
             local_imperfection.radius
@@ -763,6 +788,7 @@ def _with_rims(
     if isinstance(shape, Grid):
         return RimmedGrid(shape, rims) if rims else shape
     if isinstance(shape, DiscShape):
+        # of circles nearer to each other than an element some are left out
         lines = line_coordinates(
             np.array(circles), lambda r: size(np.array([r, 0.0])), (0.0, shape.radius)
         )
@@ -788,9 +814,11 @@ def _loads(case: Case, modelled: Modelled) -> Loads:
     joined; of other values the first one that is set counts.
     """
     context, last_steps = case.context, {step.name: step for step in case.programme}
+    # a step may also drive or hold amplitudes of which no step has the name
     amplitudes = set(last_steps)
     for step in case.programme:
         amplitudes.update(step.load.drives, step.load.hold)
+    # `implied` is what the amplitude of a kind of step needs, `adds` what this step contributes
     additions = [
         kind.implied() for kind in STEPS.values() if getattr(kind, "amplitude", None) in amplitudes
     ]
@@ -824,7 +852,7 @@ def _thickness(case: Case, turn: float) -> Thickness | None:
 
     def in_model_frame(x: Array, y: Array, z: Array) -> Array:
         """Return the factor at places of the model, which are turned back into the case's frame."""
-        if not turn:
+        if not turn:  # without rounding
             return in_case_frame(x, y, z)
         return in_case_frame(*np.tensordot(Q.T, np.stack([x, y, z]), 1))
 
@@ -854,7 +882,7 @@ def _unit_warning(case: Case, places: Array) -> str | None:
 
     The hint is an extent of `places` (n, 3) that is far from the radius, which is their unit.
     """
-    extent = float(np.ptp(places, axis=0).max())
+    extent = float(np.ptp(places, axis=0).max())  # over the radius
     is_usual = 1 / MAX_EXTENT_OVER_RADIUS <= extent <= MAX_EXTENT_OVER_RADIUS
     if not isinstance(case.shell, MeshSurface) or is_usual:
         return None

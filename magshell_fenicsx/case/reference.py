@@ -1,6 +1,9 @@
 """The JSON Schema of the case file, for editors, and its reference in Markdown.
 
-The results are docs/case.schema.json and docs/case.md.
+The results are docs/case.schema.json and docs/case.md. A section of the case is a definition of the
+schema; a part is any piece of the schema: a dictionary, a list or a value. A tag is the key, such
+as `kind`, whose value tells sections of one family apart: the sections that may stand under one
+key.
 """
 
 import json
@@ -96,9 +99,10 @@ def schema() -> dict[str, Any]:
     case_schema = _without_noise(
         _with_definitions(Case.model_json_schema(schema_generator=_WithMeanings))
     )
-    # parts come last
+    # keys of `PART_CLASSES`, the sections that parts of the program register, come last
     properties = sorted(case_schema["properties"].items(), key=lambda item: item[0] in PART_CLASSES)
     case_schema["properties"] = dict(properties)
+    # a case has one shell with its required keys, or several shells
     case_schema["anyOf"] = [{"required": case_schema.pop("required")}, {"required": ["shells"]}]
     return {**head, **case_schema}
 
@@ -111,7 +115,8 @@ def schema_text() -> str:
 def _with_definitions(schema_of_case: Schema) -> Schema:
     """Return a schema with every section as a definition, and a reference wherever it is used.
 
-    pydantic 2.14 writes some sections in full where they are used.
+    pydantic 2.14 writes some sections in full where they are used. References go by titles first,
+    which are unique (module and class); then titles are shortened to names of classes.
     """
     titles = {
         f"#/$defs/{name}": section["title"]
@@ -135,6 +140,7 @@ def _with_definitions(schema_of_case: Schema) -> Schema:
         }
         if "$ref" in part:
             rewritten_part["$ref"] = titles.get(part["$ref"], part["$ref"])
+        # a section is what has keys and a title, except the case itself
         if (
             "properties" not in part
             or part is schema_of_case
@@ -153,6 +159,7 @@ def _with_definitions(schema_of_case: Schema) -> Schema:
         for name, section in definitions_of_case.items()
         if f"#/$defs/{name}" not in titles
     }
+    # two classes of one name keep the whole title
     class_counts = Counter(title.rsplit(".", 1)[-1] for title in sections)
     definition_names = {}
     for title in sections:
@@ -197,13 +204,22 @@ def _without_noise(part: Any, *, names: bool = False) -> Any:
     cleaned = {}
     for key, value in content.items():
         has_names = key in ("properties", "$defs")
+        # a default is a value, not a schema
         cleaned[key] = value if key == "default" else _without_noise(value, names=has_names)
     return cleaned
 
 
 @dataclass(frozen=True)
 class KeyText:
-    """Words on one key of a section: its meaning, the values that it allows, and its default."""
+    """Words on one key of a section, in Markdown.
+
+    Attributes
+    ----------
+    allowed
+        The values that it allows, and their unit.
+    default
+        The default as code, `REQUIRED` for a key that must be given, or empty.
+    """
 
     key: str
     meaning: str
@@ -237,6 +253,7 @@ def reference() -> str:
         if _tag_key(sections[name]):
             families[_family(title)].append(sections[name])
     texts = [HEAD, _section(TITLE_OF_CASE, case_schema, titles)]
+    # the common keys of a family are written before the first of its sections
     common_of_family = dict[str, set[KeyText]]()
     for name, title in titles.items():
         family = _family(title)
@@ -296,6 +313,7 @@ def _common_keys(
             counts[replace(text, default="")] += 1
     items, common = list[str](), set[KeyText]()
     all_kinds = [kind for section in sections for kind in _tags(section)]
+    # texts of one shared key: the default of most kinds comes first, without naming them
     for without_default in (text for text, count in counts.items() if count > 1):
         texts = [text for text in kinds_of_text if replace(text, default="") == without_default]
         texts.sort(key=lambda text: -len(kinds_of_text[text]))
@@ -340,6 +358,7 @@ def _places(of_case: Schema, sections: dict[str, Schema]) -> dict[str, list[str]
         for key, value in (part["properties"] | any_name).items():
             for name in _references(value):
                 full_key = f"{path}{key}"
+                # a path that is known is not followed again
                 if full_key not in places.setdefault(name, []):
                     places[name].append(full_key)
                     visit(sections[name], f"{full_key}.")
@@ -404,6 +423,7 @@ def _key_texts(section: Schema, titles: dict[str, str]) -> list[KeyText]:
 
     The tag is left out where the title already says all of it.
     """
+    # of the whole case the required keys are in the first of two alternatives
     required = section.get("required", section.get("anyOf", [{}])[0].get("required", []))
     return [
         _key_text(key, value, key in required, titles)
@@ -450,6 +470,7 @@ def _allowed(part: Schema, titles: dict[str, str]) -> str:
     """
     if "$ref" in part:
         title = titles[part["$ref"].rsplit("/", 1)[-1]]
+        # a title with a tag is "loading, kind: field": the link says the tag's value alone
         words = title.split(": ")[-1] if ": " in title else title.split(", ")[0]
         return f"[{words}](#{anchor(title)})"
     for alternatives in ("anyOf", "oneOf"):
@@ -459,6 +480,7 @@ def _allowed(part: Schema, titles: dict[str, str]) -> str:
                 for alternative in part[alternatives]
                 if alternative.get("type") != "null"
             ]
+            # pydantic writes oneOf for sections that a tag tells apart
             return (", " if alternatives == "oneOf" else " or ").join(choices)
     if "const" in part or "enum" in part:
         return ", ".join(
@@ -513,6 +535,7 @@ def columns_page() -> str:
 
     Columns of parts are sorted by name, so that their order does not depend on imports.
     """
+    # columns of every run and of motions keep the order in which they are written
     part_quantities = [q for q in QUANTITIES.values() if q not in (*OF_EVERY_RUN, *IN_TIME)]
     columns = [
         (

@@ -74,7 +74,7 @@ class PlaceSection(Section):
         """Rotation (3, 3) whose columns are the shell's axes in the frame of the case."""
         turn, polar, azimuth = np.radians([self.turn, self.axis.polar, self.axis.azimuth])
         Q = _about_e3(azimuth) @ _about_e2(polar) @ _about_e3(turn)
-        return np.asarray(np.where(np.abs(Q) < 1e-15, 0.0, Q))
+        return np.asarray(np.where(np.abs(Q) < 1e-15, 0.0, Q))  # rounding of right angles
 
 
 class ShellMeshSection(Section):
@@ -115,7 +115,7 @@ def in_words_of_shells(message: str, data: Any) -> str:
     Parameters
     ----------
     message
-        Text with names of edges and points of the common mesh.
+        Text with names of edges and points of the common mesh, or with keys of the merged case.
     data
         Plain data of a case. Edges and points that it names are known, and edges of all geometries.
 
@@ -128,7 +128,7 @@ def in_words_of_shells(message: str, data: Any) -> str:
     shells = data.get("shells") if isinstance(data, Mapping) else None
     if not isinstance(shells, Mapping):
         return message
-    texts = {*_texts(data)}
+    texts = {*_texts(data)}  # all keys and values of the case file
     for name in map(str, shells):
         names_in_text = {
             text.removeprefix(f"{name}.")
@@ -139,6 +139,8 @@ def in_words_of_shells(message: str, data: Any) -> str:
             sorted({*EDGE_NAMES, *names_in_text, *filter(str.isidentifier, _texts(shells[name]))})
         )
         shell = re.escape(name)
+        # first keys: boundary.a_rim is shells.a.boundary.rim in the file; then single names, if
+        # they are no part of a path, a file name or a column such as a_tip_uz
         message = re.sub(
             rf"\b(boundary|points)\.({shell})_({known_names})\b", r"shells.\2.\1.\3", message
         )
@@ -222,6 +224,7 @@ class SeveralShells:
                 member.section.place.model_dump_json(),
                 member.case.outside,
             ]
+            # and of each imperfection the number of modes for which it waits
             + [section.pending_modes for section in member.case.imperfections.values()]
             for member in self.parts
         ]
@@ -283,8 +286,9 @@ class SeveralShells:
         for member in self.parts:
             with member.naming():
                 own_thickness = member.case.problem().thickness
-            ratio = self.ratio(member)
+            ratio = self.ratio(member)  # of the nominal thicknesses
             factors[member.name] = ratio
+            # a shell's own factor: a formula in its own frame, or numbers by its own patches
             if own_thickness and own_thickness.of_position:
                 factors[member.name] = PlacedFactor(own_thickness, self.place(member), ratio)
             for name, factor in ((own_thickness and own_thickness.patches) or {}).items():
@@ -305,6 +309,7 @@ class SeveralShells:
         laws = list(self.laws)
         for member in self.parts:
             shell, keys = member.case.shell, ("modulus", "density")
+            # shells without a modulus or density have a ratio of one
             modulus_ratio, density_ratio = (
                 (getattr(shell, key) or 1.0) / (getattr(first_shell, key) or 1.0) for key in keys
             )
@@ -337,7 +342,7 @@ class SeveralShells:
         """Name of each shell with plies -> its plies, placed in the frame of the case."""
         laminates: dict[str, Laminate] = {}
         for member in self.parts:
-            if laminate := laminate_of(member.case.shell, 0.0):
+            if laminate := laminate_of(member.case.shell, turn=0.0):
                 place = self.place(member)
                 laminates[member.name] = replace(laminate, axes=place.Q, origin=place.position)
         return laminates
@@ -348,7 +353,7 @@ class SeveralShells:
         has_density = self.parts[0].case.shell.density is not None
         scales = "R, h, E, nu and the density" if has_density else "R, h, E and nu"
         lines = [f"scales: {scales} are those of the shell {self.parts[0].name}"]
-        law_words = self.assembly.laws
+        law_words = self.assembly.laws  # name of a shell -> name of its law
         for member in self.parts[1:]:
             line = f"h {self.ratio(member):.4g} times" + (
                 "" if member.case.thickness_factor is None else " its factor"

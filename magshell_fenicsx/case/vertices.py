@@ -1,7 +1,10 @@
 """Places of a case that are vertices of its mesh.
 
 Places that are nearly on edges or planes of symmetry are moved onto them. Distinct places must be
-far enough from each other.
+far enough from each other. A place (3,) is in space, over the reference length R; its chart (2,)
+are its coordinates on the surface, for a mesh file (3,). The outline is the surface of the shell. A
+chart is meshed as a disc, a strip or a grid of lines; sides of a grid that are the same curve in
+space are glued. The model's frame is turned about e3 from that of the case.
 """
 
 from collections.abc import Collection, Mapping
@@ -55,7 +58,7 @@ def named_points(case: "Case", outline: Outline, turn: float, plane: Mirror | No
     Q, R = rotation(turn), case.shell.reference
     points: Points = {}
     for name, place in case.points.items():
-        x = np.array(place) / R
+        x = np.array(place) / R  # in the case's frame, Q x is in the model's
         refuse_off_surface(f"points.{name}", x, outline, R, with_units=case.shell.with_units)
         chart = chart_of(_on_planes(Q @ x, plane), outline, half=plane is not None)
         points[name] = on_features(chart, outline, points)
@@ -106,7 +109,7 @@ def on_features(chart: Array, outline: Outline, points: Mapping[str, Array]) -> 
     for point in points.values():
         if is_at(point):
             return point
-    if outline.disc and is_at(np.zeros(CHART)):
+    if outline.disc and is_at(np.zeros(CHART)):  # the pole is the origin of a disc's chart
         return np.zeros(CHART)
     for edge in edges_near(chart, outline):  # one after the other: of two that meet at a corner too
         on_edge = edges_near(chart, outline)[edge]
@@ -119,7 +122,9 @@ def edges_near(chart: Array, outline: Outline) -> dict[str, Array]:
 
     Glued sides of a grid are no edges.
     """
-    shape = outline.chart(None, Grading([], 1.0))
+    # edges do not depend on the part that is modelled, nor on element sizes: any will do
+    any_size = Grading([], 1.0)
+    shape = outline.chart(None, any_size)
     if isinstance(shape, DiscShape):
         distance = float(np.hypot(*chart))
         return {shape.edge: chart * (shape.radius / distance)} if distance else {}
@@ -132,6 +137,7 @@ def edges_near(chart: Array, outline: Outline) -> dict[str, Array]:
         names, glued = shape.sides, shape.glued
     is_high = chart - lowest >= highest - chart
     nearest = np.where(is_high, highest, lowest)
+    # names are those of low and high x, then of low and high y
     return {
         names[2 * axis + is_high[axis]]: np.where(np.arange(CHART) == axis, nearest, chart)
         for axis in range(CHART)
@@ -198,7 +204,7 @@ class Vertices:
         places = list(self.points.values())
         vertices = shape.vertices_of(places) if isinstance(shape, Grid) else None
         for (i, name), (j, other_name) in combinations(enumerate(self.points), 2):
-            if vertices is not None:
+            if vertices is not None:  # in a grid: both take the same vertex
                 is_near = (vertices[i] == vertices[j]).all()
             else:
                 distance = float(np.hypot(*(places[i] - places[j])))
@@ -223,7 +229,7 @@ class Vertices:
         (place,) = self.outline.embedding(chart[None])
         for side in plane.planes.values() if plane else ():
             distance = float(side.signed_distance(place))
-            if ROUNDING < abs(distance) < factor * size:
+            if ROUNDING < abs(distance) < factor * size:  # a point on the plane is at its vertex
                 on_plane = self._in_case_frame(place - distance * side.normal)
                 hint = "put it there, or take symmetry: none"
                 self._refuse(name, on_plane, "the plane of symmetry at [{}]", hint, factor)
@@ -234,7 +240,7 @@ class Vertices:
 
     def _size_of_elements(self, chart: Array, shape: Grid | PlaneShape) -> float:
         """Return the size of the elements at a chart (2,); no element is wider than the shape."""
-        if isinstance(shape, Grid):
+        if isinstance(shape, Grid):  # its lines may be denser than the element sizes ask for
             return min(
                 self.size(chart),
                 *(shape.size_at(axis, float(chart[axis])) for axis in range(CHART)),
@@ -262,6 +268,7 @@ class Vertices:
             for coordinates in distinguishable_texts(place, other_place)
         )
         distance, size = float(np.linalg.norm(place - other_place)), self.size(chart) * self.R
+        # elements at which both places would fit, with a margin for the lines of a grid
         fit_size = GRID_FACTOR * distance / factor
         raise CaseError(
             f"{self._key(name)}: [{text}]: is {distance:.3g}{unit} from {what.format(other_text)}, "

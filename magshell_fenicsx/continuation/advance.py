@@ -2,6 +2,11 @@
 
 `advance` repeats the steps of an `Integrator`, and shortens them where Newton's method fails, where
 the estimated error is too large, or where contact makes the balance of energy leak.
+
+A `Motion` is a moving state; mu are its load parameters. Its imbalance is kinetic + stored +
+dissipated energy - work since the begin, zero in an exact solution, and its turnover the sum of
+their magnitudes. A step leaks by the change of the imbalance in it. Lengths and errors are in units
+of the system's length.
 """
 
 from collections.abc import Callable
@@ -82,16 +87,16 @@ def advance(
 ) -> tuple[Motion, float]:
     """Return the motion at a later time, and the step to continue with. Collective.
 
+    A step that fails, has too large an error or leaks is repeated with a shorter length.
+
     Parameters
     ----------
-    motion
-        The motion at the begin.
+    integrator
+        Makes one step of a given length, or returns why it fails.
     end
         The later time.
-    steps
-        Options of the step lengths.
     dt
-        The first step.
+        The length of the first step, from an earlier call or `TimeSteps.first`.
     before_step
         Called before every step; may raise an exception to stop.
 
@@ -111,18 +116,19 @@ def advance(
     while end - motion.t > END_TOLERANCE * (end - begin):
         before_step()
         remaining = end - motion.t
+        # after the time `fastest` only the error limits a step
         longest = steps.longest if motion.t < steps.fastest else dt
         dt = min(dt, steps.fixed or dt, longest)
-        # steps of equal length up to the end, none of them tiny
+        # steps of equal length up to the end, none of them tiny; rounding must not add one
         length = remaining / np.ceil(remaining / dt * (1 - 1e-9))
         trial = integrator.step(motion, length)
-        if isinstance(trial, str):
+        if isinstance(trial, str):  # the reason why Newton's method fails
             dt, failed = length / 2, True
             if dt < smallest:
                 raise TimeStopped(f"the time step has become too small: {trial}", motion)
             continue
         if steps.fixed is None:
-            # the error of a step grows with the third power of its length
+            # the error of a step grows with the third power of its length; 0.9 is for safety
             length_ratio = 0.9 * (steps.tolerance / max(trial.error, 1e-300)) ** (1 / 3)
             if trial.error > steps.tolerance and length > smallest:
                 dt = max(0.3, length_ratio) * length
@@ -132,12 +138,14 @@ def advance(
             if leak > 1 and abs(trial.imbalance) > abs(motion.imbalance):
                 if length <= smallest:
                     raise TimeStopped(leak_message(motion, trial), motion)
+                # as if the leak grew with the square of the length
                 dt = max(0.3, 0.8 / leak**0.5) * length
                 continue
             length_ratio = min(length_ratio, 1.0) if leak > MAX_LEAK_FOR_GROWTH else length_ratio
+            # a change of the length takes new factors, so that it must be worth it
             unchanged = max(length, dt if length_ratio > 1 else 0.0)
             dt = length * min(length_ratio, 2.0) if length_ratio > 1.3 else unchanged
-        elif not failed:
+        elif not failed:  # after a failure only the second success in turn
             dt = max(dt, 2 * length)
         failed = False
         motion = trial

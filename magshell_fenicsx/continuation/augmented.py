@@ -4,6 +4,13 @@ A fold is R(u, mu, p) = 0 and g(u, mu, p) = 0, a bifurcation R + beta b = 0, g =
 with g and v of `fold.AugmentedTangent`: K v + g b = 0 and b . v = 1. One more row says where on the
 curve a point is (Govaerts, Numerical methods for bifurcations of dynamical equilibria, SIAM 2000,
 ch. 3 and 4). A step takes one factorisation and a back-solve for each of R, R_mu and R_p.
+
+Pi(u; mu) is the potential, R = dPi/du, K = dR/du; a dot is the inner product over all ranks, and
+Pi'''(v, w, .) a third derivative as a vector. mu is the one load parameter (amplitude) that is
+unknown. w_R, w_mu and w_p solve K w + t b = R, R_mu and R_p with b . w = 0; their t are the parts
+that K cannot balance. A family of systems (`SystemFamily`) has one system for each p. A family of
+modes, by number, shares a tangent: 0 are the model's own modes, 1, 2, ... symmetry-breaking modes,
+which the model excludes. The null vector is also called phi, scaled to length one.
 """
 
 from collections.abc import Callable, Sequence
@@ -98,9 +105,9 @@ class BoundaryPoint:
     unstable
         Number of unstable directions other than `phi`.
     way
-        Tangent of the boundary, of length one.
+        Tangent (du, dmu, dp) of the boundary, of length one in the metric of `Boundary.inner`.
     cubic, pull
-        phi . Pi'''(phi, phi) and phi . R_mu.
+        phi . Pi'''(phi, phi), which is zero at a cusp, and phi . R_mu, zero at a bifurcation.
     second
         The eigenvalue nearest to zero other than that of `phi`, if requested; else NaN.
     load_error
@@ -108,12 +115,13 @@ class BoundaryPoint:
     factorisations
         Iterations of its solve, of one factorisation each.
     counts
-        Number of unstable directions other than `phi` for each family: the model's own modes, then
-        each family that it excludes, where these are counted.
+        Number of unstable directions other than `phi` for each family of modes: the model's own,
+        then each one that it excludes, where these are counted.
     met
         At a crossing: index in `counts` of the family of the other bifurcation.
     habit
-        `Factorisation.habit` after its solve, where one system serves all p.
+        `Factorisation.habit` after its solve, with which a resumed run has the same rounding; -1
+        where systems at other p are made anew.
     """
 
     p: float
@@ -131,7 +139,7 @@ class BoundaryPoint:
     habit: int = -1
 
     def unstable_of(self, family: int) -> int:
-        """Return the count of a family; 0 if its modes are too short to be counted."""
+        """Return the count of a family of modes; 0 if its waves are too short to be counted."""
         return self.counts[family] if family < len(self.counts) else 0
 
 
@@ -176,7 +184,8 @@ class DifferenceSystem:
 class AugmentedRows:
     """The rows of Newton's step at a state of a boundary, in the unknowns dmu, dp and alpha.
 
-    The step is du = alpha v - w_R - dmu w_mu - dp w_p. The constructor is collective.
+    The step is du = alpha v - w_R - dmu w_mu - dp w_p: with it R + K du + R_mu dmu + R_p dp is a
+    multiple of b. The constructor is collective.
 
     Parameters
     ----------
@@ -187,7 +196,7 @@ class AugmentedRows:
     tangent
         The augmented tangent at the state.
     difference
-        The systems of a difference by p.
+        The systems whose weighted sum is a derivative by p.
     scales
         Changes of the amplitude and of p that count as of order one.
 
@@ -211,6 +220,8 @@ class AugmentedRows:
         difference: Sequence[DifferenceSystem],
         scales: tuple[float, float],
     ) -> None:
+        """Solve for the responses w with the tangent's factors, and differentiate g. Collective."""
+        # `_mixed_size`: size of the terms that may cancel in the row v . R_mu, for its rounding
         self._kind, self._scales, self._mixed_size = kind, scales, 0.0
         self._system, self._state, self._name, self._tangent = system, state, name, tangent
         self._difference = difference
@@ -224,6 +235,7 @@ class AugmentedRows:
         # Pi'''(v, v, .) by a second difference of the residual
         self.cubic = np.asarray((backward - 2 * self._R + forward) / step_factor**2)
         self.v, self.unstable = v, tangent.unstable
+        # v . R_mu = t_mu, since v . K w_mu = -g b . w_mu = 0
         self.bend, self.pull = dot(system.comm, self.cubic, v), self.t_mu
         self.K_mu_v = first_difference(lambda x: system.load(x, mu, name), system, u, v)
         R_p, self.K_p_v = self._derivatives_by_p(step_factor, forward, backward)
@@ -232,12 +244,12 @@ class AugmentedRows:
     def _derivatives_by_p(
         self, d: float, forward: Vector, backward: Vector
     ) -> tuple[Vector, Vector]:
-        """Return R_p and K_p v, by the difference by p.
+        """Return R_p and K_p v: weighted sums of R and K v over systems at several p.
 
         Parameters
         ----------
         d
-            Factor of v in the difference along it.
+            Factor of v in the difference along it, which gives K v.
         forward, backward
             Residuals at u + d v and at u - d v, at the p of the state.
         """
@@ -253,21 +265,22 @@ class AugmentedRows:
         return R_p, K_p_v
 
     def set_residual(self, residual: Vector) -> None:
-        """Replace the residual by that of a nearby state, with the same factors."""
+        """Take the residual of a nearby state for the next `step`; the factors stay."""
         self.w_R, self.t_R = self._tangent.solve(residual)
 
     def eigenvalue(self, family: int, p: float, state: State) -> float:
         """Return the model's eigenvalue nearest to zero in the space orthogonal to b.
 
-        It is computed with the factors of the last step, whatever the arguments.
+        It belongs to the state of these rows. The arguments serve only the same method of
+        `SymmetryBreakingRows`.
         """
         return second_eigenvalue(self._tangent, self._system)
 
     def step(self, row: CurveRow, value: float | None, *, settled: bool = False) -> CurveVector:
         """Return Newton's step to the point on which a row has the value zero. Collective.
 
-        Three rows, scaled to order one, determine dmu, dp and alpha: g = 0, the condition of the
-        kind, and the given row.
+        Three linear equations, scaled to order one, determine dmu, dp and alpha: g = 0, then R = 0
+        along b for a fold or v . R_mu = 0 for a bifurcation, and the given row.
 
         Parameters
         ----------
@@ -276,7 +289,8 @@ class AugmentedRows:
         value
             The value of the row at the state; None for the tangent of the curve instead of a step.
         settled
-            Whether only the residual and the row are not yet zero.
+            Whether g and v . R_mu count as zero already, after convergence: the step then reduces
+            the residual alone, with the same matrix.
         """
         kind, comm, v, tangent = self._kind, self._system.comm, self._tangent.v, self._tangent
         is_tangent = value is None
@@ -284,7 +298,7 @@ class AugmentedRows:
         g, pull = (0.0, 0.0) if is_tangent or settled else (tangent.g, self.t_mu)
 
         def coefficients(c: Vector) -> list[float]:
-            """Return c . du as a row: coefficients of dmu, dp and alpha, and the constant term."""
+            """Return the row of c . du: the coefficients of dmu, dp, alpha, and the constant."""
             return [
                 -dot(comm, c, self.w_mu),
                 -dot(comm, c, self.w_p),
@@ -292,14 +306,16 @@ class AugmentedRows:
                 -dot(comm, c, w_R),
             ]
 
+        # -(g + dg) = 0 with -dg = Pi'''(v, v, du) + v . K_mu v dmu + v . K_p v dp
         cubic, K_mu_vv = coefficients(self.cubic), dot(comm, v, self.K_mu_v)
         K_p_vv = dot(comm, v, self.K_p_v)
         singular_row = [cubic[0] + K_mu_vv, cubic[1] + K_p_vv, cubic[2], cubic[3] - g]
-        if kind == "fold":
+        if kind == "fold":  # the factor of b that is left of the equilibrium
             kind_row = [self.t_mu, self.t_p, -tangent.g, t_R]
         else:
             kind_row = self._row_without_work(coefficients, pull)
         c = coefficients(row.du) if row.du is not None else [0.0] * 4
+        # for the tangent the row changes by 1 along it
         place_row = [
             c[0] + row.dmu,
             c[1] + row.dp,
@@ -307,10 +323,11 @@ class AugmentedRows:
             c[3] + value if value is not None else -1.0,
         ]
         rows = np.array([singular_row, kind_row, place_row])
+        # units of dmu, dp and alpha: alpha v then moves the system by one length
         columns = np.array([*self._scales, self._system.length / max_abs(comm, v)])
         rows[:, :3] *= columns
         row_sizes = np.abs(rows[:, :3]).max(axis=1)
-        if kind == "bifurcation":
+        if kind == "bifurcation":  # a coefficient that is zero by symmetry counts as rounding
             row_sizes[1] = max(row_sizes[1], self._mixed_size * columns[2])
         rows /= np.where(row_sizes, row_sizes, 1.0)[:, None]
         # where bifurcations meet by symmetry the rows are dependent: the least step is taken
@@ -325,7 +342,8 @@ class AugmentedRows:
     ) -> list[float]:
         """Return the row v . R_mu = 0: coefficients of dmu, dp and alpha, and the constant term.
 
-        The null vector changes as v' = -K^-1 K' v.
+        Its change is v . R_mu' + v' . R_mu. The null vector changes by v' = -K^-1 K' v, so the
+        second part is -w_mu . K' v.
 
         Parameters
         ----------
@@ -336,6 +354,7 @@ class AugmentedRows:
         """
         system, state, name, comm = self._system, self._state, self._name, self._system.comm
         v, w_mu = self._tangent.v, self.w_mu
+        # minus the derivative of v . R_mu by u
         mixed = mixed_third_derivative(system, state, v, w_mu, self._R) - self.K_mu_v
         self._mixed_size = dot(comm, np.abs(mixed), np.abs(v))
         mu, mu_step = state.mu[name], RELATIVE_DIFFERENCE_STEP * (abs(state.mu[name]) or 1.0)
@@ -343,6 +362,7 @@ class AugmentedRows:
             system.load(state.u, {**state.mu, name: mu + step}, name)
             for step in (mu_step, -mu_step)
         )
+        # its partial derivatives by mu and p, at fixed u
         by_mu = dot(comm, v, np.asarray((forward - backward) / (2 * mu_step))) - dot(
             comm, w_mu, self.K_mu_v
         )
@@ -359,8 +379,10 @@ class AugmentedRows:
 def second_eigenvalue(tangent: AugmentedTangent, system: System) -> float:
     """Return the eigenvalue of K nearest to zero in the space orthogonal to b. Collective.
 
-    A power iteration of the bordered inverse finds it, in a fixed number of steps.
+    A power iteration of the bordered inverse finds it, in a fixed number of steps: its error is
+    not needed, only where its sign changes.
     """
+    # a start vector that no symmetry makes orthogonal to a mode, always the same
     x = np.sin(1.0 + np.arange(system.size) + system.comm.rank)
     value = np.nan
     for _ in range(POWER_ITERATIONS):

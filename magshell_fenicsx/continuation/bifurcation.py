@@ -8,6 +8,13 @@ for (u, mu, beta), with g and v of `fold.AugmentedTangent`. This system is regul
 bifurcation. A small imperfection, from the mesh or from rounding, splits the bifurcation; beta is
 the force along v that restores it (Govaerts, Numerical methods for bifurcations of dynamical
 equilibria, SIAM 2000, ch. 4 and 6). `switch_branch` enters the branches that cross the path there.
+
+Pi(u; mu) is the potential, R = dPi/du, K = dR/du; mu is the load parameter (amplitude) that varies,
+R_mu its load vector. A dot is the inner product over all ranks; Pi'''(v, w, .) is a third
+derivative as a vector. phi is the null vector of K. w_R and w_mu solve K w + t b = R and R_mu with
+b . w = 0. The system's length (a thickness) is the unit of displacements. `stress` is a list of
+weighted displacements: K takes the sum of their stresses in place of the stress of u, which small
+errors of a guess spoil.
 """
 
 from collections.abc import Callable, Sequence
@@ -107,7 +114,7 @@ def find_bifurcation(
     phi
         A vector near the null vector of the tangent.
     stress
-        The stress of the guess, see `System.tangent`.
+        Weighted displacements whose stress replaces that of the guess in the first tangent.
 
     Raises
     ------
@@ -115,7 +122,7 @@ def find_bifurcation(
         If Newton's method diverges or takes too long, or the tangent is singular in two directions.
     """
     try:
-        start = _equilibrate(newton, guess, phi, stress)[0]
+        start, _ = _equilibrate(newton, guess, phi, stress)
         return _find_from_equilibrium(newton, start, phi, name)
     except np.linalg.LinAlgError:
         raise BifurcationLost from None
@@ -138,7 +145,7 @@ def _find_from_equilibrium(
     """
     system, state, count = newton.system, guess, newton.factorisation.count
     b, sizes, load_changes = phi, list[float](), list[float]()
-    # of a position the tangent is not linear in the amplitude
+    # K is not linear in an amplitude that is a position: convergence of u does not show that of mu
     checks_load = name in system.coordinates
     while not (
         _has_converged(sizes)
@@ -175,6 +182,8 @@ def _equilibrate(
 ) -> tuple[State, float]:
     """Return the equilibrium near a state up to a force along v, and its error in lengths.
 
+    The force keeps the component of the state along v.
+
     Raises
     ------
     BifurcationLost
@@ -191,8 +200,8 @@ def _newton_step(
 ) -> tuple[Vector, float, Vector]:
     """Return Newton's step (du, dmu) for the regular system of a bifurcation, and w_mu.
 
-    du = alpha v - w_R - dmu w_mu; alpha and dmu are from the rows g and v . R_mu. w_mu is the
-    response to the load, without v.
+    du = alpha v - w_R - dmu w_mu leaves only a force along b. alpha and dmu follow from the linear
+    equations g + dg = 0 and v . R_mu + d(v . R_mu) = 0. w_mu is the response to the load without v.
 
     Parameters
     ----------
@@ -205,6 +214,7 @@ def _newton_step(
     cubic = third_derivative(system, state, v)
     K_mu_v = first_difference(lambda u: system.load(u, state.mu, name), system, u, v)
     mixed = mixed_third_derivative(system, state, v, w_mu) - K_mu_v  # -d(v . R_mu)/du
+    # derivatives of g and of v . R_mu along (du, dmu) = (-w_mu, 1)
     g_mu = dot(comm, mixed, v)
     load_rate = dot(comm, v, _load_rate(system, state, name))
     work_mu = dot(comm, mixed, w_mu) - dot(comm, K_mu_v, w_mu) + load_rate
@@ -215,7 +225,10 @@ def _newton_step(
 
 
 def _load_rate(system: System, state: State, name: str) -> Vector:
-    """Return R_mumu by a difference; exactly zero for an amplitude that multiplies its term."""
+    """Return R_mumu, the derivative of the load vector by its own amplitude, by a difference.
+
+    It is exactly zero for an amplitude that multiplies its term.
+    """
     mu, d = state.mu[name], DIFFERENCE_STEP * (abs(state.mu[name]) or 1.0)
     forward, backward = (
         system.load(state.u, {**state.mu, name: mu + step}, name) for step in (d, -d)
@@ -226,7 +239,10 @@ def _load_rate(system: System, state: State, name: str) -> Vector:
 def mixed_third_derivative(
     system: System, state: State, v: Vector, w: Vector, residual: Vector | None = None
 ) -> Vector:
-    """Return Pi'''(v, w, .) at a state, by polarisation of `third_derivative`. Collective.
+    """Return Pi'''(v, w, .) at a state as a vector. Collective.
+
+    It is the polarisation 4 Pi'''(v, w) = Pi'''(v + w, v + w) - Pi'''(v - w, v - w), with w
+    scaled to the size of v.
 
     Parameters
     ----------
@@ -235,7 +251,7 @@ def mixed_third_derivative(
     """
     comm = system.comm
     size = max_abs(comm, w) / max_abs(comm, v)
-    if size == 0.0:
+    if size == 0.0:  # w is zero
         return np.zeros_like(v)
     residual = system.residual(state.u, state.mu) if residual is None else residual
     plus, minus = (
@@ -246,6 +262,8 @@ def mixed_third_derivative(
 
 def _has_converged(sizes: Sequence[float]) -> bool:
     """Return whether the last step is below the tolerance, or as small as rounding allows.
+
+    A small step that is not half as long as the one before counts as rounding.
 
     Parameters
     ----------
@@ -294,6 +312,9 @@ def switch_branch(
 ) -> BranchSwitch | None:
     """Leave a path at a located bifurcation along the null vector. Collective.
 
+    Points are solved at a distance along the null vector, in both directions. Distances grow until
+    the amplitude changes by more than rounding, and are tried smaller if the first one fails.
+
     Parameters
     ----------
     path
@@ -319,13 +340,14 @@ def switch_branch(
         points = (_step_off(path, state, mode, signed) for signed in (size, -size))
         starts = [point if point and not refused(bifurcation, point) else None for point in points]
         if starts[0] is None or starts[1] is None:
-            if branch_switch:
+            if branch_switch:  # the points at the last distance serve
                 break
             sizes = [smaller for smaller in SMALLER_STEP_SIZES if smaller < size]
             continue
         rises = [point.state.mu[name] - state.mu[name] for point in starts if point]
         symmetric = abs(rises[0] - rises[1]) <= ASYMMETRY_TOLERANCE * abs(rises[0] + rises[1])
         branch_switch = BranchSwitch(symmetric, (starts[0], starts[1]))
+        # otherwise the symmetry is judged by rounding, and a larger distance is tried
         changes_load = max(map(abs, rises)) > LOAD_CHANGE_TOLERANCE * abs(state.mu[name])
         if size < FIRST_STEP_SIZES[0] or changes_load:
             break
@@ -345,7 +367,8 @@ def _step_off(path: Path, state: State, mode: Vector, size: float) -> Point | No
     """Return the first point of the branch at a distance along the null vector. Collective.
 
     Its tangent leads away from the bifurcation. First a force along the null vector pushes the
-    system there at the same amplitude. Then the force is removed and the amplitude is unknown.
+    system there at the same amplitude. Then the force is removed, the distance is kept, and the
+    amplitude is unknown.
 
     Parameters
     ----------
@@ -369,7 +392,9 @@ def _step_off(path: Path, state: State, mode: Vector, size: float) -> Point | No
         return None
     if pushed is None:
         return None
-    point = path.solve(row, 0.0, pushed[0])
+    pushed_state, _ = pushed
+    point = path.solve(row, 0.0, pushed_state)
     if isinstance(point, str):
         return None
+    # the tangent per unit of arc length, with the sense of the step
     return point.with_tangent_per(copysign(metric.norm(point.du, point.dmu), size))

@@ -5,6 +5,18 @@ Both are curves in (u, mu, p), see `augmented` and, for symmetry-breaking modes,
 Along folds v . (R_mu dmu + R_p dp) = 0. So where p turns, mu turns too and the curve goes along v
 alone, a cusp, at which v . Pi'''(v, v) is zero; or v . R_mu is zero: two folds meet at a
 bifurcation.
+
+A `BoundaryPoint` has the state, the null vector phi of K and the boundary's tangent `way`; a
+`CurveVector` (du, dmu, dp) is a direction or, as a prediction, a point (u, mu, p). mu is the one
+unknown load parameter (amplitude), by name. A row is the scalar equation that says where on the
+boundary a point is. R = dPi/du, K = dR/du, v is phi with another scale; Pi''' is the third
+derivative of the potential. Numbers of unstable directions never count phi.
+
+`family` is a `SystemFamily`: one system for each p, costly if each is made anew. A family of modes,
+by number, shares a tangent: 0 the model's own modes, 1, 2, ... symmetry-breaking modes, which the
+model excludes. A turn is where p turns back; a meeting, on a boundary of the model, where a second
+mode of the model is neutral; a crossing, where any other second mode is. At these two `second` is
+zero, the eigenvalue nearest to zero other than that of phi.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -85,7 +97,8 @@ class Boundary:
     scales
         Changes of the amplitude and of p that count as of order one in the arc length.
     recorded
-        Called with each solve. It returns its result, or that of an interrupted run at this place.
+        Called with a function that solves. It returns the function's result or, in a resumed run,
+        the stored one.
     m
         The family of symmetry-breaking modes in which the bifurcation is; 0: it is one of the model
         itself.
@@ -112,9 +125,9 @@ class Boundary:
         self._solved_at = list[float]()  # values of p
 
     def inner(self, a: CurveVector, b: CurveVector) -> float:
-        """Return <a, b>: root mean square of u over the length, mu and p over their scales.
+        """Return the inner product <a, b> of the arc length. Collective.
 
-        Collective.
+        u counts by its mean square over the system's length, mu and p over their scales.
         """
         mu_scale, p_scale = self.scales
         displacement = self._weight * dot(self._comm, a.du, b.du)
@@ -138,6 +151,7 @@ class Boundary:
         solver = self.family.solver_at(p)
         system = solver.system
         self._comm, self._length = system.comm, system.length
+        # of du . du in the metric: the mean square over the length
         self._weight = 1 / (float(system.comm.allreduce(system.size)) * system.length**2)
         if solver.factor_at(state).skewed:
             raise BoundaryLost(
@@ -176,7 +190,7 @@ class Boundary:
         current = start if start.way.dp * sense >= 0 else _reversed(start)
         previous: tuple[BoundaryPoint, float] | None = None  # the previous point, and its step
         max_dp = self.scales[1] / steps
-        # the length that changes p by `max_dp`, but at most 10/steps in the metric
+        # the arc length that changes p by `max_dp`, but at most 10/steps
         first_length = min(
             max_dp / max(abs(current.way.dp), 1e-3 * self.scales[1]), 2.0 / steps * 5
         )
@@ -189,6 +203,7 @@ class Boundary:
                     yield from self._events_between(current, *end)
                     yield "end", end[0]
                     return
+            # a point, or the reason why there is none
             point: BoundaryPoint | str = "the end of the range is not reached at once"
             if ends[0] < guess.dp < ends[1]:
                 point = self._correct(current, guess, length)
@@ -205,6 +220,7 @@ class Boundary:
             step = self._distance(current, point, length)
             yield from self._events_between(current, point, step)
             yield "point", point
+            # easy steps on a straight stretch grow, hard ones shrink
             straight = self.inner(current.way, point.way) > GROWTH_COSINE
             previous, current = (current, step), point
             if point.factorisations <= EASY_ITERATIONS and straight:
@@ -222,8 +238,8 @@ class Boundary:
         """Yield cusps, turns, meetings and crossings between two successive points.
 
         A turn is where p turns back, and a cusp is one where v . Pi'''(v, v) changes its sign too.
-        At a meeting or crossing a second mode becomes neutral: of the same family, or of another
-        one.
+        Where the number of unstable directions of a family of modes differs, a second mode becomes
+        neutral between the points: a meeting within the model's own family, a crossing otherwise.
 
         Parameters
         ----------
@@ -257,7 +273,7 @@ class Boundary:
         for i, point in sorted(meetings.items(), key=distance):
             if point is None:
                 continue
-            if i == self.m == 0:
+            if i == self.m == 0:  # a mode of the model, on a boundary of the model
                 yield "meeting", replace(point, met=i)
             else:
                 # its own counts are those of a nearby point, which may be beyond other crossings
@@ -268,13 +284,13 @@ class Boundary:
     def _predict(
         self, previous: tuple[BoundaryPoint, float] | None, current: BoundaryPoint, length: float
     ) -> CurveVector:
-        """Predict the point (u, mu, p) after a step of a length along the tangent.
+        """Predict the point (u, mu, p) after a step of a length along the current tangent.
 
         Parameters
         ----------
         previous
-            The point before the current one, and its distance from it. With both, the cubic through
-            points and tangents predicts; without, the tangent.
+            The point before the current one, and the distance between them. The cubic through both
+            points with their tangents predicts; if it is None, the tangent does.
         """
         if previous is None:
             mu, tangent = current.state.mu[self.name], current.way
@@ -284,6 +300,7 @@ class Boundary:
                 current.p + length * tangent.dp,
             )
         low, step = previous
+        # in units of the last step, along its own tangent
         t = 1 + length * self.inner(low.way, current.way) / step
         return self._hermite(low, current, step, t)
 
@@ -302,9 +319,10 @@ class Boundary:
         # the second tangent has length one too: per unit of the first it is longer
         faster = 1 / self.inner(low.way, high.way)
         (h00, h10), (h01, h11) = hermite(t, (0.0, 1.0))
-        a, b, name = step * h10, step * faster * h11, self.name
+        a, b, name = step * h10, step * faster * h11, self.name  # weights of both tangents
 
         def cubic(x0: float, d0: float, x1: float, d1: float) -> float:
+            """Return the value for the values x0, x1 and slopes d0, d1 at both points."""
             return h00 * x0 + a * d0 + h01 * x1 + b * d1
 
         return CurveVector(
@@ -318,13 +336,13 @@ class Boundary:
     ) -> BoundaryPoint | str:
         """Return the point near a guess, or the reason why there is none.
 
-        It lies at the predicted p if systems at other p are costly, else at a distance along the
-        tangent.
+        The point is solved at the predicted p if systems at other p are costly, so that one system
+        serves all iterations; otherwise at a distance along the current tangent.
 
         Parameters
         ----------
         length
-            That distance from the current point.
+            That distance.
         """
         if not self._is_taken_at_given_p(current):
             return self._correct_at_distance(current, guess, length)
@@ -333,7 +351,8 @@ class Boundary:
     def _is_taken_at_given_p(self, current: BoundaryPoint) -> bool:
         """Return whether the point after the current one is solved at a given p.
 
-        This is so if systems are costly and p changes enough along the boundary.
+        This is so if systems are costly and p changes enough along the boundary; near a turn there
+        may be no point at a given p.
         """
         slope = abs(current.way.dp) / self.scales[1]
         return self.family.costly and slope > MIN_SLOPE_FOR_GIVEN_P
@@ -348,6 +367,7 @@ class Boundary:
         """
         if not self._is_taken_at_given_p(current):
             return length
+        # at a given p the distance follows from the solution
         name = self.name
         chord = CurveVector(
             next_point.state.u - current.state.u,
@@ -380,6 +400,7 @@ class Boundary:
             chord = CurveVector(u - base.state.u, m - base.state.mu[name], q - base.p)
             return self.inner(tangent, chord) - length
 
+        # the gradient of that value by u, mu and p
         row = CurveRow(
             self._weight * tangent.du, tangent.dmu / mu_scale**2, tangent.dp / p_scale**2, value
         )
@@ -390,8 +411,9 @@ class Boundary:
     ) -> BoundaryPoint | str:
         """Return a point with the second eigenvalue of a family, or the reason why there is none.
 
-        The point is at the distance `s` from a base. Where families do not couple and it is
-        cheaper, it is at the p of the guess instead.
+        The point is at the distance `s` from a base. On a boundary of symmetry-breaking modes
+        (m > 0), whose equations do not couple with another family, it is solved at the p of the
+        guess where that is cheaper.
         """
         if not (self.m and self._is_taken_at_given_p(base)):
             return self._correct_at_distance(base, guess, s, eigenvalue_family=family)
@@ -411,8 +433,8 @@ class Boundary:
     ) -> BoundaryPoint | str:
         """Return the point near a guess on which a row holds, or the reason why it is not accepted.
 
-        A point is refused if it is far from the guess, or if the boundary turns sharply between the
-        base and the point.
+        It is not accepted if it is far from the guess, or if the boundary turns sharply between the
+        base and the point: then the step has jumped to another boundary.
 
         Parameters
         ----------
@@ -435,6 +457,7 @@ class Boundary:
         )
         if isinstance(point, str):
             return point
+        # the guess is a point (u, mu, p)
         correction = CurveVector(
             point.state.u - guess.du, point.state.mu[name] - guess.dmu, point.p - guess.dp
         )
@@ -453,12 +476,12 @@ class Boundary:
     ) -> tuple[BoundaryPoint, float] | None:
         """Return the point at the end of the range of p, and its distance from the current point.
 
-        Bisection finds where the prediction leaves the range.
+        Bisection finds where the prediction leaves the range; the point is solved at that end.
 
         Parameters
         ----------
         previous
-            As in `_predict`.
+            The point before the current one and its distance, from which the cubic predicts.
         length
             A step whose prediction is outside the range.
         ends
@@ -483,6 +506,7 @@ class Boundary:
             current,
             low_order=self._is_taken_at_given_p(current),
         )
+        # behind a turn, on a sharp bend or far from the prediction: another part of the boundary
         if isinstance(point, str) or point.way.dp * current.way.dp < 0:
             return None
         if self.inner(point.way, current.way) < MIN_COSINE:
@@ -508,6 +532,7 @@ class Boundary:
         base, a, b = low, 0.0, length  # distances along the tangent of the base
         best = min(low, high, key=lambda point: abs(point.way.dp))
         for _ in range(MAX_TRIALS):
+            # slopes of p by the distance along the tangent of the base
             d0, d1 = (point.way.dp / self.inner(base.way, point.way) for point in (low, high))
             s = a + (b - a) * stationary((high.p - low.p) / (b - a), d0, d1)
             guess = self._hermite(
@@ -538,9 +563,10 @@ class Boundary:
     ) -> BoundaryPoint | None:
         """Locate the point between two others where a second eigenvalue of a family is zero.
 
-        Inverse interpolation finds it. The bordered tangent may be singular there, so the point
-        itself is interpolated between others close by. Where families do not couple, the tangent is
-        regular, and these may be closer. Collective.
+        Inverse interpolation of the eigenvalue finds it. For modes of the boundary's own family or
+        of the model, the equations are singular there, so the point is interpolated between others
+        that are close by. Other families do not couple with them: solved points may be closer.
+        Collective.
 
         Parameters
         ----------
@@ -557,7 +583,8 @@ class Boundary:
         """
         coupled = family in (0, self.m)
         tolerance = MEETING_TOLERANCE if coupled else MEETING_TOLERANCE**2
-        # places, second eigenvalues and points, those with the smallest eigenvalues first
+        # places, second eigenvalues and points, those with the smallest eigenvalues first; a and b
+        # are the places between which the number of unstable directions changes
         solved, a, b = list[tuple[float, float, BoundaryPoint]](), 0.0, length
         s = length / 2
         for _ in range(MAX_MEETING_POINTS):
@@ -566,7 +593,7 @@ class Boundary:
             if isinstance(point, str):
                 break
             if any(s == place or point.second == second for place, second, _ in solved):
-                break
+                break  # nothing more to interpolate
             solved = sorted([*solved, (s, point.second, point)], key=lambda entry: abs(entry[1]))
             solved = solved[:INTERPOLATED_POINTS]
             a, b = (s, b) if count(point) == count(low) else (a, s)
@@ -580,7 +607,7 @@ class Boundary:
                     s = zero
                     break
                 s = zero if a < zero < b else s
-        if len(solved) < 2:
+        if len(solved) < 2:  # too few to interpolate
             return solved[0][2] if solved else None
         return self._interpolated_point(solved, s)
 
@@ -588,6 +615,8 @@ class Boundary:
         self, solved: Sequence[tuple[float, float, BoundaryPoint]], s: float
     ) -> BoundaryPoint:
         """Return the nearest solved point, with p and amplitude interpolated at the distance `s`.
+
+        Its load error grows by the change of the amplitude when one point less is interpolated.
 
         Parameters
         ----------
@@ -614,16 +643,16 @@ class Boundary:
         p: float,
         difference: Sequence[tuple[float, float]],
     ) -> AugmentedRows | SymmetryBreakingRows:
-        """Return the rows of Newton's step at a state, with a tangent bordered by b.
+        """Return the equations of Newton's step at a state, whose tangent is bordered by b.
 
         Parameters
         ----------
         newton
             The solver of the system at p.
         b
-            A vector near the null vector.
+            A vector near the null vector: with it as border the singular tangent becomes regular.
         difference
-            Weights and values of p of a difference by p.
+            Pairs of a weight and a p: derivatives by p are weighted sums over the systems there.
         """
         if self.m:
             family = cast(SymmetryBreakingSystems, self.family)
@@ -662,7 +691,7 @@ class Boundary:
         rows
             Rows of the last step of Newton's method, at the state.
         """
-        if family and not self.m:
+        if family and not self.m:  # the rows have the model's tangent alone
             systems = cast(SymmetryBreakingSystems, self.family)
             return nearest_eigenvalue(systems.factored_tangent(p, state, family), self._comm)
         return rows.eigenvalue(family, p, state)
@@ -694,11 +723,12 @@ class Boundary:
         eigenvalue_family
             The family whose second eigenvalue the point gets; None: none.
         low_order
-            Whether a difference by p of low order is enough.
+            Whether a difference by p of low order is enough: p is given, and derivatives by p only
+            serve the tangent of the boundary.
         """
 
         def solve() -> BoundaryPoint | str:
-            """Run Newton's method; the result also has the choice of the factorisation."""
+            """Run Newton's method; its result has `habit`, so that a resumed run rounds alike."""
             try:
                 point = self._iterate(
                     float(p),
@@ -716,6 +746,7 @@ class Boundary:
             return replace(point, habit=self.family.solver_at(point.p).factorisation.habit)
 
         point = self._recorded(solve)
+        # a stored result also renews what its solve would have left behind
         if isinstance(point, BoundaryPoint):
             self._solved_at.append(point.p)
             if not self.family.costly:
@@ -729,12 +760,13 @@ class Boundary:
         ----------
         low_order
             Whether a formula of low order is enough. It may use the last solved p, whose systems
-            exist.
+            exist already; the formula of the family makes new ones.
 
         Returns
         -------
         Pairs of a weight and its p.
         """
+        # p itself and the last solved values, not too close to one another
         places = [p]
         min_distance = MIN_SLOPE_DISTANCE * self.scales[1]
         for q in reversed(self._solved_at):
@@ -847,8 +879,8 @@ class Boundary:
     def _has_converged(self, sizes: Sequence[float], load_changes: Sequence[float]) -> bool:
         """Return whether the remaining errors of u and of the load are small.
 
-        They are extrapolated from geometric decay. Sizes that shrink slowly below the tolerance are
-        rounding.
+        If all further steps shrink by the last ratio or by one half, they sum up to the last step
+        times ratio/(1 - ratio). Sizes that shrink slowly below the tolerance are rounding.
 
         Parameters
         ----------
@@ -857,7 +889,7 @@ class Boundary:
         load_changes
             Magnitudes of their changes of the amplitude.
         """
-        ratio, shrinks_slowly = 0.5, False
+        ratio, shrinks_slowly = 0.5, False  # after one step
         if len(sizes) > 1:
             ratio = min(sizes[-1] / sizes[-2], 0.5) if sizes[-2] else 0.5
             shrinks_slowly = sizes[-1] > sizes[-2] / 2

@@ -4,6 +4,13 @@ Between two successive points of a path the change of inertia and the sign of dm
 instabilities. Folds (limit points) are located by interpolation of mu(s), bifurcations (branch
 points) as solutions of a regular system or by bisection. Instabilities that cannot be separated
 count as one cluster. Theory: docs/theory.md.
+
+The inertia of a point is `negative_pivots`: its number of unstable directions at a fixed amplitude
+mu, the one load parameter that varies. s is the controlled quantity of the path: load, conjugate
+displacement or arc length, which is measured from a base point along its tangent, or along the
+direction `across` where the path turns sharply. A bracket is two points, `low` and `high`, with
+something between them. Budget and `iterations`, `factorisations` count the work. A conjugate is the
+displacement on which the amplitude does work.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -198,6 +205,7 @@ class _InstabilityLocator:
         single = changed_pivots == 1 or not halvings
         if single and turns_back:
             fold = self.locate_fold(low, high)
+            # without a change of one, the point was not checked by an inertia of its own
             point = self.with_work(fold) if changed_pivots == 1 else self.with_own_inertia(fold)
             # rounding decides what its own matrix counts
             point = replace(
@@ -208,6 +216,7 @@ class _InstabilityLocator:
             yield Instability(point, "fold")
         elif single:
             point = self.solve_bifurcation(low, high) or self.bisect_bifurcation(low, high)
+            # at a bifurcation the load still changes along the path
             if abs(point.dmu) < FOLD_SLOPE_RATIO * abs(low.dmu):
                 raise PathStopped("the step passed a fold and left the branch", low)
             yield Instability(point, "bifurcation")
@@ -220,7 +229,9 @@ class _InstabilityLocator:
             yield from self.locate(middle, high, halvings - 1)
 
     def solve(self, s: float, low: Point, high: Point) -> Point:
-        """Return the point at s on the branch between two points, without valid inertia.
+        """Return the point at s on the branch between two points.
+
+        Its numbers of unstable directions are not valid; this saves factorisations.
 
         Raises
         ------
@@ -261,9 +272,10 @@ class _InstabilityLocator:
         return deviation > max(MAX_DEVIATION_FROM_CUBIC * chord, ZERO_DISPLACEMENT * system.length)
 
     def middle(self, low: Point, high: Point) -> Point | None:
-        """Return a point between two others with its own inertia; None if no solve succeeds.
+        """Return a point between two others, with the inertia of its own tangent.
 
-        Several fractions of the bracket are tried: rounding near a singular tangent may hide some.
+        Several fractions of the bracket are tried: rounding near a singular tangent may hide some
+        points. If no solve succeeds, or the budget is exhausted, the result is None.
         Each trial counts in the budget.
         """
         for fraction in MIDDLE_FRACTIONS:
@@ -293,6 +305,7 @@ class _InstabilityLocator:
         except NoEigenpair:
             return None
         a, b = (mode.eigenvalue for mode in modes)
+        # the zero between both by linear interpolation; with one sign they show nothing
         t = a / (a - b) if a * b < 0 else 0.5
         guess = path.interpolated_state(low.s + t * (high.s - low.s), low, high)
         stress = [(1 - t, low.state.u), (t, high.state.u)]
@@ -304,6 +317,7 @@ class _InstabilityLocator:
                 continue
             if not min(low.s, high.s) <= point.s <= max(low.s, high.s):
                 continue
+            # its own null vector does not count, so the larger number is excluded
             if not least_pivots <= point.negative_pivots < most_pivots:
                 continue
             if not self.is_on_another_branch(point, low, high):
@@ -323,7 +337,7 @@ class _InstabilityLocator:
         Parameters
         ----------
         guess, stress
-            A state near the bifurcation, and its stress as in `System.tangent`.
+            A state near the bifurcation, and weighted displacements whose stress replaces its own.
         phi
             A vector near the null vector.
         low, high
@@ -352,7 +366,7 @@ class _InstabilityLocator:
     def _interpolated_tangent(self, state: State, low: Point, high: Point) -> Direction:
         """Return the tangent (du, dmu) of the path near a state between two points.
 
-        It is linear in mu between the tangents of both points.
+        It is interpolated between their tangents, linearly in the amplitude.
         """
         name = self.path.name
         t = (state.mu[name] - low.state.mu[name]) / (high.state.mu[name] - low.state.mu[name])
@@ -360,10 +374,11 @@ class _InstabilityLocator:
         return (1 - t) * low.du + t * high.du, (1 - t) * low.dmu + t * high.dmu
 
     def bisect_bifurcation(self, low: Point, high: Point) -> Point:
-        """Return the last point before an instability, by bisection with the inertia.
+        """Return the last point before an instability, by bisection.
 
-        Bisection ends at the tolerance, or where no point is found between both ends. The width of
-        the last bracket in the amplitude is the point's `load_error`.
+        Each half is judged by the inertia of the point between them. Bisection ends at the
+        tolerance, or where no point is found between both ends. The width of the last bracket in
+        the amplitude is the point's `load_error`.
 
         Raises
         ------
@@ -378,7 +393,7 @@ class _InstabilityLocator:
             middle = self.middle(low, high)
             if middle is None:
                 break
-            if middle.negative_pivots == low.negative_pivots:
+            if middle.negative_pivots == low.negative_pivots:  # not yet past the instability
                 low = middle
             else:
                 high = middle
@@ -449,12 +464,15 @@ class _InstabilityLocator:
 
         Parameters
         ----------
+        stability
+            Gives the tangent with that eigenvalue.
         slope
             Derivative of the eigenvalue by the load; zero if it is unknown.
         upper_bound
             Upper bound of the distance, which is returned if the slope is unknown.
         """
         u = point.state.u
+        # u with each entry one unit in the last place larger or smaller, twice
         random = np.random.default_rng(self.path.system.comm.rank)
         rounded = [u + signs * np.spacing(u) for signs in random.choice([-1.0, 1.0], (2, u.size))]
         eigenvalues = [
@@ -468,9 +486,9 @@ class _InstabilityLocator:
     def locate_zero_eigenvalue(self, low: Point, high: Point, stability: Stability) -> Point:
         """Return the point between two others where an eigenvalue of `stability` is zero.
 
-        Illinois' regula falsi, of order 1.44, ends when two successive guesses agree to
-        tolerance^(3/4). While the eigenvalue shows a larger error, it goes on as long as the error
-        is halved: close to zero the eigenvalue is only rounding.
+        Illinois' regula falsi is of order 1.44: if two successive guesses agree to tolerance^(3/4),
+        the error of the second is below the tolerance. While the eigenvalue shows a larger error,
+        the search goes on as long as the error is halved: close to zero it is only rounding.
 
         Parameters
         ----------
@@ -486,6 +504,7 @@ class _InstabilityLocator:
         NoEigenpair
             If the eigenpair nearest to zero is not found at a point.
         """
+        # last_side: which end the last point replaced, 1 for high, -1 for low, 0 for none yet
         name, last_side, last_s, best = self.path.name, 0, np.inf, None
         low_mode = critical_mode(stability, low.state)
         a, b = low_mode.eigenvalue, critical_mode(stability, high.state).eigenvalue
@@ -602,7 +621,7 @@ class ContinuationGoal:
     targets
         Requested points: values of s or, on a path by arc length, of `quantity`.
     quantity
-        "load": the amplitude; "conjugate": the displacement conjugate to it.
+        "load": the amplitude; "conjugate": the displacement on which it does work.
     steps
         With every other `until`, the largest number of steps.
     sense
@@ -657,6 +676,7 @@ class ContinuationRun:
         renew: Callable[[Point, Point], State | None] | None = None,
         refuse: Callable[[Point], str] = lambda point: "",
     ) -> None:
+        """Begin at the start; the located folds are kept, to detect a closed loop."""
         self._refuse = refuse
         self.path, self.goal, self.points, self._renew = path, goal, [start], renew
         self.done = False
@@ -682,7 +702,8 @@ class ContinuationRun:
                 low, shorter_step = self.path.base_before(self.points[-1], point), None
                 renewal = self._renewed_step(low, point)
                 if renewal:
-                    shorter_step, reason = renewal[0], renewal[1] or reason
+                    shorter_step, new_reason = renewal
+                    reason = new_reason or reason
                     break
                 events, refusal = self._accepted_events(low, point)
                 if refusal:  # approach in shorter steps
@@ -707,7 +728,7 @@ class ContinuationRun:
                         point,
                         final=True,
                     )
-            if shorter_step is None:
+            if shorter_step is None:  # the path has reached its end
                 return
             if shorter_step < options.smallest:
                 raise PathStopped(reason, self.points[-1])
@@ -718,7 +739,7 @@ class ContinuationRun:
             )
 
     def _renewed_step(self, low: Point, point: Point) -> tuple[float, str] | None:
-        """Replace the first of two points, if `renew` changes amplitudes there.
+        """Replace the first of two points in `points`, if `renew` changes amplitudes there.
 
         Returns
         -------
@@ -745,13 +766,13 @@ class ContinuationRun:
     def _steps(self) -> Iterator[tuple[Point, bool]]:
         """Yield the next points of the path, each with whether it is a target.
 
-        Where no point is found before a cluster of instabilities, the end of the earlier step that
-        passed the cluster is yielded instead, once.
+        Where no point is found before a cluster (instabilities that could not be separated), the
+        end of the earlier step that passed the cluster is yielded instead, once.
 
         Raises
         ------
         PathStopped
-            If no point is found, as in `Path.continue_to`.
+            If a step of the smallest length fails.
         """
         try:
             targets = self._remaining_targets()
@@ -761,7 +782,8 @@ class ContinuationRun:
             if not (budget.end and budget.clustered):
                 raise
             end = self.path.as_base(self.path.measured_from(current, budget.end))
-            budget.repeated, budget.end = MAX_REPEATED_SEARCHES, None  # it is tried once
+            # it is tried once, and the instabilities then count as a cluster
+            budget.repeated, budget.end = MAX_REPEATED_SEARCHES, None
             yield end, end.s in self._remaining_targets()
             yield from self._steps()
 
@@ -804,7 +826,7 @@ class ContinuationRun:
         return [t for t in goal.targets if (t - s) * sense > 0]
 
     def _step_end(self, s: float, predictors: Sequence[Point]) -> float:
-        """Return the s at which a planned step to `s` ends; hook of `Path.continue_to`.
+        """Return the s at which a planned step to `s` ends; `Path.continue_to` calls it.
 
         A path by arc length ends its step close behind the last target.
 
@@ -825,7 +847,8 @@ class ContinuationRun:
 
         Returns
         -------
-        The events as in `_events_between`, and the reason; "" if the step is accepted.
+        For each event its label, its point, and whether it ends the run; and the reason, "" if the
+        step is accepted.
         """
         try:
             events = self._events_between(low, high)
@@ -850,7 +873,8 @@ class ContinuationRun:
             if ends_run:
                 break
         if self._by_arc and self.goal.targets:
-            until, targets = self.goal.until in ("target", "limit"), self.goal.targets
+            last_ends_run, targets = self.goal.until in ("target", "limit"), self.goal.targets
+            # the last point is `low`, perhaps with another base direction
             predictors = [*self.points[-2:-1], low]
             folds = (point for label, point, _ in events if label == "fold" and point.s != low.s)
             for end in (*(self.path.as_base(fold) for fold in folds), high):
@@ -859,7 +883,7 @@ class ContinuationRun:
                 for target, point in targets_between(
                     self.path, self.goal.quantity, targets, self.goal.sense, predictors
                 ):
-                    events.append(("target", point, until and target == targets[-1]))
+                    events.append(("target", point, last_ends_run and target == targets[-1]))
         return sorted(events, key=lambda event: abs(event[1].s - low.s))
 
     def _located(self, low: Point, high: Point) -> Iterator[Instability]:
@@ -890,6 +914,7 @@ class ContinuationRun:
                 raise
             budget.renew()
             yield self._cluster(e.point, e.high)
+            # the rest of the step, from the first point behind the cluster
             base_behind = self.path.as_base(e.high)
             yield from self._located(base_behind, self.path.measured_from(base_behind, high))
         except PathStopped:

@@ -5,6 +5,11 @@ given conjugate displacement or a given arc length. This module has these rows, 
 [K R_mu; c d] with (c, d) the gradient of g, inverted by block elimination, the chord method with
 Broyden's update that keeps a matrix over several iterates, and the refinement of a path's tangent
 by generalised conjugate residuals.
+
+mu is the one amplitude (load parameter) that varies, q = -dPi/dmu its conjugate: the displacement
+on which it does work. R = dPi/du, K = dR/du, and R_mu is the load vector. A direction is a pair
+(du, dmu). Lengths are displacements in units of the system's length. Parts of a lagged K, from
+terms that couple all unknowns, belong to an earlier state.
 """
 
 from collections.abc import Callable, Sequence
@@ -80,7 +85,10 @@ class PrescribedLoad:
 
 @dataclass(frozen=True)
 class PrescribedConjugate:
-    """Displacement or volume control: the row -dPi/dmu = target of the amplitude `name`."""
+    """Displacement or volume control: the row -dPi/dmu = target of the amplitude `name`.
+
+    -dPi/dmu is the displacement, or the volume, on which the amplitude does work.
+    """
 
     system: System
     name: str
@@ -131,6 +139,7 @@ def nearest_combination(metric: Metric, a: Direction, span: Sequence[Direction])
     span
         The linearly independent directions that are combined.
     """
+    # normal equations of the least distance
     gram = [
         [metric.inner(direction, other_direction) for other_direction in span] for direction in span
     ]
@@ -219,21 +228,23 @@ class BorderedMatrix:
         *,
         lagged: bool = False,
     ) -> None:
+        """Solve for the response to the load, K^-1 R_mu, of which every solution is made."""
         self.state, self.row, self.lagged, self._mu = state, row, lagged, state.mu[name]
         self._comm, self._factors, self._length = system.comm, factors, system.length
         self._gradient = row.gradient(state)
         self.column = system.load(state.u, state.mu, name)
-        self._x2 = factors.solve(self.column, low_accuracy=lagged)
-        self._schur = derivative_along(self._comm, self._gradient, (-self._x2, 1.0))
-        # dmu counts as the displacement that it causes
-        self._weight = dot(self._comm, self._x2, self._x2)
+        # K^-1 R_mu, and the Schur complement of K
+        self._load_response = factors.solve(self.column, low_accuracy=lagged)
+        self._schur = derivative_along(self._comm, self._gradient, (-self._load_response, 1.0))
+        # of dmu dmu in `inner`: dmu counts as the displacement that it causes
+        self._weight = dot(self._comm, self._load_response, self._load_response)
 
     def size(self, step: Direction) -> float:
-        """Return the size of a step (du, dmu), in lengths: that of the larger part.
+        """Return the size of a step (du, dmu), in lengths: the larger one of its two parts.
 
         dmu counts relative to mu or as the displacement that it causes, whichever is smaller.
         """
-        displacement_per_mu = max_abs(self._comm, self._x2) / self._length
+        displacement_per_mu = max_abs(self._comm, self._load_response) / self._length
         scale = min(displacement_per_mu, 1 / abs(self._mu)) if self._mu else displacement_per_mu
         return max(max_abs(self._comm, step[0]) / self._length, abs(step[1]) * scale)
 
@@ -243,17 +254,17 @@ class BorderedMatrix:
         Parameters
         ----------
         low_accuracy
-            Whether a rough solution is enough, see `Factorisation.solve`.
+            Whether a relative residual of about 3 % is enough, where K has a dense part.
         """
-        x1 = self._factors.solve(f, low_accuracy=low_accuracy)
+        response = self._factors.solve(f, low_accuracy=low_accuracy)
         # block elimination: the row without dmu, over the Schur complement
-        dmu = (g - derivative_along(self._comm, self._gradient, (x1, 0.0))) / self._schur
-        return x1 - dmu * self._x2, dmu
+        dmu = (g - derivative_along(self._comm, self._gradient, (response, 0.0))) / self._schur
+        return response - dmu * self._load_response, dmu
 
     @property
     def tangent(self) -> Direction:
         """The solution (du, dmu) for f = 0 and g = 1: the path's tangent per unit of the row."""
-        return np.asarray(-self._x2 / self._schur), 1 / self._schur
+        return np.asarray(-self._load_response / self._schur), 1 / self._schur
 
     def inner(self, a: Direction, b: Direction) -> float:
         """Return the inner product in which Broyden's update is the smallest. Collective."""
@@ -268,8 +279,9 @@ class BorderedMatrix:
 class Chord(Generic[V]):
     """The chord method: one matrix for several iterates, with Broyden's update after each step.
 
-    C. T. Kelley, Iterative Methods for Linear and Nonlinear Equations, SIAM 1995, algorithm brsol.
-    Steps are subtracted from the iterate. V is the type of a step.
+    The updates are not stored as a matrix; the steps so far determine them: C. T. Kelley, Iterative
+    Methods for Linear and Nonlinear Equations, SIAM 1995, algorithm brsol. Steps are subtracted
+    from the iterate. V is the type of a step.
 
     Parameters
     ----------
@@ -305,7 +317,7 @@ class Chord(Generic[V]):
             # Sherman and Morrison's formula for the update by the last step
             divisor = 1 - inner(last_step, step) / inner(last_step, last_step)
             if divisor > MIN_BROYDEN_DIVISOR:
-                return self._add_scaled(step, 1 / divisor - 1, step)
+                return self._add_scaled(step, 1 / divisor - 1, step)  # step/divisor
             self._steps.clear()
         return step
 
@@ -315,12 +327,12 @@ class Chord(Generic[V]):
         Parameters
         ----------
         step
-            The next step at the iterate, which `step` has returned.
+            The next step at the iterate, which the method `step` has returned.
         """
         return self._updated_solution(f, [*self._steps, step])
 
     def _updated_solution(self, f: V, steps: Sequence[V]) -> V:
-        """Return the solution for a right side with the updates by successive steps."""
+        """Return the solution for a right side with the matrix updated by successive steps."""
         solution, inner = self._solve(f), self._inner
         for earlier, later in pairwise(steps):
             factor = inner(earlier, solution) / inner(earlier, earlier)
@@ -356,7 +368,8 @@ def refined_tangent(
     row
         The last row, along which the tangent has length one.
     extrapolating
-        Whether forces of dense terms may be extrapolated. They are then computed along the tangent.
+        Whether forces of terms that couple all unknowns may be extrapolated from earlier states.
+        They are computed at states along the tangent until the extrapolation holds there.
 
     Returns
     -------
@@ -373,7 +386,8 @@ def refined_tangent(
         if system.extrapolation_holds_along(state.u, state.mu, refined[0]):
             return refined
         t = refined
-        # forces computed here make the extrapolation hold along t from now on
+        # forces computed here make the extrapolation hold along t from now on; the result, from
+        # any vector in place of R, has no meaning
         refinement.stiffness(system.residual, t[0], t[0])
     return None
 
@@ -403,6 +417,9 @@ class _TangentRefinement:
     def refined(self, residual: Residual, t: Direction) -> Direction | None:
         """Return the tangent for a residual function, by refinement of an approximation.
 
+        The correction is the preconditioned residual z of both equations. Directions p and their
+        images q, the preconditioned matrix times p, are made orthogonal in the images.
+
         Parameters
         ----------
         residual
@@ -418,7 +435,7 @@ class _TangentRefinement:
         R = residual(self.state.u, self.state.mu)
 
         def preconditioned_product(t: Direction, g: float = 0.0) -> Direction:
-            """Return the preconditioner times the left sides at t, less g in the row."""
+            """Return the preconditioner times the left sides at t, the row's less g."""
             force = self.stiffness(residual, t[0], R) + t[1] * self.load
             row_value = derivative_along(comm, gradient, t) - g
             return self.matrix.solve(force, row_value, low_accuracy=self.matrix.lagged)
@@ -429,15 +446,17 @@ class _TangentRefinement:
             size = max_abs(comm, t[0])
             du_converged = max_abs(comm, z[0]) <= DU_TOLERANCE * size
             if du_converged and abs(z[1]) <= DMU_TOLERANCE * abs(t[1]):
-                is_accurate = max_abs(comm, z[0]) > DIFFERENCE_ACCURACY * size
-                return add_scaled(t, 1.0, z) if is_accurate else t
+                # a smaller correction is only the error of the differences
+                is_significant = max_abs(comm, z[0]) > DIFFERENCE_ACCURACY * size
+                return add_scaled(t, 1.0, z) if is_significant else t
             p, q = z, preconditioned_product(z)
             for direction, image, square in directions:
                 component = self.matrix.inner(image, q) / square
                 p = add_scaled(p, -component, direction)
                 q = add_scaled(q, -component, image)
-            directions.append((p, q, self.matrix.inner(q, q)))
-            component = self.matrix.inner(z, q) / directions[-1][2]
+            square = self.matrix.inner(q, q)
+            directions.append((p, q, square))
+            component = self.matrix.inner(z, q) / square
             t, z = add_scaled(t, component, p), add_scaled(z, -component, q)
         return None
 

@@ -2,6 +2,13 @@
 
 Each mode has a boundary of its own. Along one, a crossing shows where another mode becomes critical
 before it; from there the boundary of that mode is followed.
+
+A mode is represented by its `Boundary`, a curve in (u, mu, p) whose points are instabilities of
+that mode; p is the second parameter, `ends` its range and `sense` the sign of its change. Modes
+belong to families, by number: 0 are the model's own, 1, 2, ... symmetry-breaking ones; `mode.m` is
+the family. `unstable` and `counts` of a point are numbers of unstable directions other than its own
+mode, in all and by family: where they are zero, the mode is the first. `met` is the family that
+crosses there.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -60,8 +67,10 @@ def critical_boundary(
     while True:
         last_point, successor = start, None
         for label, point in mode.follow(start, sense, ends, steps):
+            # the crossing at which this boundary began is found again
             if last_point is start and label == "crossing" and point.met == begun_by:
                 continue
+            # other modes are unstable without a crossing that was located
             is_point = label in ("point", "end")
             if not last_point.unstable and is_point and _unstable_families(mode, point):
                 successor, sense = search.overtaking_mode(mode, point), point.p - last_point.p
@@ -69,6 +78,7 @@ def critical_boundary(
                 if label == "end":
                     return
                 break
+            # where others are unstable already, no crossing changes which mode is the first
             if label != "crossing" or last_point.unstable:
                 yield label, point, mode
                 last_point = point
@@ -80,7 +90,7 @@ def critical_boundary(
                 yield label, point, mode
                 raise
             yield label, replace(point, met=successor.mode.m), mode
-            if successor.begun_by is None:
+            if successor.begun_by is None:  # it begins beside the crossing
                 yield "point", successor.start, successor.mode
             break
         if successor is None:
@@ -100,7 +110,7 @@ def first_mode(
     Parameters
     ----------
     curve, null_vector
-        As in `critical_boundary`.
+        Return the boundary of a family that begins at a point, and a vector near its null vector.
     mode, start
         The boundary that the path has named, and the point on it.
     """
@@ -111,6 +121,7 @@ def first_mode(
         overtaking = search.overtaking_mode(mode, start)
     except BoundaryLost:
         return mode, start
+    # the path cannot tell two modes at nearly one load apart
     load, other_load = (point.state.mu[mode.name] for point in (start, overtaking.start))
     if abs(load - other_load) <= LOAD_TOLERANCE * abs(load):
         return overtaking.mode, overtaking.start
@@ -140,8 +151,12 @@ class _FirstModeSearch:
 
     Attributes
     ----------
-    curve, null_vector, ends
-        As in `critical_boundary`.
+    curve
+        Returns the boundary of a family that begins at a point.
+    null_vector
+        Returns a vector near its null vector, from the point, the family and the previous family.
+    ends
+        The range of p.
     """
 
     curve: BoundaryOfFamily
@@ -151,7 +166,9 @@ class _FirstModeSearch:
     def mode_beyond(self, mode: Boundary, crossing: BoundaryPoint, sense: float) -> _Successor:
         """Return the boundary beyond a crossing, of the mode that becomes critical there.
 
-        It may be that of a third mode that becomes critical there too.
+        It may belong to a third mode that becomes critical there too. Where the equations of both
+        modes do not couple, it begins at the crossing itself; else they are singular there, and it
+        is taken up at a p beside the crossing.
 
         Parameters
         ----------
@@ -171,6 +188,7 @@ class _FirstModeSearch:
             boundary, phi = self._boundary_of(family, crossing, mode.m)
             if mode.m and family not in (0, mode.m):  # the two equations do not couple
                 start = boundary.start(crossing.p, crossing.state, phi)
+                # the mode of the boundary that ends is neutral there and does not count
                 unstable = start.unstable - start.unstable_of(mode.m)
                 yield _Successor(boundary, replace(start, unstable=unstable), mode.m)
             yield _Successor(boundary, _point_beyond(boundary, crossing, phi, sense, self.ends))
@@ -214,9 +232,9 @@ class _FirstModeSearch:
         mode: Boundary,
         point: BoundaryPoint,
     ) -> _Successor:
-        """Return the first mode of some families, which no other mode precedes.
+        """Return where the boundary of a family may be taken up with no other mode unstable.
 
-        Families that prove to be unstable before join the candidates.
+        Families that prove to be unstable at a place join the candidates.
 
         Parameters
         ----------
@@ -288,7 +306,7 @@ def _point_beyond(
         try:
             start = mode.start(crossing.p + dp, crossing.state, phi)
         except (BoundaryLost, NoSystem):
-            if not halvings_left and farthest is None:
+            if not halvings_left and farthest is None:  # no distance has a point
                 raise
         else:
             if not start.unstable:

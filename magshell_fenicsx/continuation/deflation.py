@@ -5,6 +5,10 @@ step for M R is a multiple of that for R, so it needs neither another matrix nor
 E. Farrell, A. Birkisson, S. W. Funke, SIAM Journal on Scientific Computing 37, 2015, A2026):
 
     M(u) = prod_i (|u - u_i|^-p + sigma),    du = tau d,    K d = -R,    tau = 1/(1 - d . grad M/M)
+
+d is Newton's step at u without M, tau d the step with it; grad M/M is the gradient of log M. A row
+is a scalar equation that is solved together with equilibrium, R = 0, for u and one amplitude (load
+parameter).
 """
 
 from collections.abc import Sequence
@@ -56,12 +60,13 @@ class Deflation:
             distance = self.metric.norm(*difference)
             if not distance:
                 return -np.inf
+            # the derivative along d of log(r^-p + sigma), r the distance
             component = self.metric.inner(difference, (d, 0.0))
             slope -= POWER * component / (distance**2 * (1 + SHIFT * distance**POWER))
         return slope
 
     def factor(self, u: Vector, d: Vector) -> float:
-        """Return the factor tau of Newton's step d at u, with M; zero at a known solution.
+        """Return tau, the factor by which M changes Newton's step d at u; zero at a known solution.
 
         Collective.
         """
@@ -98,7 +103,7 @@ def find_deflated(
     The state; None if none is found.
     """
     system, state, fraction, leaps = newton.system, guess, 1.0, 0
-    deflation = Deflation(Metric(system, 1.0), known_solutions)
+    deflation = Deflation(Metric(system, 1.0), known_solutions)  # no amplitude is compared
     residual = system.residual(state.u, state.mu), row.residual(state)
     for _ in range(MAX_ITERATIONS):
         matrix = BorderedMatrix(system, newton.factor_at(state), state, name, row)

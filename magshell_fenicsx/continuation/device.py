@@ -10,6 +10,12 @@ is stationary in u and in the amplitudes mu_f where Pi is in equilibrium and -dP
 A constant q_f holds the conjugate; a q_f that falls with mu_f is a spring or a gas. So a device is
 a system like any other, with the unknowns u and y_f = mu_f length/scale_f. Its inertia is that of
 the shell in the device.
+
+An amplitude mu is a load parameter, or a prescribed position, by name. Its conjugate q = -dPi/dmu
+is the displacement on which it does work, or for a position the force. The free amplitudes mu_f are
+those that the device makes unknown; all others are given. R = dPi/du; a load vector is R_mu, the
+derivative of R by an amplitude; `stress` are weighted displacements whose stress replaces that of u
+in a tangent. Vectors (u, y) have the k unknowns y on the last rank.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -49,10 +55,11 @@ class Device:
     system
         The inner system, without the device.
     held_conjugates_of_step
-        Amplitude that becomes unknown -> its conjugate: a value of -dPi/dmu, a function q(mu) that
-        does not rise, or the name of a further amplitude of the device, whose value it is.
+        Amplitude that becomes unknown -> its conjugate, which the step of loading prescribes: a
+        value of -dPi/dmu, a function from mu to q and dq/dmu <= 0, or the name of a further
+        amplitude of the device, whose value it is.
     scale
-        Amplitude -> a value that counts as of order one.
+        Amplitude -> a value that counts as of order one; it scales the unknown y.
 
     Attributes
     ----------
@@ -66,13 +73,16 @@ class Device:
         held_conjugates_of_step: Mapping[str, HeldConjugate],
         scale: Mapping[str, float],
     ) -> None:
+        """Take over the interface of the inner system, with further unknowns on the last rank."""
         self.comm, self.length, self.coordinates = system.comm, system.length, system.coordinates
         self._system, self.names = system, list(held_conjugates_of_step)
         self._conjugates = [
             conjugate if callable(conjugate) or isinstance(conjugate, str) else constant(conjugate)
             for conjugate in held_conjugates_of_step.values()
         ]
+        # of the amplitudes per unit of y
         self._units = np.array([scale[name] / system.length for name in held_conjugates_of_step])
+        # the further unknowns are on the last rank
         self.size = system.size + len(held_conjugates_of_step) * (
             self.comm.rank == self.comm.size - 1
         )
@@ -89,13 +99,14 @@ class Device:
         return join(u, np.zeros(len(self.names)), self.comm)
 
     def enter(self, state: State) -> State:
-        """Return a state of the inner system as a state of the device."""
+        """Return a state of the inner system as a state of the device: mu_f become unknowns y."""
         fixed = {name: value for name, value in state.mu.items() if name not in self.names}
         return State(join(state.u, self.unknowns(state.mu), self.comm), fixed)
 
     def leave(self, state: State) -> State:
         """Return a state of the device as a state of the inner system, with all its amplitudes."""
         u, mu = self._split(state.u, state.mu)
+        # amplitudes that name a conjugate are the device's alone
         return State(u, {name: value for name, value in mu.items() if name not in self._conjugates})
 
     def displacement(self, x: Vector) -> Vector:
@@ -127,7 +138,7 @@ class Device:
         return join(self._system.residual(v, amplitudes), rows, self.comm)
 
     def rows(self, u: Vector, mu: Amplitudes) -> Array:
-        """Return dPi/dmu + q of the unknown amplitudes, zero where the conjugates are held.
+        """Return the residuals dPi/dmu + q of the unknown amplitudes; zero in equilibrium.
 
         Parameters
         ----------
@@ -138,20 +149,19 @@ class Device:
         -------
         (k,) numbers, as derivatives by y.
         """
-        held_conjugates_of_step = [
+        # a function returns q and its slope
+        held_values = [
             mu[conjugate] if isinstance(conjugate, str) else conjugate(mu[name])[0]
             for name, conjugate in zip(self.names, self._conjugates, strict=True)
         ]
-        rows = (
-            np.array([self._system.potential(u, mu, name) for name in self.names])
-            + held_conjugates_of_step
-        )
+        rows = np.array([self._system.potential(u, mu, name) for name in self.names]) + held_values
         return np.asarray(rows * self._units)
 
     def load(self, u: Vector, mu: Amplitudes, name: str) -> Vector:
         """Return the derivative of the residual (u, y) by the amplitude `name`.
 
-        That may be an amplitude of the inner system, or one that holds a conjugate.
+        That may be an amplitude of the inner system, or one whose value is a held conjugate: it
+        enters the row of each free amplitude with that conjugate, with the derivative 1.
         """
         v, amplitudes = self._split(u, mu)
         if name in self._conjugates:
@@ -164,7 +174,8 @@ class Device:
     def potential(self, u: Vector, mu: Amplitudes, name: str) -> float:
         """Return the derivative of the Legendre transform L by an amplitude.
 
-        By the amplitude of a held conjugate q_f it is mu_f.
+        An amplitude whose value is a held conjugate q_f multiplies mu_f in L, so the derivative is
+        mu_f.
         """
         v, amplitudes = self._split(u, mu)
         if name in self._conjugates:
@@ -172,6 +183,7 @@ class Device:
         return self._system.potential(v, amplitudes, name)
 
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
+        """Return the second derivative of L by two amplitudes; zero by a held conjugate."""
         if {name, other} & set(self._conjugates):
             return 0.0
         return self._system.curvature(*self._split(u, mu), name, other)
@@ -202,6 +214,7 @@ class Device:
             unit * system.load(u, mu, name) for name, unit in zip(names, self._units, strict=True)
         ]
         D = np.array([[system.curvature(u, mu, i, j) for j in names] for i in names])
+        # dq/dmu, which a function returns after q
         slopes = [
             0.0 if isinstance(conjugate, str) else conjugate(mu[name])[1]
             for name, conjugate in zip(names, self._conjugates, strict=True)
@@ -236,7 +249,7 @@ def constant(q: float) -> Conjugate:
 def natural_scale(system: System, factors: Factorisation, state: State, name: str) -> float:
     """Return the amplitude that moves the system by about its length. Collective.
 
-    It is a power of two: the same on any number of ranks.
+    It is rounded to a power of two, so that it is the same on any number of ranks.
 
     Parameters
     ----------
@@ -251,7 +264,7 @@ def natural_scale(system: System, factors: Factorisation, state: State, name: st
 class ParametrisedSystem:
     """A system in one amplitude t; the inner system has the amplitudes mu_i = f_i(t).
 
-    It is a `System` again.
+    It is a `System` again: a path in t follows a curve in the space of amplitudes.
 
     Parameters
     ----------

@@ -2,6 +2,12 @@
 
 `Factorisation` factors any `Tangent` by CHOLMOD or MUMPS, counts its negative pivots and solves
 with the factors. `BlockElimination` adds the border of a tangent with further scalar unknowns.
+
+A tangent is a symmetric K, or K with a part more: skewed, K + N with N skew-symmetric, of loads
+without potential; corrected, K + D with D a matrix of all entries, of terms that couple all
+unknowns; bordered, [K C; C^T D], with k further scalar unknowns y after u, on the last rank.
+Inertia is the number of negative pivots of LDL^T, that is of unstable directions. A lagged part of
+K + D belongs to an earlier state.
 """
 
 import time
@@ -73,13 +79,18 @@ class Factorisation:
     skewed
         Whether that tangent was a skewed one.
     inertia_uncertainty
-        Where K was factored in place of K + D: the inverse of the error of D, or of its lagged
-        part, relative to it, with which the pivots' signs would still be certain. Else infinite.
+        Where K was factored in place of K + D: the inverse of the largest relative error of D, or
+        of its lagged part, that could not change a sign. Else infinite.
     inertia_is_known
         Whether the negative pivots of the latest tangent, and their uncertainty, are known.
     """
 
     def __init__(self, comm: MPI.Comm) -> None:
+        """Begin without factors; CHOLMOD is tried first where it can be used.
+
+        Of `_cholmod` and `_mumps` one is in use, as `_pc`. `_border`, `_correction` and
+        `_correction_solver` belong to the latest tangent, if it is bordered or corrected.
+        """
         self.count, self.negative_pivots = 0, 0
         self.stopwatch, self.solving = Stopwatch(), Stopwatch()
         self.comm = comm
@@ -121,6 +132,7 @@ class Factorisation:
         self.skewed = isinstance(inner, SkewedTangent)
         with self.stopwatch:
             self._border = self._correction = self._correction_solver = None
+            # a border adds to the count of its K, which must be known then
             needs_inertia = needs_inertia or inner is not tangent
             is_factored = isinstance(inner, CorrectedTangent) and self._factor_sparse_part(
                 inner, needs_inertia=needs_inertia
@@ -152,7 +164,7 @@ class Factorisation:
     @property
     def size(self) -> tuple[int, int]:
         """Rows of the matrix last factored: on this rank, and on all."""
-        k = self._border.count if self._border else 0
+        k = self._border.count if self._border else 0  # further unknowns, on the last rank
         local_rows, rows = (size[0] for size in (self.matrix.getLocalSize(), self.matrix.getSize()))
         return local_rows + k * (self.comm.rank == self.comm.size - 1), rows + k
 
@@ -186,6 +198,7 @@ class Factorisation:
         -------
         Whether these factors serve; False if D is not small compared with K, now or shortly before.
         """
+        # after a failure the next matrices are factored with all entries
         self._full_factorisations_left -= 1
         if self._full_factorisations_left > 0:
             return False
@@ -197,7 +210,9 @@ class Factorisation:
     def count_corrected_inertia(self) -> bool:
         """Count the negative pivots of K + D by the factors of K. Collective.
 
-        It also determines how certain the count is, see `inertia_uncertainty`.
+        On the way from K to K + D the matrix becomes singular a few times, and each time one pivot
+        changes its sign (`krylov_correction`). How certain the count is, `inertia_uncertainty`
+        tells afterwards.
 
         Returns
         -------
@@ -249,6 +264,7 @@ class Factorisation:
             self._cholmod.factor()
         except PETSc.Error as e:
             self._cholmod, self._tries_cholmod, self._definite_count = None, False, 0
+            # it is tried again later only if the matrix was the reason
             self._has_cholmod = e.ierr == INDEFINITE
             if e.ierr not in (INDEFINITE, MISSING, REFUSED):
                 raise
@@ -263,6 +279,7 @@ class Factorisation:
         After some matrices without a negative pivot, CHOLMOD is tried again.
         """
         entries = _entry_count(K)
+        # [1] is the matrix that was factored
         if self._mumps is None or (self._mumps.getOperators()[1].handle, self._entries) != (
             K.handle,
             entries,
@@ -279,7 +296,7 @@ class Factorisation:
             if self.comm.size > 1:
                 # no ScaLAPACK for the root front: its pivots must be counted too
                 F.setMumpsIcntl(13, 1)
-            F.setMumpsIcntl(14, 50)
+            F.setMumpsIcntl(14, 50)  # per cent of memory above the estimate
             # no scaling: a tenth faster, and the tangent's entries are of similar size
             F.setMumpsIcntl(8, 0)
         _renew(self._mumps, K)
@@ -299,11 +316,11 @@ class Factorisation:
         self._pc = pc = _new_pc(sum_matrix, "mumps", "lu")
         pc.setFactorSetUpSolverType()
         F = pc.getFactorMatrix()
-        F.setMumpsIcntl(33, 1)  # the determinant
-        F.setMumpsIcntl(14, 50)
+        F.setMumpsIcntl(33, 1)  # the determinant, whose mantissa RINFOG(12) has the sign
+        F.setMumpsIcntl(14, 50)  # per cent of memory above the estimate
         _renew(pc, sum_matrix)
         is_positive = self.comm.bcast(F.getMumpsRinfog(12) > 0.0 if self.comm.rank == 0 else None)
-        # det K is positive for an even number of negative pivots
+        # det K is positive for an even number of negative pivots: here the signs differ
         if self.negative_pivots % 2 == is_positive:
             self.negative_pivots -= 1
 
@@ -346,7 +363,7 @@ class Factorisation:
             return self.solve(rhs)  # K + D is symmetric
         assert self._pc is not None
         solve, times = as_map(self._pc.applyTranspose), as_map(self.matrix.multTranspose)
-        if self._bordered:
+        if self._bordered:  # only K changes by the transposition
             return BlockElimination(self._bordered, self.comm, solve, times).solve(rhs)
         return solve(rhs)
 
@@ -364,7 +381,8 @@ class Factorisation:
     def _solve_inner(self, rhs: Vector, *, low_accuracy: bool = False) -> Vector:
         """Return K^-1 rhs, or (K + D)^-1 rhs if there is a dense correction. Collective.
 
-        The result is NaN if K + D is so nearly singular that the factors of K do not serve.
+        With a correction the solution is an iteration, preconditioned by the factors of K. The
+        result is NaN if K + D is so nearly singular that the factors of K do not serve.
         """
         if self._correction is None:
             return self._solve_sparse(rhs)
@@ -393,6 +411,7 @@ class Factorisation:
             (rows of this rank, count).
         """
         assert self._pc is not None
+        # dense matrices of PETSc, which stores them by columns
         rows = (len(columns), PETSc.DETERMINE)
         B = PETSc.Mat().createDense(
             (rows, columns.shape[1]), array=np.array(columns, order="F"), comm=self.comm
@@ -412,6 +431,7 @@ def has_cholmod() -> bool:
 
     Without CHOLMOD, PETSc would report its options as unused.
     """
+    # CHOLMOD takes a matrix in this format on one rank
     K = PETSc.Mat().createSBAIJ([1, 1], 1, nnz=1, comm=MPI.COMM_SELF)
     K.setValue(0, 0, 1.0)
     K.assemble()
@@ -499,7 +519,8 @@ class BlockElimination:
     Parameters
     ----------
     bordered
-        The matrix, of which C, D and the number of multipliers are used.
+        The matrix, of which the border C, D and the number of Lagrange multipliers are used: each
+        multiplier adds one negative pivot that is no unstable direction.
     solve, times
         K^-1 and K times a vector.
 
@@ -519,10 +540,11 @@ class BlockElimination:
         solve: Callable[[Vector], Vector],
         times: Callable[[Vector], Vector],
     ) -> None:
+        """Solve for K^-1 C, and count the negative eigenvalues of the Schur complement."""
         self._C, self._D, self._comm = bordered.C, bordered.D, comm
         self._solve, self._times = solve, times
         self.count = len(bordered.C)
-        # K^-1 C, and the Schur complement S of K
+        # the columns of K^-1 C, and the Schur complement S of K
         self._X = [solve(column) for column in self._C]
         self._S = self._D - self._products(self._X).T
         eigenvalues = np.linalg.eigvalsh((self._S + self._S.T) / 2)
@@ -544,7 +566,7 @@ class BlockElimination:
         return x
 
     def _eliminate(self, rhs: Vector) -> Vector:
-        """Return (u, y) for a right side by S y = g - C^T K^-1 f and K u = f - C y."""
+        """Return (u, y) for a right side (f, g) by S y = g - C^T K^-1 f and K u = f - C y."""
         f, g = split(rhs, self.count, self._comm)
         u = self._solve(f)
         y = np.linalg.solve(self._S, g - self._products([u])[0])

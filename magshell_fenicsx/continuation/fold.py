@@ -9,6 +9,13 @@ has g = 0 exactly where K is singular, and the gradient of g is -Pi'''(v, v, .) 
 augmentation: Govaerts, Numerical methods for bifurcations of dynamical equilibria, SIAM 2000, ch.
 4). A fold is R(u, mu) = 0 and g(u, mu) = 0, solved for (u, mu): an iteration of Newton's method
 takes one factorisation and three back-solves.
+
+R = dPi/du, K = dR/du; mu is the one amplitude (load parameter) that varies, R_mu its load vector. A
+dot is the inner product over all ranks; Pi'''(v, v, .) is a third derivative of the potential as a
+vector. phi is the null vector. Lengths are displacements in units of the system's length. `stress`
+are weighted displacements: K takes the sum of their stresses in place of the stress of u, which
+small errors of a guess spoil. A holding force along b, of unknown size, keeps the component of u
+along b.
 """
 
 from collections.abc import Callable, Sequence
@@ -105,7 +112,7 @@ class AugmentedTangent:
     b
         A vector near the null vector, of any length.
     stress
-        As in `System.tangent`.
+        Weighted displacements whose stress replaces that of the state in K.
 
     Attributes
     ----------
@@ -131,6 +138,7 @@ class AugmentedTangent:
         self.unstable = self._factors.negative_pivots  # not v, which the spring has made stable
         inner = partial(dot, system.comm)
         self._b, self._e, self._inner = b / np.sqrt(inner(b, b)), spring.e, inner
+        # the solutions for the spring's e and for b
         self._p, self._q = self._factors.solve(self._e), self._factors.solve(self._b)
         q = inner(self._e, self._q)
         # 2 x 2 Schur complement, whose unknowns are the spring's force and the factor of b
@@ -140,7 +148,10 @@ class AugmentedTangent:
         self.v, self.g = self._solve_bordered(np.zeros_like(b), 1.0)
 
     def solve(self, f: Vector) -> tuple[Vector, float]:
-        """Return w and t with K w + t b = f and b . w = 0. Collective."""
+        """Return w and t with K w + t b = f and b . w = 0. Collective.
+
+        So w is a solution orthogonal to b, and t b the part of f that K cannot balance.
+        """
         return self._solve_bordered(self._factors.solve(f), 0.0)
 
     def _solve_bordered(self, y: Vector, c: float) -> tuple[Vector, float]:
@@ -167,7 +178,8 @@ class AugmentedTangent:
         old_product, new_product = (
             times_tangent(self._system, state, self.v) for state in (old, new)
         )
-        return self.v - self.solve(new_product - old_product)[0]
+        change, _ = self.solve(new_product - old_product)
+        return self.v - change
 
 
 def held_along(
@@ -186,7 +198,7 @@ def held_along(
     b
         The direction of the force, of any length.
     stress
-        The stress of the guess, see `System.tangent`.
+        Weighted displacements whose stress replaces that of the guess in the first tangent.
 
     Returns
     -------
@@ -200,6 +212,7 @@ def held_along(
     equilibrium = _held_by_full_steps(newton, guess, b, stress)
     if equilibrium or not newton.options.has_onsets:
         return equilibrium
+    # the force is the unknown amplitude, and b . u its conjugate, which is prescribed
     system = HoldingForceSystem(newton.system, b)
     row = PrescribedConjugate(system, FORCE, -dot(system.comm, b, guess.u))
     start = State(guess.u, {**guess.mu, FORCE: 0.0})
@@ -215,6 +228,7 @@ def _held_by_full_steps(
     """Return the equilibrium held along b, as `held_along` does, by full steps alone.
 
     One augmented tangent serves several steps. It is renewed when the steps do not shrink enough.
+    A tangent is the iterate's own (`is_own`) if it was computed there.
 
     Returns
     -------
@@ -228,7 +242,7 @@ def _held_by_full_steps(
         is_rounding = is_own and CONTRACTION * last_size < size <= ROUNDING_STEP
         if size <= TOLERANCE or is_rounding:
             return State(u - du, guess.mu), size
-        if not is_own and size > CONTRACTION * last_size:
+        if not is_own and size > CONTRACTION * last_size:  # the step is repeated
             tangent = AugmentedTangent(newton, State(u, guess.mu), b, stress)
             tangent_count, is_own = tangent_count + 1, True
             continue
@@ -357,13 +371,14 @@ def find_fold(newton: BorderedNewton, guess: FoldGuess, name: str) -> Fold:
             du, dmu = _newton_step(system, state, name, tangent)
         except np.linalg.LinAlgError:
             raise FoldLost("the tangent is singular in more than one direction") from None
-        b = tangent.v
+        b = tangent.v  # a better border for the next step
         sizes.append(max_abs(system.comm, du) / system.length)
         grows = len(sizes) > 2 and sizes[-1] > max(2 * sizes[-2], FOLD_ROUNDING_STEP)
         if grows or not sizes[-1] <= MAX_STEP:
             raise FoldLost("Newton's method diverged on its way to a fold")
         last_state, state = state, state.with_(state.u + du, name, state.mu[name] + dmu)
     load = system.load(state.u, state.mu, name)
+    # the tangent belongs to the state before the last step
     phi = _oriented(system, tangent.null_vector_at(last_state, state), load)
     work = dot(system.comm, phi, system.load(state.u, state.mu, name))
     cubic = third_derivative(system, state, phi)
@@ -450,7 +465,7 @@ def _left_null_vector(newton: BorderedNewton, state: State, v: Vector) -> Vector
     Its largest entry is one in magnitude. Collective.
     """
     factors = newton.factor_at(state)
-    for _ in range(3):
+    for _ in range(3):  # near a fold one iteration nearly suffices
         v = factors.solve_transposed(v)
         v = np.asarray(v / max_abs(newton.system.comm, v))
     return v
@@ -461,7 +476,8 @@ def _newton_step(
 ) -> tuple[Vector, float]:
     """Return Newton's step (du, dmu) for R = 0 and g = 0. Collective.
 
-    du = alpha v - w_R - dmu w_mu; the rows for alpha and dmu are R along v, and g.
+    du = alpha v - w_R - dmu w_mu leaves a force along b alone. dmu and alpha follow from two linear
+    equations: this force is zero, and g + dg = 0.
 
     Parameters
     ----------
@@ -473,6 +489,7 @@ def _newton_step(
     w_mu, t_mu = tangent.solve(system.load(u, state.mu, name))
     cubic = third_derivative(system, state, v)
     K_mu_v = first_difference(lambda u: system.load(u, state.mu, name), system, u, v)
+    # the derivative of g along (du, dmu) = (-w_mu, 1)
     g_mu = dot(comm, cubic, w_mu) - dot(comm, v, K_mu_v)
     rows = [[t_mu, -tangent.g], [g_mu, -dot(comm, cubic, v)]]
     dmu, alpha = np.linalg.solve(rows, [-t_R, -tangent.g - dot(comm, cubic, w_R)])
@@ -503,6 +520,7 @@ def _remaining_error(sizes: Sequence[float]) -> float:
     sizes
         Sizes of the steps so far, in lengths of the system.
     """
+    # the ratio of the last two sizes; the sum of a geometric series follows
     ratio = sizes[-1] / sizes[-2] if len(sizes) > 1 else 0.5
     if ratio > 0.5 and sizes[-1] <= FOLD_ROUNDING_STEP:
         return 0.0
@@ -533,10 +551,11 @@ def fold_ahead(newton: BorderedNewton, point: Point, name: str) -> FoldGuess | N
         mode = critical_mode(newton, state)
     except NoEigenpair:
         return None
+    # du/dmu along the path
     rate, phi = np.asarray(point.du / point.dmu), mode.vector
     rate_along_phi = dot(comm, phi, rate)
     cubic = dot(comm, phi, third_derivative(system, state, phi))
-    work = mode.eigenvalue * rate_along_phi
+    work = mode.eigenvalue * rate_along_phi  # b
     if mode.eigenvalue <= 0 or not cubic * work:
         return None
     dmu = -(mode.eigenvalue**2) / (2 * cubic * work)

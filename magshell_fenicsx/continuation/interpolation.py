@@ -18,7 +18,8 @@ MIN_KINK_DISTANCE = 0.05  # the same of a kink
 def slope_weights(places: Sequence[float]) -> list[tuple[float, float]]:
     """Return the weights of a difference formula for the slope at the first of some places.
 
-    The formula differentiates the polynomial through the values at all places.
+    The formula differentiates the polynomial through the values at all places. The slope is the sum
+    of the weights times the values.
 
     Returns
     -------
@@ -27,7 +28,7 @@ def slope_weights(places: Sequence[float]) -> list[tuple[float, float]]:
     offsets = np.array(places) - places[0]
     scale = np.abs(offsets).max()
     vandermonde = np.vander(offsets / scale, increasing=True)
-    # exact for all powers: of these the first alone has a slope at zero
+    # exact for all powers of the offset x: the slopes at zero are 0, 1, 0, ..., the right side
     weights = np.linalg.solve(vandermonde.T, np.eye(len(places))[1]) / scale
     return [(float(weight), float(place)) for weight, place in zip(weights, places, strict=True)]
 
@@ -53,6 +54,7 @@ def stationary(rise: float, d0: float, d1: float) -> float:
     d0, d1
         Its slopes at 0 and 1, of opposite signs.
     """
+    # without a place between the ends: the zero of a slope that is linear
     inner_places = [t for t in _stationary_places(rise, d0, d1) if 0 < t < 1]
     t = inner_places[0] if inner_places else d0 / (d0 - d1)
     return float(min(max(t, MIN_END_DISTANCE), 1 - MIN_END_DISTANCE))
@@ -96,7 +98,7 @@ def hermite(s: float, nodes: Sequence[float]) -> list[tuple[float, float]]:
 def kink(rise: float, d0: float, d1: float) -> float:
     """Return the place between 0 and 1 where straight lines from both ends meet.
 
-    It is not too close to the ends.
+    It is not too close to the ends, so that a bracket shrinks whatever the error.
 
     Parameters
     ----------

@@ -3,6 +3,9 @@
 Each step has its size in lengths of the system, and whether its matrix was computed at the same
 iterate. From these `Iterates.judge` decides whether the solve has converged, goes on, or is given
 up (P. Deuflhard, Newton Methods for Nonlinear Problems, Springer 2004, sec. 2.1.4).
+
+A matrix that was computed at the iterate is its own; a matrix of an earlier iterate is kept while
+the steps shrink. Negative pivots of a new matrix count unstable directions.
 """
 
 from collections.abc import Callable, Sequence
@@ -138,17 +141,20 @@ class Iterates:
         self.allowed = EXTRAPOLATED_TOLERANCE * tolerance * min(1.0, longest)
         if step.size <= tolerance or self.extrapolated_error <= self.allowed:
             return "converged"
+        # only steps with a new matrix show that the solve does not converge
         if not step.is_own:
             return "go on"
         earlier_own = [s for s in earlier if s.is_own]
         if self.stops_early and self._leads_astray(earlier_own, step):
             return "far"
         if earlier and earlier[-1].is_own:
+            # two full steps in turn, small but not shrinking
             stalled = QUADRATIC_RATIO * earlier[-1].size < step.size < SMALL_STEP
             if stalled and step.size <= ROUNDING_FACTOR * rounding():
                 return "rounding"
         sizes = [s.size for s in earlier_own]
         grows = bool(sizes) and step.size > DIVERGENCE_RATIO * sizes[-1]
+        # the first steps, and steps that a line search shortens, may grow
         if len(earlier) > 2 and grows and not self.searched:
             return "diverged"
         if len(sizes) >= self.patience and step.size > PATIENCE_RATIO * sizes[0]:
@@ -166,7 +172,8 @@ class Iterates:
             The last step, with its own matrix.
         """
         if len(earlier) == 1 and step.pivots != earlier[0].pivots:
-            # past an instability, which a shorter step of the path meets too
+            # with more unstable directions than before it is past an instability, which a shorter
+            # step of the path meets too; then the step must shrink, not only stay bounded
             is_past = step.pivots > earlier[0].pivots
             return step.size > (QUADRATIC_RATIO if is_past else DIVERGENCE_RATIO) * earlier[0].size
         if len(earlier) < MAX_MATRICES_TO_HALVE:

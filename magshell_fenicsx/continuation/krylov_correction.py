@@ -6,6 +6,10 @@ where K is singular. On the way K0 + t D, t from 0 to 1, an eigenvalue nu < -1 o
 singular once, at t = -1/nu, with the vector x of nu: one more negative eigenvalue where
 x . D x < 0, else one less. So the inertia of K is that of K0 plus what the few eigenvalues of A
 below -1 contribute. Arnoldi's method finds them; generalised conjugate residuals solve with K.
+
+A lagged part of K belongs to an earlier state, so its error may be as large as the part itself.
+Vectors are parts of this rank; a dot is the inner product over all ranks. Two vectors are
+K-conjugate if x . K y = 0.
 """
 
 from collections.abc import Callable, Sequence
@@ -40,6 +44,9 @@ LinearMap = Callable[[Vector], Vector]
 
 class ArnoldiBasis:
     """An orthonormal basis of a Krylov space and the matrix H in it (Arnoldi's method).
+
+    H has one row more than columns: the last entry is the part of the newest image outside the
+    space.
 
     Parameters
     ----------
@@ -100,7 +107,10 @@ class ProductCache:
         return product
 
     def cache_for(self, D: DenseCorrection) -> "ProductCache":
-        """Return a cache for a correction, with scaled products if it is a multiple of this one."""
+        """Return a cache for a correction D.
+
+        If D is a known multiple of this one, the stored products are scaled and kept.
+        """
         factor = D.multiple_of(self.D)
         if factor == 1.0:
             return self
@@ -169,6 +179,7 @@ class CorrectionSolver:
         size = np.sqrt(dot(self._comm, b, b))
         if not 0.0 < size < np.inf:
             return b
+        # the best combination of earlier vectors, and what it leaves of b
         x, remainder = self._project_out(np.zeros_like(b), np.array(b), -1.0)
         residual, column_count = np.sqrt(dot(self._comm, remainder, remainder)) / size, self._count
         while residual > tolerance and column_count < MAX_STORED_PRODUCTS + MAX_PRODUCTS:
@@ -188,22 +199,27 @@ class CorrectionSolver:
             )
             column_count, previous = column_count + 1, residual
             residual = np.sqrt(dot(self._comm, remainder, remainder)) / size
+            # rounding prevents more
             if previous < ACCEPTED_TOLERANCE and residual > previous / 2:
                 break
         self._count = min(column_count, MAX_STORED_PRODUCTS)
         if not residual <= max(ACCEPTED_TOLERANCE, tolerance):
             return np.full_like(b, np.nan)
+        # (I + A) x = remainder has nearly the solution x = remainder, where A is small
         return x + remainder if residual <= tolerance else x
 
     def _project_out(
         self, u: Vector, c: Vector, sign: float, count: int | None = None
     ) -> tuple[Vector, Vector]:
-        """Remove from c its components along the columns C, and from u the same columns of U.
+        """Remove from c its components along the columns of C, and from u the same columns of U.
+
+        Since C = (I + A) U, a pair with c = (I + A) u stays such a pair.
 
         Parameters
         ----------
         sign
-            With -1 the columns of U are added to u instead, which makes u a solution.
+            1 as described. With -1 the columns of U are added to u: if c is a right side, u gains
+            the solution for what c loses.
         count
             Number of columns; None: all in use.
         """
@@ -238,7 +254,7 @@ class EigenvalueCrossings:
 
 
 class ConjugateComplement:
-    """The complement, in the inner product of K, of the space of some vectors X.
+    """The complement of some vectors X: all vectors that are K-conjugate to them, x . K y = 0.
 
     The constructor and all methods are collective.
 
@@ -266,9 +282,9 @@ class ConjugateComplement:
 class SymmetricUpdate:
     """A lagged D with a symmetric update F that gives the present product along some vectors X.
 
-    With F X = Y, Powell's symmetric update for several vectors is F = Y C + C^T Y^T - C^T X^T Y C
-    with C X = 1, here C = (X^T K X)^-1 X^T K: nothing is added between vectors that are K-conjugate
-    to X.
+    Y is the product that is missing along X. With F X = Y, Powell's symmetric update for several
+    vectors is F = Y C + C^T Y^T - C^T X^T Y C with C X = 1, here C = (X^T K X)^-1 X^T K: nothing is
+    added between vectors that are K-conjugate to X.
 
     Parameters
     ----------
@@ -306,8 +322,9 @@ def count_crossings(
 ) -> EigenvalueCrossings | None:
     """Count how many more negative eigenvalues K0 + D has than K0. Collective.
 
-    Arnoldi runs find the eigenvalues of A = K0^-1 D, each run without the vectors found before,
-    until no large one is left.
+    Each real eigenvalue of A = K0^-1 D below -1 stands for one change of sign on the way from K0 to
+    K0 + D. Arnoldi runs find the eigenvalues, each run without the vectors found before, until no
+    large one is left.
 
     Parameters
     ----------
@@ -330,6 +347,7 @@ def count_crossings(
     def deflated_product(v: Vector) -> Vector:
         return orthogonal_to_found(solve_sparse(D(v)))
 
+    # a run finds one vector of each multiple eigenvalue
     for _ in range(MAX_RUNS):
         krylov = ArnoldiBasis(deflated_product, orthogonal_to_found(first), comm, MAX_PRODUCTS)
         eigenpairs = _converged_eigenpairs(krylov)
@@ -367,6 +385,7 @@ def _converged_eigenpairs(krylov: ArnoldiBasis) -> tuple[Array, Array] | None:
         if not np.isfinite(H).all():
             return None
         values, vectors = np.linalg.eig(H)
+        # the residual of each pair: the part of A x outside the space
         errors = abs(krylov.H[size, size - 1] * vectors[-1])
         large_indices = np.flatnonzero(np.abs(values) > SMALL_EIGENVALUE)
         distances = np.minimum(abs(1 + values[large_indices]), abs(values[large_indices]))
@@ -409,6 +428,7 @@ def crossings_with_lag(
     lagged = tangent.lagged
     if lagged is None:
         return crossings
+    # smallest: a bound of the ratio along all vectors whose eigenvalues are not large
     X, smallest = crossings.large_vectors, SMALL_EIGENVALUE / (1 - SMALL_EIGENVALUE)
     KX = [K(x) for x in X]
     uncertainties = list[float]()

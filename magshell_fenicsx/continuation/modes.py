@@ -8,6 +8,11 @@ sphere.
 The lowest, K phi = lambda M phi, come from SLEPc's Lanczos iteration around a shift below all
 eigenvalues. The inertia of K - sigma M shows that no eigenvalue lies below the shift, and none
 between those found is missing.
+
+K is a tangent, M a mass matrix, phi a mode with its eigenvalue lambda. The inertia, or number of
+negative pivots, of a factored matrix is its number of negative eigenvalues. A skewed tangent is not
+symmetric; Ritz pairs are approximate eigenpairs in a Krylov space, in which theta stands for
+1/lambda.
 """
 
 from dataclasses import dataclass
@@ -56,6 +61,7 @@ def nearest_to_zero(factors: Factorisation) -> tuple[float, Vector]:
         pair = space.grow()
         if pair.error <= TOLERANCE or space.is_whole:
             return pair.value, pair.vector
+        # at the level of rounding the error falls no further
         progresses = pair.error < least_error / 2
         solves_without_progress = 0 if progresses else solves_without_progress + 1
         least_error = min(least_error, pair.error)
@@ -102,7 +108,7 @@ class _InverseKrylovSpace:
     def __init__(self, factors: Factorisation) -> None:
         """Begin with an empty space and a fixed start vector. Collective."""
         self._factors, self._comm = factors, factors.comm
-        n, self._size = factors.size
+        n, self._size = factors.size  # rows on this rank, and on all
         self._count, self.solves = 0, 0
         self._V, self._W = np.empty((MAX_VECTORS, n)), np.empty((MAX_VECTORS, n))
         self._next = np.sin(1.0 + np.arange(n) + self._comm.rank)
@@ -137,10 +143,10 @@ class _InverseKrylovSpace:
             theta, Y = _real_pairs(inverse)
         else:
             theta, Y = np.linalg.eigh((inverse + inverse.T) / 2)  # ascending, of K^-1
-        # the largest of either sign is at an end of the ascending list
+        # the largest of either sign, nearest to zero in lambda, is at an end of the ascending list
         pairs = [self._pair(theta[i], Y[:, i]) for i in {0, len(theta) - 1}]
         pair = self._nearest(pairs)
-        if self._count == MAX_VECTORS:
+        if self._count == MAX_VECTORS:  # restart
             largest = np.argsort(-np.abs(theta))[:VECTORS_AFTER_RESTART]
             Y = np.linalg.qr(Y[:, largest])[0] if self._factors.skewed else Y[:, largest]
             self._count = Y.shape[1]
@@ -166,8 +172,9 @@ class _InverseKrylovSpace:
     def _nearest(self, pairs: list[tuple[float, Vector, Vector]]) -> _RitzPair:
         """Return the pair nearest to zero, and choose the next vector of the space.
 
-        The next vector is the larger residual of this pair and of a rival of the other sign, if
-        that may be as near to zero. Of two equally near the negative one is returned.
+        A rival is the pair of the other sign, if its eigenvalue may be as near to zero within its
+        error. The next vector is the larger one of both residuals. Of two equally near pairs the
+        negative one is returned, so that the result does not depend on rounding.
 
         Parameters
         ----------
@@ -178,6 +185,7 @@ class _InverseKrylovSpace:
         residual_size = np.sqrt(dot(self._comm, residual, residual))
         self._next, error = residual, residual_size / abs(theta)
         for rival, rival_w, rival_residual in rivals:
+            # the rival's eigenvalue is uncertain by its residual
             rival_size = np.sqrt(dot(self._comm, rival_residual, rival_residual))
             if rival * theta < 0 and abs(rival) + rival_size >= (1 - TIE_TOLERANCE) * abs(theta):
                 error = max(error, rival_size / abs(theta))
@@ -274,8 +282,9 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int, kernel: int = 0) -> lis
         If Lanczos does not converge, or Sylvester's law says that some eigenvalues stay hidden.
     """
     slices = _SpectrumSlices(K, M)
+    # a positive semidefinite tangent with a kernel would break down at the shift zero
     requested = min(max(count, kernel or slices.count_below(0.0)), slices.finite_count)
-    # (a) the eigenvalues nearest to zero give the order of magnitude
+    # (a) the eigenvalues nearest to zero, to three digits, give the order of magnitude
     nearest = slices.nearest_to(-slices.rounding if kernel else 0.0, requested + kernel + 1, 1e-3)
     shift = -2 * max(abs(mode.eigenvalue) for mode in nearest)
     # (b) a shift with nothing below it
@@ -328,6 +337,7 @@ class _SpectrumSlices:
     """
 
     def __init__(self, K: PETSc.Mat, M: PETSc.Mat) -> None:
+        """Begin without factors; unknowns without mass have infinite eigenvalues. Collective."""
         self._K, self._M = K, M
         self._shifted = K.duplicate()
         self._shifted.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -343,7 +353,10 @@ class _SpectrumSlices:
         return float(ROUNDING * self._K.norm(norm) / self._M.norm(norm))
 
     def count_below(self, sigma: float) -> int:
-        """Return the number of eigenvalues below sigma: of negative pivots of K - sigma M."""
+        """Return the number of eigenvalues below sigma: the negative pivots of K - sigma M.
+
+        The factors are kept for solves at this sigma.
+        """
         if sigma != self._sigma:
             self._K.copy(self._shifted, PETSc.Mat.Structure.SAME_NONZERO_PATTERN)
             self._shifted.axpy(-sigma, self._M, PETSc.Mat.Structure.SUBSET_NONZERO_PATTERN)
@@ -364,7 +377,7 @@ class _SpectrumSlices:
         ModesNotFound
             If the iteration finds fewer.
         """
-        self.count_below(sigma)
+        self.count_below(sigma)  # factors K - sigma M, with which the iteration solves
         count = min(count, self.finite_count)
         eps = SLEPc.EPS().create(self._K.comm)
         eps.setOptionsPrefix("magshell_modes_")

@@ -4,6 +4,11 @@ A device holds the conjugates q of some amplitudes: g(u, mu) = dPi/dmu + q = 0. 
 its own amplitude (a gas, a body that is pressed on) that follows from u. Otherwise g constrains u:
 C.v = 0 and C.a + v.(dC/du v) = 0 with the column C = dg/du, and the amplitude is the force of this
 constraint.
+
+A dot is the inner product over all ranks; y are the unknown amplitudes in units that make them like
+displacements, and `device.border` returns the columns C and the matrix D = dg/dy, whose diagonal is
+zero where g constrains u. v and a are velocity and acceleration, conjugates the displacements or
+forces on which amplitudes do work.
 """
 
 from collections.abc import Callable
@@ -201,7 +206,9 @@ def consistent_state(
 ) -> tuple[Vector, Vector, dict[str, float]]:
     """Return the nearest displacement and velocity that a device allows, with its amplitudes.
 
-    They are nearest in the norm of the mass; Newton's method finds them. Collective.
+    Newton's method solves g = 0. Where g constrains u, u moves along the mass's inverse times C, so
+    that the change is the smallest in the norm of the mass; elsewhere the amplitude itself changes.
+    The velocity loses its components that violate C . v = 0. Collective.
 
     Parameters
     ----------
@@ -224,12 +231,14 @@ def consistent_state(
         # amplitudes with a spring are unknowns themselves; the others constrain u along X
         S = np.where(is_spring, D, [[dot(comm, c, x) for x in X] for c in C])
         correction = np.linalg.solve(S, device.rows(u, amplitudes))
+        # u changes by the constraints, y by the springs
         step = _combination(np.where(is_spring, 0.0, correction), X)
         y, u = y - np.where(is_spring, correction, 0.0), u - step
         size = max_abs(comm, step) / system.length
         spring_size = np.abs(correction[is_spring]).max(initial=0.0)
         if size <= ROUNDING and spring_size <= ROUNDING * (1 + np.abs(y).max()):
             break
+    # the component of v along each constraint, which is removed
     normal_velocity = np.where(is_spring, 0.0, [dot(comm, c, v) for c in C])
     v = v - _combination(np.where(is_spring, 0.0, np.linalg.solve(S, normal_velocity)), X)
     return u, v, {**mu, **device.values(y)}
@@ -260,13 +269,14 @@ def constrained_acceleration(
     """
     C, D = device.border(motion.u, motion.mu)
     is_constraint, speed = np.diag(D) == 0, max_abs(system.comm, motion.v)
-    forward, backward, dt = C, C, 1.0
+    forward, backward, dt = C, C, 1.0  # at rest C does not change
     if speed:
         dt = DIFFERENCE_STEP * system.length / speed
         forward, backward = (
             device.border(motion.u + sign * dt * motion.v, motion.mu)[0] for sign in (1, -1)
         )
     X = [inverse_mass(c) for c in C]
+    # rows of amplitudes with a spring stay out: identity on the left, zero on the right
     S = np.where(is_constraint, [[dot(system.comm, c, x) for x in X] for c in C], np.eye(len(C)))
     # v . (dC/du v) by a central difference along the velocity
     curvature = [

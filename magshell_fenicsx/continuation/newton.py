@@ -5,6 +5,13 @@
 
 One factorisation of K and two back-solves make a step, whatever the last row. `BorderedNewton` is
 the corrector of a path, and computes the path's tangent at a solution.
+
+mu is the one amplitude (load parameter) that varies; the others are fixed. A row is the scalar
+equation g = 0: a prescribed load, conjugate displacement (on which mu does work) or arc length.
+`stress` are weighted displacements: K takes the sum of their stresses in place of the stress of u,
+which small errors of a guess spoil. Lengths are displacements in units of the system's length.
+Negative pivots of K count unstable directions. Forces of terms that couple all unknowns are
+extrapolated from earlier states where they are small.
 """
 
 from collections.abc import Sequence
@@ -109,6 +116,7 @@ class BorderedNewton:
         options: NewtonOptions | None = None,
         factorisation: Factorisation | None = None,
     ) -> None:
+        """Create a SNES with full steps, and one with a line search where forces have onsets."""
         self.system = system
         self.options = options or NewtonOptions()
         self.factorisation = factorisation or Factorisation(system.comm)
@@ -154,7 +162,7 @@ class BorderedNewton:
         Parameters
         ----------
         stress
-            The stress of the guess, as in `System.tangent`.
+            Weighted displacements whose stress replaces that of the guess in the first matrix.
         search
             Whether softer faces and a line search are tried where full steps fail and forces begin
             within a step.
@@ -168,10 +176,12 @@ class BorderedNewton:
         options = SolveOptions(stress, reuse_distance, max_step)
         extrapolating = replace(options, extrapolating=self._tangent.may_extrapolate)
         result = self._run_snes(self._full_steps, guess, name, row, extrapolating)
+        # again with computed forces, unless these would lead away as well
         if not result.converged and self._callbacks.extrapolating:
             leads_away = result.reason in (DIVERGED, GUESS_TOO_FAR)
             if not leads_away or self._callbacks.is_misled_by_extrapolation():
                 result = self._run_snes(self._full_steps, guess, name, row, options)
+        # rounding hides the solution whatever the steps
         if result.converged or result.reason == HIDDEN_BY_ROUNDING:
             return result
         if not (search and self._line_search):
@@ -187,7 +197,8 @@ class BorderedNewton:
         """Solve between touching faces that are soft at first and then harder.
 
         Faces that penetrate each other deeply at a guess push shells far away, from where full
-        steps do not come back. Soft ones, as stiff as the shells, show where these touch.
+        steps do not come back. Soft ones, as stiff as the shells, show where these touch. The
+        stiffnesses are amplitudes, which grow from solve to solve.
 
         Returns
         -------
@@ -208,6 +219,7 @@ class BorderedNewton:
             state, iterations = result.state, iterations + result.iterations
             if not result.converged:
                 return None
+        # the amplitudes of the guess again, with the stiffnesses that it had
         hard_guess = guess.with_(state.u, name, state.mu[name])
         result = self._run_snes(self._full_steps, hard_guess, name, row, SolveOptions())
         if not result.converged:
@@ -232,11 +244,13 @@ class BorderedNewton:
             The way this one solve runs.
         """
         callbacks = self._callbacks
+        # [2] is SNES's tolerance of steps, which an option may have replaced
         callbacks.begin(guess, name, row, snes.getTolerances()[2], options)
         callbacks.join((guess.u, guess.mu[name]), self._x)
         snes.solve(None, self._x)
         code, iterations = snes.getConvergedReason(), snes.getIterationNumber()
         u, mu = callbacks.split(self._x)
+        # positive codes mean convergence
         if code > 0 and (step := callbacks.step_at(self._x)):  # the last step is known already
             u, mu = add_scaled((u, mu), -1.0, step)
         self._work.iterations += iterations
@@ -286,7 +300,7 @@ class BorderedNewton:
         Parameters
         ----------
         stress
-            As in `System.tangent`.
+            Weighted displacements whose stress replaces that of the state.
         """
         return self._tangent.factor_at(state, stress)
 
@@ -314,7 +328,7 @@ class BorderedNewton:
         row
             The last row, whose gradient is (c, d).
         exact
-            Whether K is factored at the solution itself; a small part of it may lag.
+            Whether K is factored at the solution itself, not at a nearby state.
         may_lag
             Whether a small part of K may belong to an earlier state. If not, K is factored at the
             solution.
@@ -336,6 +350,7 @@ class BorderedNewton:
             needs_inertia=needs_inertia,
         )
         tangent, load = matrix.tangent, self.system.load(state.u, state.mu, name)
+        # the matrix is not quite that of the solution
         if (distance and reuses_factors) or self._tangent.lagged:
             refined = refined_tangent(
                 self.system,
@@ -346,7 +361,7 @@ class BorderedNewton:
                 row,
                 extrapolating=self._tangent.may_extrapolate,
             )
-            if refined is None:
+            if refined is None:  # too far: with a matrix of the solution itself
                 return self.response(state, name, row, may_lag=False)
             tangent = refined
         du, dmu = tangent

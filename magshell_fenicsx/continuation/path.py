@@ -5,6 +5,15 @@ the bordered system corrects it, and the step length adapts. A corrected point i
 path between both points would not be smooth: then the step jumped to another branch. Where contact
 forces begin within a step, the path has kinks, and the step ends at the onset. Theory:
 docs/theory.md, "Equilibria, paths, instabilities".
+
+mu is the amplitude (load parameter) that varies; q = -dPi/dmu is its conjugate, the displacement on
+which it does work. s is the controlled quantity: mu, q or the arc length, and a point's tangent is
+d(u, mu)/ds. Arc length is measured from a base point along its tangent, or along the direction
+`across` where the path turns sharply. Inertia is the number of unstable directions, from negative
+pivots. Predictors are the points that a polynomial through them and their tangents extrapolates.
+Lengths are displacements in units of the system's length. `stress` are weighted displacements: the
+tangent matrix takes the sum of their stresses in place of the stress of u, which small errors of a
+guess spoil. Results pass through a journal, from which an interrupted run resumes.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -121,6 +130,11 @@ class Path:
         progress: Progress | None = None,
         step_event: Callable[[State, State], StepEvent] | None = None,
     ) -> None:
+        """Begin with no failures; their numbers decide how later solves are tried.
+
+        `_hard_solves` counts solves that failed or took many factorisations, `_successive_failures`
+        solves that failed one after the other.
+        """
         self.newton, self.name, self.control, self.options = newton, name, control, options
         self.system = newton.system
         self.metric = Metric(newton.system, scale)
@@ -142,10 +156,12 @@ class Path:
         NotANumber
             If the tangent at the state is not a number.
         """
+        # the tangent per unit of mu; the target of the row does not matter
         row = PrescribedLoad(self.name, 0.0)
         response = self.newton.response(state, self.name, row, exact=True)
         if not np.isfinite(dot(self.system.comm, response.du, response.du)):
             raise NotANumber("the tangent at its begin is not a number")
+        # rate: ds/dmu, by which the tangent is divided
         if self.control == "arc":
             s, rate = 0.0, float(np.copysign(self.metric.norm(response.du, 1.0), sense))
         else:
@@ -217,7 +233,8 @@ class Path:
             )
             t = (s - low.s) / (high.s - low.s)
             du, dmu = (1 - t) * low.du + t * high.du, (1 - t) * low.dmu + t * high.dmu
-            tangent = Response(du, dmu, 0.0, low.negative_pivots)
+            # the softness dq/dmu is unknown, and not needed
+            tangent = Response(du, dmu, softness=0.0, negative_pivots=low.negative_pivots)
             return self._point(state, s, tangent) if state else GUESS_TOO_FAR
 
         return self.recorded(estimate)
@@ -266,7 +283,7 @@ class Path:
         s
             The value of s that the point gets.
         stress
-            The stress of the guess, as in `System.tangent`.
+            Weighted displacements whose stress replaces that of the guess in the first matrix.
         neighbour
             A nearby solution, whose factors may begin the solve; None: no other factors may.
         max_step
@@ -280,6 +297,7 @@ class Path:
         def solve() -> Point | str:
             """Run Newton's method, and compute the tangent at its result."""
             if neighbour:
+                # any known factors serve; for the inertia, close to the neighbour, only near ones
                 distance = np.inf
                 reach = FACTOR_REUSE_DISTANCE * self.system.length
                 if needs_inertia and max_abs(self.system.comm, guess.u - neighbour.u) < reach:
@@ -313,6 +331,7 @@ class Path:
             )
 
         point = self.recorded(solve)
+        # a guess that is too far away says nothing about the stress
         if isinstance(point, str):
             self._hard_solves += point != GUESS_TOO_FAR
             self._successive_failures += 1
@@ -327,11 +346,11 @@ class Path:
         return self._hard_solves >= HARD_SOLVES_BEFORE_EXTRAPOLATED_STRESS
 
     def recorded(self, solve: Callable[[], Point | str]) -> Point | str:
-        """Return the result of `solve`, or that which an interrupted run recorded at this place.
+        """Return the result of `solve` or, in a resumed run, the recorded one. Collective.
 
-        All results pass through the journal, in a fixed order. A replayed point also restores the
-        choice of the factorisation, so that a resumed run continues with the same rounding.
-        Collective.
+        All results pass through the journal, in a fixed order. A replayed point also restores
+        `habit`, the choice between two factorisations, so that the run continues with the same
+        rounding.
 
         Parameters
         ----------
@@ -353,7 +372,7 @@ class Path:
         return result
 
     def recorded_values(self, find: Callable[[], RecordedValues]) -> RecordedValues:
-        """Return the values of `find`, or those of an interrupted run at this place. Collective."""
+        """Return the values of `find` or, in a resumed run, the recorded ones. Collective."""
         return self._journal.recorded_values(find)
 
     def _event(self, current: State, guess: State) -> StepEvent:
@@ -382,6 +401,7 @@ class Path:
             Number of unstable directions of the state at fixed amplitudes.
         """
         du, dmu = direction
+        # dq is the change of the conjugate q, and `rate` the change of s, along the direction
         u, mu, name = state.u, state.mu, self.name
         curvature = self.system.curvature(u, mu, name, name)
         dq = -dot(self.system.comm, self.system.load(u, mu, name), du) - curvature * dmu
@@ -426,8 +446,8 @@ class Path:
     def base_before(self, low: Point, high: Point) -> Point:
         """Return the first of two points as the base from which the second is measured.
 
-        Where the path turns by more than 90 degrees between them, arc length goes along the
-        displacement: see `_measured_along_displacement`.
+        Where the path turns by more than 90 degrees between them, arc length along the first
+        tangent would fall; it is measured along the displacement du alone.
         """
         if self.control == "arc" and self.metric.inner(low.normal, (high.du, high.dmu)) <= 0:
             return self._measured_along_displacement(low)
@@ -471,8 +491,8 @@ class Path:
         targets
             Values of s, in the order of the path; infinite values have no end.
         step_end
-            Called with the planned end of a step and the points that predict it. It returns the s
-            at which the step ends, the planned one or less far.
+            Called with the planned s at the end of a step and the points that predict it. It
+            returns the s at which the step ends, the planned one or a nearer one.
 
         Raises
         ------
@@ -485,6 +505,7 @@ class Path:
                 plan = self._plan(controller, target, step_end)
                 result = self._try_plan(current, plan)
                 passes_kinks = False
+                # a rejected point is kept for later, or accepted if only kinks explain the turn
                 if isinstance(result, RejectedPoint):
                     passes_kinks = self._passes_kinks(current, result, plan)
                     controller.rejected = None if passes_kinks else result
@@ -503,8 +524,8 @@ class Path:
     def _plan(self, controller: StepController, target: float, step_end: StepEnd) -> StepPlan:
         """Plan the next step towards a target.
 
-        The step is shortened so that its prediction is good. It ends a little behind a fold, or
-        where forces begin.
+        The step is shortened so that its prediction is good. It ends a little behind a fold of mu,
+        or where contact forces begin.
 
         Parameters
         ----------
@@ -513,7 +534,7 @@ class Path:
         target
             The value of s to reach; it may be infinite.
         step_end
-            As in `continue_to`.
+            Returns the s at which the step ends, from the planned s and the predictors.
         """
         points, current, distance = (
             controller.points,
@@ -525,6 +546,7 @@ class Path:
         cubic_error, quintic_error = self._prediction_errors(points)
         # of both polynomials the one that predicted the last point better predicts the next
         smooth = quintic_error < cubic_error
+        # with three points the quintic has no error yet, but shows that of the cubic
         is_third_point = len(points) == PREDICTOR_POINTS - 1
         if smooth or (is_third_point and not self.newton.options.has_onsets):
             end = current.s + np.copysign(length, distance)
@@ -532,6 +554,7 @@ class Path:
         s = target if length == abs(distance) else current.s + np.copysign(length, distance)
         predictors, event = points[-3:] if smooth else points[-2:], StepEvent()
         s = step_end(s, predictors)
+        # behind that onset no solution was found: the step ignores it
         if current is not controller.onset_without_solution:
             event = self._event(current.state, self.predicted_state(s, predictors))
         if event.loses_forces:  # the tangent alone may predict other onsets
@@ -549,8 +572,9 @@ class Path:
         The next point, a rejected point that is too far away, or the reason why there is none.
         """
         result, event = self._try_step(plan.s, plan.predictors), plan.event
-        if event.fraction < 1 and not event.ends_behind:
+        if event.fraction < 1 and not event.ends_behind:  # just before an onset of forces
             return self._checked_before_onset(current, result)
+        # behind an onset the load may turn back: arc length along the displacement still grows
         if event.ends_behind and self.control == "arc" and not isinstance(result, Point):
             return self._try_step(plan.s, [self._measured_along_displacement(current)])
         return result
@@ -572,6 +596,7 @@ class Path:
         current = controller.current
         point = self.measured_from(current, rejected.point)
         length, rejected.retries = (point.s - current.s) * sense, rejected.retries + 1
+        # the inertia of a nearby matrix serves where it shows no instability
         has_inertia = rejected.exact or not point.has_instability_since(current)
         if length > 0 and has_inertia:
             point = self.relative_to(current, point)
@@ -595,6 +620,7 @@ class Path:
         if len(points) < 2 or self.control == "load":
             return np.inf
         previous, current = points[-2:]
+        # the cubic in units of the last step: 0 is the previous point, 1 the current one
         step, current_per_s = current.s - previous.s, self.relative_to(previous, current)
         slope = (current.state.mu[self.name] - previous.state.mu[self.name]) / step
         to_fold = (
@@ -725,7 +751,7 @@ class Path:
             and abs(next_point.s - current.s) > self.options.max_step_past_several
         ):
             return "the step passed several instabilities, or jumped to another branch"
-        # no kink is an instability, but where the load turns back
+        # a kink is no instability, except where the load turns back
         may_have_kink = self.newton.options.has_onsets and (
             changed_pivots == 0 or current.across is not None
         )
@@ -736,7 +762,8 @@ class Path:
     def _is_smooth(self, current: Point, next_point: Point) -> bool:
         """Return whether the tangents at both ends of a step allow a smooth arc between them.
 
-        Their cosine must be large enough, and their mean must explain the displacement of the step.
+        Their cosine must be large enough, and the mean of both tangents times the change of s must
+        be nearly the displacement of the step.
         """
         chord = next_point.state.u - current.state.u
         # the trapezoidal rule: what the mean of both tangents leaves of the displacement
@@ -782,6 +809,7 @@ class Path:
         rejected
             The end of the step, which was rejected for its sharp turn.
         """
+        # only for the shortest step: others are tried again at half their length
         if plan.length / 2 >= self.options.smallest or self.control != "arc":
             return False
         if not self.newton.options.allows_kinks or rejected.reason != SHARP_TURN:
@@ -804,6 +832,8 @@ class Path:
     def are_apart(self, low: Point, high: Point, rounding: float = ZERO_DISPLACEMENT) -> bool:
         """Return whether two points lie too far apart for one path, given their tangents.
 
+        Their distance is compared with the change of s times the faster of both tangents.
+
         Parameters
         ----------
         high
@@ -824,9 +854,10 @@ class Path:
         """
         comm, length = self.system.comm, next_point.s - current.s
         turn = next_point.du - current.du
+        # from the straight path along the first tangent
         deviation = next_point.state.u - current.state.u - length * current.du
         square = dot(comm, turn, turn)
-        # least squares: the length in s behind the kink, within that of the step
+        # least squares: the length in s behind the kink, at most that of the step
         after_kink = dot(comm, turn, deviation) / square if square else 0.0
         after_kink = min(max(after_kink / length, 0.0), 1.0) * length
         gap = max_abs(comm, deviation - after_kink * turn)
@@ -869,11 +900,12 @@ class Path:
         return self.prescribed(self.control, s)
 
     def _point(self, state: State, s: float, response: Response) -> Point:
-        """Return a point with its tangent and both numbers of unstable directions.
+        """Return a point with its tangent and its numbers of unstable directions, at fixed mu or q.
 
         With the conjugate q held instead of mu, there is one unstable direction less where dq/dmu <
         0. This is Haynsworth's inertia additivity: dq/dmu = R_mu . K^-1 R_mu - Pi_mumu is minus the
-        Schur complement. A coordinate whose force is held has one more instead where dq/dmu > 0.
+        Schur complement. An amplitude that is a position has a force as q: with the force held, the
+        position is free, and there is one more instead where dq/dmu >= 0.
 
         Parameters
         ----------

@@ -2,6 +2,9 @@
 
 A point is a state in equilibrium with the path's tangent and the numbers of unstable directions
 there. By the journal an interrupted run resumes. `StepOptions` says how step lengths adapt.
+
+mu are the amplitudes (load parameters) by name; the conjugate -dPi/dmu of one is the displacement
+on which it does work. s is the quantity by which the path is controlled.
 """
 
 from collections.abc import Callable, Mapping
@@ -36,7 +39,8 @@ class Point:
     load_error
         Estimated error of the amplitude of an instability.
     habit
-        `Factorisation.habit` after this point: a resumed run continues with the same rounding.
+        `Factorisation.habit` after this point, the choice between two factorisations: a resumed run
+        continues with the same rounding.
     across
         The direction along which arc length is measured from this point; None: its tangent.
     """

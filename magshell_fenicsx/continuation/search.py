@@ -11,6 +11,11 @@ arc length, through folds, until the force t is zero: there is an equilibrium.
 **Settling.** Every step solves (K + s K0) du = -R, with the tangent K0 of the unloaded system: one
 implicit step of the flow K0 du/dt = -R, of length 1/s. Sharp folds relax, while soft directions
 stay almost where they are. It goes down the energy, so its fixed points are stable equilibria.
+
+R = dPi/du, K = dR/du; the guess's displacement b is counted from the known solution. Deflation
+multiplies R by a factor that removes known solutions. The softest mode has the eigenvalue of K
+nearest to zero; a stable solution has no negative pivots. Lengths are displacements in units of the
+system's length.
 """
 
 from collections.abc import Callable, Iterable, Iterator
@@ -72,18 +77,23 @@ def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]
     """
     system = newton.system
     residual, square = system.residual(guess.u, guess.mu), dot(system.comm, b, b)
-    # the amplitude of the force is of order one
+    # a multiple of b that is as large as the residual: the amplitude of the force is of order one
     scale = np.sqrt(dot(system.comm, residual, residual) / square) or 1.0
     b = np.asarray(b * scale)
     holder = newton.for_system(HoldingForceSystem(system, b))
     force = -dot(system.comm, b, residual) / dot(system.comm, b, b)
+    # the component of u along b stays; without known solutions, steps are only shortened
     row = PrescribedConjugate(holder.system, FORCE, -dot(system.comm, b, guess.u))
     start = find_deflated(holder, State(guess.u, {**guess.mu, FORCE: force}), FORCE, row)
     result = holder.solve(start, FORCE, row) if start else None
     if result is None or not result.converged:
         return
-    options = StepOptions(FIRST_STEP, MAX_STEP_RATIO * FIRST_STEP, MIN_STEP_RATIO * FIRST_STEP)
-    path = Path(holder, FORCE, "arc", options, FORCE_SCALE)
+    options = StepOptions(
+        first=FIRST_STEP,
+        largest=MAX_STEP_RATIO * FIRST_STEP,
+        smallest=MIN_STEP_RATIO * FIRST_STEP,
+    )
+    path = Path(holder, FORCE, "arc", options, scale=FORCE_SCALE)
     max_force = MAX_FORCE_RATIO * abs(result.state.mu[FORCE])
     last_point = path.start(result.state, -float(np.copysign(1.0, result.state.mu[FORCE])))
     try:
@@ -91,6 +101,7 @@ def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]
             force_before, force_after = (
                 step_end.state.mu[FORCE] for step_end in (last_point, point)
             )
+            # between two zero forces there is nothing to find
             if force_before * force_after <= 0 and force_before != force_after:
                 state = _state_without_force(path, last_point, path.relative_to(last_point, point))
                 yield State(state.u, dict(guess.mu))
@@ -114,6 +125,7 @@ def _state_without_force(path: Path, base: Point, high: Point) -> State:
     low, force_change = base, abs(base.state.mu[FORCE]) + abs(high.state.mu[FORCE])
     for _ in range(MAX_BRACKETS):
         low_force, high_force = low.state.mu[FORCE], high.state.mu[FORCE]
+        # where the force, linear between both points, is zero
         s = low.s + (high.s - low.s) * low_force / (low_force - high_force)
         middle = path.correct_between(s, low, high, base)
         if isinstance(middle, str):
@@ -128,7 +140,8 @@ def _state_without_force(path: Path, base: Point, high: Point) -> State:
 class Settling:
     """The flow of a system from any guess towards a stable equilibrium.
 
-    Each step solves (K + s K0) du = -R; the module's docstring explains why.
+    Each step solves (K + s K0) du = -R with a shift s: one implicit step in time, of length 1/s, of
+    the flow K0 du/dt = -R, which goes down the energy.
 
     Parameters
     ----------
@@ -187,11 +200,11 @@ class Settling:
                     if is_at_rest:
                         return State(u, guess.mu)
                     break
-                shift *= 3
+                shift *= 3  # the step is refused: a shorter one in time
         return State(u, guess.mu)
 
     def _size(self, residual: Vector) -> float:
-        """Return the size of a residual: of the displacement K0^-1 R, in the norm of K0."""
+        """Return the square root of R . K0^-1 R: the norm by K0 of the displacement K0^-1 R."""
         square = dot(self.system.comm, residual, self._K0_factors.solve(residual))
         return float(np.sqrt(abs(square))) or np.finfo(float).tiny
 
@@ -223,8 +236,8 @@ class AcceptanceRules:
         Called with two states. It returns whether shells pass through each other on the straight
         segment between them.
     with_own_parameters
-        Called with a solution. It returns the solution with penalties and cuts that fit it, to be
-        solved again; None if it has them already.
+        Called with a solution. It returns the solution with contact stiffnesses and with parts of
+        cells in contact (cuts) that fit it, to be solved again; None if it has them already.
     """
 
     passes: Callable[[State, State], bool] = lambda here, there: False
@@ -327,6 +340,7 @@ def further_solutions(
                 continue
             search.known_solutions.append(point.state)
             queue += search.guesses_along_mode(point.state, displacement)
+            # of a search for stable solutions an unstable one does not count
             accepted += not (descend and point.negative_pivots)
             yield point
             if accepted == limits.solutions:
@@ -361,8 +375,10 @@ class _SolutionSearch:
         The path by load control on which the solutions are points.
     known_solutions
         The solutions that are deflated; at least one.
-    descend, rules
-        As in `further_solutions`.
+    descend
+        Lets a state go down in energy by some steps; None: the search is not for stable solutions.
+    rules
+        Conditions on solutions of shells in contact.
     time_is_over
         Whether the time of the search is over.
 
@@ -380,6 +396,10 @@ class _SolutionSearch:
         time_is_over: Callable[[], bool],
         rules: AcceptanceRules,
     ) -> None:
+        """Take the amplitude from the first known solution; a row holds it in every solve.
+
+        Attempts use a solver without a journal: only their results are recorded.
+        """
         self._path, self.known_solutions, self._descend = path, known_solutions, descend
         self._over, self._rules = time_is_over, rules
         self._system, self._newton = path.system, path.newton
@@ -390,8 +410,9 @@ class _SolutionSearch:
     def accept_by_rules(self, guess: SearchGuess, point: Point) -> Point | str:
         """Return a solution that obeys the rules, or the reason why it is refused.
 
-        The solution gets penalties of its own and is solved again. It must be new. A known solution
-        or a reachable guess must lead there without shells passing through each other.
+        The solution gets contact stiffnesses and cuts that fit it, and is solved again until they
+        do. It must be new. From one known solution, or from the guess if a path leads there, the
+        straight way to it must not lead shells through each other.
         """
         for _ in range(MAX_PARAMETER_CHANGES):
             if (state := self._rules.with_own_parameters(point.state)) is None:
@@ -404,6 +425,7 @@ class _SolutionSearch:
             return "the shells that touch have no cuts and penalties that last"
         if self._is_known(point.state):
             return "the solution is a known one"
+        # one way without passage is enough
         states_before = [*self.known_solutions, *([guess.state] if guess.reachable else [])]
         if all(self._rules.passes(begin, point.state) for begin in states_before):
             return "shells have passed through each other"
@@ -429,7 +451,7 @@ class _SolutionSearch:
             if self._over():
                 return TIME_IS_OVER
             state = self._descend(state)
-            if self._newton.factor_at(state).negative_pivots:
+            if self._newton.factor_at(state).negative_pivots:  # not near a stable solution yet
                 continue
             start = find_deflated(self._newton, state, self._path.name, self._row)
             result: Point | str = "no solution is near"
@@ -467,7 +489,7 @@ class _SolutionSearch:
         state
             The solution.
         displacement
-            As in `further_solutions`.
+            Returns a vector with zeros for unknowns that are no displacements.
         """
         mode = _SoftestMode(self._path, state)
         return [
@@ -487,6 +509,7 @@ class _SolutionSearch:
         point = self._solver.solve(self._row, self._value, start)
         if isinstance(point, str):
             return point
+        # without deflation the solver may fall back to a known one
         if self._is_known(point.state):
             return "the solution is a known one"
         return self._solver.with_own_inertia(point, point)

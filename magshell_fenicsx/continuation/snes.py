@@ -5,6 +5,14 @@ is kept while the steps shrink. Its test of convergence is the next step, which 
 if its matrix is good (P. Deuflhard, Newton Methods for Nonlinear Problems, Springer 2004, sec.
 2.1.4, QNERR). The residual does not measure it: rounding of the stiff part of a structure hides
 errors of its soft part.
+
+R = dPi/du is the residual of equilibrium, K its derivative by u, g the residual of the row: the
+scalar equation that is solved together with equilibrium for u and the amplitude (load parameter)
+mu. A direction is a pair (du, dmu). A kept matrix gets Broyden's updates (`Chord`), and is an
+iterate's own if it was computed there. Dense terms couple all unknowns: their part of K may lag,
+that is belong to an earlier state, and their forces may be extrapolated from earlier states while
+steps are long. `stress` are weighted displacements whose stress replaces that of u in K, since
+small errors of a guess spoil its own. Lengths are displacements in units of the system's length.
 """
 
 from collections.abc import Mapping, Sequence
@@ -177,7 +185,7 @@ class LatestTangent:
         Parameters
         ----------
         stress
-            As in `System.tangent`.
+            Weighted displacements whose stress replaces that of the state; empty: its own.
         may_lag
             Whether a small part of the tangent may belong to an earlier state.
         needs_inertia
@@ -193,6 +201,7 @@ class LatestTangent:
             or self._has_other_stress
             or not factored.equals(state, self.system.comm)
         )
+        # with an exact tangent required, a lagged one does not serve, even of the same state
         is_too_old = self.lagged and not may_lag
         if is_other or is_too_old or (needs_inertia and not self.inertia_is_certain):
             self.lagged = may_lag and factor_with_lag(
@@ -243,7 +252,7 @@ def factor_with_lag(
     factors
         Gets the factors.
     stress
-        As in `System.tangent`.
+        Weighted displacements whose stress replaces that of the state; empty: its own.
     needs_inertia
         Whether the number of unstable directions must be right in spite of the lag.
 
@@ -254,6 +263,7 @@ def factor_with_lag(
     """
     if not (isinstance(system, InexactSystem) and system.has_dense_terms):
         return False
+    # without a count of the inertia nothing shows whether the factors serve
     if not (factors.correction_is_small or needs_inertia):
         return False
     tangent = system.tangent(state.u, state.mu, stress, inexact=True)
@@ -375,7 +385,7 @@ class SnesCallbacks:
         self.join((R, self._row.residual(state)), f)
 
     def jacobian(self, snes: PETSc.SNES, x: PETSc.Vec, J: PETSc.Mat, P: PETSc.Mat) -> None:
-        """Choose the matrix for an iterate; PETSc's callback.
+        """Choose the matrix for an iterate; PETSc's callback, which needs J marked as assembled.
 
         While the steps shrink it is the matrix of an earlier iterate.
         """
@@ -438,6 +448,7 @@ class SnesCallbacks:
         if self._state is not None and x.stateGet() == self._x_counter:
             return self._state
         state, previous = self._state_of(x), self._state
+        # PETSc's counters tell for which x and f the step is known
         if previous is not None:
             self._go_on(previous, state)
         self._x_counter, self._state = x.stateGet(), state
@@ -449,7 +460,7 @@ class SnesCallbacks:
             self._next = self._repeated_step(self.split(f))
             size = self._iterates.steps[-1].size
             self._computed_steps.append(size)
-            self._largest_step = size
+            self._largest_step = size  # extrapolation begins anew
         self._largest_step = max(self._largest_step, size)
         self._f_handle, self._f_counter = f.handle, f.stateGet()
         return state
@@ -500,6 +511,7 @@ class SnesCallbacks:
         """
         assert self._chord
         assert self._next
+        # where a full step leads
         after_full = add_scaled((previous.u, previous.mu[self._name]), -1.0, self._next)
         is_full = after_full[1] == state.mu[self._name] and np.array_equal(after_full[0], state.u)
         is_full = bool(self._system.comm.allreduce(is_full, MPI.LAND))
@@ -525,7 +537,9 @@ class SnesCallbacks:
             if self._matrix_serves(size):
                 steps.append(NewtonStep(size, is_own=False))
                 return step
+        # factors of a near state may begin the solve
         is_own = bool(steps) or not self._tangent.is_near(state, self._reuse_distance)
+        # after some matrices with a lagged part one without, since the lag may slow the solve
         renews = sum(step.is_own for step in steps) == MATRICES_WITH_LAG and not self.extrapolating
         factors = self._tangent.latest
         if is_own:
@@ -553,8 +567,9 @@ class SnesCallbacks:
     def _lag_slows(self, matrix: BorderedMatrix, step: Direction) -> bool:
         """Return whether the lagged part of the matrix is the reason why steps do not shrink.
 
-        The part was small at its own state, but need not be so now. After the step the residual is
-        what the matrix lacks, times the step; this product is extrapolated.
+        The part was small at its own state, but need not be so now. After the step a residual is
+        left: the part of the tangent that the matrix lacks, times the step. The extrapolated forces
+        give this product. If it causes a long next step, the lag is the reason.
 
         Parameters
         ----------
@@ -577,6 +592,7 @@ class SnesCallbacks:
         """
         steps, options = self._iterates.steps, self._options
         ratio = size / steps[-1].size
+        # old factors mislead after a guess with a stress
         is_first = sum(step.is_own for step in steps) <= 1 and not self._has_stress
         if not self._has_stress and ratio <= 0.5:
             # the size after as many chord steps as cost one factorisation
@@ -591,7 +607,8 @@ class SnesCallbacks:
     def _rounding_error(self, state: State, f: PETSc.Vec) -> float:
         """Return the error of u from rounding of the residual, in lengths of the system.
 
-        It is estimated from the change of the residual when u is rounded differently.
+        u is changed by one unit in the last place, up or down at random. What the change of the
+        residual has more than K times this change is rounding; its step is the error.
 
         Parameters
         ----------
@@ -648,12 +665,13 @@ def make_snes(
     snes.setTolerances(stol=options.tolerance, max_it=options.max_iterations)
     snes.getKSP().setType("preonly")
     petsc_options = PETSc.Options(PREFIX)
+    # an option of the user has priority
     sets_line_search = not petsc_options.hasName("snes_linesearch_type")
     if (
         sets_line_search
     ):  # full steps are not PETSc's default; if they fail, the path takes a smaller step
         petsc_options["snes_linesearch_type"] = line_search
-    for prefix in (PREFIX, ""):
+    for prefix in (PREFIX, ""):  # options with our prefix, then those without
         snes.setOptionsPrefix(prefix)
         snes.setFromOptions()
     if sets_line_search:

@@ -3,6 +3,13 @@
 A model with symmetry excludes modes that break it. `StabilityMonitor` evaluates the inertia of
 their tangents at points of the path, in families of modes that share a tangent, and locates the
 points where a mode becomes neutral.
+
+Modes of one family share a tangent, for example all waves of one number; a mode is neutral where
+its eigenvalue is zero, and unstable below. Inertia is the number of unstable directions of a
+tangent. An evaluation has these numbers at one point of the path, `counts` by family; a crossing is
+a point where a mode is neutral. The softest mode has the eigenvalue of least magnitude; it softens
+as that falls. Arc length is measured anew from the first point of each segment. Results pass
+through the path's journal, from which an interrupted run resumes.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -109,13 +116,15 @@ class PathSegment:
         Parameters
         ----------
         counts
-            Identity `id` of a point -> number of unstable directions of the family there; it grows.
+            Identity `id` of a point -> number of unstable directions of the family there; new
+            points are added.
         halvings
             Number of halvings that are left; without any, several crossings count as one.
         """
         count_before, count_after = counts[id(low)], counts[id(high)]
         if count_before == count_after:
             return
+        # several crossings are separated at a point between them; for one no new point is solved
         middle = self._middle(low, high, solve=abs(count_after - count_before) > 1 and halvings > 0)
         if middle is None:
             base = self._path.as_base(low)
@@ -150,6 +159,7 @@ class PathSegment:
         PathStopped
             If the solve fails.
         """
+        # the same objects, by their places among the points of the segment
         low_index, high_index = (
             next(i for i, p in enumerate(self._points) if p is end) for end in (low, high)
         )
@@ -294,6 +304,7 @@ class StabilityMonitor:
     """
 
     def __init__(self, excluded: SymmetryBreakingModes | None) -> None:
+        """Begin before any path; the last two evaluations and the skipped points are kept."""
         self._excluded = excluded
         self._families = excluded.families if excluded else []
         self._last_evaluation: _InertiaEvaluation | None = None
@@ -334,18 +345,20 @@ class StabilityMonitor:
         self._counts_before_path = (
             last_evaluation.counts if last_evaluation else (0,) * len(self._families)
         )
+        # the same object: the last evaluation is that of this point
         is_last_point = start.state.u is self._u and not self._skipped
         known_evaluation = last_evaluation if is_last_point else None
         self._path, self._expand = path, expand
         self._last_point, self._u, self._distance = start, start.state.u, 0.0
         self._softening_rate: float | None = None
+        # how many points in a row may be skipped; at first none
         self._may_skip, self._skipped, self._previous_evaluation = 0, [], None
         self._last_evaluation = (
             replace(known_evaluation, point=start, distance=0.0) if known_evaluation else None
         )
         if evaluate and not known_evaluation:
             self._last_evaluation = self._evaluate(start, 0.0)
-        elif not known_evaluation:
+        elif not known_evaluation:  # evaluated later, if it proves to be needed
             self._skipped.append((start, 0.0))
 
     def pass_to(self, point: Point, *, evaluate: bool = False) -> list[Crossing]:
@@ -410,6 +423,7 @@ class StabilityMonitor:
         """
         previous = self._last_evaluation
         new_evaluation = self._evaluate(self._last_point, self._distance)
+        # faster than was allowed for, and by much
         softened = previous is not None and new_evaluation.softest < min(
             self._least_softest, previous.softest / 2
         )
@@ -464,6 +478,7 @@ class StabilityMonitor:
         if not halvings or low.point.s == high.point.s or not self._may_recover(other, low, high):
             return
         segment = PathSegment(self._path, low.point, high.point)
+        # an estimated point costs no solve; it counts if both halves with it are certain
         estimate = self._evaluate_between(low, high, segment.estimated_middle())
         if estimate and estimate.counts == low.counts == high.counts:
             evaluations_by_half = (other or high, low, estimate), (low, estimate, high)
@@ -519,6 +534,7 @@ class StabilityMonitor:
             return False
         if other is None or other.numbers is None:
             return True
+        # no parabola through two points at one place
         if other.distance in (low.distance, high.distance):
             return True
         distances = other.distance, low.distance, high.distance
@@ -540,6 +556,7 @@ class StabilityMonitor:
 
         The numbers of unstable directions are compared with those at the end of the last path.
         """
+        # counts may have further families, whose crossings are not located
         counts = zip(self._families, evaluation.counts, self._counts_before_path, strict=False)
         for family, count, count_before in counts:
             if count and count != count_before:
@@ -554,6 +571,7 @@ class StabilityMonitor:
         """
         segment = PathSegment(self._path, low.point, high.point)
         located = list[tuple[float, str, Point, int]]()
+        # only the first families of the counts are located
         for family, count_before, count_after in zip(
             self._families, low.counts, high.counts, strict=False
         ):
@@ -569,6 +587,7 @@ class StabilityMonitor:
                 self.unlocated = self.unlocated or str(e)
         crossings, unstable_count = list[Crossing](), sum(low.counts)
         for _, label, point, rise in sorted(located, key=lambda crossing: crossing[0]):
+            # at the crossing itself the neutral mode does not count
             crossings.append(Crossing(label, point, min(unstable_count, unstable_count + rise)))
             unstable_count += rise
         return crossings
@@ -582,6 +601,7 @@ class StabilityMonitor:
         if excluded is None:
             return _InertiaEvaluation(point, distance, ())
         tangents, state = excluded.tangents, self._expand(point.state)
+        # computed when they are first needed: a replayed result does not need them
         numbers = cache(partial(tangents.sampled_tangents, state)) if tangents else None
         start_vector = self._last_evaluation.vector if self._last_evaluation else None
 
@@ -633,6 +653,7 @@ def _softest_mode(factors: Factorisation, start_vector: Vector | None) -> tuple[
     if start_vector is not None:
         v = start_vector + GENERAL_FRACTION * v / np.sqrt(dot(comm, v, v))
     eigenvalue_size = np.inf
+    # |v|/|K^-1 v| is never below the least magnitude of an eigenvalue
     for _ in range(ITERATIONS_FROM_RANDOM if start_vector is None else ITERATIONS_FROM_LAST_MODE):
         v = factors.solve(v / np.sqrt(dot(comm, v, v)))
         eigenvalue_size = 1 / np.sqrt(dot(comm, v, v))

@@ -1,4 +1,9 @@
-"""Step control along a path: the planned step, and the length of the next one after its outcome."""
+"""Step control along a path: the planned step, and the length of the next one after its outcome.
+
+s is the quantity that controls a path, for example its arc length; lengths of steps are in units of
+s. An onset is where contact forces begin. A rejected point is a solution that may lie on another
+branch, and is compared again with later points. A leap is a longer step after a failure.
+"""
 
 from dataclasses import dataclass
 
@@ -89,7 +94,7 @@ class StepController:
     step
         The length of the next step, unless something shortens it.
     leaps
-        The number of failed steps since the last point.
+        The number of failed steps since the last point; a few of them may be followed by leaps.
     rejected
         A solution that a step rejected as too far.
     onset_without_solution
@@ -117,9 +122,10 @@ class StepController:
         distance
             Distance of the target in s, of either sign; it may be infinite.
         """
-        steps = np.inf
+        steps = np.inf  # to the target
         if np.isfinite(distance):
             steps = max(1.0, np.ceil(BELOW_ONE * abs(distance) / self.step))
+        # one or two equal steps; the steps before them need not be equal
         return abs(distance) / steps if steps < 3 else self.step
 
     def reject_step(self, plan: StepPlan, reason: str, smallest: float) -> None:
@@ -141,6 +147,7 @@ class StepController:
         PathStopped
             If the next step would be shorter than the smallest.
         """
+        # behind an onset there is no solution: the same length again, which ignores the onset
         if plan.event.fraction < 1 and plan.event.ends_behind:
             self.onset_without_solution, self.rejected = self.current, None
             return
@@ -175,8 +182,10 @@ class StepController:
         if straight and easy:
             longer = min(self.step + length / 2, 2 * length)
             self.step = min(max(self.step, longer), options.largest)  # a target may have cut it
+        # a step to an onset says nothing about the length
         elif point.factorisations >= options.hard_factorisations and plan.event.fraction == 1:
             self.step = 0.6 * length
+        # the last points before this one that a polynomial may go through
         smooth = plan.event.fraction == 1 and not kink
         earlier_points = self.points[1 - PREDICTOR_POINTS :] if smooth else []
         self.points, self.leaps = [*earlier_points, point], 0

@@ -4,6 +4,12 @@ Modes of a family m (waves of a meridian) have a tangent K_m of their own at a s
 and the path before them is regular: R(u, mu, p) = 0 and g(u, mu, p) = 0, with K_m v + g b = 0 and b
 . v = 1, so that dg = -v . dK_m v. Families do not couple. So where two of them are neutral at once
 both equations are regular, and each goes on alone.
+
+R = dPi/du is the residual of the model, mu its unknown amplitude (load parameter), v the null
+vector of K_m, and b a fixed vector near v; g = 0 where K_m is singular. A dot is the inner product
+over all ranks. w_R, w_mu and w_p are K^-1 times R, R_mu and R_p. The quadratic form is v . K_m v,
+whose differences give all derivatives of g. A row is the scalar equation that says where on the
+boundary a point is. `family` are the systems at all p, m is the number of a family of modes.
 """
 
 from collections.abc import Sequence
@@ -58,7 +64,7 @@ class SymmetryBreakingRows:
     family
         The systems at all p.
     difference
-        Weights and values of p of a difference by p.
+        Pairs of a weight and a p: derivatives by p are weighted sums over the systems there.
 
     Attributes
     ----------
@@ -117,6 +123,7 @@ class SymmetryBreakingRows:
 
         Collective.
         """
+        # families from 1, padded up to m, whose own count leaves v out
         m, counts = self._m, list(self._family.counts(self._p, self._state))
         counts += [0] * (m - len(counts))
         counts[m - 1] = self._other_unstable
@@ -138,14 +145,17 @@ class SymmetryBreakingRows:
         value
             The value of the row at the state; None for the tangent instead of a step.
         settled
-            Whether only the residual and the row are not yet zero.
+            Whether g counts as zero already, after convergence: the step then reduces the residual
+            alone.
         """
         comm, w_mu, w_p = self._comm, self._w_mu, self._w_p
         is_tangent = value is None
         w_R = 0.0 * w_mu if is_tangent else self._w_R
         g = 0.0 if is_tangent or settled else self.g - self._derivative_of_g(w_R)
+        # the row along -w_mu, -w_p and -w_R
         c = [-dot(comm, row.du, w) for w in (w_mu, w_p, w_R)] if row.du is not None else [0.0] * 3
         rows = np.array([[self._g_mu, self._g_p], [c[0] + row.dmu, c[1] + row.dp]])
+        # for the tangent the row changes by 1 along it
         right_side = np.array([g, c[2] + value if value is not None else -1.0])
         size = np.abs(rows).max(axis=1)
         dmu, dp = np.linalg.solve(rows / size[:, None], -right_side / size)
@@ -176,7 +186,7 @@ class SymmetryBreakingRows:
 def nearest_eigenvalue(factors: Factorisation, comm: MPI.Comm, b: Vector | None = None) -> float:
     """Return the eigenvalue nearest to zero of a factored matrix. Collective.
 
-    Inverse iteration finds it.
+    Inverse iteration finds it, from a start vector that is always the same.
 
     Parameters
     ----------
@@ -187,7 +197,8 @@ def nearest_eigenvalue(factors: Factorisation, comm: MPI.Comm, b: Vector | None 
     x, value = np.sin(1.0 + np.arange(factors.matrix.getLocalSize()[0]) + comm.rank), np.inf
     for _ in range(MAX_INVERSE_ITERATIONS):
         y = factors.solve(x)
-        if b is not None and solution_for_b is not None:  # the bordered tangent is regular
+        # with the border the tangent is regular, and y is orthogonal to b
+        if b is not None and solution_for_b is not None:
             y = y - dot(comm, b, y) / dot(comm, b, solution_for_b) * solution_for_b
         previous_value, value = value, float(dot(comm, x, x) / dot(comm, x, y))
         if abs(value - previous_value) <= EIGENVALUE_TOLERANCE * abs(value):

@@ -3,6 +3,10 @@
 The solvers know nothing of finite elements. They see a distributed vector of unknowns u, amplitudes
 mu (load parameters and prescribed positions), and the residual and tangent of a potential
 Pi(u; mu). This module defines that interface and the forms that a tangent may have.
+
+An amplitude's conjugate -dPi/dmu is the displacement on which it does work, or the force if the
+amplitude is a position. A lagged part of a tangent, from terms that couple all unknowns, belongs to
+an earlier state.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -179,7 +183,7 @@ class InexactSystem(Protocol):
     def has_dense_terms(self) -> bool: ...
 
     def residual(self, u: Vector, mu: Amplitudes, *, inexact: bool = False) -> Vector:
-        """Return the residual, see `System`. Collective.
+        """Return R = dPi/du. Collective.
 
         Parameters
         ----------
@@ -198,10 +202,12 @@ class InexactSystem(Protocol):
         *,
         inexact: bool = False,
     ) -> Tangent:
-        """Assemble the tangent, see `System`. Collective.
+        """Assemble K = d2Pi/du2, or dR/du where a load has no potential. Collective.
 
         Parameters
         ----------
+        stress
+            Displacements with weights, whose stress may replace that of u.
         inexact
             Whether its dense terms may be those of an earlier state.
         """

@@ -1,6 +1,10 @@
 """Targets of a path by arc length: requested loads or displacements between two points, solved for.
 
 Polynomials through the points predict where a target lies; Newton's method solves at its value.
+
+A quantity is the load (amplitude) of the path or its conjugate, the displacement on which the load
+does work. s is the arc length, measured from a point of the path. Predictors are the points that a
+polynomial with their tangents goes through.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -36,10 +40,12 @@ def end_near_last_target(
     current = predictors[-1].s
 
     def difference(s: float) -> float:
+        """Return the quantity at the predicted state, less its target."""
         return path.value(quantity, path.predicted_state(s, predictors)) - target
 
     if not difference(current) * difference(s) < 0:
         return s
+    # a little behind the target, but not behind the planned end
     fraction = END_PAST_TARGET * (_zero(difference, current, s) - current) / (s - current)
     return current + min(fraction, 1.0) * (s - current)
 
@@ -105,12 +111,14 @@ def _solve(path: Path, quantity: Quantity, target: float, points: Sequence[Point
             predictors.insert(0, earlier)
 
     def difference(s: float) -> float:
+        """Return the quantity at the interpolated state, less its target."""
         return path.value(quantity, path.interpolated_state(s, *predictors)) - target
 
     s = _zero(difference, low.s, high.s)
     t = (s - low.s) / (high.s - low.s)
+    # the stress at the target, interpolated between both points
     stress = [(1 - t, low.state.u), (t, high.state.u)]
-    # between different inertias a target has its own; the step's end serves where it is close
+    # the factors of the step's end serve where it is close, and the inertia does not change
     inertias = {(point.negative_pivots, point.negative_pivots_held) for point in (low, high)}
     is_close = abs(high.s - s) < 2 * (END_PAST_TARGET - 1) * abs(high.s - low.s)
     neighbour = high.state if len(inertias) == 1 and is_close else None
@@ -127,7 +135,7 @@ def _zero(f: Callable[[float], float], low: float, high: float) -> float:
     It is the second place if the function has one sign at both.
     """
     a, b = f(low), f(high)
-    place, side = high, 0
+    place, side = high, 0  # side: which end was replaced last, -1 the low one, 1 the high one
     for _ in range(MAX_TRIALS if a * b < 0 else 0):
         previous, place = place, low + (high - low) * a / (a - b)
         is_same = abs(place - previous) <= ZERO_TOLERANCE * abs(high - low)

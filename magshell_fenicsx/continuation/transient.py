@@ -6,6 +6,15 @@ With rho = 1 the force is averaged along the step at Gauss points, which conserv
 (G. R. W. Quispel and D. I. McLaren, Journal of Physics A 41, 2008). PETSc's TSALPHA2 has the same
 formulas for rho < 1, but shows neither its acceleration, without which a resumed run is another
 one, nor a place for that average.
+
+u, v, a are displacement, velocity and acceleration; M is the mass, c the drag, D the viscous force,
+mu are the amplitudes: load parameters and prescribed positions, by name. dPi/dmu of a load is minus
+the displacement on which it works, of a position the force on it. A device makes some amplitudes
+unknown, since it holds their conjugates: its unknowns y follow u on the last rank. A step averages
+forces at `AlphaParameters.forces`, with the end weighted by 1 - alpha_f, inertia by 1 - alpha_m. At
+a jump of the loads or of the supports' velocity a value before and one after exist. Contact forces
+are averaged along a step and then restored. Lengths are displacements in units of the system's
+length.
 """
 
 from collections.abc import Callable, Collection, Mapping
@@ -86,15 +95,15 @@ class AlphaParameters:
 
     @classmethod
     def from_spectral_radius(cls, rho: float) -> "AlphaParameters":
-        """Return the parameters for a spectral radius at infinite frequency, 0 to 1.
+        """Return the parameters for a spectral radius rho at infinite frequency, 0 to 1.
 
         Radius 1 dissipates nothing, and radius 0 damps the highest frequencies in one step.
         """
         alpha_m, alpha_f = (2 * rho - 1) / (rho + 1), rho / (rho + 1)
         forces = GAUSS_POINTS if rho == 1 else ((1 - alpha_f, 1.0),)
-        return cls(
-            alpha_m, alpha_f, (1 - alpha_m + alpha_f) ** 2 / 4, 0.5 - alpha_m + alpha_f, forces
-        )
+        # second order, and the strongest damping of high frequencies for this rho
+        beta, gamma = (1 - alpha_m + alpha_f) ** 2 / 4, 0.5 - alpha_m + alpha_f
+        return cls(alpha_m, alpha_f, beta, gamma, forces)
 
 
 @dataclass(frozen=True)
@@ -182,6 +191,11 @@ class Integrator:
         viscous: ViscousForces | None = None,
         surroundings: Surroundings | None = None,
     ) -> None:
+        """Begin without factors.
+
+        `_free` are the amplitudes that the device makes unknown, `_driven` all positions that move.
+        `_total_energy` is the energy at the begin, from which an imbalance is counted.
+        """
         surroundings = surroundings or Surroundings()
         device = surroundings.device
         self.system, self.mass, self.loads = system, mass, loads
@@ -258,8 +272,9 @@ class Integrator:
     def begins_anew(self, t: float) -> bool:
         """Return whether a motion begins anew at a kink or jump of the loads at time t.
 
-        In contact with a body it does not begin anew at a kink. There the acceleration is
-        continuous; a new one from the remaining residual would be large where the contact is stiff.
+        In contact with a body it begins anew only at a jump or with moving supports. At a kink the
+        acceleration is continuous; a new one from the remaining residual would be large where the
+        contact is stiff.
         """
         return (
             not self.contact
@@ -279,6 +294,7 @@ class Integrator:
         return replace(
             motion,
             imbalance=sum(energies) - self._total_energy,
+            # not less than the energy of a small displacement, with a stiffness of one
             turnover=sum(map(abs, energies)) + (MIN_ENERGY_DISPLACEMENT * self.system.length) ** 2,
         )
 
@@ -287,6 +303,7 @@ class Integrator:
 
         Massless unknowns, as at supports, get ones on the diagonal, so the matrix is regular.
         """
+        # the pattern of M need not have these entries: PETSc may add them
         M = self.mass.copy()
         massless_diagonal = M.getDiagonal()
         massless_diagonal.setArray((massless_diagonal.array_r == 0).astype(float))
@@ -316,7 +333,7 @@ class Integrator:
         return dot(self.system.comm, v, self.supports.times(v)) / 2
 
     def _mass_times_supports(self, x: Vector) -> Vector:
-        """Return the mass times a vector at supports: the forces at all other nodes."""
+        """Return the mass times a vector at supports: the forces of inertia on all other nodes."""
         assert self.supports
         return self.supports.zeroed_at_supports(self.supports.times(x))
 
@@ -331,6 +348,7 @@ class Integrator:
             Length of the step.
         """
         if self.contact:
+            # contacts that may meet too fast become stiffer before the step
             v = motion.v + self.supports.velocity(motion.t, False) if self.supports else motion.v
             settings = self.contact.stiffened_settings(State(motion.u, motion.mu), v)
             motion = replace(motion, mu=motion.mu | settings)
@@ -414,7 +432,7 @@ class Integrator:
         """Return the forces of inertia and drag by moving supports in a step of length dt.
 
         The method's averages of accelerations and velocities at both ends are used. Unknown
-        amplitudes have zeros.
+        amplitudes have zeros. At the end, which may be a kink, the values before it count.
         """
         forces, supports, end = 0.0 * motion.u, self.supports, motion.t + dt
         if supports:
@@ -454,6 +472,7 @@ class Integrator:
         if self.supports:
             loads_at_end = self.loads(motion.t + dt, True)
             ends |= {name: loads_at_end[name] for name in self.supports.names & set(mu)}
+        # unknown amplitudes, and positions of supports
         linear = {
             name: motion.mu[name] + fraction * (end - motion.mu[name]) for name, end in ends.items()
         }
@@ -484,6 +503,7 @@ class Integrator:
         The forces, followed by the device's rows on the last rank.
         """
         alpha_m, alpha_f = self.parameters.alpha_m, self.parameters.alpha_f
+        # the system's residual has the contact forces of the whole step from here on
         self._average_contact(motion, u, y, dt)
         residual = self._times(
             (1 - alpha_m) * a
@@ -500,6 +520,7 @@ class Integrator:
             )
         if self.device is None:
             return residual
+        # conjugates are held at the end of the step; (1 - alpha_f) keeps the matrix symmetric
         if self.contact:
             self.contact.use_state_forces()
         rows = (1 - alpha_f) * self.device.rows(u, self._amplitudes(motion, y, 1.0, dt))
@@ -514,7 +535,8 @@ class Integrator:
     def _rounding_error(self, motion: Motion, u: Vector, y: Array, dt: float) -> float:
         """Return the size of an iteration's step that rounding of the forces makes, in lengths.
 
-        It is estimated from the change of the residual when u is rounded differently.
+        u is changed by one unit in the last place, up or down at random; the change of the residual
+        gives the step.
         """
         signs = np.random.default_rng(self.system.comm.rank).choice([-1.0, 1.0], u.size)
 
@@ -542,8 +564,9 @@ class Integrator:
         """Factor the matrix of a step at a state. Collective.
 
         The matrix is (1 - alpha_f) K + ((1 - alpha_m)/(beta dt^2) + drag (1 - alpha_f) gamma/(beta
-        dt)) M, bordered by the device's rows.
+        dt)) M, bordered by the device's rows. K is the tangent at the state.
         """
+        # a resumed run factors with the same choice of method, and so the same rounding
         self.factorisation.habit = state.habit
         parameters, u, mu, dt = self.parameters, state.u, state.mu, state.dt
         fraction, rate = 1 - parameters.alpha_f, parameters.gamma / (parameters.beta * dt)
@@ -551,6 +574,7 @@ class Integrator:
         tangent = viscous.tangent(u, mu, dt, rate) if viscous else self.system.tangent(u, mu)
         assert not isinstance(tangent, BorderedTangent)
         K = tangent.K if isinstance(tangent, SkewedTangent | CorrectedTangent) else tangent
+        # another object, as after a change of contact: another pattern
         if self._tangent is None or self._K is None or self._tangent.handle != K.handle:
             self._tangent, self._K = K, K.duplicate()
             self._K.setOption(PETSc.Mat.Option.SYMMETRIC, True)
@@ -593,6 +617,7 @@ class Integrator:
             self._work(name, motion, mu, potentials, mean_forces.get(name)) for name in potentials
         )
         step, velocity = u - motion.u, (1 - alpha_f) * v + alpha_f * motion.v
+        # drag times the mean velocity works along the step, at supports too
         if self.supports and self.drag:
             begin, end = self.supports.velocity(motion.t, False), self.supports.velocity(t, True)
             step_of_all = step + dt / 2 * (begin + end)
@@ -623,11 +648,12 @@ class Integrator:
         error = abs(self.parameters.beta - 1 / 6) * dt**2 * acceleration_change / length
         if viscous is None:
             return error
-        # errors add up in the motion's own time
+        # a motion that creeps: errors of the steps add up in its own time |v|/|a|
         if viscous.creep_time > dt and dt**2 * acceleration_change > ACCELERATION_ROUNDING * length:
             acceleration = max(max_abs(comm, end_motion.a), acceleration_change)
             motion_time = max_abs(comm, end_motion.v) / max(acceleration, 1e-300)
             error *= max(1.0, min(viscous.creep_time, motion_time) / dt)
+        # the displacement that an error of the viscous force causes
         force = viscous.error_force(motion.u, end_motion.u, dt)
         if force is not None:
             force = self.device.padded(force) if self.device else force
@@ -647,6 +673,7 @@ class Integrator:
             Whether supports have their velocity and acceleration before or after a jump.
         """
         mu = motion.mu
+        # positions that do not move, and stiffnesses of contacts
         without_work = (self.system.coordinates - self._driven) | set(
             self._contact_settings(motion)
         )
@@ -667,7 +694,10 @@ class Integrator:
     def _mean_forces(
         self, motion: Motion, end_motion: Motion, y: Array, dt: float
     ) -> dict[str, float]:
-        """Return the mean forces in a step on moving positions, by name; empty without contact."""
+        """Return the mean forces in a step on moving positions, by name.
+
+        Without contact the result is empty: the mean of both ends is enough there.
+        """
         if not self.contact:
             return {}
         support_names = self.supports.names if self.supports else frozenset[str]()
@@ -700,6 +730,7 @@ class Integrator:
             mu = self._amplitudes(motion, y, fraction, dt)
             force += weight * self.system.potential(u, mu, name)
         if supports and name in supports.names:
+            # end and begin of the step; at a jump the end counts before it, the begin after it
             ends = (end_motion, end_motion.t, True), (motion, motion.t, False)
             a, a_before = (end.a + supports.acceleration(t, is_end) for end, t, is_end in ends)
             v, v_before = (end.v + supports.velocity(t, is_end) for end, t, is_end in ends)
@@ -720,7 +751,8 @@ class Integrator:
     ) -> float:
         """Return the work of the amplitude `name` in a step.
 
-        A load works on its conjugate displacement; a moving position works with the force on it.
+        A load times the change of its conjugate -dPi/dmu is work; for a position, the force dPi/dmu
+        times the change of the position.
 
         Parameters
         ----------

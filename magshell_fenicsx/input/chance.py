@@ -1,4 +1,10 @@
-"""Random numbers of a case file: distributions, random places, and imperfections there."""
+"""Random numbers of a case file: distributions, random places, and imperfections there.
+
+A distribution is a section of the case, with a law (its kind) and perhaps bounds, which cut it off.
+The numbers of a lognormal law have logarithms with a normal one. A study runs a case as many
+samples with different random numbers; each sample and key has a generator of its own, so that one
+does not change another. The polar angle is from the axis of the sphere.
+"""
 
 import zlib
 from math import cos, degrees, inf, log, nextafter, pi, radians, sqrt
@@ -70,6 +76,7 @@ class DistributionSection(Section):
             raise ValueError(
                 f"a lognormal number is positive: its mean must be too, here {self._mean:g}"
             )
+        # the inverse of the distribution function would be rounding
         if (
             self.kind in ("normal", "lognormal")
             and np.diff(self._probabilities)[0] < MIN_PROBABILITY
@@ -95,7 +102,7 @@ class DistributionSection(Section):
         if self.kind == "choice":
             assert self.values
             weights = np.array(self.weights or [1.0] * len(self.values))
-            steps = np.cumsum(weights) / weights.sum()
+            steps = np.cumsum(weights) / weights.sum()  # of the distribution function
             return self._with_unit(
                 self.values[int(np.searchsorted(steps, probability, side="right"))]
             )
@@ -105,6 +112,7 @@ class DistributionSection(Section):
         # the distribution between the bounds is a part of the normal one
         first_probability, last_probability = self._probabilities
         centre, width = self._normal
+        # not 0 or 1, whose quantiles are infinite
         inner = min(
             max(
                 first_probability + probability * (last_probability - first_probability),
@@ -200,7 +208,7 @@ def random_places(
         If not even a dense packing has room, or none was found.
     """
     refuse_no_room(count, polar, distance)
-    low, high = cos(radians(polar[1])), cos(radians(polar[0]))
+    low, high = cos(radians(polar[1])), cos(radians(polar[0]))  # of z: uniform in z is so in area
     max_cosine = cos(radians(distance))
     for _ in range(MAX_STARTS):
         places = np.empty((0, 3))
@@ -213,7 +221,7 @@ def random_places(
                 if (places @ place <= max_cosine).all():
                     places = np.vstack([places, place])
                     break
-            else:
+            else:  # no try has found room: all begins again
                 break
         if len(places) == count:
             angles = np.degrees(
@@ -243,12 +251,14 @@ def refuse_no_room(count: int, polar: tuple[float, float], distance: float) -> N
     NoRoom
         If the discs are too large or too many even for a hexagonal packing.
     """
+    # each place has a disc of half the distance, which may reach beyond the zone
     disc_radius = radians(distance) / 2
     zone_begin, zone_end = (
         max(radians(polar[0]) - disc_radius, 0.0),
         min(radians(polar[1]) + disc_radius, pi),
     )
     if disc_radius:
+        # area of the zone over that of a disc; one place always has room
         max_count = max(
             DENSEST_PACKING * (cos(zone_begin) - cos(zone_end)) / (1 - cos(disc_radius)), 1.0
         )
@@ -329,5 +339,6 @@ def generator(seed: int, number: int, name: str) -> np.random.Generator:
     number
         Number of the sample.
     """
+    # a hash that is the same in every process
     spawn_key = number, zlib.crc32(name.encode())
     return np.random.default_rng(np.random.SeedSequence(seed, spawn_key=spawn_key))

@@ -4,6 +4,10 @@ Values at places show a formula only at these places. Interval arithmetic shows 
 may have other values between them, however narrow a step or a Gaussian is. After each operation the
 range is also bounded by the value in the middle of the box plus or minus the change that the
 derivatives allow. So the excess of the range shrinks with the square of the box.
+
+An interval has all values of a quantity in a box; operations on intervals return intervals that
+contain all results. Slopes are intervals of derivatives. An enclosure is a function in boxes: its
+values, slopes, and the value in the middle. Each array has one entry for each of n boxes.
 """
 
 from collections.abc import Callable
@@ -80,6 +84,7 @@ def _negative(a: Interval) -> Interval:
 
 def _multiply(a: Interval, b: Interval) -> Interval:
     """Return all products of two numbers of the intervals."""
+    # a number is an interval with one array as both bounds
     ends = [(c.low,) if c.low is c.high else (c.low, c.high) for c in (a, b)]
     products = [x * y for x in ends[0] for y in ends[1]]
     if np.isnan(sum(products)).any():
@@ -107,13 +112,13 @@ def _power(a: Interval, p: Interval) -> Interval:
         # NumPy has no real power of a negative number with a broken exponent.
         return _exp(_multiply(p, _log(a)))
     n = float(p.low)
-    if n != int(n) or abs(n) > 1e9:
+    if not n.is_integer() or abs(n) > 1e9:  # of numbers that are not negative
         return _power_positive(Interval(np.maximum(a.low, 0.0), a.high), n)
     if n < 0:
         return _inverse(_power(a, Interval.number(-n)))
     if n == 1:
         return a
-    if n % 2:
+    if n % 2:  # odd powers increase
         return a.monotone(lambda x: np.power(x, n))
     return _power_positive(_absolute(a), n) if n else Interval.number(np.ones_like(a.low))
 
@@ -143,6 +148,7 @@ def _sin(a: Interval) -> Interval:
 
     def passes(peak: float) -> NDArray[np.bool_]:
         """Return whether each interval contains the angle `peak` up to full turns."""
+        # the number of peaks below an angle is higher at the upper end
         passed = np.floor((a.high - peak) / turns) > np.floor((a.low - peak) / turns)
         return np.asarray(passed | ~np.isfinite(a.size))
 
@@ -293,7 +299,7 @@ class Enclosure(NDArrayOperatorsMixin):
         intervals = [
             a.values if isinstance(a, Enclosure) else Interval.number(a) for a in arguments
         ]
-        partial_slopes = SLOPES[ufunc](*intervals)
+        partial_slopes = SLOPES[ufunc](*intervals)  # by each argument
         slopes = [Interval.number(np.zeros_like(self.middle))] * 3
         for a, factor in zip(arguments, partial_slopes, strict=True):
             if isinstance(a, Enclosure):
@@ -302,6 +308,7 @@ class Enclosure(NDArrayOperatorsMixin):
         middle = ufunc(*(a.middle if isinstance(a, Enclosure) else a for a in arguments))
         max_change = np.zeros_like(self.middle)
         for slope, half in zip(slopes, self.halves, strict=True):
+            # without a slope there is no change, in an infinite box too
             max_change = max_change + np.where(slope.size == 0, 0.0, slope.size * half)
         linear_bounds = Interval.between(middle - max_change, middle + max_change)
         values = VALUES[ufunc](*intervals).intersection(linear_bounds)

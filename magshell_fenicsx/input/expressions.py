@@ -1,4 +1,11 @@
-"""Formulas of a case: parsed, checked and evaluated, with derivatives by Taylor arithmetic."""
+"""Formulas of a case: parsed, checked and evaluated, with derivatives by Taylor arithmetic.
+
+The text of a formula becomes steps of a stack machine, which pushes numbers and names and replaces
+the top values by a function of them; then a program, in which each repeated part stands once.
+Programs run on arrays, on `Taylor` objects (a value with its first and second derivatives), and on
+enclosures (bounds of all values in a box). Frames are given by rotation matrices Q. R is the
+reference length, over which a model measures places.
+"""
 
 import ast
 import operator
@@ -49,6 +56,7 @@ class Taylor(NDArrayOperatorsMixin):
         if method != "__call__" or options or ufunc not in PARTIALS:
             return NotImplemented
         values = [a.value if isinstance(a, Taylor) else a for a in arguments]
+        # a number has no derivatives
         positions = [i for i, a in enumerate(arguments) if isinstance(a, Taylor)]
         first_partials, second_partials = PARTIALS[ufunc](*values)
         gradient, hessian = np.zeros_like(self.gradient), np.zeros_like(self.hessian)
@@ -58,7 +66,7 @@ class Taylor(NDArrayOperatorsMixin):
         for (i, j), partial in second_partials.items():
             if i in positions and j in positions:
                 product = arguments[i].gradient[:, None] * arguments[j].gradient
-                if i != j:
+                if i != j:  # the pair (j, i) too
                     product = product + product.swapaxes(0, 1)
                 hessian = hessian + partial * product
         return Taylor(ufunc(*values), gradient, hessian)
@@ -68,6 +76,7 @@ def _power(x: Any, p: Any) -> Partials:
     """Return the first and second derivatives of x**p by both arguments."""
 
     def term(factor: Any, exponent: Any) -> Any:
+        """Return factor x**exponent."""
         # Not 0/0, for instance of x**1 at 0.
         return np.where(factor == 0, 0.0, factor * np.power(x, exponent))
 
@@ -171,13 +180,15 @@ class FormulaFunction:
             (n,) bound of the variation of the first derivatives within a box, each times the side
             of the box, summed.
         """
+        # a formula without a variable is a number
         enclosure, n = _evaluate(self.steps, *Enclosure.coordinates(low, high)), len(low)
         if not isinstance(enclosure, Enclosure):
             return np.full(n, enclosure), np.full(n, enclosure), np.zeros(n)
         sides = 2 * enclosure.halves
         widths = (slope.high - slope.low for slope in enclosure.slopes)
         variation = sum(
-            np.where(side > 0, width * side, 0.0) for width, side in zip(widths, sides, strict=True)
+            np.where(side > 0, width * side, 0.0)  # not 0 times infinity
+            for width, side in zip(widths, sides, strict=True)
         )
         least, largest = np.broadcast_arrays(enclosure.values.low, enclosure.values.high)
         return least, largest, np.broadcast_to(variation, n)
@@ -270,7 +281,8 @@ def formula_with_derivatives(text: str) -> Callable[[Array], Taylor]:
     def evaluate(x: Array) -> Taylor:
         coordinates = Taylor.coordinates(x)
         value = _evaluate(steps, *coordinates)
-        return value if isinstance(value, Taylor) else value + 0.0 * coordinates[0]  # a number
+        # a formula without a variable is a number: it gets derivatives of zero
+        return value if isinstance(value, Taylor) else value + 0.0 * coordinates[0]
 
     return evaluate
 
@@ -295,6 +307,7 @@ def _parse(text: str) -> _Program:
         if "nested parentheses" in str(e):
             raise ValueError(f"{excerpt!r}: allowed are 200 brackets within each other") from None
         raise ValueError(f"{excerpt!r} is not a formula") from None
+    # names of functions may only be called, and other names may not
     called_functions = {id(node.func) for node in nodes if isinstance(node, ast.Call)}
     for node in nodes:
         allowed = isinstance(node, _ALLOWED)
@@ -304,7 +317,7 @@ def _parse(text: str) -> _Program:
             allowed = node.id in (FUNCTIONS if id(node) in called_functions else NAMES)
         if isinstance(node, ast.Call):
             name = node.func.id if isinstance(node.func, ast.Name) else ""
-            allowed = (
+            allowed = (  # nin: the number of arguments of NumPy's function
                 name in FUNCTIONS and not node.keywords and len(node.args) == FUNCTIONS[name].nin
             )
         if not allowed:
@@ -334,6 +347,7 @@ def _without_repetition(steps: list[_Step]) -> _Program:
     number_of_value, value_stack = dict[Any, int](), list[int]()
     unique_steps, operands = list[Any](), list[tuple[int, ...]]()
     for step in steps:
+        # numbers of the values that a function takes from the stack; step[1] is their count
         arguments = tuple(value_stack[-step[1] :]) if isinstance(step, tuple) else ()
         value_stack = value_stack[: len(value_stack) - len(arguments)]
         key: Any = step
@@ -346,6 +360,7 @@ def _without_repetition(steps: list[_Step]) -> _Program:
             unique_steps.append(step)
             operands.append(arguments)
         value_stack.append(number_of_value[key])
+    # value -> the last step that uses it: later entries of the mapping replace earlier ones
     last_use = {value: i for i, arguments in enumerate(operands) for value in arguments}
     program = _Program()
     for i, (step, arguments) in enumerate(zip(unique_steps, operands, strict=True)):
@@ -363,20 +378,20 @@ def _evaluate(steps: _Program, x: Any, y: Any, z: Any) -> Any:
     The type of the result is theirs; it is a number if the formula has no variable.
     """
     names, values = {"x": x, "y": y, "z": z, "pi": np.float64(np.pi)}, list[Any]()
-    with np.errstate(all="ignore"):
+    with np.errstate(all="ignore"):  # values that are not finite are refused later, with a place
         for step in steps:
             if isinstance(step, tuple):
                 function, arguments, unused = step
                 values.append(function(*(values[i] for i in arguments)))
                 for i in unused:
-                    values[i] = None
+                    values[i] = None  # frees the memory of an array
             else:
                 values.append(names[step] if isinstance(step, str) else step)
     return values[-1]
 
 
 def symbolic(text: str, functions: Mapping[str, Callable[..., Any]], x: Any, y: Any, z: Any) -> Any:
-    """Return a formula of the symbols x, y, z, such as those of UFL.
+    """Return a formula of the symbols x, y, z, such as symbols of UFL.
 
     Parameters
     ----------
@@ -388,7 +403,7 @@ def symbolic(text: str, functions: Mapping[str, Callable[..., Any]], x: Any, y: 
     ValueError
         If the text is no formula.
     """
-    formula(text)
+    formula(text)  # raises if it is none
     replacements = {FUNCTIONS[name]: functions[name] for name in FUNCTIONS}
     names, stack = {"x": x, "y": y, "z": z, "pi": float(np.pi)}, list[Any]()
     for step in _steps(ast.parse(text, mode="eval")):
@@ -418,7 +433,8 @@ def _steps(tree: ast.Expression) -> list[_Step]:
     """
     steps: list[_Step] = []
     pending: list[ast.AST] = [tree.body]
-    # The last operation first, and of its values the last first; then all backwards.
+    # The last operation first, and of its values the last first; then all backwards, since a stack
+    # machine needs the values before their operation.
     while pending:
         node = pending.pop()
         if isinstance(node, ast.BinOp):
@@ -526,6 +542,7 @@ class FormulasInSpace:
         Places `x` (n, 3) are in the formulas' unit of length; the first index is the component.
         """
         taylors, Q = [component(x @ self.axes) for component in self.components], self.axes
+        # from the formulas' frame to that of the places, each index by Q
         B, G, H = (
             np.stack([getattr(f, d) for f in taylors]) for d in ("value", "gradient", "hessian")
         )

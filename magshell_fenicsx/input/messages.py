@@ -1,6 +1,12 @@
 """Messages about a wrong case: file, line, key, value, what is allowed; and meanings of keys.
 
 Python does not keep the docstrings of keys: they are read in the source when somebody asks.
+
+A section class is a pydantic model of a part of the case; a field is one of its keys. A location is
+the sequence of keys and list positions that lead to a value. Where a value may be one of several
+sections (a union), a key chooses: `kind` or `geometry`. Its values are tags. Pydantic puts tags
+into the locations of its errors, after the key of the union. A mapping of sections has names of the
+user as keys, such as a body's.
 """
 
 import ast
@@ -47,6 +53,7 @@ def _docstrings(section: type) -> dict[str, str]:
     if not definition:
         return {}
     docstrings = {}
+    # each statement with the next one
     for key, statement in zip(definition.body, definition.body[1:], strict=False):
         if not isinstance(key, ast.AnnAssign) or not isinstance(key.target, ast.Name):
             continue
@@ -132,6 +139,7 @@ def explained(errors: Sequence[Any], source: Source, case: type[BaseModel]) -> s
         )
         return has_inner_error or (kind in NO_CONTAINER and locations.count(location) > 1)
 
+    # two members of a union may give one line
     lines = [
         explain(error, location, source, case)
         for location, error in zip(locations, errors, strict=True)
@@ -165,6 +173,7 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
         is_name = NAME_PATTERN_PART in error["ctx"]["pattern"]
         name_rule, number_rule = "a letter, then letters, digits and _", "a number with a unit"
         problem = f"must be {name_rule if is_name else number_rule}"
+    # a message that begins with a key of its own is about that key
     if own_key := re.match(r"(\w+(\.[^.:]+)+): ", problem):  # of a rule between sections
         keys = own_key[1].split(".")
         location = tuple(int(key) if key.isdecimal() else key for key in keys)
@@ -185,8 +194,9 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
         return f"{place}: {key}: {shown_value(value)}: must be a section, with keys below it"
     if isinstance(value, dict | BaseModel):
         return f"{place}: {key}: {problem}"
-    if problem.startswith(shown_value(value)):
+    if problem.startswith(shown_value(value)):  # the value need not be told twice
         return f"{place}: {key}: {problem}"
+    # own messages, and choices, need no meaning of the key
     says_all = kind in ("value_error", "literal_error")
     meaning = "" if says_all else _meaning(location, source.data, case)
     text_in_case = _data_at(source.data, location, str) if isinstance(value, float) else ""
@@ -199,7 +209,9 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
 def _tag_problem(error: Any, location: Location, source: Source, case: type[BaseModel]) -> str:
     """Return a message about a wrong key that chooses a section, such as `kind`."""
     keys = location[:-1] if isinstance(location[-1], int) else location
-    field = _section_at(keys, source.data, case)[1] or case.model_fields[str(location[0])]
+    # the key of the union; in a list of sections, the key of the list
+    _, field_of_keys = _section_at(keys, source.data, case)
+    field = field_of_keys or case.model_fields[str(location[0])]
     sections = [m for m in _models(field.annotation) if _tag_key([m])]
     tag, tags = error["ctx"].get("tag"), dict.fromkeys(tag for m in sections for tag in _tags(m))
     problem = "is missing" if tag is None else shown_value(tag)
@@ -250,7 +262,8 @@ def shown_value(value: Any) -> str:
 def _without_tag(loc: Location, data: Any, case: type[BaseModel]) -> Location:
     """Return the location of an error in a case, without the tags that pydantic inserts.
 
-    Pydantic puts the tag of a union's member after the key of the union.
+    Pydantic puts the tag of a union's member after the key of the union. The walk along `loc` knows
+    at each key the section classes that may be there: several below a union, one after its tag.
 
     Parameters
     ----------
@@ -265,6 +278,7 @@ def _without_tag(loc: Location, data: Any, case: type[BaseModel]) -> Location:
     for key in loc:
         if key in NO_KEYS:
             continue
+        # a word that neither the class nor the data has as a key
         fields = sections[0].model_fields if len(sections) == 1 else ()
         may_be_tag = len(sections) < 2 and not below_names and isinstance(key, str)
         if may_be_tag and key not in {*fields, *_data_at(data, keys, dict)}:
@@ -273,7 +287,7 @@ def _without_tag(loc: Location, data: Any, case: type[BaseModel]) -> Location:
             keys.append(key)
             below_names = False
             continue
-        if len(sections) > 1 and not isinstance(key, int):
+        if len(sections) > 1 and not isinstance(key, int):  # the tag: it leaves one class
             sections = [m for m in sections if _tag_key([m]) and key in _tags(m)][:1] or sections
             continue
         keys.append(key)
@@ -298,7 +312,8 @@ def _data_at(data: Any, location: Sequence[str | int], kind: type) -> Any:
 
 def _allowed_keys(location: Location, data: Any, case: type[BaseModel]) -> list[str]:
     """Return the keys of the section at a location in a case."""
-    return list(_section_at(location, data, case)[0].model_fields)
+    section, _ = _section_at(location, data, case)
+    return list(section.model_fields)
 
 
 def _meaning(location: Location, data: Any, case: type[BaseModel]) -> str:
@@ -306,7 +321,7 @@ def _meaning(location: Location, data: Any, case: type[BaseModel]) -> str:
     section, field = _section_at(location, data, case)
     description = meaning(section, str(location[-1])) if field else ""
     description = " ".join(description.split())  # of several lines of a docstring
-    words = re.split(r"[;:.,] | \[", description)[0]
+    words, *_ = re.split(r"[;:.,] | \[", description)
     if not words:
         return ""
     unit = re.search(r"\[([^\[\]]+)\]$", description)
@@ -316,9 +331,10 @@ def _meaning(location: Location, data: Any, case: type[BaseModel]) -> str:
 def _example(value: Any, location: Location, data: Any, case: type[BaseModel]) -> str:
     """Return the begin of a mapping, such as "ball: ...", as an example in a message.
 
-    `value` is a word or a list of words that a case has in place of the mapping.
+    `value` is a word or a list of words that a case has in place of the mapping: if it is a name,
+    it is the first key of the example. The type of the key says which words are allowed otherwise.
     """
-    field = _section_at(location, data, case)[1]
+    _, field = _section_at(location, data, case)
     parts_of_annotation = _nested_annotations(field.annotation if field else None)
     mappings = (
         get_args(each_type) for each_type in parts_of_annotation if get_origin(each_type) is dict
@@ -360,7 +376,7 @@ def _section_at(
             data = data.get(key)
         else:
             data = data[key] if isinstance(data, list) and isinstance(key, int) else None
-        # None: of a list or mapping of sections, or a part of a union
+        # None: the key is a position in a list, a name of the user, or unknown
         field = None if below_names else section.model_fields.get(str(key))
         if field or not (below_names or isinstance(key, int)):
             sections = _models(field.annotation) if field else []

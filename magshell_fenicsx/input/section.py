@@ -1,7 +1,10 @@
 """The base of all sections of a case: strict types, no unknown keys, units, files, choices.
 
 A case has few of many kinds of sections, so a validator is built only when a case has the section.
-Targets with units become numbers over sizes of the case, such as the thickness, at validation.
+Targets with units become numbers over sizes of the case, such as the thickness, at validation. The
+context of a validation is a mapping that pydantic passes to all validators: the shell, which comes
+first, puts its sizes there under "given". Units have the names of pint, such as "metre". A field is
+a key of a section class, and its annotation the type. A digest is a hash of a file or an object.
 """
 
 import re
@@ -150,9 +153,10 @@ def in_unit(text: str, unit: str) -> float:
     """
     number, unit_of_text = number_and_unit(text)
     if not unit_of_text and number and (not unit or float(number) == 0):
-        return float(number)
+        return float(number)  # a bare number that may be one
     if not unit or not number:
         raise ValueError(f"{text} is not convertible to {unit or 'a bare number'}")
+    # the same unit needs no rounding by a conversion
     return float(number) if unit_of_text == unit else _converted(text, unit)
 
 
@@ -231,7 +235,7 @@ def numbers_with_units(validated: Any, data: Any, key: str) -> Iterator[str]:
     elif isinstance(validated, list) and isinstance(data, list):
         for i, (value, item) in enumerate(zip(validated, data, strict=True)):
             yield from numbers_with_units(value, item, f"{key}.{i}")
-    elif isinstance(validated, float) and isinstance(data, str):
+    elif isinstance(validated, float) and isinstance(data, str):  # a text that became a number
         yield key
 
 
@@ -245,6 +249,7 @@ def is_length(annotation: Any, metadata: Iterable[Any] = ()) -> bool:
     metadata
         Annotations that pydantic keeps apart from the type, such as validators.
     """
+    # metadata of this type; then the types within it, such as the items of a list
     validators = (validator for validator in metadata if isinstance(validator, WithUnit))
     if any(validator.unit == "metre" for validator in validators):
         return True
@@ -270,6 +275,7 @@ class OrInMemory:
     ) -> CoreSchema:
         """Return the schema of the union's other members, wrapped to keep objects of `kind`."""
         other_members = reduce(or_, (part for part in get_args(source) if part is not self.kind))
+        # how the value is written: `_serialized` gets the usual function to write the others
         serialization = core_schema.wrap_serializer_function_ser_schema(self._serialized)
         schema = handler.generate_schema(other_members)
         return core_schema.no_info_wrap_validator_function(
@@ -435,7 +441,7 @@ class FileKeys(Section):
 
     def model_post_init(self, context: Any, /) -> None:
         """Take the folder and the files of the case from the context of its validation."""
-        options = context or {}
+        options = context or {}  # of a case without a file there is none
         self._folder = Path(options.get("folder", "")).absolute()
         self._files = options.get("files") or Files()
 
@@ -576,6 +582,7 @@ def is_over_unit(annotation: Any, metadata: Iterable[Any] = ()) -> bool:
 
     `annotation` is the type of the field, `metadata` what pydantic keeps apart, such as validators.
     """
+    # of an optional field the number is a member of a union
     nested = (
         validator
         for part in (annotation, *get_args(annotation))

@@ -1,4 +1,9 @@
-"""Reading a case file: YAML to plain data, with the line of every key kept for messages."""
+"""Reading a case file: YAML to plain data, with the line of every key kept for messages.
+
+A location is the sequence of keys and list positions that lead to a value; its place is the file
+and line, or the setting "--set key=value" of the command line that gave it. A node is a part of the
+YAML text with its line, before it becomes data.
+"""
 
 import re
 from collections.abc import Callable, Sequence
@@ -101,6 +106,7 @@ def read_source(file: Path, settings: Sequence[str] = ()) -> Source:
     except UnicodeDecodeError:
         raise CaseError(f"{file}: is not a text file in UTF-8") from None
     source = Source(str(file), {}, folder=file.parent.absolute())
+    # twice: nodes have lines, data have the merged keys
     root_node = _parsed(source, lambda: yaml.compose(text, Loader=_Loader))
     if not isinstance(root_node, yaml.MappingNode):
         raise CaseError(
@@ -208,13 +214,15 @@ def override(source: Source, assignment: str) -> None:
                 section = section[int(key)]
             else:
                 section = section.setdefault(key, {})
-    setting = Source(f"--set {assignment}", {})
+    setting = Source(f"--set {assignment}", {})  # a source of its own, for messages and checks
     setting_node = _parsed(setting, lambda: yaml.compose(text, Loader=_Loader))
     _note_places(setting_node or yaml.ScalarNode("", ""), (), setting)
     section[location[-1]] = _parsed(setting, lambda: yaml.load(text, Loader=_Loader))
     replaced_key = REPLACED_KEYS.get(tuple(location), "")
+    # of a file: a key that another setting gave stays, and both are refused together
     if not source.places.get((*location[:-1], replaced_key), "--set").startswith("--set"):
         section.pop(replaced_key, None)
+    # the place of the key, and of sections on the way that the setting has made
     for length in range(1, len(keys) + 1):
         if length == len(keys) or tuple(location[:length]) not in source.places:
             source.places[tuple(location[:length])] = f"--set {assignment}"

@@ -1,4 +1,9 @@
-"""Tables from files beside the case: columns with units, and vectors at control points."""
+"""Tables from files beside the case: columns with units, and vectors at control points.
+
+A header is the line of a CSV file with the names of its columns, perhaps with units, such as
+"x [mm]". Measured tables may have empty cells; tables of vectors have a field at points in space,
+or on a meridian (rho is the distance from the axis). A place is a point.
+"""
 
 import csv
 import io
@@ -102,9 +107,10 @@ def read_rows(file: Path, files: Files) -> TableRows:
     lengths = {column.shape for column in columns.values()}
     if len(lengths) > 1 or any(len(shape) != 1 for shape in lengths):
         raise TableError("its arrays have different lengths")
+    # an .npz file has no lines: its rows are counted from 1
     lines = cells.lines or range(1, 1 + next(iter(lengths))[0])
     for name, column in columns.items():
-        for row in np.flatnonzero(np.abs(column) > MAX_MEASURED_NUMBER)[:1]:
+        for row in np.flatnonzero(np.abs(column) > MAX_MEASURED_NUMBER)[:1]:  # the first, if any
             raise TableError(
                 f"line {lines[row]}: {name}: {column[row]:g}: allowed are numbers up to "
                 f"{MAX_MEASURED_NUMBER:g} in size"
@@ -131,7 +137,7 @@ def _cells(file: Path, files: Files) -> _TableCells:
             return _TableCells(npz_arrays(content))
         return _csv_cells(table_text(content))
     except TableError:
-        raise
+        raise  # a ValueError too, with its message
     except (ValueError, csv.Error) as e:
         raise TableError(str(e)) from None
 
@@ -271,6 +277,7 @@ def _csv_cells(text: str) -> _TableCells:
     header, begin = _header(text)
     separator, names = _separator(header), _names(header)
     _refuse_double(names)
+    # an array takes less memory than a list: there may be millions of cells
     cell_values, lines, word = array("d"), list[int](), ""
     for line, row in _rows(text, separator, begin):
         if len(row) != len(names):
@@ -306,7 +313,9 @@ def _header(text: str) -> tuple[str, int]:
             comments.append((bare.lstrip("# "), number))
         elif bare:
             cells = [cell for cell in re.split(r"[;,\s]+", bare.replace('"', "")) if cell]
+            # a line of numbers: the names are in a comment above
             if comments and any(_number(cell) is not None for cell in cells):
+                # the first comment with the largest key: True where the counts agree
                 return max(comments, key=lambda comment: len(_names(comment[0])) == len(cells))
             return bare, number
     return "", 0
@@ -329,6 +338,7 @@ def _rows(text: str, separator: str | None, begin: int) -> Iterator[tuple[int, l
 
     Comments and empty rows are left out. `begin` is the number of the header's line.
     """
+    # lines above become empty, so that numbers of lines stay right
     numbered = enumerate(io.StringIO(text), 1)
     bare = (line.partition("#")[0] if number > begin else "" for number, line in numbered)
     if separator:

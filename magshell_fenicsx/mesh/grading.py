@@ -2,7 +2,12 @@
 
 A `Grading` is the least size that its features ask for: discs, rings, lines and squares of a chart
 with small elements, which grow away from there. It gives the size at a point, the distance of grid
-lines, and an estimate of the number of triangles. Lengths are over R.
+lines, and an estimate of the number of triangles.
+
+The size of an element is the length of its sides. The growth of a feature is the increase of the
+size per distance from it. Points and coordinates are those of a chart of the surface; a grid line
+across axis 0 (or 1) is the line of one first (or second) coordinate. h and R are thickness and
+reference length. Lengths are over R.
 """
 
 from collections.abc import Callable, Sequence
@@ -53,7 +58,8 @@ class Feature(Protocol):
         x
             (n, 2) points of the chart.
         distance
-            (n,); positive: the largest size at most so far from the point, negative: the least.
+            (n,); positive: bound is the largest size within this distance of the point; negative:
+            the least size within its absolute value; zero: the size itself.
         """
 
 
@@ -80,7 +86,7 @@ class DiscFeature:
         return self.size + self.growth * max(0.0, abs(x - self.centre[axis]) - self.radius)
 
     def size_bound(self, x: Array, distance: Array) -> Array:
-        """Return bounds (n,) of the sizes near points; see `Feature.size_bound`."""
+        """Return bounds (n,) of the sizes near points: upper ones for a positive distance."""
         from_centre = np.hypot(x[:, 0] - self.centre[0], x[:, 1] - self.centre[1])
         from_disc = from_centre - self.radius + distance
         return np.asarray(self.size + self.growth * np.maximum(from_disc, 0.0))
@@ -92,8 +98,9 @@ class DiscFeature:
         the growth g and the radius a or, if that is less, the reach.
         """
         s, g, a = self.size, self.growth, min(self.radius, reach)
-        outer = g * (reach - a) / s
+        outer = g * (reach - a) / s  # relative growth of the size from the disc to the reach
         ratio = outer / (1 + outer)
+        # the integral from a to the reach, in closed form
         outside_disc = 2 * pi * (a / (s * g) * outer / (1 + outer) + (log1p(outer) - ratio) / g**2)
         return PER_AREA * (pi * a**2 / s**2 + outside_disc)
 
@@ -136,12 +143,12 @@ class SquaresFeature:
         return float((self.sizes + self.growth * distances).min())
 
     def size_bound(self, x: Array, distance: Array) -> Array:
-        """Return bounds (n,) of the sizes near points; see `Feature.size_bound`.
+        """Return bounds (n,) of the sizes near points: upper ones for a positive distance.
 
         Every square is considered for every point.
         """
         offsets = np.abs(x[:, None] - self.centres) - self.halves[:, None]
-        # negative inside a square: the distance to its nearest side
+        # negative inside a square: less the distance to its nearest side
         depth = np.minimum(offsets.max(axis=-1), 0.0)
         distance_outside = np.hypot(*np.moveaxis(np.maximum(offsets, 0.0), -1, 0))
         from_squares = distance_outside + depth + distance[:, None]
@@ -154,6 +161,7 @@ class SquaresFeature:
         """
         area, least_size, growth = 4 * self.halves**2, self.size, self.growth
         disc = DiscFeature((0.0, 0.0), sqrt(float(area.sum()) / pi), least_size, growth)
+        # without those in the disc itself, which the squares have
         cells_within = DiscFeature((0.0, 0.0), disc.radius, least_size, growth).cells(
             min(disc.radius, reach)
         )
@@ -182,7 +190,7 @@ class RingFeature:
         return inf  # a ring belongs to discs, which are no grids
 
     def size_bound(self, x: Array, distance: Array) -> Array:
-        """Return bounds (n,) of the sizes near points; see `Feature.size_bound`."""
+        """Return bounds (n,) of the sizes near points: upper ones for a positive distance."""
         from_ring = np.abs(np.hypot(x[:, 0], x[:, 1]) - self.radius) + distance
         return np.asarray(self.size + self.growth * np.maximum(from_ring, 0.0))
 
@@ -209,7 +217,7 @@ class LineFeature:
         return self.size + self.growth * abs(x - self.place) if axis == self.axis else inf
 
     def size_bound(self, x: Array, distance: Array) -> Array:
-        """Return bounds (n,) of the sizes near points; see `Feature.size_bound`."""
+        """Return bounds (n,) of the sizes near points: upper ones for a positive distance."""
         from_line = np.abs(x[:, self.axis] - self.place) + distance
         return np.asarray(self.size + self.growth * np.maximum(from_line, 0.0))
 
@@ -252,6 +260,7 @@ class Grading:
         It is the integral of one over the square of the size, over cells of the shape that are
         divided until the size varies little in each.
         """
+        # how many cells may be looked at: each takes an evaluation of every feature
         feature_count = sum(
             len(f.halves) if isinstance(f, SquaresFeature) else 1 for f in self.features
         )
@@ -262,8 +271,9 @@ class Grading:
             sizes, max_sizes, min_sizes = (
                 self._size_bound(centres, factor * radius) for factor in (0.0, 1.0, -1.0)
             )
+            # over `PER_AREA`; triangles near small ones take the smaller size
             triangles = area / self._size_bound(centres, -SIZE_SAMPLING_DISTANCE * sizes) ** 2
-            # bounds of the number of triangles in a cell, by the bounds of its size
+            # the number of triangles in a cell lies between bounds, by the bounds of its size
             uncertainty = area / min_sizes**2 - area / max_sizes**2
             divided = (uncertainty > CELL_TOLERANCE * triangles) & (
                 uncertainty > TOTAL_TOLERANCE * (total + triangles.sum())
@@ -272,11 +282,15 @@ class Grading:
                 divided[:] = False
             total += float(triangles[~divided].sum())
             undivided_cells, budget = undivided_cells.quarters(divided), budget - len(divided)
+        # where a strip is narrower than a triangle, its length decides instead of its area
         along_thin_strip = 2 * shape.reach / self.largest
         return PER_AREA * total + along_thin_strip
 
     def _size_bound(self, x: Array, distance: Array) -> Array:
-        """Return bounds (n,) of the sizes of all features, see `Feature.size_bound`."""
+        """Return bounds (n,) of the element sizes near points x (n, 2), as `Feature.size_bound`.
+
+        Positive distances (n,) give upper bounds, negative ones lower bounds.
+        """
         sizes = np.full(len(x), self.largest)
         for feature in self.features:
             np.minimum(sizes, feature.size_bound(x, distance), out=sizes)
@@ -308,6 +322,7 @@ class _EstimateCells:
             counts = np.array([RADIAL_CELLS, ANGULAR_CELLS // 2 if shape.half else ANGULAR_CELLS])
         else:
             counts = np.maximum(1, np.ceil(CELLS_OF_REACH * (high - low) / shape.reach))
+        # lower and upper coordinates of the cells along each axis, then of all cells
         bounds_by_axis = [
             np.linspace(a, b, int(n) + 1) for a, b, n in zip(low, high, counts, strict=True)
         ]
@@ -323,6 +338,7 @@ class _EstimateCells:
         if not self.polar:
             return middle, width * height, np.hypot(width, height) / 2
         r, angle = middle.T
+        # area r dr dangle; the half diagonal with the arc at the outer radius
         x = r[:, None] * np.column_stack([np.cos(angle), np.sin(angle)])
         return x, r * width * height, np.hypot(width, self.high[:, 0] * height) / 2
 

@@ -2,6 +2,11 @@
 
 Opposite sides may be one line of the surface: their nodes are then glued. Grid lines pass through
 the named points; lines that nearly coincide are one line, which is bent to the points.
+
+The chart has two coordinates, axis 0 and 1; a line across an axis is the line of one value of this
+coordinate. Fixed lines are straight and stay; movable lines may be moved to points nearby. Glued
+nodes have one representative. An embedding maps chart coordinates to places in space. A rim is a
+closed curve that element edges follow, such as the edge of a dimple.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -66,12 +71,12 @@ class Grid:
     @property
     def cells(self) -> float:
         """Approximate number of triangles."""
-        counts = [max(self._counts[axis][1][-1], 1.0) for axis in range(2)]
+        counts = [max(cumulative_count[-1], 1.0) for _, cumulative_count in self._counts]
         return float(4 * counts[0] * counts[1])
 
     @cached_property
     def _counts(self) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        """Numbers of quadrilaterals along both axes, see `_cumulative_count`."""
+        """For each axis: coordinates, and the number of quadrilaterals up to each of them."""
         return self._cumulative_count(0), self._cumulative_count(1)
 
     def _cumulative_count(self, axis: int) -> tuple[Array, Array]:
@@ -83,6 +88,7 @@ class Grid:
         if not callable(size):
             return np.array([low, high]), np.array([0.0, (high - low) / size])
         x = np.linspace(low, high, SIZE_SAMPLES, dtype=np.float64)
+        # integrated by the trapezoidal rule
         per_length = 1 / np.array([size(axis, float(c)) for c in x])
         steps = (per_length[1:] + per_length[:-1]) / 2 * np.diff(x)
         return x, np.concatenate([[0.0], np.cumsum(steps)])
@@ -102,13 +108,13 @@ class Grid:
         required = np.unique([*self._straight_lines(axis), *movable])
         is_new = np.diff(required) > CHART_TOLERANCE * (high - low)
         required = required[np.concatenate([[True], is_new])]
-        required[-1] = high
+        required[-1] = high  # which may have been dropped as equal to a line before it
         x, cumulative_count = self._counts[axis]
         # quadrilaterals up to each required line, not yet whole numbers
         counts = np.interp(required, x, cumulative_count)
         intervals = [max(int(np.ceil(b - a - COUNT_TOLERANCE)), 1) for a, b in pairwise(counts)]
         if self.glued[axis] and sum(intervals) < MIN_GLUED_COUNT:
-            min_count = -(-MIN_GLUED_COUNT // len(intervals))
+            min_count = -(-MIN_GLUED_COUNT // len(intervals))  # rounded up
             intervals = [max(n, min_count) for n in intervals]
         lines = [required[:1]]
         for i, n in enumerate(intervals):
@@ -139,9 +145,9 @@ class Grid:
         return nearest if abs(nearest - x) <= min_distance else None
 
     def _movable_groups(self, axis: int, points: Sequence[Array]) -> list[tuple[Array, float]]:
-        """Return groups of coordinates near each other and near no straight line.
+        """Return groups of coordinates near each other, with the coordinate of the group's line.
 
-        Each group comes with the coordinate of its line.
+        They are the coordinates of points and movable lines that are near no straight line.
         """
         rounding = CHART_TOLERANCE * (self.high[axis] - self.low[axis])
         coordinates = np.unique([*(float(x[axis]) for x in points), *self.movable_lines[axis]])
@@ -158,7 +164,7 @@ class Grid:
     def vertices_of(self, points: Sequence[Array]) -> NDArray[np.int64]:
         """Return the numbers (n, 2) of the two grid lines that cross at the vertex of each point.
 
-        Of glued ends the first counts.
+        The first and the last line of a glued axis are one; it has the number 0.
         """
         numbers = np.zeros((len(points), 2), dtype=np.int64)
         for axis in range(2):
@@ -166,7 +172,7 @@ class Grid:
             for i, point in enumerate(points):
                 x = float(point[axis])
                 line = self.straight_line_at(axis, x)
-                if line is None:
+                if line is None:  # the line of the point's group
                     line = next(line for group, line in groups if group[0] <= x <= group[-1])
                 number = int(np.abs(lines - line).argmin())
                 is_second_end = self.glued[axis] and number == len(lines) - 1
@@ -190,13 +196,14 @@ def grid_mesh(grid: Grid, points: Mapping[str, Array], embedding: Embedding) -> 
         if (point < grid.low - tolerance).any() or (point > grid.high + tolerance).any():
             raise MeshError(f"the point {name} is not on the surface")
     x, y = (grid.lines(axis, list(points.values())) for axis in range(2))
-    n, m = len(x) - 1, len(y) - 1
+    n, m = len(x) - 1, len(y) - 1  # quadrilaterals along both axes
     vertices = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
     _move_to_points(vertices, grid, points)
     centres = (vertices[:-1, :-1] + vertices[1:, 1:]) / 2
     nodes = np.concatenate([vertices.reshape(-1, 2), centres.reshape(-1, 2)])
     number = np.arange((n + 1) * (m + 1)).reshape(n + 1, m + 1)
     centre = number.size + np.arange(n * m).reshape(n, m)
+    # of each quadrilateral, counter-clockwise
     corners = [number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]]
     cells = np.concatenate(
         [
@@ -232,7 +239,7 @@ def _move_to_points(vertices: Array, grid: Grid, points: Mapping[str, Array]) ->
     for number, (name, place) in enumerate(points.items()):
         i, j = int(numbers[number, 0]), int(numbers[number, 1])
         first_name, first_place = point_of_vertex.setdefault((i, j), (name, place))
-        offset = np.asarray(place - vertices[i, j])
+        offset = np.asarray(place - vertices[i, j])  # by which the vertex is moved
         # across glued ends, places that differ by the extent are the same
         offset -= np.where(grid.glued, np.round(offset / extent) * extent, 0.0)
         distance = place - first_place
@@ -252,16 +259,23 @@ def _move_to_points(vertices: Array, grid: Grid, points: Mapping[str, Array]) ->
         # a vertex on a glued end stands at both ends
         rows = (0, -1) if grid.glued[0] and i == 0 else (i,)
         columns = (0, -1) if grid.glued[1] and j == 0 else (j,)
-        if first_name == name:
+        if first_name == name:  # equal points move their vertex once
             for vertex in product(rows, columns):
                 vertices[vertex] += offset
 
 
 @dataclass(frozen=True)
 class RimmedGrid:
-    """A grid's rectangle with closed curves, points (n, 2) each, that element edges follow.
+    """A grid's rectangle with closed curves that element edges follow, for gmsh to triangulate.
 
-    It is a `PlaneShape`, a plane figure for gmsh.
+    It has the methods of a `PlaneShape`.
+
+    Attributes
+    ----------
+    rims
+        Points (n, 2) of each curve.
+    half
+        False: the rectangle is that of the modelled part itself.
     """
 
     grid: Grid
@@ -309,13 +323,14 @@ class RimmedGrid:
             """Make the rectangle and return its dimension and tag."""
             return 2, occ.addRectangle(x0, y0, 0, x1 - x0, y1 - y0)
 
+        # a rim across a glued side continues at the opposite side: images are shifted by the extent
         steps = [(-1, 0, 1) if glued else (0,) for glued in grid.glued]
         rims_and_images = [
             points + np.multiply(step, self.extent)
             for points in self.rims
             for step in product(*steps)
         ]
-        # those of which a part is inside the rectangle
+        # rims of which a part is inside the rectangle, by their bounding boxes
         rims_inside = list[Array]()
         for points in rims_and_images:
             begins_inside = (points.min(axis=0) < grid.high).all()
@@ -336,6 +351,7 @@ class RimmedGrid:
         """Return name of an edge -> whether points x (n, 2) lie on it; glued sides are left out."""
         edges = dict[str, NDArray[np.bool_]]()
         for i, name in enumerate(self.grid.sides):
+            # sides are in the order x = low, x = high, y = low, y = high
             axis, end = i // 2, (self.grid.low, self.grid.high)[i % 2]
             if name in self.grid.edges and not self.grid.glued[axis]:
                 on_side = np.abs(x[:, axis] - end[axis]) < CHART_TOLERANCE * self.reach

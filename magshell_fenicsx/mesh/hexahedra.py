@@ -2,7 +2,13 @@
 
 Each triangle of the mid-surface is divided into three quadrilaterals of degree 2, which meet at its
 centre: they are graded as the triangles are, and their edges follow the same circles. `sweep` makes
-the mesh of the body on all ranks. Lengths are over R.
+the mesh of the body on all ranks.
+
+The nodes of a mid-surface have coordinates in a chart (d = 2), or are places in space (d > 2); its
+embedding maps both to places in space. The offset of a node is the vector by which it moves per
+distance through the thickness. A layer of hexahedra has three levels of nodes: its begin, its
+middle and its end, which is the begin of the next layer. h is the thickness and R the reference
+length. Lengths are over R.
 """
 
 from collections.abc import Callable, Sequence
@@ -82,6 +88,7 @@ def split(patch: PatchMesh) -> Quadrilaterals:
         basix.ElementFamily.P, basix.CellType.triangle, order, basix.LagrangeVariant.equispaced
     )
     to_dolfinx = perm_gmsh(mesh.CellType.triangle, patch.cells.shape[1])
+    # [0] shape functions and [1:] their two derivatives, at the places of the quadrilaterals' nodes
     values = geometry.tabulate(1, reference)[..., 0]
     vertices, corners = np.unique(patch.corners, return_inverse=True)
     corners = corners.reshape(-1, 3)
@@ -89,13 +96,16 @@ def split(patch: PatchMesh) -> Quadrilaterals:
     dolfinx_cells = patch.cells[:, to_dolfinx]
     nodes_of_cells = np.einsum("qk,ckx->cqx", values[0], patch.nodes[dolfinx_cells])
     nodes = np.empty((numbers.max() + 1, patch.nodes.shape[1]))
-    nodes[numbers] = nodes_of_cells  # of glued sides either: they have one place in space
+    # a node of two glued sides gets the coordinates of either: they have one place in space
+    nodes[numbers] = nodes_of_cells
+    # a chart is mapped smoothly, so the normals are enough; a surface in space may have kinks
     if nodes.shape[1] == 2:
         offsets = surface_normal(patch.embedding, nodes)
     else:
         a1, a2 = np.einsum("dqk,ckx->dcqx", values[1:], patch.embedding(patch.nodes)[dolfinx_cells])
         offsets = _mitred_offsets(a1, a2, numbers, quads)
     first_side_node = len(vertices)
+    # a side has three nodes between its vertices, see `_node_numbers`: + 1 is the middle one
     middle_of_side = {
         (int(sides[n, 0]), int(sides[n, 1])): first_side_node + 3 * n + 1 for n in range(len(sides))
     }
@@ -135,7 +145,8 @@ def _node_numbers(
     is_backwards = (pairs[:, 0] > pairs[:, 1]).reshape(3, -1)
     numbers = np.empty((len(corners), nodes_per_triangle), dtype=np.int64)
     numbers[:, :3] = corners
-    for side, nodes in enumerate(nodes_on_sides):  # counted from the lower vertex
+    # two triangles share the nodes of a side, so these are counted from its lower vertex
+    for side, nodes in enumerate(nodes_on_sides):
         position = np.where(is_backwards[side][:, None], [2, 1, 0], [0, 1, 2])
         numbers[:, nodes] = vertex_count + 3 * side_numbers[side][:, None] + position
     inner = np.setdiff1d(np.arange(nodes_per_triangle), [0, 1, 2, *np.ravel(nodes_on_sides)])
@@ -155,22 +166,23 @@ def surface_normal(embedding: Embedding, x: Array) -> Array:
 def _mitred_offsets(a1: Array, a2: Array, numbers: Numbers, quads: Numbers) -> Array:
     """Return offsets (nodes, 3) for a surface that may have kinks.
 
-    At corners of quadrilaterals the offset is the mean normal over its mean cosine with the cells'
-    normals. Each cell's normal is weighted by the cell's angle there. This is exact between two
-    faces and between three that are normal to each other. The difference from a cell's own normal
-    is interpolated bilinearly to the nodes between.
+    An offset is the vector by which a node moves when all faces around it move outward by one. At
+    corners of quadrilaterals it is the mean normal over its mean cosine with the cells' normals.
+    Each cell's normal is weighted by the cell's angle there. This is exact between two faces and
+    between three that are normal to each other. The difference from a cell's own normal is
+    interpolated bilinearly to the nodes between the corners.
 
     Parameters
     ----------
     a1, a2
-        Tangents (cells, places, 3).
+        (cells, places, 3) tangents of the surface, at the places of each cell's nodes.
     numbers
         (cells, places) node of each place.
     quads
         (3, 9) places of the three quadrilaterals.
     """
     n = _unit(np.cross(a1, a2))
-    # angle of the cell at each place: pi but at the vertices of the triangle
+    # angle of the cell at each place: pi but at the triangle's vertices, which are the first places
     weights = np.full(n.shape[:2], np.pi)
     for corner, (e, f) in enumerate(((a1, a2), (a2 - a1, -a1), (-a2, a1 - a2))):
         cosine = np.sum(_unit(e[:, corner]) * _unit(f[:, corner]), axis=1)
@@ -182,8 +194,10 @@ def _mitred_offsets(a1: Array, a2: Array, numbers: Numbers, quads: Numbers) -> A
     mitre = total * total_weight / np.maximum(np.sum(total**2, axis=1, keepdims=True), TINY)
     xi, eta = quadrilateral_nodes().T
     bilinear = np.column_stack([(1 - xi) * (1 - eta), xi * (1 - eta), (1 - xi) * eta, xi * eta])
+    # the first four places of a quadrilateral are its corners
     difference = mitre[numbers[:, quads[:, :4]]] - n[:, quads[:, :4]]
     directions = n[:, quads] + np.einsum("kc,mqcx->mqkx", bilinear, difference)
+    # mean over the quadrilaterals at each node
     offsets = np.zeros_like(total)
     np.add.at(offsets, numbers[:, quads], directions)
     return np.asarray(offsets / np.bincount(numbers[:, quads].ravel())[:, None])
@@ -206,6 +220,7 @@ def _reference_split() -> tuple[Array, Numbers, list[list[int]]]:
     nodes_on_sides
         For each side the numbers of the three places between its vertices.
     """
+    # a column for each, to be multiplied by places (2,)
     xi, eta = quadrilateral_nodes().T[:, :, None]
     centre = VERTICES.mean(axis=0)
     places = [*VERTICES]
@@ -220,7 +235,7 @@ def _reference_split() -> tuple[Array, Numbers, list[list[int]]]:
             + (1 - xi) * eta * other_middle
         )
         quad_numbers = []
-        for x in quad:
+        for x in quad:  # neighbouring quadrilaterals share places
             known_numbers = [n for n, y in enumerate(places) if np.allclose(x, y)]
             if not known_numbers:
                 places.append(x)
@@ -254,8 +269,8 @@ class BodyMesh:
         Hexahedra with geometry of degree 2; the third coordinate of their reference cell runs
         outwards.
     faces
-        Name -> facets (local numbers): those of `OUTER_FACE`, and those above each named edge of
-        the mid-surface.
+        Name -> facets (local numbers): of the outer face (`OUTER_FACE`, an empty name), and above
+        each named edge of the mid-surface.
     points, normals
         Name -> (3,) position of a node in the middle of the thickness, and the mid-surface's normal
         there.
@@ -284,7 +299,10 @@ class BodyMesh:
     w0: Array | None = None
 
     def at_nodes(self, V: fem.FunctionSpace, values: Array) -> Array:
-        """Return nodal values of a quadratic space for values (n, ...) at the geometry's nodes."""
+        """Return nodal values of a quadratic space for values (n, ...) at the geometry's nodes.
+
+        Space and geometry have the same nodes in each cell, but number them differently.
+        """
         nodes = V.dofmap.index_map
         nodal = np.empty((nodes.size_local + nodes.num_ghosts, *values.shape[1:]))
         nodal[V.dofmap.list] = values[compat.geometry_dofs(self.mesh)]
@@ -318,17 +336,19 @@ def sweep(
     """
     quads = split(patch)
     bounds = np.linspace(0, 1, layers + 1) if isinstance(layers, int) else np.array(layers)
+    # heights of the levels, from 0 inside to 1 outside
     middles_and_ends = [((a + b) / 2, b) for a, b in pairwise(bounds)]
     heights = np.concatenate([bounds[:1], *middles_and_ends])
     factors = np.ones(len(quads.places)) if factor is None else factor(quads.places)
     thickness = h * factors
+    # distance of each level from the mid-surface, (nodes of it, levels)
     z = (heights - MIDSURFACE_HEIGHT) * thickness[:, None]
     X = (quads.places[:, None] + z[..., None] * quads.offsets[:, None]).reshape(-1, 3)
     layer_count = len(bounds) - 1
     cells = _swept_cells(quads.cells, layer_count)
     _refuse_overlap(X, cells)
     domain = create_mesh(comm, basix.ufl.element("Lagrange", "hexahedron", 2, shape=(3,)), cells, X)
-    # number of the hexahedron in `cells`, from which its triangle and layer follow
+    # number of the hexahedron in `cells`: layers vary fastest, then the triangle's three parts
     original_cells = domain.topology.original_cell_index
     triangle, layer = original_cells // (3 * layer_count), original_cells % layer_count
     points = {name: patch.embedding(x[None])[0] for name, x in patch.points.items()}
@@ -336,27 +356,27 @@ def sweep(
     for name, x in points.items():
         offset = quads.offsets[np.argmin(np.linalg.norm(quads.places - x, axis=1))]
         normals[name] = offset / np.linalg.norm(offset)
-    # node of the mid-surface and level of each node, see `_swept_cells`
+    # the body's node above node q of the mid-surface, at level k, has the number q levels + k
     node, level = np.divmod(domain.geometry.input_global_indices, len(heights))
     w0 = None
     if isinstance(patch.embedding, DeviatedEmbedding):
         w0 = patch.embedding.w0(quads.nodes)[node]
     return BodyMesh(
-        domain,
-        _named_faces(domain, quads, len(heights)),
-        points,
-        normals,
-        {name: mask[triangle] for name, mask in patch.patches.items()},
-        np.column_stack([bounds[layer], bounds[layer + 1]]),
-        quads.nodes[node],
-        heights[level],
-        thickness[node],
-        w0,
+        mesh=domain,
+        faces=_named_faces(domain, quads, len(heights)),
+        points=points,
+        normals=normals,
+        patches={name: mask[triangle] for name, mask in patch.patches.items()},
+        layer_bounds=np.column_stack([bounds[layer], bounds[layer + 1]]),
+        chart=quads.nodes[node],
+        heights=heights[level],
+        thickness=thickness[node],
+        w0=w0,
     )
 
 
 def _refuse_overlap(X: Array, cells: Numbers) -> None:
-    """Check that the volume of all cells is positive at all of their nodes.
+    """Check that no cell is turned over: the Jacobian is positive at all nodes of all cells.
 
     Parameters
     ----------
@@ -373,6 +393,7 @@ def _refuse_overlap(X: Array, cells: Numbers) -> None:
     element = basix.create_element(
         basix.ElementFamily.P, basix.CellType.hexahedron, 2, basix.LagrangeVariant.equispaced
     )
+    # derivatives of the shape functions at the nodes
     tables = element.tabulate(1, element.points)[1:, :, :, 0]
     for some_cells in np.array_split(cells, len(cells) // CELLS_PER_CHECK + 1):
         volumes = np.linalg.det(np.einsum("dqk,ckx->cqdx", tables, X[some_cells]))
@@ -401,6 +422,7 @@ def _swept_cells(quads: Numbers, layers: int) -> Numbers:
     points = basix.create_element(
         basix.ElementFamily.P, basix.CellType.hexahedron, 2, basix.LagrangeVariant.equispaced
     ).points
+    # for each node of a hexahedron, the node of the quadrilateral below it, and its level (0 to 2)
     distances = np.linalg.norm(points[:, None, :2] - quadrilateral_nodes()[None], axis=2)
     node_of_quad = np.argmin(distances, axis=1)
     level = np.rint(2 * points[:, 2]).astype(np.int64)
@@ -421,12 +443,14 @@ def _named_faces(
     levels
         Number of nodes through the thickness.
     """
+    # dimensions: 0 vertices, 2 facets, 3 cells; what the calls below need
     for pair in ((2, 3), (2, 0), (0, 3), (3, 2)):
         domain.topology.create_connectivity(*pair)
     facets = mesh.exterior_facet_indices(domain.topology)
     vertices = domain.topology.index_map(0)
     vertex_numbers = np.arange(vertices.size_local + vertices.num_ghosts, dtype=np.int32)
-    # for each vertex its number in the chart and its level
+    # number of each vertex as `sweep` gave it, from which its node of the mid-surface and its level
+    # follow
     nodes = mesh.entities_to_geometry(domain, 0, vertex_numbers)
     numbers = domain.geometry.input_global_indices[nodes[:, 0]]
     corners = domain.topology.connectivity(2, 0).array.reshape(-1, 4)[facets]

@@ -4,7 +4,12 @@ The kernels use the affine mesh alone. So their Jacobian is constant, and one co
 every shape. The shape itself is the vector field r0. It is interpolated at the nodes of the
 displacement's own element, so that rigid motions are exact.
 
-`distribute` makes a `Midsurface` of a triangulation that every rank has. Lengths are over R.
+`distribute` makes a `Midsurface` of a triangulation that every rank has, a `PatchMesh`. A node of
+that has coordinates in a chart (d = 2), or is a place in space: alone (d = 3), with a normal
+(d = 6), or followed by the coordinates in its shell and the shell's number (d = 10, see
+`multi_shell`). An embedding maps nodes to places in space. The deviation w0 is the distance of the
+imperfect from the perfect surface along the normal. A user's field is a function on the mesh of a
+program. Reference points are those of the reference triangle. Lengths are over R.
 """
 
 from collections.abc import Sequence
@@ -53,6 +58,7 @@ def nodal_normals(nodes: Array, cells: NDArray[np.int64]) -> Array:
     a1, a2 = np.einsum(
         "dqk,ckx->dcqx", element.tabulate(1, element.points)[1:, :, :, 0], nodes[dolfinx_cells]
     )
+    # angle of each triangle at its nodes: pi at nodes on its sides, and no matter inside
     angles = np.full(dolfinx_cells.shape, np.pi)
     sides_at_vertices = ((a1, a2), (a2 - a1, -a1), (-a2, a1 - a2))  # vertices are the first nodes
     for vertex, (e, f) in enumerate(sides_at_vertices):
@@ -90,9 +96,10 @@ class Midsurface:
     _patch: PatchMesh
 
     def chart_coordinates(self, V: fem.FunctionSpace) -> NDArray[np.float64]:
-        """Return the coordinates (cells, nodes, 2 | 3) of the nodes of each cell in its own chart.
+        """Return the coordinates (cells, nodes, 2 | 3) of the nodes of `V`, in each cell's chart.
 
-        Of several shells, and of a mesh file, they are places in space.
+        Of several shells, and of a mesh file, they are places in space, the first three numbers of
+        a node.
         """
         return self._node_coordinates(compat.interpolation_points(V))[..., :3]
 
@@ -102,14 +109,17 @@ class Midsurface:
         Charts of several shells may overlap. Without charts they are places in space, as those of
         `chart_coordinates`.
         """
+        # only the embedding of several shells has this attribute; their nodes are ten numbers, in
+        # which the chart of the shell follows the place in space
         if not getattr(self._patch.embedding, "has_charts", False):
             return self.chart_coordinates(V)
         return self._node_coordinates(compat.interpolation_points(V))[..., 3:5]
 
     def _node_coordinates(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return rows as in `PatchMesh.nodes` at reference points of each cell, (cells, q, d).
+        """Return coordinates as in `PatchMesh.nodes` at points of each cell, (cells, q, d).
 
-        For a mesh file with imperfections these are places and normals.
+        They are interpolated from the nodes of the cell. For a mesh file with imperfections they
+        are places and normals.
 
         Parameters
         ----------
@@ -141,7 +151,7 @@ class Midsurface:
         points
             (q, 2) in the reference triangle.
         function
-            Rows of `PatchMesh.nodes` (n, d) -> values (n, ...).
+            Coordinates as in `PatchMesh.nodes` (n, d) -> values (n, ...).
         """
         coordinates = self._node_coordinates(points)
         values = function(coordinates.reshape(-1, coordinates.shape[-1]))
@@ -164,7 +174,13 @@ class Midsurface:
         )
 
     def _vector_field(self, V: fem.FunctionSpace, name: str, values: Embedding) -> fem.Function:
-        """Return a function in the space `V` with values (n, 3) of nodes (n, d)."""
+        """Return a function in the vector space `V` whose nodal values are a map of coordinates.
+
+        Parameters
+        ----------
+        values
+            Coordinates as in `PatchMesh.nodes` (n, d) -> values (n, 3).
+        """
         function = fem.Function(V, name=name)
         nodal = self.evaluate(compat.interpolation_points(V), values)
         function.x.array.reshape(-1, 3)[V.dofmap.list] = nodal
@@ -212,8 +228,8 @@ class Midsurface:
             ends_on_sheet = np.asarray(np.isin(self._patch.corners, vertices).any(axis=1))
             return np.asarray(~ends_on_sheet[self._original_cells])
         if not hasattr(self._patch.embedding, "has_charts"):
-            return None
-        # the last number of a node is that of its shell
+            return None  # one shell
+        # several shells: the last number of a node is that of its shell
         shell_of_cell = np.rint(self._patch.nodes[self._patch.cells[:, 0], -1])
         shell_of_point = np.rint(self._patch.points[point][-1])
         return np.asarray((shell_of_cell == shell_of_point)[self._original_cells])
@@ -269,6 +285,7 @@ def distribute(patch: PatchMesh, comm: MPI.Comm) -> Midsurface:
         On every rank, if the normals of the triangulation disagree.
     """
     check_orientation(patch)
+    # only vertices: the mesh is affine, and inner nodes of the triangles give r0 alone
     vertices, corners = np.unique(patch.corners, return_inverse=True)
     corners = corners.reshape(-1, 3).astype(np.int64)
     xyz = patch.embedding(patch.nodes[vertices])
@@ -286,6 +303,7 @@ def create_mesh(
 
     For the same cells, numbers and ranks of the mesh are the same.
     """
+    # rank 0 gives all cells, so that their numbers do not depend on how they were divided
     is_first_rank = comm.rank == 0
     return mesh.create_mesh(
         comm,
@@ -315,6 +333,7 @@ def at_reference_points(
         ORDERS[count],
         basix.LagrangeVariant.equispaced,
     )
+    # shape functions (q, nodes), in dolfinx's order of the nodes
     values = geometry.tabulate(0, points)[0, :, :, 0]
     to_dolfinx = perm_gmsh(mesh.CellType.triangle, count)
     return np.asarray(np.einsum("qk,ckd->cqd", values, nodes[cells[:, to_dolfinx]]))
@@ -337,6 +356,7 @@ def _named_facets(
     ends = np.empty((0, 2), dtype=np.int32)
     if len(facets):
         ends = mesh.entities_to_geometry(domain, 1, facets)
+    # numbers of the triangulation for both ends of each facet
     numbers = np.sort(vertices[domain.geometry.input_global_indices[ends]], axis=1)
     facets_of_edges = {}
     for name, pairs in patch.edges.items():

@@ -2,7 +2,10 @@
 
 A model with a symmetry plane is computed on one half; a model with the planes of waves
 cos(m theta) is computed on a sector of 180/m degrees. `Mirror` and `Sector` say which part is
-modelled and how its images make the whole surface. Lengths are over R (docs/theory.md, half shell).
+modelled and how its images make the whole surface. An image is a copy of the modelled part,
+mirrored or turned about e3; the part itself is the first one. A turned frame has its first axis at
+an azimuth. Edges are named by strings and given by pairs of vertices. Lengths are over R
+(docs/theory.md, half shell).
 """
 
 from collections.abc import Mapping
@@ -47,7 +50,7 @@ class Mirror:
     offset
         Distance of the plane from the origin, along the normal.
     removed_edges
-        Edges of the half that is not modelled -> their mirror images.
+        Name of an edge in the half that is not modelled -> name of its mirror image, which is.
     """
 
     normal: Array
@@ -106,15 +109,15 @@ class Mirror:
 
     @property
     def copies(self) -> int:
-        """Number of copies of the modelled part that make the whole."""
+        """Number of images of the modelled part, itself included, that make the whole."""
         return 2
 
     @property
     def images(self) -> list["Image"]:
-        """The copies that make the whole; the first is the modelled part itself."""
+        """The images that make the whole; the first is the modelled part itself."""
         return [
-            Image(np.eye(3), np.zeros(3), 1.0),
-            Image(self.reflection, 2 * self.offset * self.normal, -1.0),
+            Image(np.eye(3), np.zeros(3), sign=1.0),
+            Image(self.reflection, 2 * self.offset * self.normal, sign=-1.0),
         ]
 
     def with_images(self, x: Array) -> Array:
@@ -127,7 +130,7 @@ class Mirror:
         Parameters
         ----------
         parity
-            Factor of mirrored images, 1 or -1.
+            Factor of mirrored images: 1, or -1 for axial vectors such as a moment.
         """
         factors = [parity if image.sign < 0 else 1.0 for image in self.images]
         images = [image.Q @ v for image in self.images]
@@ -161,14 +164,17 @@ class Mirror:
         return np.asarray(np.asarray(x) - 2 * self.signed_distance(x)[..., None] * self.normal)
 
     def keeps_lines(self, direction: Array | None) -> bool:
-        """Whether the images of a family of lines belong to the family.
+        """Whether the plane maps a family of lines, such as a field's, to itself.
+
+        It does so with parallel lines that are normal to the plane or parallel to it.
 
         Parameters
         ----------
         direction
-            (3,) of straight lines; None for the meridians about e3.
+            (3,) of parallel lines; None for the meridians about e3.
         """
         if direction is None:
+            # the axis must be mapped to itself: it lies in the plane, or is normal to it
             maps_axis = (
                 abs(self.offset) < PLANARITY_TOLERANCE
                 or abs(float(self.normal[2])) > PLANARITY_TOLERANCE
@@ -184,13 +190,14 @@ class Mirror:
         return np.asarray(np.asarray(x) @ self.normal - self.offset)
 
     def image_of_edge(self, edge: str) -> str:
-        """Return the name of the mirror image of an edge."""
+        """Return the name of the mirror image of an edge; its own name if it is its own image."""
         edge_of_image = {image: name for name, image in self.removed_edges.items()}
         return {**edge_of_image, **self.removed_edges}.get(edge, edge)
 
     @property
     def in_plane_vectors(self) -> tuple[Array, Array]:
         """Two unit vectors in the plane, normal to each other."""
+        # the coordinate axis that is farthest from the normal
         axis = np.eye(3)[int(np.argmin(np.abs(self.normal)))]
         first = np.cross(axis, self.normal)
         first /= np.linalg.norm(first)
@@ -269,7 +276,7 @@ class Sector(Mirror):
 
     @property
     def images(self) -> list[Image]:
-        """The copies that make the whole: the half at each of its turned places."""
+        """The images that make the whole: the sector and its mirror image, in m places."""
         half_images = super().images
         rotations = [rotation(-2 * self.angle * k) for k in range(self.waves)]
         return [
@@ -304,7 +311,7 @@ def _halved(patch: PatchMesh, mirror: Mirror, edge_name: str) -> PatchMesh:
     Parameters
     ----------
     edge_name
-        Name of the edge in the plane; border edges without another name belong to it.
+        Name of the new edge in the plane; all border sides without another name belong to it.
 
     Raises
     ------
@@ -314,7 +321,7 @@ def _halved(patch: PatchMesh, mirror: Mirror, edge_name: str) -> PatchMesh:
     places = patch.embedding(patch.nodes)
     distances, extent = mirror.signed_distance(places), np.ptp(places, axis=0).max()
     corners = distances[patch.cells[:, :3]]
-    in_half = corners.mean(axis=1) > 0
+    in_half = corners.mean(axis=1) > 0  # by the centre of each triangle
     depths = np.where(in_half[:, None], corners, -corners)  # into each triangle's own half
     crosses_plane = depths.min() < -ROUNDING * extent
     lies_in_plane = depths.max(axis=1).min() <= ROUNDING * extent
@@ -328,12 +335,13 @@ def _halved(patch: PatchMesh, mirror: Mirror, edge_name: str) -> PatchMesh:
     cells = cells.reshape(-1, patch.cells.shape[1])
     glued = patch.representative
     representative = np.arange(len(patch.nodes)) if glued is None else glued
-    # for each vertex, its first node that is in the half
+    # for each vertex, its first node that is in the half, in new numbers; in reversed order the
+    # first of several glued nodes is written last, and stays
     first_node = np.full(len(patch.nodes), -1, dtype=np.int64)
     first_node[representative[used][::-1]] = np.arange(len(used))[::-1]
     edges = {name: first_node[representative[pairs]] for name, pairs in patch.edges.items()}
     border = border_pairs(first_node[representative[used[directed_sides(cells)]]])
-    # without edges of the other half
+    # drops sides of edges in the other half
     edges = on_border(edges, border)
     named_pairs = {pair for pairs in edges.values() for pair in as_set(pairs)}
     if pairs_in_plane := sorted(as_set(border) - named_pairs):

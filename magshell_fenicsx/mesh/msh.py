@@ -4,6 +4,11 @@
 several shells. It orients the triangles, takes T-junctions apart, names edges and patches by
 physical groups, and finds named points among the vertices. Messages tell places in the coordinates
 of the file.
+
+At a T-junction an edge of a sheet ends on another sheet; the sheet gets nodes of its own there. A
+patch is a named part of the surface. Edges and curves are given by the pairs of vertices of their
+sides. Cells have 3, 6 or 10 nodes in gmsh's order, vertices first. A held edge is clamped or
+hinged. A sector is the part between two symmetry planes. R is the reference length.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -55,14 +60,15 @@ LINE_TYPES = ("Line 2", "Line 3", "Line 4")
 def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells:
     """Return triangles (m, 3 | 6 | 10) with one orientation in each connected component.
 
-    It is that of the larger area, see `_is_reversed`.
+    It is the orientation that the larger part of the component's area has, see `_is_reversed`.
 
     Parameters
     ----------
     nodes, cells
         (n, 3) places, and (m, 3 | 6 | 10) node numbers; an edge has two triangles at most.
     first_copy
-        Nodes from this one on stand at places of others, see `non_manifold.separate_sheets`.
+        Nodes from this one on are copies of others at the same places, on purpose, for sheets that
+        end there. None without copies.
 
     Raises
     ------
@@ -79,34 +85,34 @@ def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells
     _, edge_of_side, side_counts = np.unique(
         np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
     )
-    # sort the sides by edge; of an inner edge both sides are then neighbours
+    # sort the sides by edge; the two sides of an inner edge then follow one another
     sides_by_edge = np.argsort(edge_of_side.ravel(), kind="stable")
     first_of_inner = np.cumsum(side_counts)[side_counts == 2] - 2
     side, opposite_side = sides_by_edge[first_of_inner], sides_by_edge[first_of_inner + 1]
     # neighbours that agree run through their edge in opposite directions
     agree = edges[side, 0] != edges[opposite_side, 0]
     m = len(cells)
-    cell, neighbour = side % m, opposite_side % m
-    # each triangle counts twice, once in each orientation: an orientable surface then has two
-    # separate copies
+    cell, neighbour = side % m, opposite_side % m  # see the order of `directed_sides`
+    # in the graph each triangle stands twice, as it is (i) and reversed (i + m); orientations of
+    # neighbours that agree are joined. An orientable component then makes two separate parts
     rows = np.concatenate([cell, cell + m])
     columns = np.concatenate(
         [np.where(agree, neighbour, neighbour + m), np.where(agree, neighbour + m, neighbour)]
     )
     graph = scipy.sparse.coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * m, 2 * m))
-    _, copy = scipy.sparse.csgraph.connected_components(graph, directed=False)
-    if (copy[:m] == copy[m:]).any():
+    _, part = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    if (part[:m] == part[m:]).any():
         place = nodes[edges[side[~agree][0]]].mean(axis=0)
         raise MeshError(
             "the surface has only one side: its normals cannot agree across the edge around "
             f"{place_text(place)}"
         )
-    _refuse_torn(nodes, cells, copy[:m], first_copy)
+    _refuse_torn(nodes, cells, part[:m], first_copy)
     keeps_orientation = np.empty(m, dtype=bool)
-    components = np.minimum(copy[:m], copy[m:])
+    components = np.minimum(part[:m], part[m:])  # one number for both parts
     for component in np.unique(components):
         in_component = np.flatnonzero(components == component)
-        as_first = copy[in_component] == copy[in_component[0]]
+        as_first = part[in_component] == part[in_component[0]]
         is_reversed = _is_reversed(nodes, cells[in_component], areas[in_component], as_first)
         keeps_orientation[in_component] = ~as_first if is_reversed else as_first
     reversed_cells = cells[:, REVERSED_NODES[cells.shape[1]]]
@@ -114,10 +120,11 @@ def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells
 
 
 def _is_reversed(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.bool_]) -> bool:
-    """Return whether a component has the orientation of the triangles that are not `as_first`.
+    """Return whether a component shall have the orientation opposite to its first triangle's.
 
-    The larger area decides. If both areas are equal, the number of triangles must not decide. Then
-    the normals point upwards on the whole, else along e2 or e1, else out of the volume.
+    The larger area decides. If both areas are equal, the normals shall point upwards on the whole,
+    else along e2 or e1, else out of the volume. The numbers of triangles never decide, as they
+    would make the orientation depend on the mesh.
 
     Parameters
     ----------
@@ -133,6 +140,7 @@ def _is_reversed(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.
     # area vectors, all in the orientation of the first triangle
     vectors = np.where(as_first[:, None], 1, -1) * np.cross(b - a, c - a) / 2
     outward = (a * vectors).sum(axis=1) / np.ptp(nodes, axis=0).max()
+    # the first criterion that is not zero by symmetry decides
     for components in (vectors[:, 2], vectors[:, 1], vectors[:, 0], outward):
         if abs(total := components.sum()) > AREA_TIE_TOLERANCE * total_area:
             return bool(total < 0)
@@ -147,9 +155,9 @@ def _refuse_torn(
     Parameters
     ----------
     component
-        (m,) number of the component of each triangle.
+        (m,) number of the connected component of each triangle.
     first_copy
-        Nodes from this one on stand at places of others on purpose; None without.
+        Nodes from this one on are copies of others on purpose; None without.
 
     Raises
     ------
@@ -157,7 +165,7 @@ def _refuse_torn(
         With the place of two nodes.
     """
     if (component == component[0]).all():
-        return
+        return  # connected; two nodes at one place then show as border edges without a name
     vertices = np.unique(cells[:, :3])
     if first_copy is not None:
         vertices = vertices[vertices < first_copy]
@@ -189,6 +197,7 @@ def border_edges(nodes: Array, cells: Cells, curves: Mapping[str, Cells]) -> dic
     named_pairs = {pair for lines in curves.values() for pair in as_set(lines)}
     unnamed = [(int(a), int(b)) for a, b in border if (int(a), int(b)) not in named_pairs]
     if unnamed:
+        # a second node at one end tells that triangles are not connected, else there is a hole
         place = nodes[list(unnamed[0])].mean(axis=0)
         vertices = np.unique(cells[:, :3])
         extent = np.ptp(nodes[vertices], axis=0).max()
@@ -205,7 +214,7 @@ def border_edges(nodes: Array, cells: Cells, curves: Mapping[str, Cells]) -> dic
             "(an edge without a condition is free)"
         )
     ends, counts = np.unique(border, return_counts=True)
-    if (counts > 2).any():
+    if (counts > 2).any():  # a vertex has two border edges
         raise MeshError(
             f"the surface touches itself in the vertex {place_text(nodes[ends[counts > 2][0]])}"
         )
@@ -223,8 +232,8 @@ class MeshFile:
     scale
         Factor from its coordinates to lengths over R.
     normals
-        Whether nodes are places followed by normals, (n, 6), which the triangles around a node have
-        on average.
+        Whether nodes are places followed by normals, (n, 6): the mean normals of the triangles
+        around each node.
     files
         Reads the file.
     in_memory
@@ -284,7 +293,7 @@ def read_msh(
         the pole. Of several highest vertices it is one on no held edge, and best the pole of one of
         several shells.
     mirror
-        The symmetry plane or the sector of which that part is read; None for the whole surface.
+        Symmetry plane or sector, whose half or sector of the surface is returned; None for all.
     held_edges
         Names of edges that are clamped or hinged.
 
@@ -298,6 +307,7 @@ def read_msh(
         If the file cannot be read, or its surface cannot carry a shell. Places in messages are
         those of the file.
     """
+    # several shells have been triangulated and cut already
     if isinstance(file.in_memory, MultiShellMesh):
         return _with_points_of_shells(file, file.in_memory.patch, points, held_edges)
     try:
@@ -317,8 +327,15 @@ def _with_points_of_shells(
 ) -> PatchMesh:
     """Return the triangulation of several shells with named points, as `read_msh` for a file.
 
-    Points that a shell names keep the vertex of that shell. All others take the vertex at their
-    place.
+    A point that belongs to a shell keeps the vertex of this shell, as another shell may have a
+    vertex at the same place. So do other names of the same place. All others take the vertex there.
+
+    Parameters
+    ----------
+    points
+        Name -> place (3,) over R.
+    held_edges
+        Names of edges that are clamped or hinged.
     """
     points_of_shells = dict[str, Array]()
     for name_in_shell, x in patch.points.items():
@@ -360,7 +377,7 @@ def _patch_of_triangles(file: MeshFile) -> PatchMesh:
         edges[name] = new_number[pairs]
         if (edges[name] < 0).any():
             raise MeshError(f"{file.path}: the physical curve {name} is not part of the surface")
-    first_copy = len(nodes)
+    first_copy = len(nodes)  # copies of nodes at T-junctions follow the nodes
     origin, cells, t_junctions = separate_sheets(nodes, cells)
     nodes = nodes[origin]
     if t_junctions:
@@ -374,6 +391,7 @@ def _patch_of_triangles(file: MeshFile) -> PatchMesh:
         edges[name] = t_junction.pairs
     cells_of_file = cells
     cells = oriented(nodes, cells, first_copy if t_junctions else None)
+    # reversing exchanges the second and the third vertex
     is_reversed = (cells[:, 1] != cells_of_file[:, 1]).astype(np.int64)
     edges = border_edges(nodes, cells, edges)
     nodes = nodes * file.scale
@@ -413,12 +431,17 @@ def _named_vertices(
 ) -> dict[str, Array]:
     """Return the vertex (d,) of each named point, and the highest vertex as "pole".
 
-    Of several highest vertices the pole is one on no held edge, and best one of `shell_poles` (d,).
+    Of several highest vertices the pole is one on no held edge, and best a shell's own pole. A
+    point that is called "pole" replaces it.
 
     Parameters
     ----------
     points
         Name -> place (3,) over R.
+    held_edges
+        Names of edges that are clamped or hinged.
+    shell_poles
+        Poles (d,) of several shells.
     scale
         Factor from the file's coordinates to lengths over R, for messages.
 
@@ -428,7 +451,7 @@ def _named_vertices(
         If a named point is no vertex.
     """
     numbers = np.unique(patch.cells[:, :3])
-    corners = patch.nodes[numbers]
+    corners = patch.nodes[numbers]  # all vertices
     held_vertices = [pairs.ravel() for name, pairs in patch.edges.items() if name in held_edges]
     is_free = ~np.isin(numbers, np.concatenate([*held_vertices, np.zeros(0, dtype=np.int64)]))
     candidates = np.array([*corners, *shell_poles])
@@ -438,7 +461,7 @@ def _named_vertices(
     # the last key counts first: height, free edge, a shell's pole, then y and x
     pole = np.lexsort((x, y, is_shell_pole, is_free[nearest_corner], z))[-1]
     vertices = {"pole": candidates[pole]}
-    for name, x in points.items():
+    for name, x in points.items():  # x is now a place
         distance = np.linalg.norm(corners[:, :3] - x[:3], axis=1)
         nearest = corners[np.argmin(distance)]
         if distance.min() > POINT_TOLERANCE * np.ptp(corners[:, :3], axis=0).max():
@@ -492,7 +515,10 @@ def _triangles_of_file(file: MeshFile) -> SurfaceTriangles:
 def _blocks_of_dimension(
     file: MeshFile, content: MshContent, dimension: int, allowed_types: Collection[str]
 ) -> list[tuple[int, NDArray[np.int64]]]:
-    """Return entity and node numbers (m, k) of the blocks of elements of one dimension.
+    """Return entity and node numbers (m, k) of each block of elements of one dimension.
+
+    gmsh's entities are the surfaces and curves of the geometry; a block has the elements of one
+    type on one entity.
 
     Raises
     ------
@@ -523,6 +549,7 @@ def _node_indices(
     """
     order = np.argsort(content.tags)
     positions = np.searchsorted(content.tags, numbers, sorter=order).clip(max=len(order) - 1)
+    # a missing number has found a neighbour, which is told below
     indices: NDArray[np.int64] = order[positions]
     if (missing := content.tags[indices] != numbers).any():
         raise MeshError(

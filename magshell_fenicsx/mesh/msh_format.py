@@ -3,7 +3,10 @@
 gmsh chooses how to read a file from its first line. It runs scripts (SystemCall "..."), and it also
 runs a file of the same name with .opt at its end. So gmsh gets a copy in an empty folder, and only
 if the first line is that of a mesh. gmsh crashes on some damaged files, so it runs in a process of
-its own: this module as a program.
+its own: this module as a program, which leaves the mesh in a file.
+
+gmsh's words: an entity is a curve or surface of the geometry, a physical group a named set of
+entities, a tag the number of a node in the file.
 """
 
 import os
@@ -70,6 +73,7 @@ def parsed(content: bytes) -> MshContent:
         copy = Path(folder) / "part.msh"
         copy.write_bytes(content)
         command = [sys.executable, "-m", __name__, str(copy)]
+        # the process finds the modules that this one finds
         import_paths = [str(Path(__file__).parents[2]), *filter(None, sys.path)]
         env = {**os.environ, "PYTHONPATH": os.pathsep.join(import_paths)}
         process = subprocess.run(
@@ -78,7 +82,7 @@ def parsed(content: bytes) -> MshContent:
         if process.returncode == UNUSABLE:
             raise Unusable(process.stderr.strip())
         if process.returncode:
-            reason = "it crashed"
+            reason = "it crashed"  # by a signal: the exit code is negative
             if process.returncode > 0:
                 reason = (process.stderr.strip().splitlines() or ["nothing"])[-1]
             reason = reason.replace(str(copy), "the file").removeprefix("Exception: ").strip()
@@ -101,11 +105,11 @@ def _fields_of_model(
         for kind, _, nodes in zip(*model.mesh.getElements(dim, entity), strict=True):
             name, _, _, width, *_ = model.mesh.getElementProperties(kind)
             elements = nodes.astype(np.int64).reshape(-1, width)
-            # MSH 2 repeats an element for each of its groups
+            # MSH 2 repeats an element for each of its groups; the order of the rest is kept
             first_index = np.unique(elements, axis=0, return_index=True)[1]
             blocks.append((name, dim, entity, elements[np.sort(first_index)]))
     for dim, group in model.getPhysicalGroups():
-        if dim in groups:
+        if dim in groups:  # curves and surfaces
             name = model.getPhysicalName(dim, group) or str(group)
             groups[dim][name] = model.getEntitiesForPhysicalGroup(dim, group).tolist()
     return tags.astype(np.int64), xyz.reshape(-1, 3), blocks, groups

@@ -4,7 +4,12 @@ A node of the triangulation has ten numbers: its place in space (3,), its coordi
 triangulation of its shell alone (up to 6), and the number of the shell. So readers of mesh files
 find places, and the embedding finds the shell's own coordinates: placement and curvature are as
 exact as those of the shell alone. Edges of two shells are glued at joints; at a T-junction an edge
-ends on another shell, and nothing is glued. Lengths are over R.
+ends on another shell, and nothing is glued.
+
+An embedding maps nodes to places in space. A patch is a named part of the surface, here also each
+shell; an edge is given by the pairs of vertices of its sides. Glued nodes stay apart and have one
+representative, whose number edges and triangles' corners have. Elements of order 1, 2 or 3 have 3,
+6 or 10 nodes, in gmsh's order; `perm_gmsh` gives dolfinx's order. Lengths are over R.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -45,7 +50,8 @@ MAX_SHELL_COORDINATES = 6  # numbers of a node in its shell: place and normal, i
 class ShellPose:
     """Position, orientation and scale of a shell: x in its frame -> scale Q x + position.
 
-    x is over the shell's own length, and the result over R.
+    The frame is the one in which the shell is meshed alone. There x is over the shell's own length
+    (the radius of a sphere, say); the result is over R, the reference length of all shells.
 
     Attributes
     ----------
@@ -54,7 +60,7 @@ class ShellPose:
     position
         (3,) of its origin, over R.
     scale
-        Its own length over R.
+        The shell's own length over R.
     """
 
     Q: Array
@@ -118,6 +124,7 @@ class MultiShellEmbedding:
 
     def __call__(self, nodes: Array) -> Array:
         """Return the places (n, 3) over R of nodes (n, 10)."""
+        # the last number of a node is that of its shell; the shell's own coordinates begin at 3
         shell_numbers, places = np.rint(nodes[:, -1]), np.array(nodes[:, :3])
         for i, (embedding, dimension, place) in enumerate(self.embeddings):
             is_in_shell = shell_numbers == i
@@ -164,7 +171,8 @@ class MultiShellMesh:
     laws
         Name of a shell -> the name of its law.
     mirrors
-        Symmetry planes of every shell, see `Outline.mirrors`.
+        Returns the symmetry planes that all shells share. It takes vectors that a plane should
+        contain, and whether loose symmetry suffices, see `Outline.mirrors`.
     make_meridian
         Makes the meridians of shells with one axis, see `shape.meridian_chart.MeridianChart`; or
         says why there are none.
@@ -242,7 +250,7 @@ def union_of_shells(
         """Return nodes (n, 10) for coordinates (n, d) of the shell with this number."""
         nodes_of_shell = np.zeros((len(coordinates), 3 + MAX_SHELL_COORDINATES + 1))
         nodes_of_shell[:, 3 : 3 + coordinates.shape[1]], nodes_of_shell[:, -1] = coordinates, number
-        nodes_of_shell[:, :3] = embedding(nodes_of_shell)
+        nodes_of_shell[:, :3] = embedding(nodes_of_shell)  # which reads the numbers just set
         return nodes_of_shell
 
     first_node = first_cell = 0
@@ -259,11 +267,12 @@ def union_of_shells(
             earlier_pairs = [edges[name]] if is_common and name in edges else []
             edges[name_of_all] = np.concatenate([*earlier_pairs, pairs + first_node])
         for name in patch.points:
+            # a shell's pole is a point of all shells even if the case does not name it
             if name in ("pole", *member.points):
                 node = with_shell_number(patch.points[name][None], number)[0]
                 points[f"{member.name}_{name}"] = node
         end_cell = first_cell + len(patch.cells)
-        all_cells = np.ones(len(patch.cells), dtype=bool)
+        all_cells = np.ones(len(patch.cells), dtype=bool)  # "": the shell as a patch of its own
         for name, mask in {"": all_cells, **patch.patches}.items():
             in_patch = np.zeros(cell_count, dtype=bool)
             in_patch[first_cell:end_cell] = mask
@@ -291,10 +300,15 @@ def with_joints(patch: PatchMesh, joints: Sequence[tuple[str, str]]) -> PatchMes
 
     Glued edges are no boundary edges any more; the edge of a T-junction stays one.
 
+    Parameters
+    ----------
+    joints
+        Pairs of names: an edge, and another edge or the shell or patch on which it ends.
+
     Raises
     ------
     MeshError
-        See `glue_edges`.
+        If there is no such edge, or two edges cannot be glued.
     """
     keys = [f"joints.{number}.edges" for number in range(len(joints))]
     are_t_junctions = [
@@ -303,6 +317,7 @@ def with_joints(patch: PatchMesh, joints: Sequence[tuple[str, str]]) -> PatchMes
     for edges, key, ends_on_shell in zip(joints, keys, are_t_junctions, strict=True):
         if not ends_on_shell:
             patch = glue_edges(patch, edges, key)
+    # only now, since gluing may divide triangles: a mask has a value for each triangle
     masks, glued_names = list[tuple[NDArray[np.bool_], NDArray[np.bool_]] | None](), set[str]()
     for edges, ends_on_shell in zip(joints, are_t_junctions, strict=True):
         if ends_on_shell:
@@ -315,7 +330,7 @@ def with_joints(patch: PatchMesh, joints: Sequence[tuple[str, str]]) -> PatchMes
 
 
 def is_t_junction(patch: PatchMesh, edges: tuple[str, str], key: str) -> bool:
-    """Return whether the first edge of a joint ends on a shell, or on a patch of one.
+    """Return whether a joint is a T-junction: its first edge ends on a shell, or a patch of one.
 
     Parameters
     ----------
@@ -342,7 +357,8 @@ def is_t_junction(patch: PatchMesh, edges: tuple[str, str], key: str) -> bool:
 def glue_edges(patch: PatchMesh, edges: tuple[str, str], key: str) -> PatchMesh:
     """Return the triangulation with the second edge glued to the first, vertex by vertex.
 
-    Where one edge has a vertex and the other has none, the triangle there is divided.
+    Where one edge has a vertex and the other has none, the triangle there is divided. Both edges
+    then have the same vertices.
 
     Parameters
     ----------
@@ -373,13 +389,14 @@ def glue_edges(patch: PatchMesh, edges: tuple[str, str], key: str) -> PatchMesh:
     places = patch.nodes[:, :3]
     distances = np.linalg.norm(places[second][:, None] - places[first][None], axis=2)
     nearest = distances.argmin(axis=1)
-    # gluing needs one vertex of the second edge for each of the first
+    # gluing needs exactly one vertex of the second edge for each of the first
     if len(np.unique(nearest)) != len(first):
         near_pair = _nearest_pair_text(places[first], places[second])
         raise MeshError(
             f"{key}: vertices of {' and '.join(edges)} nearly meet, {near_pair}, over R: "
             "give both shells the same mesh.size"
         )
+    # number of the vertex -> number after gluing
     glued_to = np.arange(len(patch.representative))
     glued_to[second] = first[nearest]
     glued_patch = replace(
@@ -410,7 +427,7 @@ def _nearest_pair_text(first: Array, second: Array) -> str:
 def _with_vertices_on_edge(
     patch: PatchMesh, edge: str, targets: Array
 ) -> tuple[PatchMesh, tuple[float, Array]]:
-    """Return the triangulation with vertices on an edge where the other edge has some.
+    """Return the triangulation with a vertex on an edge wherever the other edge has one.
 
     Parameters
     ----------
@@ -420,20 +437,21 @@ def _with_vertices_on_edge(
     Returns
     -------
     patch
-        With triangles divided at the targets that lie within their sides.
+        The triangulation, with triangles divided at the targets that lie within their sides.
     gap
-        Largest distance of a target from the edge over R, and the target (3,).
+        Largest distance of a target from the edge over R, and this target (3,).
     """
     pairs, triangle_sides = patch.edges[edge], patch.corners[:, TRIANGLE_SIDES]
+    # the two vertices of a side -> its triangle, and its number there (0 to 2)
     cell_and_side = {
         tuple(sorted(triangle_sides[c, s])): (c, s)
         for c, s in np.ndindex(*triangle_sides.shape[:2])
     }
-    # triangle on the edge and its side (0 to 2), for each of the S pairs
+    # for each of the S sides on the edge
     cell, side = np.array([cell_and_side[tuple(sorted(pair))] for pair in pairs]).T
     S, T = len(pairs), len(targets)
     start, end = REFERENCE_VERTICES[TRIANGLE_SIDES[side]].transpose(1, 0, 2)
-    t = np.full((S, T), 0.5)
+    t = np.full((S, T), 0.5)  # parameter along each side, from 0 to 1; the search begins midway
     end_places = patch.nodes[patch.cells[cell[:, None], TRIANGLE_SIDES[side]], :3]
     chord = end_places[:, 1] - end_places[:, 0]
 
@@ -443,7 +461,7 @@ def _with_vertices_on_edge(
         places = patch.embedding(_nodes_in_cells(patch, np.repeat(cell, T), X.reshape(-1, 2)))
         return np.asarray(places.reshape(S, T, 3))
 
-    # t (S, T): closest point of each side to each target, by steps along the chord
+    # move t to the point of each curved side closest to each target, by projection on its chord
     squared_lengths = np.einsum("si,si->s", chord, chord)[:, None]
     for _ in range(PROJECTION_ITERATIONS):
         offset = targets[None] - place_on_sides(t)
@@ -483,6 +501,7 @@ def _with_divided_triangle(
 
     assert patch.representative is not None
     assert patch.source_triangles is not None
+    # a cell's number of nodes, and the vertices (0 to 2) at the ends of the side
     count, (i, j) = patch.cells.shape[1], TRIANGLE_SIDES[side]
     family, variant = basix.ElementFamily.P, basix.LagrangeVariant.equispaced
     points = basix.create_element(family, basix.CellType.triangle, ORDERS[count], variant).points
@@ -490,8 +509,7 @@ def _with_divided_triangle(
     X = REFERENCE_VERTICES[i] + cut_parameters[:, None] * (
         REFERENCE_VERTICES[j] - REFERENCE_VERTICES[i]
     )
-    # the vertex that is not on the side
-    apex = 3 - i - j
+    apex = 3 - i - j  # the third vertex: 0 + 1 + 2 = 3
     first_new_node = len(patch.nodes)
     # nodes along the side: its ends and the new ones between
     side_nodes = [
@@ -504,7 +522,7 @@ def _with_divided_triangle(
     node_count = first_new_node + len(cuts)
     for k in range(len(cut_parameters) - 1):
         a, b, c = X[k], X[k + 1], REFERENCE_VERTICES[apex]
-        # nodes of the new triangle beyond its vertices, in the old triangle
+        # nodes of the new triangle but its vertices, in reference coordinates of the old triangle
         further_points = a + points[3:] @ np.array([b - a, c - a])
         further_count = len(further_points)
         new_nodes.append(_nodes_in_cells(patch, np.full(further_count, cell), further_points))
@@ -517,13 +535,14 @@ def _with_divided_triangle(
         new_cells.append(new_cell)
         node_count += further_count
     nodes = np.concatenate([patch.nodes, *new_nodes])
+    # coordinates in the shell are interpolated; places in space follow from them exactly
     nodes[first_new_node:, :3] = patch.embedding(nodes[first_new_node:])
     cells = np.concatenate([patch.cells, np.array(new_cells[1:])])
     cells[cell] = new_cells[0]
     parent_cells = np.full(len(new_cells) - 1, cell)
     representative = np.concatenate([patch.representative, np.arange(first_new_node, node_count)])
     ends = {int(representative[side_nodes[0]]), int(representative[side_nodes[-1]])}
-    # the side's pair in the edge is replaced by those of the new sides
+    # in the edge, the pair of the old side is replaced by the pairs of the new sides
     other_pairs = [pair for pair in patch.edges[edge] if {int(pair[0]), int(pair[1])} != ends]
     new_pairs = representative[np.array([side_nodes[:-1], side_nodes[1:]]).T]
     pairs = np.concatenate([np.array(other_pairs, dtype=np.int64).reshape(-1, 2), new_pairs])
@@ -544,8 +563,11 @@ def _with_divided_triangle(
 
 
 def _nodes_in_cells(patch: PatchMesh, cell: NDArray[np.int64], X: Array) -> Array:
-    """Return nodes (n, d) at reference points X (n, 2) of cells (n,), by their polynomials."""
-    import basix
+    """Return nodes (n, d) at reference points X (n, 2) of cells (n,).
+
+    They are interpolated between the nodes of the cell, by its polynomials.
+    """
+    import basix  # slow to import, and not needed to read a case
     from dolfinx import mesh
     from dolfinx.cpp.io import perm_gmsh
 
@@ -560,11 +582,14 @@ def _nodes_in_cells(patch: PatchMesh, cell: NDArray[np.int64], X: Array) -> Arra
 
 
 def _cells_on_edge(patch: PatchMesh, edge: str) -> NDArray[np.bool_]:
-    """Return whether each triangle (m,) has a side on an edge; False on other shells."""
+    """Return whether each triangle (m,) has a side on an edge, and is on the edge's own shell.
+
+    A glued edge is a side of triangles of both shells.
+    """
     pairs, sides = as_set(patch.edges[edge]), np.sort(directed_sides(patch.corners), axis=1)
     is_side_on_edge = np.array([(int(a), int(b)) in pairs for a, b in sides])
     has_side_on_edge = is_side_on_edge.reshape(3, -1).any(axis=0)
-    # the longest name of a patch with which the edge's name begins
+    # an edge is called SHELL_EDGE; the longest name counts, as shells may be called a and a_b
     shell = max((name for name in patch.patches if edge.startswith(f"{name}_")), key=len)
     return np.asarray(has_side_on_edge & patch.patches[shell])
 
@@ -572,7 +597,8 @@ def _cells_on_edge(patch: PatchMesh, edge: str) -> NDArray[np.bool_]:
 def _with_nodes_per_cell(patch: PatchMesh, count: int) -> PatchMesh:
     """Return the same triangles with `count` nodes each (3, 6 or 10); vertices keep their numbers.
 
-    The new nodes are at the places that the old triangles have there. Neighbours do not share them.
+    One triangulation has triangles of one order: those of shells with fewer nodes get more. The new
+    nodes are at the places that the old triangles have there. Neighbours do not share them.
     """
     if patch.cells.shape[1] == count:
         return patch

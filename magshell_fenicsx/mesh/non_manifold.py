@@ -1,7 +1,9 @@
 """Non-manifold edges of a mesh file: an edge with three and more triangles is a T-junction.
 
 Of the triangles at such an edge the two that are nearest to one plane are one sheet; each other one
-ends there, with nodes of its own, and is tied to these two.
+ends there, with nodes of its own, and is tied to these two by the model. A sheet is a set of
+triangles that are connected through ordinary edges. Edges and sides are given by pairs of vertices;
+cells have 3, 6 or 10 nodes in gmsh's order, vertices first.
 """
 
 from collections.abc import Iterable, Iterator, Mapping
@@ -63,6 +65,7 @@ def separate_sheets(nodes: Array, cells: Cells) -> tuple[Cells, Cells, dict[str,
     )
     if (triangle_counts <= 2).all():
         return np.arange(len(nodes)), cells, {}
+    # sides sorted by edge, and where those of each edge begin
     sides_by_edge = np.argsort(edge_of_side.ravel(), kind="stable")
     first_of_edge = np.concatenate([[0], np.cumsum(triangle_counts)])
     supporting_cells = dict[int, tuple[int, int]]()  # by edge
@@ -70,7 +73,7 @@ def separate_sheets(nodes: Array, cells: Cells) -> tuple[Cells, Cells, dict[str,
     ending_cells = list[tuple[int, int]]()  # edges, and triangles whose sheet ends there
     for edge in np.flatnonzero(triangle_counts > 1):
         sides = sides_by_edge[first_of_edge[edge] : first_of_edge[edge + 1]]
-        cells_at_edge = [int(side) % m for side in sides]
+        cells_at_edge = [int(side) % m for side in sides]  # see the order of `directed_sides`
         if len(cells_at_edge) == 2:
             neighbours.append((cells_at_edge[0], cells_at_edge[1]))
             continue
@@ -85,15 +88,17 @@ def separate_sheets(nodes: Array, cells: Cells) -> tuple[Cells, Cells, dict[str,
         neighbours.append(flattest)
         supporting_cells[int(edge)] = flattest
         ending_cells += [(int(edge), cell) for cell in cells_at_edge if cell not in flattest]
-    vertices = np.unique(pairs[triangle_counts > 2])
+    vertices = np.unique(pairs[triangle_counts > 2])  # of T-junctions
     cells, copied_nodes = _with_own_nodes(len(nodes), cells, neighbours, vertices)
     sheets = _sheet_numbers(m, neighbours)
     origin = np.append(np.arange(len(nodes)), copied_nodes)
     t_junctions = dict[str, TJunction]()
+    # each sheet that ends somewhere is one T-junction
     for sheet in dict.fromkeys(sheets[cell] for _, cell in ending_cells):
         end_pairs, supports = list[list[int]](), np.zeros(m, dtype=bool)
         for edge, cell in ending_cells:
             if sheets[cell] == sheet:
+                # the side of the triangle at the edge, in its new nodes
                 corners = [int(corner) for corner in cells[cell, :3]]
                 end_pairs.append([corner for corner in corners if origin[corner] in pairs[edge]])
                 supports[list(supporting_cells[edge])] = True
@@ -159,6 +164,7 @@ def _with_own_nodes(
         neighbours_of_cell.setdefault(first, set()).add(second)
         neighbours_of_cell.setdefault(second, set()).add(first)
     for node, cells_at_node in cells_of_node.items():
+        # other vertices are in one sheet; nodes on sides at a junction must be looked at
         if node not in vertices and node in cells[:, :3]:
             continue
         for number, group in enumerate(_connected_groups(cells_at_node, neighbours_of_cell)):
@@ -172,7 +178,7 @@ def _with_own_nodes(
 def _connected_groups(
     cells: Iterable[int], neighbours: Mapping[int, set[int]]
 ) -> Iterator[set[int]]:
-    """Yield the cells in groups that are connected through neighbours among the cells.
+    """Yield the cells around a node in groups that are connected without leaving these cells.
 
     Parameters
     ----------
@@ -181,6 +187,7 @@ def _connected_groups(
     """
     remaining = set(cells)
     while remaining:
+        # the least cell first, so that the groups come in the same order in each run
         group, queue = set[int](), [min(remaining)]
         while queue:
             cell = queue.pop()
@@ -196,7 +203,9 @@ def _connected_groups(
 def edges_with_new_nodes(
     edges: Mapping[str, Cells], cells: Cells, origin: Cells
 ) -> dict[str, Cells]:
-    """Return named curves (e, 2) with the new nodes of their sides on the border.
+    """Return named curves (e, 2) in new nodes: a side becomes all border sides at its place.
+
+    A side that is on no border keeps its nodes.
 
     Parameters
     ----------
@@ -207,6 +216,7 @@ def edges_with_new_nodes(
     """
     border = border_pairs(directed_sides(cells))
     border_sides = dict[tuple[int, ...], list[Cells]]()
+    # several sheets may end at one side: old nodes -> all border sides there
     for side in border:
         old_nodes = tuple(sorted(int(origin[node]) for node in side))
         border_sides.setdefault(old_nodes, []).append(side)

@@ -2,8 +2,11 @@
 
 `SurfaceTriangles` and `UserField` hold what a file or a program gives. `PatchMesh` is the
 triangulation that the shell is computed on: nodes in a chart or in space, the embedding into space,
-named edges, points and patches. Lengths are over R, if nothing else is said. Arrays are NumPy's,
-and no function here is collective but `refuse_places`.
+named edges, points and patches. A chart is the plane of two coordinates of the surface; a patch is
+a named part of the surface; a user field is a function on the mesh of a program. The deviation w0
+is the distance of the imperfect from the perfect surface along its normal. Lengths are over R, the
+reference length, if nothing else is said. Arrays are NumPy's, and no function here is collective
+but `refuse_places`.
 """
 
 import hashlib
@@ -113,7 +116,9 @@ class UserField:
         return replace(self, nodal=linear_map(self.nodal))
 
     def in_cells(self, source_triangles: NDArray[np.int64]) -> Array:
-        """Return the values (cells, nodes, size) in triangles of a triangulation.
+        """Return the values (cells, nodes, size) in triangles of a triangulation, at their nodes.
+
+        In a reversed triangle the second and third vertex are exchanged, and so are values there.
 
         Parameters
         ----------
@@ -144,7 +149,7 @@ class PatchMesh:
     nodes
         (n, d) coordinates: of a chart (d = 2) or of space (d = 3; 6 with normals).
     cells
-        (m, 3 | 6 | 10) node numbers in gmsh's order, vertices first.
+        (m, 3 | 6 | 10) node numbers in gmsh's order, vertices first; of order 1, 2 or 3.
     embedding
         Maps (n, d) coordinates to (n, 3) places of the mid-surface.
     edges
@@ -257,6 +262,7 @@ def check_orientation(patch: PatchMesh) -> None:
         If two neighbours run through their common edge in the same direction, or
         if more than two triangles share an edge.
     """
+    # neighbours that agree run through their edge in opposite directions: no side stands twice
     sides, times = np.unique(directed_sides(patch.corners), axis=0, return_counts=True)
     if (times > 1).any():
         a, b = sides[times > 1][0]
@@ -290,7 +296,7 @@ class DeviatedEmbedding:
         return np.asarray(self.perfect(chart) + self.w0(chart)[:, None] * self.normal(chart))
 
     def along_normal(self, chart: Array, deviations: Sequence[Deviation]) -> Array:
-        """Return the displacement (n, 3) over R of places by deviations along the normal."""
+        """Return the displacement (n, 3) over R that deviations give to places of the chart."""
         w0 = replace(self, deviations=tuple(deviations)).w0(chart)
         return w0[:, None] * self.normal(chart)
 

@@ -6,7 +6,10 @@ seminorm of the kernel -r^5 (Duchon 1977). The weights of the patches add up to 
 differentiable. Generalised cross-validation over all patches estimates the noise (Craven and Wahba
 1979); the lambda of each patch then has the least estimated risk (Mallows 1973).
 
-Lengths are over R.
+A patch is here a ball of places, in which its spline counts. The seminorm vanishes for quadratic
+polynomials. lambda weighs smoothness against the values: zero interpolates. In a patch the splines
+are found in the eigenvectors ("modes") of the kernel on the complement of the polynomials, where a
+lambda removes the part lambda/(lambda + eigenvalue) of each mode. Lengths are over R.
 """
 
 from collections.abc import Sequence
@@ -53,7 +56,10 @@ class ScatteredSpline:
     residual: float = 0.0
 
     def __call__(self, x: Array) -> Array:
-        """Return values (n,) at places (n, 3); nan where no patch reaches."""
+        """Return the mean (n,) of the patches' splines at places (n, 3); nan where none reaches.
+
+        A spline is weighted by the distance from the centre of its patch.
+        """
         total, weights = np.zeros(len(x)), np.zeros(len(x))
         places_of_patches = scipy.spatial.cKDTree(x).query_ball_point(self.centres, self.radii)
         for centre, radius, spline, in_patch in zip(
@@ -63,7 +69,7 @@ class ScatteredSpline:
                 weight = _wendland(np.linalg.norm(x[in_patch] - centre, axis=1) / radius)
                 total[in_patch] += weight * spline(x[in_patch])
                 weights[in_patch] += weight
-        with np.errstate(invalid="ignore"):
+        with np.errstate(invalid="ignore"):  # 0/0 where no patch reaches
             return np.asarray(total / weights)
 
 
@@ -83,6 +89,7 @@ def fit_scattered(
     """
     tree = scipy.spatial.cKDTree(places)
     if len(duplicates := tree.query_pairs(SAME_PLACE_TOLERANCE, output_type="ndarray")):
+        # drop the later one of each pair
         places, values = (np.delete(f, duplicates.max(axis=1), axis=0) for f in (places, values))
         tree = scipy.spatial.cKDTree(places)
     centres, radii = _covering_balls(tree, np.vstack([cover, places]))
@@ -92,6 +99,7 @@ def fit_scattered(
         patch = _PatchPlaces.around_centre(places[in_patch], np.asarray(centre))
         patches.append((patch, values[in_patch]))
     if noise is None:
+        # some of the patches are enough
         noise = _estimated_noise(patches[:: max(1, len(patches) // MAX_NOISE_PATCHES)])
     splines = tuple(patch.spline(w, noise) for patch, w in patches)
     function = ScatteredSpline(centres, radii, splines, noise)
@@ -104,10 +112,12 @@ def _covering_balls(tree: "scipy.spatial.cKDTree", cover: Array) -> tuple[Array,
 
     The balls with `INNER_RADIUS` of these radii cover all places of `cover` (m, 3).
     """
+    # distances of the nearest value, and of the last one that a patch needs
     nearest, farthest = tree.query(cover, [1, min(MIN_VALUES, tree.n)])[0].T
     radii = np.maximum(farthest, HOLE_RADIUS * nearest) * (1 + RADIUS_MARGIN)
     cover_tree, is_uncovered = scipy.spatial.cKDTree(cover), np.ones(len(cover), dtype=bool)
     centres = []
+    # greedily: a place that no ball covers yet becomes the centre of one
     for i in range(len(cover)):
         if is_uncovered[i]:
             centres.append(i)
@@ -123,7 +133,7 @@ def _thinned(numbers: list[int]) -> NDArray[np.int64]:
     """
     if len(numbers) <= 2 * MIN_VALUES:
         return np.array(numbers)
-    generator = np.random.default_rng(len(numbers))
+    generator = np.random.default_rng(len(numbers))  # the same choice in each run
     return np.sort(generator.permutation(numbers)[: 2 * MIN_VALUES])
 
 
@@ -213,11 +223,13 @@ class _PatchPlaces:
         components, smoothing = modes.T @ values, 0.0
         if noise:
             candidates = sizes[-1] * SMOOTHINGS
-            # part of each mode that a lambda removes
+            # (lambdas, modes) part of each mode that a lambda removes
             removed = candidates[:, None] / (candidates[:, None] + sizes)
+            # squares of what is removed, less their mean by noise alone
             risk = removed**2 @ components**2 - 2 * noise**2 * removed.sum(axis=1)
             smoothing = candidates[np.argmin(risk)]
         kernel = modes @ (components / (sizes + smoothing)) * self.scale**5
+        # of the equations K kernel + lambda kernel + P polynomial = values, P polynomial remains
         kernel_values = _kernel(self.places, self.places) @ kernel
         remainder = values - kernel_values - smoothing / self.scale**5 * kernel
         quadratics = _quadratics(self.places, self.axes)

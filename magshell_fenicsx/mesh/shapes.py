@@ -1,7 +1,10 @@
 """Plane shapes that gmsh triangulates: the chart of the mid-surface, or half of it.
 
-And the embeddings of sphere and plane over a chart. The sphere of radius 1 is charted by
-(x, y) = phi (cos theta, sin theta). Lengths are over R.
+And the embeddings of sphere and plane over a chart, the maps from its coordinates to places in
+space. The sphere of radius 1 is charted by (x, y) = phi (cos theta, sin theta), with the angle phi
+from the pole and the azimuth theta. A rim is a closed curve that element edges follow, such as the
+edge of a dimple. gmsh's kernel makes faces by calls, and names them by dimension and tag. Lengths
+are over R.
 """
 
 from collections.abc import Callable, Sequence
@@ -108,17 +111,20 @@ class DiscShape:
             """Make a disc and return its dimension and tag."""
             return 2, occ.addDisk(0, 0, 0, self.radius, self.radius)
 
+        # inner discs divide the outer one, so that elements follow their circles
         faces = [(2, occ.addDisk(0, 0, 0, r, r)) for r in (self.radius, *self.circles)]
         faces += faces_within(occ, self.rims, disc)
         if not self.half:
             return faces
         if self.waves > 1:
             return list(occ.intersect(faces, [self._wedge(occ)])[0])
+        # a rectangle over y >= 0 that is larger than the disc
         upper = (2, occ.addRectangle(-2 * self.radius, 0, 0, 4 * self.radius, 2 * self.radius))
         return list(occ.intersect(faces, [upper])[0])
 
     def _wedge(self, occ: Any) -> tuple[int, int]:
         """Make the triangle between the two sides of the sector, larger than the disc."""
+        # its third side is then at twice the radius from the origin
         side = 2 * self.radius / np.cos(pi / (2 * self.waves))
         ends = [side * self._second_side, np.array([side, 0.0])]
         corners = [occ.addPoint(*x, 0) for x in (np.zeros(2), ends[1], ends[0])]
@@ -214,8 +220,12 @@ def faces_within(
 
 
 def sphere_embedding(chart: Array) -> Array:
-    """Return places (n, 3) of the unit sphere, which are the normals too, at chart (n, 2)."""
+    """Return places (n, 3) of the unit sphere, which are the normals too, at chart (n, 2).
+
+    They are (sin phi cos theta, sin phi sin theta, cos phi).
+    """
     phi = np.hypot(chart[:, 0], chart[:, 1])
+    # sin(phi)/phi, which is defined at the pole
     horizontal = np.sinc(phi / np.pi)[:, None] * chart
     return np.column_stack([horizontal, np.cos(phi)])
 

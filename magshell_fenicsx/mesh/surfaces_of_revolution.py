@@ -1,7 +1,9 @@
 """Surfaces of revolution about e3: profiles, and the embeddings of charts.
 
-A chart is (rho theta, s) or, up to a pole, s (cos theta, sin theta). A profile is a curve in the
-plane (r, z) with the coordinate s. With r to the right and z upwards, the normal of the surface
+A chart is (rho theta, s) or, up to a pole, t (cos theta, sin theta): theta is the azimuth about e3,
+rho a fixed radius, s the length along the meridian, and t its length from the pole. An embedding
+maps chart coordinates to places in space. A profile is the meridian, a curve in the plane (r, z)
+with its length s as coordinate. With r to the right and z upwards, the normal of the surface
 points to the right of the direction of s: on a cylinder with s upwards it points outwards. Lengths
 are over R.
 """
@@ -101,7 +103,7 @@ class ArcProfile:
         """Return s of the place nearest to a point (2,), by its angle around the centre."""
         angle = np.arctan2(rz[1], rz[0] - self.centre) - self.start
         missing_angle = 2 * np.pi - (self.end - self.start)
-        # a point beyond the arc belongs to the nearer end
+        # a point beyond the arc belongs to the nearer end: the angle is cut midway in the gap
         angle = (angle + missing_angle / 2) % (2 * np.pi) - missing_angle / 2
         return float(np.clip(angle, 0.0, self.end - self.start) * self.radius)
 
@@ -146,6 +148,7 @@ class SplineProfile:
             method="bounded",
             options={"xatol": PARAMETER_TOLERANCE},
         )
+        # the minimum may be at a bound, which a bounded search only approaches
         candidates = [float(minimum.x), *(float(s) for s in neighbours)]
         return min(candidates, key=lambda s: float(np.sum((self(np.array(s)) - rz) ** 2)))
 
@@ -169,7 +172,7 @@ class RevolvedEmbedding:
         return np.column_stack([r * np.cos(theta), r * np.sin(theta), z])
 
     def normal(self, chart: Array) -> Array:
-        """Return outward normals (n, 3)."""
+        """Return outward normals (n, 3): the profile's tangent turned to its right."""
         theta, (along_r, along_z) = chart[:, 0] / self.rho, self.profile.tangent(chart[:, 1]).T
         return np.column_stack([along_z * np.cos(theta), along_z * np.sin(theta), -along_r])
 
@@ -179,6 +182,7 @@ class RevolvedEmbedding:
         The azimuth theta is in [first_azimuth, first_azimuth + 2 pi).
         """
         theta = np.arctan2(x[1], x[0])
+        # the tolerance keeps an azimuth that is less by rounding from becoming 2 pi
         from_first_azimuth = (theta - first_azimuth + AZIMUTH_TOLERANCE) % (2 * np.pi)
         theta = first_azimuth + from_first_azimuth - AZIMUTH_TOLERANCE
         s = self.profile.nearest_parameter(np.array([np.hypot(x[0], x[1]), x[2]]))
@@ -201,13 +205,14 @@ class CappedEmbedding:
         return np.column_stack([r[:, None] * _direction(chart, t), z])
 
     def normal(self, chart: Array) -> Array:
-        """Return outward normals (n, 3)."""
+        """Return outward normals (n, 3): the profile's tangent turned to its right."""
         t = np.hypot(chart[:, 0], chart[:, 1])
         along_r, along_z = self.profile.tangent(self.profile.length - t).T
         return np.column_stack([along_z[:, None] * _direction(chart, t), -along_r])
 
     def from_pole(self, places: Array) -> Array:
         """Return the lengths (n,) of the meridian from the pole to places (n, 3) of the surface."""
+        # places (r, z); the nearest sample of the profile is where Newton's method starts
         meridian_places = np.column_stack([np.hypot(places[:, 0], places[:, 1]), places[:, 2]])
         samples = np.linspace(0, self.profile.length, POLE_SAMPLES, dtype=np.float64)
         s = samples[scipy.spatial.cKDTree(self.profile(samples)).query(meridian_places)[1]]

@@ -1,7 +1,9 @@
 """Triangulation of a plane shape by gmsh, with cubic edges.
 
-`triangulate` refines where cubic triangles are overturned, and names the boundary edges. Lengths
-are those of the chart, over R.
+`triangulate` refines where cubic triangles are overturned, and names the boundary edges. The plane
+is the chart of the surface, and an embedding maps it to space. A rim is a closed curve that edges
+follow, such as the edge of a dimple. Opposite sides that are one line of the surface are glued:
+their nodes have one representative. Lengths are those of the chart, over R.
 """
 
 from collections.abc import Mapping
@@ -96,29 +98,33 @@ def _gmsh_mesh(
     # ~/.gmshrc may change meshes, and run commands
     gmsh.initialize(readConfigFiles=False, interruptible=False)
     try:
-        gmsh.option.setNumber("General.Terminal", 0)
+        gmsh.option.setNumber("General.Terminal", 0)  # gmsh writes nothing
+        # sizes come from the callback alone
         for rule in ("MeshSizeExtendFromBoundary", "MeshSizeFromPoints", "MeshSizeFromCurvature"):
             gmsh.option.setNumber(f"Mesh.{rule}", 0)
         gmsh.model.add("chart")
         occ = gmsh.model.occ
         faces = shape.faces(occ)
+        # points and inner faces divide the shape, so that nodes and edges are there
         occ.fragment(faces, [(0, occ.addPoint(x[0], x[1], 0)) for x in _with_images(shape, points)])
         occ.synchronize()
         for axis, low, high in shape.glued:
             _make_periodic(gmsh.model, axis, low, high)
+        # some sizes vary so much along a curve that gmsh must integrate them more precisely
         if precision := getattr(size, "precision", None):
             gmsh.option.setNumber("Mesh.LcIntegrationPrecision", precision)
         gmsh.model.mesh.setSizeCallback(lambda dim, tag, x, y, z, lc: size(np.array([x, y])))
         gmsh.model.mesh.generate(2)
         gmsh.model.mesh.setOrder(ORDER)
         tags, xyz, _ = gmsh.model.mesh.getNodes()
+        # gmsh's tag of a node -> its number from 0
         number = np.zeros(int(tags.max()) + 1, dtype=np.int64)
         number[tags.astype(np.int64)] = np.arange(len(tags))
         nodes = xyz.reshape(-1, 3)[:, :2].copy()
         triangle_tags = gmsh.model.mesh.getElementsByType(TRIANGLE10)[1].astype(np.int64)
         cells = number[triangle_tags].reshape(-1, 10)
         line_tags = gmsh.model.mesh.getElementsByType(LINE4)[1].astype(np.int64)
-        lines = number[line_tags].reshape(-1, 4)[:, :2]
+        lines = number[line_tags].reshape(-1, 4)[:, :2]  # its two ends of a line's four nodes
     except Exception as e:  # gmsh's own errors have no class of their own
         raise MeshError(f"gmsh cannot mesh this surface: {e}") from None
     finally:
@@ -170,7 +176,7 @@ def _make_periodic(model: Any, axis: int, low: float, high: float) -> None:
         return sorted(curves)
 
     first, second = curves_at(low), curves_at(high)
-    shift = np.eye(4)
+    shift = np.eye(4)  # gmsh's affine map from the first side to the second
     shift[axis, 3] = high - low
     model.mesh.setPeriodic(
         1, [tag for _, tag in second], [tag for _, tag in first], shift.ravel().tolist()
@@ -190,6 +196,7 @@ def _glued_nodes(shape: PlaneShape, nodes: Array) -> NDArray[np.int64]:
         first, second = (
             np.flatnonzero(np.abs(nodes[:, axis] - end) < CHART_TOLERANCE) for end in (low, high)
         )
+        # nodes of both sides are compared by their coordinate along the side
         tree = scipy.spatial.cKDTree(nodes[first, 1 - axis, None])
         distance, nearest = tree.query(nodes[second, 1 - axis, None])
         if len(first) != len(second) or distance.max() > GLUING_TOLERANCE:
@@ -211,7 +218,7 @@ def _overturned_corners(nodes: Array) -> Array:
     tangents_at_start = [-5.5 * x[a] + 9 * x[p] - 4.5 * x[q] + x[b] for a, p, q, b in sides]
     tangents_at_end = [-x[a] + 4.5 * x[p] - 9 * x[q] + 5.5 * x[b] for a, p, q, b in sides]
     corners = list[Array]()
-    for i in range(3):
+    for i in range(3):  # at vertex i side i - 1 ends and side i begins
         incoming, outgoing = tangents_at_end[i - 1], tangents_at_start[i]
         determinant = incoming[:, 0] * outgoing[:, 1] - incoming[:, 1] * outgoing[:, 0]
         corners.append(x[sides[i][0]][determinant <= 0])

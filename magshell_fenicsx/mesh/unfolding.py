@@ -2,7 +2,11 @@
 
 The symmetry-breaking modes of a sector are computed on the half, whose triangulation is the copies
 of the sector's. Copy k lies between the azimuths k and k + 1 times the sector's angle; every second
-copy is a mirror image. Lengths are over R.
+copy is a mirror image, since the sector has symmetry planes at both of its ends.
+
+Nodes are coordinates in a chart (d = 2), or places in space, perhaps followed by normals; those of
+several shells have ten numbers (see `multi_shell`): their place first, the number of the shell
+last. An embedding maps nodes to places. Glued nodes have one representative. Lengths are over R.
 """
 
 from collections.abc import Sequence
@@ -27,7 +31,8 @@ MIRRORED_NODES = {
 class ChartUnfolding:
     """Copies of a sector side by side in a chart, which together are a half.
 
-    Copy 0 is the sector; copies with odd numbers are mirror images.
+    Copy 0 is the sector; copies with odd numbers are mirror images. The surface is one of
+    revolution, so that the copies have the sector's own chart and embedding.
 
     Attributes
     ----------
@@ -52,6 +57,7 @@ class ChartUnfolding:
     def __init__(self, angle: float, count: int, patch: PatchMesh) -> None:
         """Find out by the embedding whether the chart turns with the surface, as a disc does."""
         self.count, self._angle = count, angle
+        # turning the chart of a disc turns the surface; a rectangular chart does not do so
         places, Q = patch.embedding(patch.nodes), rotation(-angle)
         rotated_chart_places = patch.embedding(patch.nodes @ Q[:2, :2].T)
         error = np.abs(rotated_chart_places - places @ Q.T).max()
@@ -62,6 +68,7 @@ class ChartUnfolding:
         """Return places (n, 2) of the sector's chart in copy k."""
         if self.round:
             return np.asarray(chart @ self.turn(k)[:2, :2].T)
+        # copies with odd numbers run backwards
         x = (k + 1) * self.end - chart[:, 0] if k % 2 else k * self.end + chart[:, 0]
         return np.column_stack([x, chart[:, 1]])
 
@@ -76,7 +83,7 @@ class ChartUnfolding:
 
     def copies(self, chart: Array) -> NDArray[np.int64]:
         """Return the number (n,) of the copy in which each place (n, 2) of the half lies."""
-        # at pi rounding has a sign
+        # absolute: at the end of the half rounding may give -pi
         angle = np.abs(np.arctan2(chart[:, 1], chart[:, 0])) if self.round else chart[:, 0]
         return np.asarray(np.clip(np.floor(angle / self.end), 0, self.count - 1), dtype=np.int64)
 
@@ -106,8 +113,13 @@ class ChartUnfolding:
 class SpaceUnfolding:
     """Copies of a sector side by side in space, for a mesh file or several shells.
 
-    The methods are those of `ChartUnfolding`. Copies of several shells do not share nodes: a node
-    has the number of its copy, and `CopiesEmbedding` places it.
+    It has the methods of `ChartUnfolding`. Copies of several shells do not share nodes: a node has
+    the number of its copy, and `CopiesEmbedding` places it.
+
+    Attributes
+    ----------
+    count
+        Number of copies: the waves m of the sector.
     """
 
     def __init__(self, sector: Sector, patch: PatchMesh) -> None:
@@ -131,6 +143,7 @@ class SpaceUnfolding:
 
         Copies with odd numbers are mirror images.
         """
+        # turn to the frame in which the sector begins at azimuth 0, and back at the end
         to_azimuth_zero = rotation(self._sector.azimuth)
         angle = self._sector.angle
         Q = rotation(-(k + k % 2) * angle)
@@ -154,7 +167,7 @@ class SpaceUnfolding:
     def embedding(self, of_sector: Embedding) -> Embedding:
         """Return the embedding of all copies."""
         if not self._several_shells:
-            return of_sector
+            return of_sector  # nodes are places already
         return CopiesEmbedding(of_sector, tuple(self.turn(k) for k in range(self.count)))
 
     def key(self, nodes: Array) -> Array:
@@ -224,7 +237,7 @@ def unfold(
     first_of_same = np.array([min(numbers) for numbers in nodes_at_place])
     glued_to = np.arange(n) if patch.representative is None else patch.representative
     representative = first_of_same[np.concatenate([k * n + glued_to for k in range(count)])]
-    # copies of several shells keep their nodes, and vertices are glued
+    # copies of several shells keep their nodes, which are glued; others share nodes at one place
     has_own_nodes = keys is not nodes
     used, numbers = np.unique(
         np.arange(len(nodes)) if has_own_nodes else first_of_same, return_inverse=True
@@ -259,6 +272,7 @@ def unfold(
         cells=numbers[cells],
         embedding=unfolding.embedding(patch.embedding),
         edges=edges,
+        # named points are those of copy 0, the sector
         points={name: unfolding.image(x[None], 0)[0] for name, x in patch.points.items()},
         representative=new_number[representative[used]] if is_glued else None,
         patches={name: np.tile(mask, count) for name, mask in patch.patches.items()},
@@ -273,5 +287,5 @@ def unfold(
 
 def double_sector(patch: PatchMesh, angle: float) -> PatchMesh:
     """Return the triangulation of a sector of an angle (rad), made of that of its first half."""
-    unfolding = ChartUnfolding(angle / 2, 2, patch)
+    unfolding = ChartUnfolding(angle / 2, count=2, patch=patch)
     return unfold(patch, unfolding, (SYMMETRY_EDGE, SECOND_SYMMETRY_EDGE))

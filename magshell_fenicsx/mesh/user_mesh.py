@@ -1,8 +1,11 @@
 """A user's dolfinx mesh of triangles in space: its triangles, fields on it, displacements for it.
 
 Every rank has all triangles, in the order in which they were made, whatever the number of ranks:
-they are few. A scene has a mesh of its own, distributed in its own way; fields go there and
-displacements come back cell by cell.
+they are few. A scene, the model of a problem with its solver, has a mesh of its own, distributed in
+its own way; fields go there and displacements come back cell by cell.
+
+A cell's number is its place in the order in which the cells were given to dolfinx, which is the
+same for any number of ranks; local numbers are those of one rank. Own cells are without ghosts.
 """
 
 from collections.abc import Mapping
@@ -83,8 +86,9 @@ class UserMesh:
         """
         nodes, ids = self._nodes_of_owned_cells()
         cells = self._gather_cells(ids)
+        # number the used nodes in the order in which they first stand in the cells
         used, first_index, index_of_used = np.unique(cells, return_index=True, return_inverse=True)
-        order = np.argsort(first_index)  # nodes in the order of the cells, too
+        order = np.argsort(first_index)
         number = np.empty(len(used), dtype=np.int64)
         number[order] = np.arange(len(used))
         places = self._gather_cells(nodes).reshape(-1, 3)[first_index[order]]
@@ -128,7 +132,7 @@ class UserMesh:
             )
         element = V.element.basix_element
         nodes = lagrange_element(element.degree)
-        # from nodal values of the function to those of the field
+        # from nodal values of the function to those of the field, whose nodes are others
         table = element.tabulate(0, nodes.points)[0, :, :, 0]
         values = function.x.array.reshape(-1, V.dofmap.bs)[V.dofmap.list[: self._owned]]
         nodal = self._gather_cells(np.matmul(table, np.asarray(values, dtype=float)))
@@ -146,10 +150,10 @@ class UserMesh:
         u
             A vector Lagrange function on the scene's mesh.
         source_triangles
-            (cells, 2) of the scene's cells, ghosts perhaps included, see
-            `PatchMesh.source_triangles`.
+            (cells, 2) of the scene's cells, ghosts perhaps included: the number of each cell in
+            this mesh, and 1 where its orientation is reversed.
         scale
-            Divisor of the values.
+            Divisor of the values, for the units of this mesh.
         """
         V = u.function_space
         degree, owned = V.element.basix_element.degree, V.mesh.topology.index_map(2).size_local
@@ -161,6 +165,7 @@ class UserMesh:
         nodal_of_all = np.zeros((cell_count, *nodal.shape[1:]))
         for numbers, values in self.comm.allgather((number, nodal)):
             nodal_of_all[numbers] = values
+        # a space is made once for each degree
         W = self._spaces.get(degree) or fem.functionspace(self.mesh, ("Lagrange", degree, (3,)))
         self._spaces[degree] = W
         displacement = fem.Function(W, name="u")
@@ -178,7 +183,7 @@ class UserMesh:
         has_all = len(numbers_of_all_ranks) == cell_map.size_global
         if has_all and (np.sort(numbers_of_all_ranks) == np.arange(cell_map.size_global)).all():
             return original_numbers
-        # the mesh is a part of another one
+        # not all numbers from 0 on are there: the mesh is a part of another one
         return np.asarray(cell_map.local_to_global(np.arange(local_count, dtype=np.int32)))
 
     def _gather_cells(self, values: NDArray[Any]) -> NDArray[Any]:
@@ -210,6 +215,7 @@ class UserMesh:
             places = np.matmul(self._element.tabulate(0, equispaced.points)[0, :, :, 0], places)
         node_numbers = geometry.index_map().local_to_global(dofs.ravel().astype(np.int32))
         node_numbers = node_numbers.reshape(dofs.shape)
+        # the inverse of the permutation from gmsh's to dolfinx's order
         order = np.argsort(perm_gmsh(mesh.CellType.triangle, dofs.shape[1]))
         return np.asarray(places[:, order]), np.asarray(node_numbers[:, order])
 
@@ -233,7 +239,7 @@ class UserMesh:
         tags_name = "facet_tags" if dimension == 1 else "cell_tags"
         entities_name = "facets" if dimension == 1 else "cells"
         entities: NDArray[np.int32] = np.empty(0, dtype=np.int32)
-        error = ""
+        error = ""  # of this rank; all ranks raise the first one together
         by_value = isinstance(part, int | np.integer)
         if not by_value:
             error = self._error_of_numbers(np.asarray(part), dimension, entities_name)
@@ -276,10 +282,11 @@ class UserMesh:
     def _vertex_pairs(self, facets: NDArray[np.int32]) -> Pairs:
         """Return global vertex numbers (e, 2) of facets of all ranks, each once; collective."""
         topology = self.mesh.topology
+        # 1 facets, 2 cells, 0 vertices: what `entities_to_geometry` needs
         for dimensions in ((1, 2), (1, 0), (2, 1)):
             topology.create_connectivity(*dimensions)
         ends = np.empty((0, 2), np.int32)
-        if len(facets):
+        if len(facets):  # dolfinx takes no empty list
             ends = mesh.entities_to_geometry(self.mesh, 1, facets)[:, :2]
         numbers = self.mesh.geometry.index_map().local_to_global(
             np.asarray(ends, dtype=np.int32).ravel()
@@ -306,6 +313,9 @@ def lagrange_element(degree: int) -> basix.finite_element.FiniteElement:
 
 
 def swapped_nodes(element: basix.finite_element.FiniteElement) -> Numbers:
-    """Return the number of each node (nodes,) with the second and the third vertex exchanged."""
+    """Return the number of each node (nodes,) with the second and the third vertex exchanged.
+
+    This exchanges the two coordinates of the reference triangle.
+    """
     distances = np.linalg.norm(element.points[:, None, ::-1] - element.points[None], axis=2)
     return np.asarray(np.argmin(distances, axis=1))

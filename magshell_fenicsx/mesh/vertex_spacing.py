@@ -4,6 +4,9 @@ The interior penalty of an edge is over the mean height of its two triangles. Wh
 than about a hundredth of the other, the default penalty is too small, whatever the degree. So
 vertices that are nearer to each other than a part of the elements there share a grid line, or are
 refused.
+
+The interior penalty makes the slope of a displacement continuous across edges; a case sets its
+factor as `mesh.penalty`. The flatness of a triangle says how much higher its neighbours are.
 """
 
 from collections.abc import Callable
@@ -42,6 +45,7 @@ def grouped_by_distance(
     rounding
         Distance up to which coordinates are always one.
     """
+    # chains of neighbours that are near each other
     groups = list[Array]()
     for c in np.sort(coordinates):
         if groups:
@@ -51,6 +55,7 @@ def grouped_by_distance(
                 groups[-1] = np.append(groups[-1], c)
                 continue
         groups.append(np.array([c]))
+    # a long chain must not become one line
     narrow_groups = list[Array]()
     for group in groups:
         max_width = max(rounding, MAX_GROUP_WIDTH * size(float(group.mean())))
@@ -115,7 +120,7 @@ def flatness(patch: PatchMesh) -> Array:
             np.sort(directed_sides(patch.corners), axis=1), axis=0, return_inverse=True
         )
         edge = edge.ravel()
-        # of both triangles at each side, in the order of `directed_sides`
+        # sum of the heights of the triangles at each side, in the order of `directed_sides`
         sum_of_heights = np.bincount(edge, weights=heights)[edge]
         has_neighbour = np.bincount(edge)[edge] > 1
         ratios = np.where(has_neighbour, sum_of_heights / (4 * heights), 0.0)
@@ -130,7 +135,7 @@ def flat_triangle(
     Parameters
     ----------
     penalty, default
-        The factor of the interior penalty, and that of its degree by default.
+        The factor of the interior penalty, and the one that a case has by default.
     length
         R in the coordinates of the message.
     unit
@@ -145,7 +150,7 @@ def flat_triangle(
     sides = np.linalg.norm(corners[[1, 2, 0]] - corners, axis=1)
     doubled_area = np.linalg.norm(np.cross(corners[1] - corners[0], corners[2] - corners[0]))
     height = doubled_area / sides.max()
-    near_vertices = ""
+    near_vertices = ""  # where a short side is the reason, its ends are told
     if sides.min() < SHORT_SIDE * sides.max():
         side = int(sides.argmin())
         start, end = distinguishable_texts(corners[side], corners[(side + 1) % 3])
@@ -171,8 +176,10 @@ def refuse_flat(patch: PatchMesh, default: float, length: float, unit: str, key:
 
     Parameters
     ----------
-    default, length, unit
-        See `flat_triangle`.
+    default
+        The default factor of the interior penalty.
+    length, unit
+        R in the coordinates of the message, and their unit.
     key
         Key with which the message begins.
 

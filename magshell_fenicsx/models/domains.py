@@ -3,6 +3,13 @@
 A domain gives the jets of fields, the measures of cells, of the edges between them and of the
 boundary's edges, and the width of cells there. So an energy is written as its density alone.
 
+- A jet is a vector field's value with its first and second derivatives by two coordinates.
+- r0 is the placement (the undeformed surface), u the displacement, v an addition to it.
+- A covector m (2,) of an edge is zero along the edge and positive outward, in the coordinates of
+  jets. A width h_e is that of the cells at an edge, in the penalty of C0 elements.
+- A wave varies as cos(m theta) or sin(m theta) around the axis e3.
+- r0 changes if an imperfection grows. Volumes are then counted from the initial placement.
+
 On a surface of revolution the coordinates are (s, theta), s the meridian's parameter; jets are
 those at theta = 0. Their components are along (e_rho, e_theta, e_z), which turn with theta: e_rho'
 = e_theta, e_theta' = -e_rho. In this order a_1 x a_2 points outward where s grows away from the
@@ -36,10 +43,11 @@ def revolved_jet(f: Expr) -> Jet:
 
 
 def revolved_jet_of(derivatives: Sequence[Sequence[Expr]]) -> Jet:
-    """Return the jet of an axisymmetric field f = (U, W), see `revolved_jet`.
+    """Return the jet of the axisymmetric field U e_rho + W e_z, from f = (U, W) and derivatives.
 
-    `derivatives` are the components of f, f' and f'', derivatives by s.
+    `derivatives` has the components of f, f' and f'', by the meridian's parameter s.
     """
+    # by theta the vector e_rho turns: U e_rho has the derivatives U e_theta and -U e_rho
     (U, W), (Us, Ws), (Uss, Wss) = derivatives
     return Jet(
         r=_vector(U, 0, W),
@@ -54,22 +62,24 @@ def revolved_jet_of(derivatives: Sequence[Sequence[Expr]]) -> Jet:
 def wave_jets(f: Expr, m: Expr) -> tuple[Jet, Jet]:
     """Return jets of v = U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z.
 
-    The unknowns are f = (P, V, W) with P = U + V. On the axis P = 0 for m = 1 (a translation has U
-    = -V there); for every other m all three vanish.
+    The unknowns are f = (P, V, W) with P = U + V, and m is the wave number. On the axis P = 0 for m
+    = 1 (a translation has U = -V there); for every other m all three vanish.
 
     Returns
     -------
     cosine, sine
-        v,_i = cosine_i cos(m theta) + sine_i sin(m theta), and so for all derivatives.
+        Two jets: v = cosine.r cos(m theta) + sine.r sin(m theta), and so for each derivative.
     """
     return wave_jets_of(_derivatives(f, 3), m)
 
 
 def wave_jets_of(derivatives: Sequence[Sequence[Expr]], m: Expr) -> tuple[Jet, Jet]:
-    """Return the cosine and sine jets of a wave f = (P, V, W), see `wave_jets`.
+    """Return the cosine and sine jets of a wave with the coefficients f = (P, V, W).
 
-    `derivatives` are the components of f, f' and f'', derivatives by s.
+    `wave_jets` has their definition; `derivatives` has the components of f, f' and f'', by the
+    meridian's parameter s.
     """
+    # U = P - V
     (U, V, W), (Us, Vs, Ws), (Uss, Vss, Wss) = ((P - V, V, W) for P, V, W in derivatives)
     cosine = Jet(
         r=_vector(U, 0, W),
@@ -124,7 +134,8 @@ class Energy:
     from_initial
         Whether it counts from the initial placement.
     reference_turn
-        The turn from which the angle of a moment is counted, and -Pi of one radian; else None.
+        Of a moment: the turn (cosine and sine) from which its angle is counted, and -Pi of one
+        radian. None for other energies.
     group, column
         Group and column of the `Term`; an empty group stands for the name.
     """
@@ -143,7 +154,8 @@ class Energy:
     def perturbed_form(self, u: Jet, v: Jet) -> ufl.Form:
         """Return a form whose Hessian in v, at v = 0, is that of the energy of u + v.
 
-        Of a virtual work, which may have no potential, it is the symmetric part of the derivative.
+        A virtual work may have no potential, and its derivative by u then is not symmetric: the
+        Hessian is the symmetric part.
         """
         if self.work is None:
             return self.form_of(u + v)
@@ -249,9 +261,10 @@ class IntegrationDomain:
         return self.measures_on([facets])[0]
 
     def measures_on(self, facet_groups: Sequence[Facets]) -> list[ufl.Measure]:
-        """Return the measures of groups of boundary edges that do not overlap, in their order.
+        """Return a measure for each group of boundary edges; groups do not overlap.
 
-        They are parts of one measure, since a form may have only one of the boundary.
+        A form may have only one measure of the boundary: so all are parts, with numbers from 1, of
+        one tagged measure.
         """
         facets = np.concatenate(facet_groups)
         numbers = np.repeat(
@@ -267,6 +280,7 @@ class IntegrationDomain:
 
     @property
     def _along_edges(self) -> dict[str, int]:
+        """Metadata of measures along edges; empty on a meridian, where edges are points."""
         return {} if self.edge_rule is None else {"quadrature_degree": self.edge_rule}
 
     def over_area(self) -> Callable[[Expr], ufl.Form]:
@@ -276,7 +290,8 @@ class IntegrationDomain:
 
     def length(self, facets: Facets) -> ufl.Form:
         """Return the undeformed length of some edges."""
-        return kin.conormal(self.j0, self.covector)[2] * self.ds(facets)
+        _, _, stretch = kin.conormal(self.j0, self.covector)
+        return stretch * self.ds(facets)
 
     def jets_from_initial(self, u: Jet) -> tuple[Jet, Jet]:
         """Return the jets of the initial placement and of the displacement from there to r0 + u."""
@@ -297,13 +312,14 @@ class IntegrationDomain:
     def value(self, density: Density, u: Jet, *, from_initial: bool = False) -> Expr:
         """Return the value of a density at the displacement's jet u.
 
-        With `from_initial` the displacement counts from the initial placement. On interior edges
-        the density takes pairs of jets, covectors and fields, '+' first.
+        With `from_initial` a density on cells counts the displacement from the initial placement.
+        On interior edges the density takes pairs of jets, covectors and fields, '+' first.
         """
         r0 = self.j0
         if density.sides == 2:
             pairs = ((j.side("+"), j.side("-")) for j in (r0, u))
             m = self.covector("+"), self.covector("-")
+            # only fields differ on the two sides, constants do not
             sided = [
                 (p("+"), p("-")) if isinstance(p, fem.Function) else p for p in density.parameters
             ]
@@ -329,8 +345,9 @@ class IntegrationDomain:
     ) -> Energy:
         """Return the energy of a density as a function of the displacement's jet.
 
-        `amplitude` is the name of its amplitude, `from_initial` is as in `value`; further
-        `attributes` are those of `Energy`.
+        `amplitude` is the name of the load parameter that multiplies it; None for the factor 1.
+        With `from_initial` the displacement counts from the initial placement. Further `attributes`
+        are those of `Energy`, such as `linear` or `group`.
         """
         virtual_work, measure = density.work, self.measure(density)
 
@@ -359,6 +376,7 @@ def surface_domain(
 ) -> IntegrationDomain:
     """Return the domain of a mid-surface, a mesh of triangles with the placement r0."""
     mesh_of_surface, degree = r0.function_space.mesh, r0.function_space.element.basix_element.degree
+    # area over length of the edge: half the height of a triangle
     interior_width = ufl.avg(ufl.CellVolume(mesh_of_surface)) / ufl.avg(
         ufl.FacetArea(mesh_of_surface)
     )
@@ -416,7 +434,7 @@ def _tables_on_surface(V: fem.FunctionSpace, points: Array) -> Callable[[Array],
 def _tables_on_meridian(V: fem.FunctionSpace, points: Array) -> Callable[[Array], Array]:
     """Return a function from nodal values (U, W) to jets on a meridian, at azimuth zero.
 
-    `points` (n, 1) are in [0, 1]; jets are (6, cells, n, 3), as in `revolved_jet`, by the
+    `points` (n, 1) are in [0, 1]. Jets are (6, cells, n, 3), along (e_rho, e_theta, e_z), by the
     coordinate of the reference cell and the azimuth.
     """
     shapes, nodes = V.element.basix_element.tabulate(2, points)[..., 0], V.dofmap.list

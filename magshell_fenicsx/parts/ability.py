@@ -2,6 +2,11 @@
 
 An ability reads its section and the rest of the case (`Context`). It gives fields of the model's
 `Loads`, the symmetry that it preserves, its formulas, and its lines for `magshell check`.
+
+An offer is a property of a case that some abilities need, such as "a mid-surface", and others
+withdraw. A programme is the list of the case's steps, its loads one after the other; each drives an
+amplitude (a load parameter, by name). R, h and E are reference length, thickness and Young's
+modulus.
 """
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
@@ -173,7 +178,7 @@ class Context:
         ValueError
             With the allowed angles; the message begins with `key`.
         """
-        edge = self.shell.edge_polar
+        edge = self.shell.edge_polar  # of a sphere (degrees); None of others
         if edge is not None and not 0 <= polar < edge - 1:
             smallest_polar = getattr(self.shell, "hole", None) or 0
             raise ValueError(

@@ -1,5 +1,11 @@
 """An elastic foundation: springs along the undeformed normal and in the surface, of stiffnesses
 that may vary.
+
+k and k_t are the stiffnesses along the normal n0 and in the surface, as forces per area and
+displacement; their amplitudes (load parameters) are over E h/R², with Young's modulus E, thickness
+h and reference length R. A jet is a map with its derivatives at a point. An `OwnTerm` is an energy
+that the case adds to the model: its name, its density, the density's parameters, and the value of
+its amplitude.
 """
 
 from collections.abc import Iterable
@@ -91,6 +97,7 @@ class Foundation(Part):
         """
         stiffnesses, energies = self._dimensionless(scales), list[OwnTerm]()
         factor = (FormulaParameter(self.factor, "foundation.factor"),) if self.factor else (1.0,)
+        # a column of results beside the energy, whose density is `reaction`
         if "k" in stiffnesses:
             observed = {"foundation_force": reaction}
             energies.append(

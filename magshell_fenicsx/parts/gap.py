@@ -2,7 +2,11 @@
 
 A shell that keeps its volume gets thinner as its surface stretches. A natural shape is what has
 grown without stress, and its volume stays. Penetrations and thicknesses are over R, stiffnesses
-over E h/R^2. docs/theory.md, Contact.
+over E h/R^2, with Young's modulus E, thickness h and reference length R. docs/theory.md, Contact.
+
+psi(s) is the penalty energy per area of a penetration s; psi' is the contact pressure. A jet is a
+map with its derivatives at a point. A memo is a value that is computed again where its inputs have
+changed. An amplitude is a load parameter.
 """
 
 from collections.abc import Callable
@@ -96,6 +100,7 @@ def thickness_ratio_at_points(
         displacement or the natural shape has changed.
     """
     r0, V = domain.r0, u.function_space
+    # arrays that change in place as the shape grows: the memo compares them
     natural_values = natural.values if natural else None
 
     def ratio_at(points: Array) -> Memo[Array]:
@@ -104,7 +109,7 @@ def thickness_ratio_at_points(
         It is a memo: a value that is computed again where displacement or natural shape have
         changed.
         """
-        jets_of = domain.tables(V, points)
+        jets_of = domain.tables(V, points)  # from coefficients to value, d/ds1, d/ds2, ...
 
         def values() -> Array:
             """Return the ratio (cells * places,) at the present displacement."""
@@ -128,6 +133,7 @@ def penalty(s: Array, k: float, soft_penetration: float) -> tuple[Array, Array, 
     Without penetration (s <= 0) all are zero. The three arrays have the shape of s.
     """
     t = np.maximum(s, 0.0)
+    # beyond: the stiffness is k; the constants make psi and psi' continuous
     is_full = t > soft_penetration
     second = np.where(is_full, k, k * t / soft_penetration)
     first = np.where(is_full, k * (t - soft_penetration / 2), k * t**2 / (2 * soft_penetration))
@@ -155,6 +161,7 @@ def expanded_penalty(
     """
     value, first, second = penalty(s0, k, soft_penetration)
     step = s - s0
+    # psi''' is zero where psi'' is constant: without penetration, and beyond the soft one
     third = with_third_order * np.where(
         (s0 > 0) & (s0 <= soft_penetration), k / soft_penetration, 0.0
     )
@@ -170,14 +177,17 @@ def mean_pressure(s0: Array, s1: Array, k: float, soft_penetration: float) -> tu
     """Return (psi(s1) - psi(s0))/(s1 - s0) and its derivative by s1.
 
     It is the pressure over a step of penetration from s0 to s1 that conserves energy. Simpson's
-    rule gives it where psi'' has no kink between both: the rule is then exact.
+    rule gives it where psi'' has no kink between both: the rule is then exact, and needs no
+    division by s1 - s0, which may be zero.
     """
+    # psi, psi' and psi'' at both penetrations
     (v0, p0, _), (v1, p1, k1) = penalty(s0, k, soft_penetration), penalty(s1, k, soft_penetration)
     _, p_middle, k_middle = penalty((s0 + s1) / 2, k, soft_penetration)
     simpson, simpson_slope = (p0 + 4 * p_middle + p1) / 6, (2 * k_middle + k1) / 6
     kinks = (0.0, soft_penetration)
     passes_kink = np.digitize(s0, kinks) != np.digitize(s1, kinks)
+    # over a tiny step the quotient is rounding, and Simpson's rule good enough
     passes_kink &= np.abs(s1 - s0) > PENETRATION_ROUNDING * soft_penetration
-    ds = np.where(passes_kink, s1 - s0, 1.0)
+    ds = np.where(passes_kink, s1 - s0, 1.0)  # 1 where the quotient is not used
     mean = np.where(passes_kink, (v1 - v0) / ds, simpson)
     return mean, np.where(passes_kink, (p1 - mean) / ds, simpson_slope)

@@ -4,6 +4,11 @@ The vertices of both edges are glued, so that displacements agree. What is left 
 edge between two cells, which C0 interior penalty has on every one: of a rigid joint it is that, of
 a hinge there is none, and of a spring it is (k/2) (theta - theta_0)^2 per undeformed length, with
 the angle theta between the normals. docs/theory.md.
+
+theta_0 is the angle at which a spring rests. It may grow with the amplitude (load parameter) of
+creases, from the angle of the undeformed shells (0) to its own (1). Stiffnesses k are over E h R.
+A density is an energy per area or length as a function of jets: maps with their derivatives at a
+point. `plus` and `minus` are the two sides of an edge.
 """
 
 from collections.abc import Sequence
@@ -107,6 +112,7 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
         shells = context.sections.get("shells")
         if not shells:
             raise ValueError("joints: join edges of several shells: give shells")
+        # raises if a part of the case excludes either of them
         context.needs("joints", "a mid-surface", "a material without viscosity")
         joined_edges = set[str]()
         for i, section in enumerate(self.sections):
@@ -118,7 +124,7 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
                     f"joints.{i}.angle: of an edge on another shell the spring rests as it is "
                     "placed: leave it out"
                 )
-            edge, other = section.edges
+            edge, other = section.edges  # of a T-junction `other` is a shell
             if other in shells and edge.startswith(f"{other}_"):
                 others = ", ".join(sorted(set(shells) - {other})) or "none"
                 raise ValueError(
@@ -147,6 +153,7 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         """Return the joints as the model's `Loads` have them, with stiffnesses over E h R."""
+        # a case without springs may have no units, hence no scales
         scales = context.scales if any(section.stiffness for section in self.sections) else None
         joints = tuple(
             Joint(
@@ -173,6 +180,7 @@ def _refuse_too_stiff(number: int, section: JointSection, context: Context) -> N
     shells, least_stiffness = context.sections["shells"], inf
     for edge in section.edges:
         shells_of_edge = [name for name in shells if edge == name or edge.startswith(f"{name}_")]
+        # "a_b_rim" begins with the names of shells a and a_b: the longest name is the right one
         for shell in (shells[name].shell for name in sorted(shells_of_edge, key=len)[-1:]):
             thickness = shell.reference / shell.R_over_h
             least_stiffness = min(
@@ -285,6 +293,7 @@ class Creases:
 
         creases, marks_of_cells = list[Joint](), list[Any]()
         for joint, marks_of_joint in zip(joints, midsurface.joints, strict=True):
+            # a rigid joint is an edge as any other; without marks it is not on this mesh
             if not (joint.rigid or marks_of_joint is None):
                 creases.append(joint)
                 marks_of_cells.append(marks_of_joint)
@@ -338,15 +347,19 @@ class Creases:
             the creases and the growth of the rest angles; all others are those of the density.
             """
             *edge_arguments, (plus, minus), k, angle, has_angle, growth = arguments
+            # pairs, one for each side: jets of placement and displacement, and covectors m normal
+            # to the edge in the reference plane
             r0, u, m = edge_arguments[:3]
             within_shell, springs, is_joint = density.function(*edge_arguments, **options), 0, 0
             conormals = zip(r0, m, strict=True)
+            # mean over both sides of the undeformed length of the edge over that of the reference
             stretch = sum(kin.conormal(jet, covector)[2] for jet, covector in conormals) / 2
             undeformed = fold_angle(r0[0], r0[1], m[0])
             sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
             for i in range(count):
                 product = plus[i] * minus[i]
-                at_joint = product * (product - 1) / 2  # 1 between its edges, 0 elsewhere
+                # 1 between its edges, where the marks are 1 and -1; 0 elsewhere
+                at_joint = product * (product - 1) / 2
                 sine_at_rest, cosine_at_rest = undeformed
                 if grow:
                     angle_of_placement = ufl.atan2(undeformed[0], undeformed[1])
@@ -354,6 +367,7 @@ class Creases:
                         angle[i] - angle_of_placement
                     )
                     sine_at_rest, cosine_at_rest = ufl.sin(rest_angle), ufl.cos(rest_angle)
+                # theta - theta_0 by sine and cosine, without a jump of the angle at 180 degrees
                 rotation = ufl.atan2(
                     sine * cosine_at_rest - cosine * sine_at_rest,
                     cosine * cosine_at_rest + sine * sine_at_rest,

@@ -1,6 +1,7 @@
 """The kinds of bodies, imperfections and sources: each is a file of its package, with its section.
 
-A new kind is such a file, named after it, and its name here.
+A new kind is such a file, named after it, and its name here. A section is the part of a case under
+a key, as a pydantic model; its key `kind` chooses the class.
 """
 
 from importlib import import_module
@@ -33,7 +34,7 @@ def section_of(package: str, kind: str) -> type[Section]:
     It is the one class in the file of the kind with this value of the key `kind`.
     """
     module = import_module(f"{__package__}.{package}.{kind}")
-    module_members = (
+    module_members = (  # without classes that the module imports
         member
         for member in vars(module).values()
         if getattr(member, "__module__", "") == module.__name__
@@ -43,6 +44,7 @@ def section_of(package: str, kind: str) -> type[Section]:
         for member in module_members
         if isinstance(member, type) and issubclass(member, Section)
     ]
+    # the values of the key's Literal are the kinds of the class: one class has this kind
     (section,) = (
         member for member in sections if kind in get_args(member.model_fields["kind"].annotation)
     )

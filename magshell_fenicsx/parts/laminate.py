@@ -4,6 +4,11 @@ preserves.
 Classical lamination theory (R. M. Jones, *Mechanics of Composite Materials*, 1999, chapters 2 and
 4): each ply is in plane stress and orthotropic, and the layer at the height z above the middle has
 the strain E - z K.
+
+E11, E22, 2 E12 are strains of the mid-surface, K changes of its curvature, Q the stiffness of a
+ply. A, B and D are the stiffnesses of membrane, coupling and bending. Entries 16 and 26 couple
+stretching with shear. Angles are from the direction `along`. E (a number) and h are Young's modulus
+of the shell and its thickness, the units of stiffnesses. e3 is the axis of the case.
 """
 
 from dataclasses import dataclass
@@ -81,13 +86,14 @@ class PlySection(Section):
 
         S are the stresses of plane stress; Q has the unit of the moduli.
         """
-        nu21 = self.nu12 * self.E2 / self.E1
+        nu21 = self.nu12 * self.E2 / self.E1  # Q is symmetric
         Q_in_ply_axes = np.array(
             [[self.E1, nu21 * self.E1, 0], [nu21 * self.E1, self.E2, 0], [0, 0, 0]]
         ) / (1 - self.nu12 * nu21)
         Q_in_ply_axes[2, 2] = self.G12
         c, s = np.cos(np.radians(self.angle)), np.sin(np.radians(self.angle))
         c, s = (0.0 if abs(v) < 1e-15 else float(v) for v in (c, s))  # 90 degrees are exact
+        # from (E_11, E_22, 2 E_12) along `along` to those along the fibres
         strain_transformation = np.array(
             [[c * c, s * s, c * s], [s * s, c * c, -c * s], [-2 * c * s, 2 * c * s, c * c - s * s]]
         )
@@ -163,9 +169,12 @@ class LaminateSection(Section):
             (3, 6): A, B and D, each with the entries 11, 12, 22, 16, 26, 66.
         """
         fractions = np.array([ply.fraction for ply in self.plies])
+        # bounds of the plies over h, from -1/2 to 1/2
         heights = np.concatenate([[0.0], np.cumsum(fractions) / fractions.sum()]) - 0.5
         Q = np.array([ply.stiffness[VOIGT_INDICES] for ply in self.plies]) / E
+        # integrals of Q, Q z and Q z^2 over the thickness
         stiffnesses = np.array([np.diff(heights**n) @ Q / n for n in (1, 2, 3)])
+        # bounds of A, B and D if all plies were as stiff as the stiffest: rounding is beside these
         largest_values = np.abs(Q).max() / np.array([1, 4, 12])[:, None]
         return np.where(
             np.abs(stiffnesses) <= STIFFNESS_TOLERANCE * largest_values, 0.0, stiffnesses
@@ -238,6 +247,7 @@ class ShellLaminate(Ability):
             With the key and what is allowed.
         """
         section = self.section
+        # E is nan where youngs_modulus has no unit
         if section.with_units == isnan(case_sizes(context.shell).E):
             moduli = (
                 "have a unit: youngs_modulus has none"
@@ -248,7 +258,7 @@ class ShellLaminate(Ability):
                 f"shell.laminate.plies: their moduli {moduli}: give all of them a unit, or none"
             )
         section.refuse_unfit_sizes(context.shell.youngs_modulus or 1.0)
-        context.needs("shell.laminate", "a mid-surface")
+        context.needs("shell.laminate", "a mid-surface")  # refuses a solid
         if section.twists:
             context.needs(
                 "shell.laminate",
@@ -289,7 +299,7 @@ def _laminate_symmetry(section: LaminateSection, geometry: str) -> SymmetryConst
     # planes through e3 along and across the direction may be planes of symmetry
     azimuths = (
         ()
-        if direction is None
+        if direction is None  # along the meridians no plane through e3 is preferred
         else tuple(
             float(np.arctan2(direction[1], direction[0])) + turn for turn in (0.0, np.pi / 2)
         )
@@ -312,6 +322,7 @@ def laminate_account(section: LaminateSection, shell: Any) -> str:
         "the meridian" if vector is None else f"[{', '.join(f'{v:g}' for v in vector)}]"
     )
     coupled = f"B up to {np.abs(B).max():.4g} E h^2 couples both" if B.any() else "not coupled"
+    # the first and third of the six entries are 11 and 22
     return (
         f"membrane and bending energy of a laminate [{angles}] with 0 along {direction_words}: "
         f"A11, A22 = {A[0]:.4g}, {A[2]:.4g} E h, D11, D22 = {D[0]:.4g}, {D[2]:.4g} E h^3, "

@@ -1,5 +1,10 @@
 """Observables: what parts observe of a state, as columns of path.csv, maps and lines of
 summary.json; and the units of what is conjugate to amplitudes.
+
+An amplitude mu is a load parameter, by name; its conjugate -dPi/dmu is the displacement on which it
+does work. Pi is the energy, and Pi_i the potential of amplitude i, its derivative. R is the
+reference length, E Young's modulus, h the thickness over R. A column is a name of a number in
+path.csv.
 """
 
 from collections.abc import Mapping, Sequence
@@ -127,6 +132,7 @@ class MapGrid:
     @property
     def places(self) -> Array:
         """The places (n, 3) of the points over R, along the first side first."""
+        # 0 to 1 along each side; reversed twice, so that the first side varies fastest
         coordinates = np.meshgrid(
             *(np.linspace(0.0, 1.0, n) for n in self.points[::-1]), indexing="ij"
         )

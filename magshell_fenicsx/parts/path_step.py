@@ -1,5 +1,13 @@
 """The base of the steps that follow a path: their controls, targets, and what comes after an
 instability.
+
+A step is a part of the load programme; a path is the sequence of equilibria that it follows. Its
+amplitude is a load parameter; the conjugate is the displacement on which the amplitude does work. A
+control says which of these, or arc length, is prescribed from point to point. A target is a value
+at which the path ends, in the unit of its key; it is of the load or of the conjugate. A limit is
+an instability. `LoadStart` has what the drive needs from the state where the step begins: the value
+and the conjugate of its amplitude, and their units. A `Drive` says how the amplitude goes on from
+there, a `StepCourse` also how the path ends.
 """
 
 from collections.abc import Mapping
@@ -87,6 +95,7 @@ class PathStep(Step):
         Exceptions are a bound beside `until: limit`, and the target of a branch that is followed.
         """
         targets, prescribed = self._given_targets, self.prescribed
+        # arc length reaches targets of the load and of the conjugate, other controls their own
         fitting = [
             key for key, (quantity, _) in self.targets.items() if prescribed in ("arc", quantity)
         ]
@@ -139,7 +148,7 @@ class PathStep(Step):
         fitting
             The keys of targets that fit the control.
         """
-        if "until" not in self.model_fields_set:
+        if "until" not in self.model_fields_set:  # limit is the default of this kind of step
             raise ValueError(
                 f"{targets[0]} is a target: it goes with until: target; or write until: limit, "
                 "for the first instability on the way there"
@@ -153,6 +162,7 @@ class PathStep(Step):
     @classmethod
     def level(cls, text: str, context: Context) -> float:
         """Return a value of a history with a unit, converted as a target of the load."""
+        # the first target of the load with a unit has the conversion
         for key in (key for key, target in cls.targets.items() if target.quantity == "load"):
             annotation = cls.model_fields[key].annotation
             if is_over_unit(annotation):
@@ -247,12 +257,12 @@ class PathStep(Step):
         begin_value = load_start.value if by_load else load_start.conjugate
         end = None if goal is None else goal[1] * (load_start.size if by_load else load_start.unit)
         change = load_start.size if end is None else end - begin_value
-        targets: list[float] = []
+        targets: list[float] = []  # values at which the path must have a point
         if end is not None and (self.until == "target" or self.limit_target):
             begin = begin_value if load_start.is_driven else self.begin(begin_value)
             targets = [float(t) for t in np.linspace(begin, end, self.points + 1)[1:]]
             targets = [t for t in targets if (t - begin_value) * change > 0]
-        if self.until == "zero":
+        if self.until == "zero":  # back to the load zero, past the largest load
             targets = [0.0]
         first_change, first_step = (
             self.first_change(change, load_start, by_load=by_load),
@@ -375,9 +385,9 @@ class FactorStep(LoadStep):
 
         Before the load it grows by arc length, with a first step of half the way.
         """
-        size = load_start.size
+        size = load_start.size  # the amplitude at a factor of one
         return (
-            Drive("arc", "load", size, [size], size / 2, size)
+            Drive("arc", "load", size, [size], first=size / 2, scale=size)
             if self._alone
             else super().drive(load_start)
         )

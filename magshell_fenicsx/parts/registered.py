@@ -1,4 +1,10 @@
-"""The lists of all parts, of all kinds of steps and of all observables; and the base of a case."""
+"""The lists of all parts, of all kinds of steps and of all observables; and the base of a case.
+
+A part is a section of a case with a key of its own. An ability is what a section adds to a problem;
+an observable what is read from a state. A step is a part of the load programme. An account is a
+list of lines of `magshell check`. Own terms are energies that a program adds to a case. Classes are
+named by text, so that this file can list them in order without importing each.
+"""
 
 import re
 from collections.abc import Callable, Sequence
@@ -138,12 +144,14 @@ class WithOwnTerms(Section):
         A name after the key, such as that of a patch, is looked up below the key. Other messages
         are returned unchanged.
         """
+        # "key.below: name: ..." or "key.below: ..."
         match = re.match(r"([a-z]\w*(?:\.\w+)*): (?:([\w.]+): )?", message)
         if (
             not (match and self._origin.place)
             or match[1].split(".")[0] not in type(self).model_fields
         ):
             return message
+        # numbers are positions in lists
         keys = [*match[1].split("."), *([match[2]] if match[2] else [])]
         path = tuple(int(key) if key.isdecimal() else key for key in keys)
         return f"{self._origin.place(path)}: {message}"

@@ -1,6 +1,9 @@
 """The keys of a shell that choose its law: small strains, or rubber of three kinds.
 
-Each law says what it is not for, and its line of `magshell check`.
+Each law says what it is not for, and its line of `magshell check`. An offer is a property of a
+case that other parts may need; a law withdraws those that it does not allow. C10 and C01 are
+constants of Mooney and Rivlin; mu and alpha the modulus and exponent of each term of Ogden's law,
+with 3/2 sum(mu alpha) = E, Young's modulus.
 """
 
 from dataclasses import dataclass
@@ -48,6 +51,7 @@ class LawKeys(Section):
                 raise ValueError(
                     f"mu.{i}: {modulus:g}: mu alpha must be positive; here alpha is {exponent:g}"
                 )
+        # a key of the shells that inherit from this class, not of the class itself
         if self.law != "koiter" and (nu := getattr(self, "poisson_ratio", 0.5)) != 0.5:
             raise ValueError(
                 f"poisson_ratio: {nu:g}: law: {self.law} is incompressible: give 0.5, or law: "

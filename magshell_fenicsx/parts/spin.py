@@ -1,4 +1,9 @@
-"""The shell spins about e3: centrifugal forces, which grow with the square of its speed."""
+"""The shell spins about e3: centrifugal forces, which grow with the square of its speed.
+
+The amplitude (load parameter) "spin" is ρ ω² R²/E, with the angular speed ω, density ρ, reference
+length R and Young's modulus E. A target is a value at which a step ends. A jet is a map with its
+derivatives at a point.
+"""
 
 from math import sqrt
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal
@@ -80,8 +85,7 @@ class SpinStep(BodyForceStep):
 def energy(r0: Jet, u: Jet) -> "Expr":
     """Return the energy density of the centrifugal force for ρ ω² R²/E = 1.
 
-    It is zero without displacement.
-
-    It is (|ρ0|² - |ρ|²)/2 with the distances ρ0 and ρ from e3 before and after the displacement.
+    It is (d0² - d²)/2, with the distances d0 and d from the axis e3 before and after the
+    displacement; without a displacement it is zero.
     """
     return -sum(u.r[i] * (r0.r[i] + u.r[i] / 2) for i in range(2))

@@ -1,4 +1,12 @@
-"""The base of the steps of a programme: what a step drives, how, and how far."""
+"""The base of the steps of a programme: what a step drives, how, and how far.
+
+A programme is the list of the loads of a case, one after the other. A step drives an amplitude (a
+load parameter mu, by name); the conjugate is the displacement on which the amplitude does work. A
+step holds other amplitudes, or their conjugates. A target is a value at which it ends, in the unit
+of its key. The chart is the pair of coordinates of the surface; the model's frame may be turned
+about e3 against the case's. `Loads` has the data of the model, to which each step adds fields. R
+is the reference length, over which places are.
+"""
 
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Self
@@ -271,6 +279,8 @@ class Step(Section):
     def place_on(self, step: ProgrammeStep, context: Context, outline: "Outline") -> Array | None:
         """Return the one place (3,) over R where the load acts, in the case's frame; None without.
 
+        `step` is this step in the programme, with its key for messages.
+
         Raises
         ------
         CaseError
@@ -289,7 +299,9 @@ class Step(Section):
     def refuse_unfit_place(
         self, step: ProgrammeStep, context: Context, outline: "Outline", at: Array
     ) -> None:
-        """Check that there is room for the load around its place in the chart.
+        """Check that there is room for the load around its place `at` (2,) in the chart.
+
+        By default there is.
 
         Raises
         ------
@@ -305,7 +317,7 @@ class Step(Section):
     def mesh_features(
         cls, loads: Sequence[Self], place: Array, sizing: "SizingContext"
     ) -> list[Feature]:
-        """Return small elements around a place in the chart with loads of this class.
+        """Return small elements around a place in the chart with loads of this class; none here.
 
         Parameters
         ----------
@@ -313,6 +325,8 @@ class Step(Section):
             The loads at the place.
         place
             The place (2,) in the chart.
+        sizing
+            Thickness and refinement, on which element sizes depend.
         """
         return []
 

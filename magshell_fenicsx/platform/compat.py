@@ -1,6 +1,8 @@
 """Calls that differ between dolfinx 0.9, 0.10 and 0.11.
 
-No other module depends on the version of dolfinx.
+No other module depends on the version of dolfinx. FFCx turns a form of UFL into kernels: C
+functions that integrate over one cell or facet, described by structures of the header UFCx. cffi
+reads such structures. Fields are coefficients of a form.
 """
 
 import ctypes
@@ -92,6 +94,7 @@ class FormKernels:
     @classmethod
     def from_library(cls, form: ufl.Form, library: ctypes.CDLL) -> "FormKernels":
         """Return the kernels of a form from the library that its code was compiled into."""
+        # the structure's name in the library, of the only form (number 0) without a prefix
         variable = ctypes.c_char.in_dll(library, naming.form_name(form, 0, ""))
         return cls(UFCX.cast("ufcx_form*", ctypes.addressof(variable))[0], library)
 
@@ -113,6 +116,7 @@ class FormKernels:
 
         Integrals over the whole mesh have no id.
         """
+        # ids of all kinds stand in one array, and those of a kind between two offsets
         first, last = (self.ufcx.form_integral_offsets[int(kind.value) + i] for i in (0, 1))
         ids = [self.ufcx.form_integral_ids[i] for i in range(first, last)]
         return [subdomain_id for subdomain_id in ids if subdomain_id != -1]
@@ -150,6 +154,7 @@ def bind_form(
     inputs = (*(_cpp_objects(group) for group in (spaces, fields, constants)), integration_domains)
     create_form = form_cpp_class(np.float64)
     try:
+        # no entity maps: all spaces are on this mesh
         cpp_form = create_form(address, *inputs, {}, domain)
     except TypeError:
         # From dolfinx 0.10 on a form may have cells of several kinds.
@@ -225,5 +230,6 @@ def finish_matrix(K: PETSc.Mat, V: fem.FunctionSpace, clamped: list[fem.Dirichle
     """
     K.assemblyBegin(PETSc.Mat.AssemblyType.FLUSH)
     K.assemblyEnd(PETSc.Mat.AssemblyType.FLUSH)
+    # entries may be added before this, and set from here on
     insert_diagonal(K, V._cpp_object, _cpp_objects(clamped), 1.0)
     K.assemble()

@@ -7,6 +7,9 @@ Of several processes that ask for a library one compiles it. A process holds the
 only while it generates the code and a compiler runs, and it waits for no other lock meanwhile. So
 whoever waits for a library waits for one compilation at most. Ranks share the work without a
 message: each takes a library that no other has taken.
+
+Ranks are the processes of one run. Kernels are the C functions of forms, which a library holds. The
+code of a library is made by a function, only if the library must be compiled.
 """
 
 import fcntl
@@ -119,6 +122,7 @@ def refuse_unusable() -> None:
     if process.returncode and not FULL_DISK.search(process.stderr):
         lines = process.stderr.strip().splitlines() or [f"exit code {process.returncode}"]
         error = next((line for line in lines if "error" in line), lines[0])
+        # the scratch folder means nothing to the user
         error = error.replace(f"{scratch}/", "")
         raise NoCompiler(
             f"{shlex.join(command)} cannot compile: {error}; install what it lacks, or {HINT}"
@@ -143,6 +147,12 @@ class Library:
     ----------
     file
         Name of the library's file in the cache.
+    _compilation
+        The compilation by this process, in a thread; None before it starts.
+    _lock
+        The open lock file, while this process holds the lock.
+    _path
+        The compiled file; None as long as it is not known to be there.
     """
 
     def __init__(
@@ -196,7 +206,7 @@ class Library:
             if not self.is_compiled:  # another process may have compiled it meanwhile
                 self._compilation = _pool().submit(self._compile, self._source())
         finally:
-            if not self._compilation:
+            if not self._compilation:  # else the compilation releases it
                 self._release_lock()
 
     def path(self) -> Path:
@@ -237,7 +247,7 @@ class Library:
         except BlockingIOError:
             self._lock.close()
             return False
-        except OSError:
+        except OSError:  # no locks on this file system
             pass
         return True
 
@@ -276,9 +286,11 @@ def compile_libraries(
         while missing := [library for library in libraries if not library.is_compiled]:
             tell(len(libraries) - len(missing))
             for library in missing:
+                # <=: one more than cores, whose code then waits for a free core
                 if not library.running_compilation and len(_running(missing)) <= cores():
                     library.start()
                     tell(sum(library.is_compiled for library in libraries))
+            # else other processes compile all that is missing: their files are looked for
             if running := _running(missing):
                 wait(running, PROGRESS_SECONDS, FIRST_COMPLETED)
             else:
@@ -365,6 +377,7 @@ def _compile(source: str, options: tuple[str, ...], file: Path) -> None:
         If the compiler fails for any code, or for this code.
     """
     compiler = c_compiler()
+    # tempfile adds eight characters to the prefix
     for abandoned in file.parent.glob(f"{file.stem}????????/"):
         shutil.rmtree(abandoned, ignore_errors=True)
     with (
@@ -379,7 +392,7 @@ def _compile(source: str, options: tuple[str, ...], file: Path) -> None:
             # The disk of the cache may be full, or that of temporary files.
             if full_disk := FULL_DISK.search(process.stderr):
                 raise OSError(0, full_disk[0])
-            refuse_unusable()
+            refuse_unusable()  # raises if the compiler fails for any code
         process.check_returncode()
         library.chmod(0o755)  # whatever the umask: a file that others may write is not trusted
         library.replace(file)

@@ -1,7 +1,10 @@
 """A cache on disk for compiled kernels, and for other results that are the same for every run.
 
 Its files are executed. So only folders and files count that the user or root owns and nobody else
-may change. Where the usual folder is not of this kind, a private one takes its place.
+may change. Where the usual folder is not of this kind, a private one takes its place. Trusted are
+such folders and files. A status is what the system knows of a file: owner, group and mode, with
+bits that say who may write. A sticky folder is one, such as /tmp, in which only owners may move
+files.
 """
 
 import grp
@@ -90,6 +93,7 @@ def _cache_folders(usual: Path) -> tuple[Path, ...]:
     """
     readable = (usual,) if usual.is_dir() and _is_private(usual) else ()
     for folder in _candidate_folders(usual):
+        # the usual folder may be for reading by all; a private one is not
         with suppress(OSError):
             folder.mkdir(parents=True, exist_ok=True, mode=0o755 if folder == usual else 0o700)
         if folder.is_dir() and os.access(folder, os.W_OK) and _is_private(folder):
@@ -156,7 +160,7 @@ def _unmapped_users() -> tuple[int, ...]:
     try:
         lines = Path("/proc/self/uid_map").read_text(encoding="utf-8").splitlines()
         if any(line.split()[0] == "0" for line in lines):
-            return ()
+            return ()  # root is itself
         return (int(Path("/proc/sys/kernel/overflowuid").read_text(encoding="utf-8")),)
     except (OSError, ValueError, IndexError):
         return ()

@@ -1,6 +1,7 @@
 """The environment of a run: versions, the BLAS of PETSc, memory, and a hash of the code.
 
-Results that other code has computed are not reused.
+Results that other code has computed are not reused. Linux tells most of this in files below /proc
+and /sys; a control group limits the memory of a set of processes, as of a container or a job.
 """
 
 import hashlib
@@ -125,6 +126,7 @@ def _control_group_memory(root: Path) -> Iterator[float]:
     Control groups may be of version 2, or of version 1, whose lines in /proc name controllers.
     """
     for line in _text(root / "proc/self/cgroup").splitlines():
+        # "0::/path" of version 2; "7:memory:/path" of version 1
         _, controllers, group_path = line.split(":", 2)
         if controllers and "memory" not in controllers.split(","):
             continue
@@ -136,9 +138,9 @@ def _control_group_memory(root: Path) -> Iterator[float]:
         innermost = top / group_path.lstrip("/")
         for group in (innermost, *innermost.parents):
             if not group.is_relative_to(top):
-                break
+                break  # above the outermost group
             limit, used = (_text(group / name).strip() for name in names)
-            if limit.isdigit() and used.isdigit():
+            if limit.isdigit() and used.isdigit():  # "max" stands for no limit
                 yield max(int(limit) - int(used) + _reclaimable(group), 0.0)
 
 
@@ -154,7 +156,7 @@ def _reclaimable(group: Path) -> int:
 def _process_memory(root: Path) -> Iterator[float]:
     """Iterate over the bytes that `ulimit -v` leaves to this process; none without a limit."""
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
-    pages = _text(root / "proc/self/statm").split()
+    pages = _text(root / "proc/self/statm").split()  # the first: all of the address space
     if limit != resource.RLIM_INFINITY and pages:
         yield max(limit - int(pages[0]) * resource.getpagesize(), 0.0)
 

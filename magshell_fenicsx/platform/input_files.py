@@ -2,7 +2,9 @@
 
 A case may come from somebody else. A file that it names may be a device or a pipe, may unpack to a
 million times its size, or may change while it is read. A message then says so before memory or time
-is spent. The size that a packed file declares is checked before the file is unpacked.
+is spent. The size that a packed file declares is checked before the file is unpacked. A digest is a
+hash of a content. VTK's files are in XML, or in an older form ("legacy"), with lines of words and
+counts.
 """
 
 import hashlib
@@ -68,13 +70,13 @@ def open_regular(file: Path) -> BinaryIO:
         If the file cannot be read, or is a folder, a device or a pipe.
     """
     try:
-        _refuse_special(file, file.stat().st_mode)
+        _refuse_special(file, file.stat().st_mode)  # to open some devices has effects
         # Without waiting for a writer.
         descriptor = os.open(file, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except ValueError:
         raise OSError(EINVAL, "its name has a zero byte", str(file)) from None
     stream = os.fdopen(descriptor, "rb")
-    try:
+    try:  # again: another file may have its name by now
         _refuse_special(file, os.fstat(descriptor).st_mode)
     except OSError:
         stream.close()
@@ -135,11 +137,11 @@ class Files:
         if file not in self.contents:
             try:
                 self.contents[file] = read_bounded(file)
-            except OSError as e:
+            except OSError as e:  # kept, so that each call has the same result
                 self.contents[file] = e
         content = self.contents[file]
         if isinstance(content, OSError):
-            raise content.with_traceback(None)
+            raise content.with_traceback(None)  # which would grow with each call
         return content
 
     def digest(self, file: Path) -> str | None:
@@ -162,6 +164,7 @@ def table_text(content: bytes) -> str:
     ValueError
         If a line is longer than any row of numbers.
     """
+    # -sig: without the mark that some programs put at the begin
     text = io.TextIOWrapper(io.BytesIO(content), encoding="utf-8-sig", errors="replace").read()
     for line_number, line in enumerate(io.StringIO(text), 1):
         if len(line) > MAX_LINE_LENGTH:
@@ -200,6 +203,7 @@ def _declared_bytes(archive: zipfile.ZipFile, member: zipfile.ZipInfo) -> int:
             shape, _, dtype = format_of_numpy.read_array_header_1_0(stream)
         else:
             shape, _, dtype = format_of_numpy.read_array_header_2_0(stream)
+    # arrays become floats of 8 bytes, but are first unpacked as they are
     return max(member.file_size, prod(map(int, shape)) * max(int(dtype.itemsize), 8))
 
 
@@ -247,15 +251,17 @@ def _vtk_declared_bytes(content: bytes) -> int:
         counts = [prod(map(int, numbers)) for numbers in LEGACY_GRID.findall(content)]
         counts += [int(numbers) for numbers in LEGACY.findall(content)]
         fields = [int(width) * int(count) for width, count in LEGACY_ARRAY.findall(content)]
-        return 8 * (3 * max(counts, default=0) + sum(fields))
+        return 8 * (3 * max(counts, default=0) + sum(fields))  # floats; points have three
     extents = [
         [int(n) for n in re.findall(rb"-?\d+", numbers)] for numbers in EXTENT.findall(content)
     ]
+    # of a structured grid: first and last index in each direction
     points = [
         prod(abs(b - a) + 1 for a, b in zip(extent[::2], extent[1::2], strict=False))
         for extent in extents
     ]
     max_count = max([*points, *(int(n) for n in COUNT.findall(content))], default=0)
+    # components of each array; one where the tag does not say
     widths = [
         int(numbers[1]) if (numbers := COMPONENTS.search(tag)) else 1
         for tag in ARRAY_TAG.findall(content)

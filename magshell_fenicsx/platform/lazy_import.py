@@ -7,7 +7,7 @@ from typing import Any
 
 def lazy_import(name: str) -> Any:
     """Return a package that is only imported when one of its attributes is first read."""
-    if name in sys.modules:
+    if name in sys.modules:  # imported already, or lazily before
         return sys.modules[name]
     spec = find_spec(name)
     assert spec, name

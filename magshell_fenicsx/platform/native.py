@@ -1,4 +1,7 @@
-"""The package's own C code, compiled once into the folder of the kernels."""
+"""The package's own C code, compiled once into the folder of the kernels.
+
+cffi calls functions of a C library: `ffi` knows their declarations, and `lib` has the functions.
+"""
 
 from pathlib import Path
 from typing import Any
@@ -52,7 +55,7 @@ def load_native(
     for file in (source, *further_sources):
         text += f'#line 1 "{file.name}"\n{file.read_text(encoding="utf-8")}\n'
     library = Library(text, lambda: text, OPTIONS, GNU_OPTIONS)
-    raise_on_all_ranks(comm, library.path)
+    raise_on_all_ranks(comm, library.path)  # compiles it
     ffi = cffi.FFI()
     ffi.cdef(declarations)
     return ffi, ffi.dlopen(str(library.path()))

@@ -31,7 +31,7 @@ class MpiFirst(MetaPathFinder):
 
     def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> None:
         """Import MPI if the package needs it, and find nothing, so that other finders go on."""
-        if fullname in MPI_PACKAGES:
+        if fullname in MPI_PACKAGES:  # it is needed once only
             sys.meta_path.remove(self)
             import mpi4py.MPI  # noqa: F401
 

@@ -7,6 +7,9 @@ its wall time, CPU time and peak memory are measured.
 -m` does, and writes the peak memory of this rank to a folder. The peak is the kernel's VmHWM.
 getrusage is no substitute: a process inherits the peak of its parent, and the parent of several
 ranks gets only the largest.
+
+Ranks are the processes of one run, numbered from 0; a launcher (mpirun) starts them. A collective
+function must be called on all of them.
 """
 
 import os
@@ -129,6 +132,7 @@ def measure(
     """
     launcher = mpirun_command(ranks) if ranks > 1 else []
     with TemporaryDirectory() as scratch:
+        # this module runs the other one, see `main`, and writes its peak memory into the folder
         command = [
             *launcher,
             sys.executable,
@@ -148,7 +152,7 @@ def measure(
                 stderr=stderr,
                 env={**os.environ, "OMP_NUM_THREADS": "1", **(environment or {})},
             )
-            try:
+            try:  # wait4 also tells the CPU time of the process and its children
                 _, status, usage = os.wait4(process.pid, 0)
             except BaseException:
                 process.terminate()
@@ -207,6 +211,7 @@ def on_first_rank(comm: "MPI.Comm", do: Callable[[], Result]) -> Result:
             pickled = pickle.dumps((do(), None))
         except Exception as e:
             failure, pickled = e, _pickled(e)
+    # a pair of result and error, as `_pickled` makes it too
     pickled = comm.bcast(pickled)
     if failure:
         raise failure  # with its traceback
@@ -232,6 +237,7 @@ def raise_on_all_ranks(comm: "MPI.Comm", do: Callable[[], object]) -> None:
         if comm.size == 1:
             raise
         failure = e
+    # errors of all ranks in order, empty where there is none; a rank prefers its own
     for pickled_error in (
         comm.allgather(_pickled(failure) if failure else b"") if comm.size > 1 else ()
     ):
@@ -243,7 +249,7 @@ def _pickled(e: Exception) -> bytes:
     """Return an error as bytes for other ranks: itself, or its text as a RuntimeError."""
     try:
         sent = pickle.dumps((None, e))
-        pickle.loads(sent)
+        pickle.loads(sent)  # some errors can be written, but not read again
     except Exception:
         return pickle.dumps((None, RuntimeError(f"on rank 0: {type(e).__name__}: {e}")))
     return sent

@@ -1,4 +1,9 @@
-"""A status line at the foot of a terminal, rewritten in place below the printed lines."""
+"""A status line at the foot of a terminal, rewritten in place below the printed lines.
+
+A line stays, or is a status that the next one replaces. Where the output is a file, a pipe or that
+of several ranks (processes of one run), a line cannot be rewritten: in this plain output a status
+is printed seldom, as a line that stays.
+"""
 
 import os
 import shutil
@@ -39,10 +44,11 @@ def write(text: str) -> None:
     try:
         print(text, end="", flush=True)
     except BrokenPipeError:
-        raise
+        raise  # the reader has gone: the program ends
     except OSError as e:
         output_failures.append(f"standard output cannot be written: {e.strerror}")
         with suppress(OSError, ValueError):  # what it has buffered would fail again at the end
+            # from here on standard output goes nowhere
             nowhere = os.open(os.devnull, os.O_WRONLY)
             os.dup2(nowhere, sys.stdout.fileno())
             os.close(nowhere)
@@ -128,7 +134,7 @@ def _plain_output(say: Say) -> Iterator[tuple[Say, Say]]:
 
     The second is for statuses. A thread repeats the last status while nothing else is printed.
     """
-    last, status = time.monotonic(), ("", 0.0)
+    last, status = time.monotonic(), ("", 0.0)  # time of the last line; last status and its time
     lock, ended = threading.Lock(), threading.Event()
 
     def stay(line: str) -> None:

@@ -1,6 +1,8 @@
 """Columns of path.csv that a case has besides those of every run, and the sizes of its units.
 
-No two columns and no two amplitudes may have one name.
+No two columns and no two amplitudes may have one name. An amplitude is a load parameter; its value
+is a column. Observables are what parts read from a state; `OBSERVABLES` has all of them. Moments
+are columns of reactions that are moments, not forces. R is the reference length.
 """
 
 from collections.abc import Collection
@@ -27,6 +29,7 @@ def sizes_in_units(problem: Problem) -> Sizes:
     """
     moments = {column for registered in OBSERVABLES for column in registered.moments(problem.loads)}
     sizes = sizes_of(problem.context, moments)
+    # nan: the case has no unit of length
     if sizes.case is None or isnan(sizes.case.R):
         return sizes
     lengths, angles = dict[str, tuple[Unit, float]](), dict[str, tuple[Unit, float]]()
@@ -34,7 +37,7 @@ def sizes_in_units(problem: Problem) -> Sizes:
         for name, (is_rotation, amount) in registered.motions(problem.loads).items():
             if amount and is_rotation:
                 angles[name] = (TURN, float(np.degrees(amount)))
-            elif amount:
+            elif amount:  # R in metres, the way in mm
                 lengths[name] = (DISTANCE, 1e3 * sizes.case.R * amount)
     return replace(sizes, distances=lengths | angles)
 
@@ -69,6 +72,7 @@ def extra_columns(problem: Problem) -> tuple[str, ...]:
     for registered in OBSERVABLES:
         columns = before_points if registered.before_points else after_points
         columns += registered.columns(loads, reported_supports)
+    # a shell that is released at the end of a step moves in time too
     is_in_time = any(step.load.in_time or step.load.released_by for step in problem.programme)
     columns_in_time = [q.name for q in IN_TIME] if is_in_time else []
     amplitudes = own_amplitudes(loads)
@@ -113,7 +117,7 @@ def _key_of_name(problem: Problem, name: str) -> str:
         if getattr(step.load, "name", None) == name:
             return f"{step.key}.name"
     for point in problem.context.points:
-        if point in name:
+        if point in name:  # a column of a point begins with its name
             return f"points.{point}"
     return "names"
 
@@ -130,6 +134,6 @@ def sizes_of(context: Context, moments: Collection[str] = ()) -> Sizes:
     units = case_sizes(shell)
     for section in context.abilities:
         units = section.units(context, units)
-    if shell.with_units and context.time_unit is not None:
+    if shell.with_units and context.time_unit is not None:  # times of motions are in seconds
         units = replace(units, second=1.0)
     return Sizes(units, moments)

@@ -4,6 +4,13 @@ A formula may vary within narrow parts of the surface. Squares of the chart are 
 polynomials resolve the formula in each, which gives the element sizes there. An adaptive division
 of the surface finds places that samples may miss. After meshing, `unresolved_formulas` reports what
 the cells miss. Lengths are over R.
+
+The chart is the pair of coordinates of the surface; squares are parts of it. A division is the
+surface cut into adaptive cells (`RefinedParts`), which are small where a formula varies; its parts
+that are divided no further are leaves. The variance is the integral of (f - mean)² of all formulas
+f. An outline is the perfect surface with its chart. R is the reference length, h the thickness. A
+formula group is the list of the formulas of one key. Q turns the frame of the model, which may be
+turned about e3, into the one of the case.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -140,6 +147,7 @@ def refuse_unfit_formulas(formulas: Sequence[PlacedFormulas], x: Array) -> None:
     """
     for key_formulas in formulas:
         spec, values = key_formulas.spec, key_formulas.values_at(x)
+        # not within: also values that are no numbers
         out_of_bounds = ~((values >= spec.minimum) & (values <= spec.maximum))
         if out_of_bounds.any():
             row, i = np.argwhere(out_of_bounds)[0]
@@ -174,6 +182,7 @@ def refined_squares(
     if isinstance(shape, MeshFile):
         return None
     low, high = extent(shape)
+    # first squares: as many as may be, at most as wide as the chart, and not too large
     least_side = float(np.sqrt(np.prod(high - low) / MAX_FIRST_SQUARES))
     first_side = side = max(min(FIRST_SIDE, *(high - low)), least_side)
     counts = [ceil((b - a) / side - 1e-9) for a, b in zip(low, high, strict=True)]
@@ -183,12 +192,13 @@ def refined_squares(
     )
     groups = list[tuple[Array, Array, Array]]()  # centres, sides and element sizes
     while len(centres) and len(centres) <= MAX_SQUARES:
-        chart = centres[:, None] + side * LOCAL
+        chart = centres[:, None] + side * LOCAL  # samples (squares, n, 2)
         on_chart = within_chart(shape, chart)
         has_samples = on_chart.any(axis=1)
         centres, chart, on_chart = centres[has_samples], chart[has_samples], on_chart[has_samples]
         x = places(chart.reshape(-1, 2)).reshape(*chart.shape[:2], 3)
         needed_size = sizes(x, on_chart, side)
+        # squares that are neither divided nor need elements smaller than the first are left out
         divided = (needed_size < side) & (side > min_size)
         bounded_size = np.maximum(needed_size, min_size)
         is_refined = ~divided & (bounded_size < first_side)
@@ -210,7 +220,7 @@ def extent(shape: PlaneShape | Grid) -> tuple[Array, Array]:
     """Return the lower and the upper corner, (2,) each, of the box around a chart."""
     if isinstance(shape, Grid):
         return np.array(shape.low), np.array(shape.high)
-    if isinstance(shape, StripShape):
+    if isinstance(shape, StripShape):  # its length is R
         return np.array([0.0, -shape.width / 2]), np.array([1.0, shape.width / 2])
     return np.full(2, -shape.reach), np.full(2, shape.reach)
 
@@ -244,7 +254,7 @@ def adaptive_cells(formulas: FormulaGroup, outline: Outline) -> RefinedParts:
 
         def embedding(x: Array) -> Array:
             """Return the places (n, 3) of points (n, 2) of the chart, or of a disc's square."""
-            # the square is mapped onto the disc
+            # from the square around the disc onto it, with its sides onto the circle
             on_disc = x * np.sqrt(1 - (x[:, ::-1] / radius) ** 2 / 2) if radius else x
             return outline.perfect(on_disc)
 
@@ -300,6 +310,7 @@ def narrow_places(leaves: Sequence[RefinedParts]) -> Array:
         by_variance = narrow_cells[
             np.argsort(-cells.area[narrow_cells] * cells.variance[narrow_cells])
         ]
+        # of those after the first, every so many: as many again
         stride = max(1, len(by_variance) // MAX_NARROW_PLACES)
         places.append(cells.centre[by_variance[:MAX_NARROW_PLACES]])
         places.append(cells.centre[by_variance[MAX_NARROW_PLACES::stride]])
@@ -322,6 +333,7 @@ def polynomial_sizes(values: Callable[[Array], Array], leaves: RefinedParts | No
         Division of the surface that shows the formulas, see `adaptive_cells`; None where nothing is
         hidden between samples.
     """
+    # kept from call to call: squares get smaller, and see more
     variance: float = 0.0
     variance_of_leaves: float = float(leaves.area @ leaves.variance) if leaves else 0.0
     mean: Array | None = None
@@ -335,21 +347,22 @@ def polynomial_sizes(values: Callable[[Array], Array], leaves: RefinedParts | No
         nonlocal variance, mean
         f = values(x.reshape(-1, 3)).reshape(*x.shape[:2], -1)
         is_valid = on_chart & np.isfinite(f).all(axis=-1)
+        # of the first, largest squares, which cover the surface
         mean = f[is_valid].mean(axis=0) if mean is None else mean
         f = np.where(is_valid[..., None], f - mean, 0.0)
-        missed = f - BASIS @ (BASIS.T @ f)
+        missed = f - BASIS @ (BASIS.T @ f)  # what the polynomial of least squares leaves
         # squares with invalid samples: the basis is orthonormal only on the valid ones by a new QR
         for i in np.flatnonzero(~is_valid.all(axis=1)):
             Q = np.linalg.qr(BASIS[is_valid[i]])[0]
             missed[i], g = 0.0, f[i][is_valid[i]]
             missed[i][is_valid[i]] = g - Q @ (Q.T @ g)
-        area = (side / SAMPLES) ** 2
+        area = (side / SAMPLES) ** 2  # of the chart, for each sample
         variance = max(variance, area * float((f**2).sum()))
-        if variance < SAMPLED_SHARE * variance_of_leaves:
+        if variance < SAMPLED_SHARE * variance_of_leaves:  # the samples miss most of it
             variance = variance_of_leaves
         missed_variance = area * (missed**2).sum(axis=(1, 2))
         if leaves:
-            middle = x[:, len(LOCAL) // 2 + SAMPLES // 2]
+            middle = x[:, len(LOCAL) // 2 + SAMPLES // 2]  # the sample nearest to the centre
             sampled = area * (f**2).sum(axis=(1, 2))
             unsampled = _unsampled_variance(leaves, middle, side, sampled)
             missed_variance = np.maximum(missed_variance, unsampled)
@@ -415,6 +428,7 @@ def formula_refinements(
     features = list[SquaresFeature]()
     for key_formulas, leaves in zip(formulas, leaves_of_formulas, strict=True):
         sizes = polynomial_sizes(key_formulas.values_at, leaves)
+        # shorter details of a load do not bend a shell; strains follow all other formulas
         min_size = LOAD_SIZE * sqrt(h) if key_formulas.spec.load else MIN_SQUARE * h
         if squares := refined_squares(places, outline, sizes, min_size):
             features.append(squares)
@@ -426,7 +440,8 @@ def imperfection_refinements(
 ) -> tuple[list[SquaresFeature], float]:
     """Return where imperfections without a centre need small elements.
 
-    Small squares pay for an imperfection if they need less than half the elements of an even mesh.
+    Squares with small elements are worth while (local) if they need less than half the elements of
+    a mesh of equal ones. Imperfections with a centre bring their own element sizes.
 
     Parameters
     ----------
@@ -459,6 +474,7 @@ def imperfection_refinements(
             continue
         assert not isinstance(shape, MeshFile)  # it has no squares
         low, high = extent(shape)
+        # elements of a mesh that is everywhere as fine as the finest square, and of a graded one
         cells_of_equal_size = PER_AREA * float(np.prod(high - low)) / squares.size**2
         graded_cells = squares.cells(float(np.linalg.norm(high - low)) / 2)
         if graded_cells < GRADED_MESH_GAIN * cells_of_equal_size:
@@ -471,7 +487,7 @@ def imperfection_refinements(
 def _least_sizes(size_at: Callable[[Array], Array]) -> Sizes:
     """Return a function for the least of the element sizes that the places in a square need.
 
-    One of four samples of a square is evaluated.
+    One of four samples of a square is evaluated, every second in both directions.
 
     Parameters
     ----------
@@ -515,6 +531,9 @@ def _unresolved_formula(
 
     `Q` (3, 3) turns places of the cells' frame into that of the case; `h` is the thickness over R.
     The messages name errors of the integral, of the stiffness, or of the integral of the square.
+    The cells have the polynomial `fit` in place of the formula. Its relative errors are `missed`,
+    of the integral, and `rest`, in the root of the mean square; `open` is a part not yet seen, and
+    `widest` the largest cell that misses something.
     """
     spec, element, messages = key_formulas.spec, cells.element, list[str]()
 
@@ -539,6 +558,7 @@ def _unresolved_formula(
             "variation may not be seen"
         )
     stiffness_error = _stiffness_error(values, cells, fit.nodal) if is_thickness else 0.0
+    # of deformed places there is no integral that could stay exact
     counts_square = spec.deformed and missed_square > SQUARE_TOLERANCE
     missed_integral = max(fit.missed, missed_square if counts_square else 0.0)
     is_resolved_load = spec.load and fit.widest < RESOLVED_LOAD * LOAD_SIZE * sqrt(h)
@@ -584,12 +604,14 @@ def _stiffness_error(
     float
         The error over the exact value, both summed over all cells.
     """
+    # points (n, 2) in the reference cell and their weights (n,), of all parts into which it is cut
     X, w = (v.reshape(-1, *v.shape[2:]) for v in sampling_points(cells))
     x, normals, area = cells.evaluate(X)
     cell_type, degree = cells.element.cell_type, max(cells.element.degree - 2, 0)
     curvatures = basix.create_element(
         basix.ElementFamily.P, cell_type, degree, basix.LagrangeVariant.legendre, discontinuous=True
     )
+    # t is the exact factor of thickness, p the polynomial of the cells
     phi, weight = curvatures.tabulate(0, X)[0, :, :, 0], (area * w)[..., None]
     t, p = values(x, normals), np.matmul(cells.element.tabulate(0, X)[0, :, :, 0], nodal)
     # minimum of the bending energy: compliance = m A^-1 m, with the stiffness A of the curvatures
@@ -600,6 +622,7 @@ def _stiffness_error(
     exact_values = np.stack([(weight * t**n).sum(axis=(1, 2)) for n in (3, -3)], axis=1)
     error = np.abs(exact_values - np.stack([stiffness, compliance], axis=1))
     middle = x.mean(axis=1)
+    # position of each cell in the box around the shell, from -1 to 1
     low = np.min(cells.comm.allgather(x.min(axis=(0, 1), initial=inf)), axis=0)
     high = np.max(cells.comm.allgather(x.max(axis=(0, 1), initial=-inf)), axis=0)
     position = (middle - (low + high) / 2) / np.maximum((high - low) / 2, MIN_EXTENT)

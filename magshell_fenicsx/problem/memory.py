@@ -1,6 +1,8 @@
 """Memory that a run needs, estimated before anything is built; what is too large is refused.
 
-The estimates are fits of measured runs (docs/scale.md).
+The estimates are fits of measured runs (docs/scale.md): a direct solver takes bytes in proportion
+to N ln N for N unknowns. Ranks are the processes of a run, which share the unknowns. A half or a
+sector is a part of a shell beside its symmetry planes.
 """
 
 from dataclasses import dataclass
@@ -62,10 +64,11 @@ class MemoryEstimate:
         """
         if context.solid:
             bytes_per_unknown = BYTES_PER_UNKNOWN_OF_SOLID
-        else:
+        else:  # a degree that was not measured counts as the highest
             bytes_of_highest_degree = BYTES_PER_UNKNOWN[max(BYTES_PER_UNKNOWN)]
             bytes_per_unknown = BYTES_PER_UNKNOWN.get(degree_of(context), bytes_of_highest_degree)
         model_bytes = bytes_per_unknown * unknowns * log(max(unknowns, 2.0)) * local_ranks / ranks
+        # a half also factors the tangent of its symmetry-breaking modes
         min_bytes = BYTES_PER_PROCESS * local_ranks + model_bytes * (
             1 + SYMMETRY_BREAKING_SHARE * half
         )
@@ -85,7 +88,7 @@ def unknowns_of(context: Context, cells: float) -> float:
     A triangle of degree k adds 3 k^2/2 unknowns. In a solid it adds three hexahedra of degree 2 in
     each layer.
     """
-    if context.solid:
+    if context.solid:  # elements of degree 2 have 2 n + 1 layers of nodes; n + 1 bounds for n
         return cells * (UNKNOWNS_PER_SOLID_LAYER * (2 * len(layer_bounds(context)) - 1))
     return cells * (UNKNOWNS_PER_TRIANGLE * degree_of(context) ** 2)
 
@@ -119,6 +122,7 @@ def refuse_beyond_memory(problem: Problem, ranks: int = 1, local_ranks: int = 1)
         ranks=ranks,
         local_ranks=local_ranks,
     )
+    # a meridian is always small
     if problem.axisymmetric or estimate.max_bytes <= free_bytes:
         return None
     if estimate.min_bytes <= free_bytes:

@@ -2,6 +2,11 @@
 
 Sizes follow the length sqrt(Rh); they are over R. The docstrings of sections and of their keys are
 the text of docs/case.md.
+
+R is the reference length, h the thickness. The chart is the pair of coordinates of the surface: a
+disc, a grid or a strip. A feature is a place in the chart with an element size, from where sizes
+grow; the grading is all of them with the largest size. k_d and F are the critical pressure and the
+force that a run computes.
 """
 
 from collections.abc import Sequence
@@ -149,12 +154,14 @@ def grading(
     if mesh.size is not None or isinstance(context.shell, MeshSurface):
         default = min(UNIFORM_SIZE * sqrt(h), MAX_SIZE)
         size = mesh.size / context.shell.reference if mesh.size else default
+        # no features
         return Grading([], size / mesh.refinement)
     sizing = SizingContext(h, mesh.refinement, context.solid, local)
     growth = _growth(context, sizing)
     features = _edge_features(context, outline, sizing)
     for part in refined:
         features += part.features(outline, sizing, growth)
+    # loads of one class at a place share their small elements; a dict keeps the order
     for place, loads in loaded:
         for load_class in {type(load): None for load in loads}:
             features += load_class.mesh_features(
@@ -170,7 +177,7 @@ def _largest_size(context: Context, outline: "Outline", sizing: SizingContext) -
     """Return the element size over R where nothing needs smaller elements, before refinement."""
     if outline.grid:
         return min(UNIFORM_SIZE * sqrt(sizing.h), MAX_SIZE)
-    if not outline.disc or context.shell.geometry == "disc":
+    if not outline.disc or context.shell.geometry == "disc":  # a strip, or a flat disc
         width = getattr(context.shell, "width", None) or 1.0
         return min(MAX_FLAT_SIZE, MAX_SIZE_OF_WIDTH * width)
     sizes = (step.load.largest(sizing) for step in context.steps)
@@ -194,7 +201,7 @@ def _edge_features(context: Context, outline: "Outline", sizing: SizingContext) 
         conditions = boundary.conditions() if boundary else {}
         features = list[Feature]()
         for i, name in enumerate(grid.sides):
-            axis, end = i // 2, (grid.low, grid.high)[i % 2]
+            axis, end = i // 2, (grid.low, grid.high)[i % 2]  # low and high side of each axis
             is_held = conditions.get(name, "free") not in ("free", "symmetry")
             if is_held and not grid.glued[axis]:
                 features.append(LineFeature(axis, end[axis], size, growth))

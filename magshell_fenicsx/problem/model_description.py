@@ -1,4 +1,9 @@
-"""Description of a model in words: what is included, and what is left out."""
+"""Description of a model in words: what is included, and what is left out.
+
+An account is what one part of a case has to say. The meridian, a half or a sector is the part of
+the shell that is modelled. A rim is the circle where a dimple ends and its curvature jumps, along
+which a mesh may have edges. k_d is the critical pressure.
+"""
 
 from collections import Counter
 from math import degrees
@@ -38,6 +43,7 @@ def describe_model(
         left_out += part_account.left_out
     if context.sections.get("imperfections"):
         included.append(_imperfections_text(context, rims))
+    # each amplitude once, by its last step
     for step in {step.name: step for step in context.steps}.values():
         if text := step.load.account(step, context):
             included.append(text)
@@ -53,7 +59,7 @@ def describe_model(
             contact_words = "; where shells touch, not those that come and go between two"
         left_out.append(f"waves around the axis (they are looked for at each point{contact_words})")
     if isinstance(mirror, Sector):
-        first_azimuth = degrees(mirror.azimuth) + 0.0
+        first_azimuth = degrees(mirror.azimuth) + 0.0  # no -0
         left_out.append(
             f"the other {mirror.copies - 1} sectors: mirror planes through e3 at azimuths "
             f"{first_azimuth:.5g} and {first_azimuth + degrees(mirror.angle):.5g} degrees "

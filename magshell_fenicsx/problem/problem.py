@@ -2,6 +2,12 @@
 
 A `Problem` is dimensionless: lengths are over R, and moduli over Young's modulus. It makes its own
 triangulation, or the vertices of its meridian.
+
+A scene is the model of a problem with its solver. The context is the case as its parts know it. A
+programme is the list of load steps. The chart is the pair of coordinates of the surface, or the
+parameter of the meridian. A half or a sector is the part of a shell on one side of a symmetry
+plane, or between two. The perfect shell is the one without imperfections. R is the reference
+length, h the thickness. The penalty is the factor with which edges between cells resist kinks.
 """
 
 from collections.abc import Callable, Mapping
@@ -93,6 +99,7 @@ def layer_bounds(context: Context) -> list[float]:
     magnetised = (remanent and remanent.layers) or []
     if not magnetised:
         return [n / element_count for n in range(element_count + 1)]
+    # ends of magnetised layers inside the thickness; the last one ends at the outer face
     layer_tops = [
         sum(layer.fraction for layer in magnetised[: n + 1]) for n in range(len(magnetised) - 1)
     ]
@@ -366,7 +373,9 @@ class Problem:
         refuse_unfit(patch, self.conditions, self.loads, self.thickness)
         if not self.body:
             key = "shell.file" if self._file_of_shell else "mesh"
-            refuse_flat(patch, *self._penalty_and_unit[1:], key)
+            # only triangles so flat that no penalty helps: the default one is for the message
+            _, default_penalty_of_degree, length, unit = self._penalty_and_unit
+            refuse_flat(patch, default_penalty_of_degree, length, unit, key)
         return patch
 
     def flat_triangle(self, patch: PatchMesh) -> str:
@@ -402,7 +411,7 @@ class Problem:
         middle_plane = Mirror.through_axis(self.mirror.angle / 2)
         points = dict[str, NDArray[np.float64]]()
         for name, chart in self.points.items():
-            x = np.append(chart, 0.0)
+            x = np.append(chart, 0.0)  # a mirror is of space
             in_first_half = middle_plane.signed_distance(x) <= 0
             points[name] = (x if in_first_half else middle_plane.image(x))[:2]
         half_shape = replace(shape, waves=2 * self.mirror.waves)
@@ -448,13 +457,13 @@ def meridian_vertices(problem: Problem) -> NDArray[np.float64]:
         return meridian.vertices
     if meridian.shell_meridians:
         return _vertices_of_shells(problem, meridian)
-    has_pole = meridian.names[0] is None
+    has_pole = meridian.names[0] is None  # it begins on the axis, where there is no edge
     h = problem.material.h / meridian.curvature
     contact_reach = max((distance for _, distance in problem.body_contacts), default=0.0)
     contact_reach = (
         meridian.length if problem.loads.pairs else contact_reach
     )  # shells may meet anywhere
-    contact_cells = None
+    contact_cells = None  # or how far from the begin there are small cells, and their size
     if contact_reach:
         contact_cells = contact_reach if has_pole else meridian.length, CONTACT_CELL_SIZE * sqrt(h)
     return graded_vertices(

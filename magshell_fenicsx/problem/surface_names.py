@@ -1,6 +1,9 @@
 """Names that a problem uses: of its energies, and of edges, points and patches of the surface.
 
-Each energy has a name of its own; edges, points and patches must be on the surface.
+Each energy has a name of its own; edges, points and patches must be on the surface. A term is an
+energy with an amplitude (its factor, a load parameter) of the same name. Parts are sections of a
+case, a step is a load of its programme. A condition is a support. A live pressure follows the
+surface, and may have no potential where an edge is free to move.
 """
 
 from collections.abc import Collection, Mapping, Sequence
@@ -41,6 +44,7 @@ def surface_terms(context: Context, user_terms: Sequence[OwnTerm]) -> tuple[OwnT
                     f"allowed are {MIN_AMPLITUDE:g} to {MAX_AMPLITUDE:g}"
                 )
             terms.append(term)
+    # several steps may drive one amplitude, which has its energy once
     for step in {step.name: step for step in context.steps}.values():
         terms += step.load.terms(step, context)
     terms += user_terms
@@ -54,7 +58,9 @@ def _refuse_taken_names(terms: Sequence[OwnTerm]) -> None:
     """Refuse energies, reported integrals and parameters whose names are taken, by a CaseError."""
     names = list[str]()
     for term in terms:
+        # a term without a density is only observed
         names += [term.name, *term.observed] if term.density else [*term.observed]
+    # parameters may be shared by terms: a set has each once
     names += {p.name for term in terms for p in term.free_parameters}
     for name in names:
         if name in RESERVED_NAMES or names.count(name) > 1:
@@ -149,8 +155,9 @@ def open_edges(
     patch_names
         Patches that the pressure acts on; empty if it acts on the whole surface.
     """
+    # name -> sides of triangles, as pairs of vertices
     pairs_of_edges = {name: as_set(pairs) for name, pairs in patch.edges.items()}
-    if patch_names:
+    if patch_names:  # only sides of triangles under pressure count
         under_pressure = np.logical_or.reduce([patch.patches[name] for name in patch_names])
         vertices = set(map(int, patch.corners[under_pressure].ravel()))
         pairs_of_edges = {

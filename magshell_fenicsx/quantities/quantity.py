@@ -1,6 +1,10 @@
 """Quantities observed along a path, amplitudes that vary, their units and their symbols.
 
-A unit is data: what one of a dimensionless number is, as a function of the shell's sizes.
+A unit is data: what one of a dimensionless number is, as a function of the shell's sizes. A
+quantity is a column of path.csv. A case with units has a second column for some quantities, whose
+name ends in the unit, such as w_mm for w_over_h. An amplitude is a load parameter; its conjugate is
+the displacement on which it does work. p_c is the classical buckling pressure, D the bending
+stiffness, E Young's modulus, R the radius, h the thickness, λ_m the dimensionless magnetic field.
 """
 
 import re
@@ -208,6 +212,7 @@ def format_number(value: float, form: str) -> str:
     ('  0.0000', '+0.0e+00', '-2')
     """
     text = f"{value:{form}}"
+    # what rounds to zero may have a minus sign
     return text if float(text) else f"{0.0:{form}}"
 
 
@@ -336,11 +341,12 @@ class Quantity:
         For example w_mm, in mm, for w_over_h with the unit h.
         """
         stem = self.stem or self.name.replace("_over_h", "")
+        # of p/p_c or F R/(2πD) the first letter alone is the quantity with a unit
         symbol = re.split("[ /]", self.symbol)[0]
         words = self.words if unit.words is None else unit.words
         if unit.symbol is not None and symbol:
             symbol = unit.symbol
-        shown_unit = Unit(unit.shown, unit.shown)
+        shown_unit = Unit(key=unit.shown, si=unit.shown)
         name = f"{stem}_{unit.ending}"
         return replace(self, name=name, words=words, symbol=symbol, units=(shown_unit,))
 

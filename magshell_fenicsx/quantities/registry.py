@@ -1,6 +1,9 @@
 """The registry of amplitudes and of columns of path.csv, in the order of the file.
 
-Each column may have a second one in the units of a case.
+Each column may have a second one in the units of a case. A quantity is a column with its words,
+symbol and units; an amplitude is a load parameter that a path varies, and its conjugate the
+displacement on which it does work. A family is a quantity or amplitude of which there may be
+several: their names have an ending, such as a body's name.
 """
 
 import re
@@ -288,6 +291,7 @@ def quantity(name: str) -> Quantity:
         return replace(
             first_of_kind, name=name, words=f"{first_of_kind.words} {numbered_name[2]}", symbol=""
         )
+    # of "approach_ball" the quantity is "approach"; of several the longest name fits best
     if families := [
         q for q in QUANTITIES.values() if q.each and re.match(rf"{q.name}_[A-Za-z]", name)
     ]:
@@ -300,6 +304,7 @@ def quantity(name: str) -> Quantity:
         "m": ("moment", MOMENT),
     }
     ending = re.search(r"_([ufm])[xyz]$", name)
+    # all else is the factor of a motion or of a user's energy, which is a load
     kind, units = (
         (kinds[ending[1]][0], kinds[ending[1]][1:]) if ending else ("load", (DISTANCE, TURN))
     )
@@ -356,7 +361,7 @@ def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
     reactions = sorted(q.name for q in QUANTITIES.values() if q.each and q.kind == "reaction")
     if name in AMPLITUDES:
         candidates = []
-    else:
+    else:  # it may be a motion of supports: its own reaction, or that of the only motion
         candidates = [*(f"{reaction}_{name}" for reaction in reactions), *reactions]
     for reaction in candidates:
         if reaction in row:
@@ -364,7 +369,7 @@ def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
     varying, own_column = amplitude(name), f"w_{name}_over_h"
     conjugate = shown_quantity(own_column if own_column in row else varying.conjugate, row)
     value = shown_quantity(varying.column, row)
-    if varying.conjugate == "w_over_h":
+    if varying.conjugate == "w_over_h":  # the note says whose displacement it is
         conjugate = replace(conjugate, note=varying.place)
     return (value, conjugate) if varying.sideways else (conjugate, value)
 
@@ -407,7 +412,7 @@ class Sizes:
         if name in self.distances:
             return self.distances[name][0]
         units = [unit for unit in quantity(name).units if self._size(unit) is not None]
-        if name in self.moments:
+        if name in self.moments:  # such a column has the unit of a force too
             units = [unit for unit in units if unit is MOMENT]
         return next(iter(units), None)
 
@@ -426,7 +431,7 @@ class Sizes:
         for name in row:
             if unit := self.unit(name):
                 column = quantity(name).in_unit(unit).name
-                values[column] = float(row[name]) * self.size(name) + 0.0
+                values[column] = float(row[name]) * self.size(name) + 0.0  # no -0
         return values
 
     def size(self, name: str) -> float:

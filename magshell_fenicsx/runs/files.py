@@ -1,4 +1,12 @@
-"""The output folder of one run: whether it may be written, resumed or replaced, and its files."""
+"""The output folder of one run: whether it may be written, resumed or replaced, and its files.
+
+The checkpoint, or journal, keeps the results of all solves while a run goes on; summary.json is
+written at its end. So a folder with a checkpoint alone has a run that was interrupted. The manifest
+is a list of the files of a run, which a later run may replace. A document is the case with the
+hashes of all that results depend on; the identity is what a folder has stored of it. A point has a
+row in path.csv and a file of fields. Rank 0 alone reads and writes: `access_disk` runs a function
+there, and raises its error on every rank. A scene is the model of a problem with its solver.
+"""
 
 import json
 import math
@@ -129,6 +137,7 @@ def _refuse_other_case(out: Path, document: Document) -> None:
     except Damaged as e:
         raise CaseError(f"{e}; --overwrite replaces the run that is there") from None
     name = identity.get(checkpoint.CASE_FILE)
+    # a file of the same name: the user has changed the case, and repeats its run
     if not name or Path(name).stem == Path(document.name).stem:
         return
     if not checkpoint.belongs_to(identity, document):
@@ -151,6 +160,7 @@ def identity_of_run(out: Path, document: Document) -> dict[str, Any]:
         return checkpoint.identity_in(out / NEW_CHECKPOINT) or {}
     if identity := checkpoint.identity_in(out / checkpoint.NAME):
         return identity
+    # a complete run has no checkpoint any more
     summary = read_object(out / SUMMARY) if (out / SUMMARY).exists() else {}
     keys = "case", checkpoint.CASE_FILE, *document.outside
     return {key: summary[key] for key in keys if key in summary}
@@ -164,7 +174,7 @@ def _refuse_interrupted(out: Path) -> None:
     if is_replacement_unfinished(out):
         return
     file, table = out / checkpoint.NAME, out / "path.csv"
-    points = max(read_result(table).count(b"\n") - 1, 0) if table.exists() else 0
+    points = max(read_result(table).count(b"\n") - 1, 0) if table.exists() else 0  # but the header
     has_results = points >= 2 or (out / MESH).exists()  # the undeformed shell alone is no loss
     if not file.exists() or not has_results:
         return
@@ -172,7 +182,7 @@ def _refuse_interrupted(out: Path) -> None:
     if (out / SUMMARY).exists():
         stopped = read_object(out / SUMMARY).get("stopped")
         if not (isinstance(stopped, str) and INTERRUPTION.search(stopped)):
-            return
+            return  # it has ended: at its target, or where the solver could not go on
         reason = stopped
     when = datetime.fromtimestamp(file.stat().st_mtime).strftime("%Y-%m-%d %H:%M")
     raise CaseError(
@@ -199,7 +209,7 @@ def _check_resumable(out: Path, document: Document) -> None:
         )
     if not file.exists() and (out / SUMMARY).exists():
         summary = read_summary(out)
-        if summary["stopped"] is None:
+        if summary["stopped"] is None:  # it has reached its target
             _check_complete(out, summary, document)
             raise AlreadyComplete(summary)
     checkpoint.check_resumable(file, document)
@@ -262,6 +272,12 @@ class RunFiles:
         Number of points of an interrupted run with rows and fields on disk.
     elapsed
         Run time in seconds of the interrupted run up to the last of these points.
+    _rows
+        Rows of path.csv that the interrupted run has written.
+    _gatherer
+        Brings the fields of a point in the present scene to rank 0.
+    _table, _fields
+        Writers of path.csv and of the fields; on rank 0, once the run has begun.
     """
 
     journal: checkpoint.Checkpoint | None = None
@@ -279,7 +295,7 @@ class RunFiles:
         self._empty_checkpoint, self._mesh = empty_checkpoint, mesh
         self._gatherer = gatherer(scene.model, scene.comm)
         self.complete_points, self._rows, self.elapsed = 0, list[dict[str, str]](), 0.0
-        if resume:
+        if resume:  # a new run begins later, with its first point
             self.begin(continues=True)
             self.elapsed = float(self._rows[-1]["wall_s"]) if self._rows else 0.0
 
@@ -313,11 +329,12 @@ class RunFiles:
         remove(folder, earlier_files - {SUMMARY, file.name})
         if self._mesh:
             write_whole(folder / MESH, self._mesh)
-        new_checkpoint.replace(file)
+        new_checkpoint.replace(file)  # in one step: there is always one of both
         remove(folder, earlier_files & {SUMMARY})
 
     def _remove_end_of_run(self) -> None:
         """Delete the files that the end of an interrupted run has written; on rank 0."""
+        # the fields of points stay
         files = files_of_runs(self._folder)
         files = {name for name in files if not name.startswith("fields/")}
         remove(self._folder, files - set(FILES_OF_PATH))
@@ -335,6 +352,7 @@ class RunFiles:
             Rows of path.csv that the interrupted run has written; empty for a new run.
         """
         identity = checkpoint.identity_in(self._folder / checkpoint.NAME) or {}
+        # for summary.json, which has the case and the version itself
         self._origin = {
             key: value for key, value in identity.items() if key not in ("case", "version")
         }
@@ -347,6 +365,7 @@ class RunFiles:
         self._R = case_sizes(problem.context.shell).R
         shell_data = ShellData(problem.material.h, problem.material.nu, mirror, self._R)
         magnetic = problem.loads.magnetic
+        # bodies and sources are drawn as outlines: one file for each point if they move, else one
         outlines_move = problem.loads.contacts or (magnetic and magnetic.driven)
         outlines_file = ""
         if outlines(problem.loads, self._scene.unloaded().mu, shell_data.h):
@@ -377,7 +396,7 @@ class RunFiles:
             _check_equal(row, self._rows[number])
         if number < self.complete_points:
             return
-        if scene is not self._scene:
+        if scene is not self._scene:  # the path goes on in another model
             self._scene, self._gatherer = scene, gatherer(scene.model, self._comm)
         surface, mirror = self._gatherer.gather(state.u, state.mu), scene.problem.mirror
         grids = [
@@ -390,6 +409,7 @@ class RunFiles:
             problem = scene.problem
             loads_and_state = problem.loads, state.mu, problem.material.h
             shell = surface
+            # the files have one half only if ParaView mirrors it, from the first point on
             if mirror and (isinstance(mirror, Sector) or self._has_whole_shell):
                 shell = completed_by_symmetry(surface, mirror)
             shell = replace(

@@ -1,4 +1,11 @@
-"""Gradients after a run: derivatives of its results by numbers and fields."""
+"""Gradients after a run: derivatives of its results by numbers and fields.
+
+A result is a number of the run, such as "knockdown", or a column of path.csv at the end of the
+path. A parameter is what it is differentiated by: a number of the case, an amplitude (load
+parameter), or a whole field, such as the thickness. One adjoint solve gives all derivatives of a
+result. Those by a field are a density, per area of the undeformed shell. A scene is the model of a
+problem with its solver. A model of half a shell has the multiplicity 2.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -131,8 +138,9 @@ def _report(
         "fields": entry_of_field,
     }
     for parameter, entry in entry_of_field.items():
-        uniform = _words(entry["alike"], entry["most_per_area"], 6)
-        place = _words(entry["at"], 1.0, 3)
+        # components that are rounding beside the largest density, or beside R, are shown as zero
+        uniform = _words(entry["alike"], size=entry["most_per_area"], digits=6)
+        place = _words(entry["at"], size=1.0, digits=3)
         say(
             f"d {name}/d {parameter}: {uniform} for a change that is the same everywhere, "
             f"most per area at ({place})"
@@ -181,8 +189,10 @@ def _adjoint(result: Result, name: str) -> tuple[str, Adjoint]:
         If the run has no such result.
     """
     scene, history = result.scene, result.path_history
-    if name in FOLDS:
-        return instabilities(scene, history.located, name, 1, history.begins)[0]
+    if name in FOLDS:  # results at the first instability of the path
+        first, *_ = instabilities(scene, history.located, name, max_count=1, begins=history.begins)
+        return first
+    # a path that ended elsewhere has no such result at its end
     reason = next(
         (remark for remark in result.remarks if remark.startswith(BEYOND_INSTABILITY)), None
     )
@@ -198,10 +208,11 @@ def _by_uniform_change(scene: Scene, parameter: str, gradient: FieldGradient) ->
     There is one number for each component. Vectors are in the frame of the case; on a meridian they
     are along e_rho and e_z.
     """
+    # the sum over all cells
     uniform_derivative = gradient.within(np.ones(len(gradient.forces), dtype=bool))
     if parameter == "remanence":
         uniform_derivative = (
-            uniform_derivative[[0, 2]]
+            uniform_derivative[[0, 2]]  # without the component around the axis, which is zero
             if scene.problem.meridian
             else uniform_derivative @ rotation(scene.problem.azimuth)
         )
@@ -229,7 +240,7 @@ def _surface(scene: Scene, adjoint: Adjoint, fields: Mapping[str, FieldGradient]
     """
     model = scene.model
     gathering, densities = gatherer(model, scene.comm), dict[str, Array | None]()
-    width = model.V.dofmap.bs
+    width = model.V.dofmap.bs  # components at a node: 2 on a meridian, else 3
     for parameter, gradient in fields.items():
         values = density(scene, gradient)
         if parameter == "remanence":
@@ -237,6 +248,7 @@ def _surface(scene: Scene, adjoint: Adjoint, fields: Mapping[str, FieldGradient]
             densities[parameter] = _at_nodes(scene, gathering, vectors)
             continue
         for i, name in enumerate(columns_of(parameter)):
+            # the gatherer takes vectors: a number goes as the component along e3
             vectors = np.zeros((len(values), width))
             vectors[:, -1] = values[:, i]
             at_nodes = _at_nodes(scene, gathering, vectors)

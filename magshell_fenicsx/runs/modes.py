@@ -1,4 +1,13 @@
-"""Modes after a run: null vectors at the instabilities, requested modes, natural frequencies."""
+"""Modes after a run: null vectors at the instabilities, requested modes, natural frequencies.
+
+A null vector is the mode of an instability, which has no stiffness. A point of the path is known by
+the number of its row in path.csv. A scene is the model of a problem with its solver. A model that
+is reduced by symmetry (a half, a sector, a meridian) excludes modes; the whole shell is the model
+that has all. The label of a mode names its symmetry, such as "m = 2" or "antisymmetric"; it is
+empty for a mode of the model itself. omega2 is omega^2 rho R^2/E. E, h, R and rho are Young's
+modulus, thickness, reference length and density. A gatherer brings the fields of all ranks to
+rank 0.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -81,6 +90,8 @@ class _ModeWriter:
         Folder of the run.
     say
         Function that prints a line.
+    _model_modes, _whole_shell_modes
+        Id of a scene -> what was made for it: solvers, and gatherers of fields.
     """
 
     result: Result
@@ -137,9 +148,11 @@ class _ModeWriter:
         """
         for number, state in self.result.singular.items():
             row, scene = self.result.rows[number], self.result.scene_of(number)
+            # `symmetric` and `asymmetric` are modes of the model itself, without a label
             label = "" if row["mode"] in OWN_MODES else str(row["mode"])
             try:
-                vector = self._modes_of(number)[0].null_vector(state, label)
+                solver, _ = self._modes_of(number)
+                vector = solver.null_vector(state, label)
             except ModesNotFound as e:
                 self.say(f"warning: no modes of point {number}: {e}")
                 continue
@@ -169,6 +182,7 @@ class _ModeWriter:
                 lowest = shell.lowest(
                     whole_shell.state(state), section.modes, allows_rigid_motion=allows_rigid_motion
                 )
+                # the solver returns the number requested of each family, and all unstable modes
                 unstable = sum(mode.eigenvalue < 0 for mode in lowest)
                 by_point[number] = lowest[: max(section.modes, unstable)]
             except ModesNotFound as e:
@@ -200,9 +214,8 @@ class _ModeWriter:
             Label of the mode; empty for a mode of the model itself.
         """
         file = mode_file(self.folder, number, name, label)
-        return write_mode_of(
-            self.result.scene_of(number), self._modes_of(number)[1], file, state, label, vector
-        )
+        _, gathering = self._modes_of(number)
+        return write_mode_of(self.result.scene_of(number), gathering, file, state, label, vector)
 
 
 def _waves_message(point: int, waves: WaveCount) -> str:
@@ -263,9 +276,9 @@ def keeps_state(section: FrequenciesSection | None, point: int) -> bool:
 
 
 def symmetric_wave(model: Model) -> str:
-    """Return the wave of modes with the symmetry of a model: "0", "symmetric" or "".
+    """Return the name of the wave that modes without a label have in a model.
 
-    See `mode_fields.wave_of`.
+    It is "0" on a meridian, where they do not vary around e3, "symmetric" on a half, else empty.
     """
     if model.axisymmetric:
         return "0"
@@ -275,8 +288,8 @@ def symmetric_wave(model: Model) -> str:
 def contact_changes(scene: Scene, state: State, modes: Sequence[ShellMode]) -> list[float]:
     """Return by how much stiffer bodies change omega^2 of each mode, relatively; collective.
 
-    The bodies in contact get four times their stiffness. A mode is compared with the nearest mode
-    of the same label.
+    The bodies in contact get four times their stiffness: where that matters, the penalty of the
+    contact determines the frequency. A mode is compared with the nearest mode of the same label.
 
     Parameters
     ----------
@@ -385,6 +398,7 @@ def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
         result.frequencies, symmetric_waves, time_unit, result.contact_changes
     )
     access_disk(scene.comm, partial(write_whole, folder / NAME, content))
+    # the first and the last point, if they have frequencies
     for number in {*list(states)[:1], *list(states)[-1:]} & set(result.frequencies):
         scene = result.scene_of(number)
         whole_shell = whole_shells[number]
@@ -404,6 +418,7 @@ def _states_of_frequencies(
     """
     states = dict(sorted(result.states_for_frequencies.items()))
     if section.at in ("ends", "end"):
+        # the start is row 0
         start = {0: result.scene.unloaded()} if section.at == "ends" else {}
         return {**start, result.end: result.last}
     if isinstance(section.at, list):
@@ -434,7 +449,7 @@ def _lowest_frequency(
     rigid_modes = (
         [mode for mode in modes if mode.eigenvalue == 0.0] if scene.allows_rigid_motion else []
     )
-    # a wave has a twin
+    # a wave has a twin, turned about e3
     motions = sum(2 if mode.label.startswith("m = ") else 1 for mode in rigid_modes)
     rigid_motions = f"{motions} rigid motions, " if motions else ""
     lowest_mode = modes[min(len(rigid_modes), len(modes) - 1)]

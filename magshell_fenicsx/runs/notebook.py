@@ -1,6 +1,8 @@
 """A scene in a notebook: the deformed surface as arrays and for pyvista, pictures without files.
 
-All functions are collective. Results that only rank 0 has are None on other ranks.
+All functions are collective. Results that only rank 0 has are None on other ranks. A scene is the
+model of a problem with its solver; a record is a point of its path. An amplitude is a load
+parameter. Lengths are over R, the reference length; h is the thickness, D the bending stiffness.
 """
 
 import os
@@ -87,6 +89,8 @@ def off_screen() -> None:
         raise RuntimeError(
             "pyvista: finds no display, and there is no Xvfb to make one: install the package xvfb"
         )
+    # Xvfb chooses a free number for the display, and writes it into the pipe. `cat` waits until
+    # this process ends, which closes its input; then the display is killed.
     read_end, write_end = os.pipe()
     command = (
         f"Xvfb -displayfd {write_end} -noreset -screen 0 1600x1200x24 -nolisten tcp & cat; kill $!"
@@ -104,7 +108,7 @@ def off_screen() -> None:
                 ["sh", "-c", command], stdin=PIPE, pass_fds=[write_end], **options
             )
         finally:
-            os.close(write_end)
+            os.close(write_end)  # Xvfb has its own: if it ends, the pipe ends too
         _displays.append(shell_process)
         readable, _, _ = select([stream], [], [], DISPLAY_TIMEOUT)
         # the whole line: Xvfb ends if it cannot write that
@@ -188,10 +192,11 @@ def _smooth(surface: Surface, h: float) -> "pyvista.PolyData":
 
     divided = vtkDataSetSurfaceFilter()
     divided.SetInputData(unstructured_grid(surface, h, deformed=True))
-    divided.SetNonlinearSubdivisionLevel(2)
+    divided.SetNonlinearSubdivisionLevel(2)  # each side in four
     divided.Update()
     smooth = pyvista.PolyData(divided.GetOutput())
     body = surface.is_body  # its edges stay sharp
+    # of points alone; the cells of a surface are oriented alike already
     return smooth.compute_normals(
         cell_normals=False, split_vertices=body, feature_angle=60.0, consistent_normals=False
     )

@@ -1,4 +1,10 @@
-"""Rows of path.csv and their columns, made from the records of a path."""
+"""Rows of path.csv and their columns, made from the records of a path.
+
+A record is a point of a history with its origin: label, step, scene, and the clock of a motion
+(time, work and energies since the begin of its step). A row has a record's columns by name. A scene
+is the model of a problem with its solver. A motion is a step in time. The journal keeps the values
+of all points, which a resumed run takes from there. h is the thickness.
+"""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -22,7 +28,9 @@ SUMMED_COLUMNS = ("time", "dissipated", "work")
 class RowMaker:
     """Maker of the rows of one path, which takes its records in their order.
 
-    A record is a point of a history with its origin; a row is a mapping of columns of path.csv.
+    A record is a point of a history with its origin; a row is a mapping of columns of path.csv. The
+    maker keeps the displacement at the end of the field. It also keeps the sums of the columns in
+    time, at the last record and before the present step.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -41,6 +49,7 @@ class RowMaker:
         point, journal = record.point, self._scene.journal
         values = journal.recorded_values(lambda: RecordedValues(scene.observe(point.state))).values
         is_field_step = self._is_programme and record.amplitude in ("lambda_m", "angle")
+        # w_from_field_over_h is measured from the last point of a field that comes before the loads
         if record.label in ("start", "field") or is_field_step:
             self._field_end = values["w_over_h"]
         self._count += 1
@@ -73,7 +82,7 @@ class RowMaker:
         """
         if "time" not in self._scene.extra_columns:
             return {}
-        if record.step != self._step:
+        if record.step != self._step:  # a new step: its clock begins at zero
             self._sums_before, self._step = dict(self._sums), record.step
         since_begin = {name: record.clock.get(name, 0.0) for name in SUMMED_COLUMNS}
         self._sums = {name: self._sums_before[name] + since_begin[name] for name in SUMMED_COLUMNS}
@@ -97,6 +106,7 @@ def imbalances(
         A displacement of the system that counts as of order one, over R.
     """
     for step in programme:
+        # a static step has the limit too: its snap may be a motion
         max_imbalance = step.load.motion.balance if step.load.motion else BALANCE
         step_imbalances = [
             _imbalance(row, length)
@@ -134,6 +144,7 @@ def motion_errors(programme: Iterable[ProgrammeStep], all_rows: Sequence[Row]) -
                 f"step {step.number}: the estimated error of its motion is {error:.2g} h, "
                 f"more than tolerance: {motion.tolerance:g}; even the shortest steps leave it"
             )
+        # a motion to an instability ends where states become unstable
         chooses_step_length = (
             load.motion and load.motion.step is None and load.motion.until != "instability"
         )
@@ -150,6 +161,7 @@ def _imbalance(row: Row, length: float) -> float:
 
     A small displacement of the system's `length` bounds the sum from below.
     """
+    # near rest all energies are small, and their ratio would be rounding
     energies = sum(abs(float(row[name])) for name in ("kinetic", "stored", "dissipated", "work"))
     return float(row["imbalance"]) / (energies + (MIN_ENERGY_DISPLACEMENT * length) ** 2)
 

@@ -1,6 +1,12 @@
 """Run a case: follow its programme, write every accepted point, summarise.
 
 A signal or a time limit stops a run between two solves or two steps in time.
+
+A scene is the model of a problem with its solver. A record is a point of the path, with the scene
+that it belongs to; a row has its columns of path.csv. The journal, or checkpoint, keeps the result
+of each solve; a resumed run replays these instead of solving, until they are used up. A status is a
+line of text that the next one replaces. The result grows with the run. All ranks (processes) run
+the same code; only rank 0 prints and writes.
 """
 
 import signal
@@ -81,6 +87,13 @@ class Watch:
         Seconds after which the run stops; None sets no limit.
     signals
         Whether `SIGNALS` are recorded, which needs the main thread. A second SIGINT is obeyed.
+
+    Attributes
+    ----------
+    _reason
+        Name of the signal, or the time limit, that asks this rank to stop; None without.
+    _handlers_before
+        Signal -> its handler before `with`.
     """
 
     def __init__(self, comm: MPI.Comm, start: float, limit: float | None, signals: bool) -> None:
@@ -134,6 +147,7 @@ class Watch:
         """
         if limited and self._limit is not None and time.perf_counter() - self._start >= self._limit:
             self._reason = self._reason or f"the time limit of {self._limit:g} s"
+        # of the first rank that has one, so that all ranks raise together
         reason = next(filter(None, self._comm.allgather(self._reason)), None)
         if reason:
             raise Interrupted(f"interrupted by {reason}")
@@ -277,9 +291,10 @@ def _kernel_progress(output: RunOutput, *, keeps_first: bool) -> Say:
     keeps_first
         Whether the first report is printed as a line that stays, since a pipe shows statuses late.
     """
-    first_reports = iter([output.say] if keeps_first else [])
+    first_reports = iter([output.say] if keeps_first else [])  # used up by the first report
 
     def report(what: str) -> None:
+        """Print or show a report with the time so far."""
         next(first_reports, output.tell)(status_line(what, time.perf_counter() - output.start))
 
     return report
@@ -306,7 +321,7 @@ def _run(problem: Problem, folder: Path | None, output: RunOutput, *, resume: bo
     """
     comm, say = output.comm, output.say
     empty_checkpoint = b""
-    if folder:
+    if folder:  # before the scene is built, which takes long: the files of the case may change
         write = partial(checkpoint.empty_content, problem.document)
         empty_checkpoint = access_disk(comm, write, "cannot be read")
     result = _unloaded_result(problem, folder if resume else None, output)
@@ -317,16 +332,18 @@ def _run(problem: Problem, folder: Path | None, output: RunOutput, *, resume: bo
         mesh_content = mesh.to_json() if mesh else None
         files = RunFiles(folder, scene, empty_checkpoint, resume=resume, mesh=mesh_content)
     if files and files.complete_points:
+        # times go on from the interrupted run
         output = replace(output, start=output.start - files.elapsed)
         say(f"resuming after {files.complete_points} points")
     interruption: RuntimeError | None = None
     scene.progress = progress = RunProgress(scene, output.tell, output.start)
     with output.watch:
+        # until the first point has opened the files, with their journal
         scene.journal = StoppableJournal(NoJournal(), output.watch)
         try:
             _follow(result, files, output, progress)
             _conclude(result, say)
-        except (Stopped, NoEigenpair) as e:
+        except (Stopped, NoEigenpair) as e:  # the solver cannot go on
             result.stopped = str(e)
         except (Interrupted, DiskError) as e:
             interruption, result.stopped = e, str(e)
@@ -370,7 +387,7 @@ def _unloaded_result(problem: Problem, folder: Path | None, output: RunOutput) -
             refuse_unknown(scene)
     except (CaseError, MeshError) as e:
         raise type(e)(problem.document.with_place(str(e))) from None
-    if mesh and mesh.branch:
+    if mesh and mesh.branch:  # the larger model of a branch gets the mesh chosen for it
         scene.remesh = mesh.branch.choice.applied
     return Result(scene, scene.unloaded(), adapted=mesh)
 
@@ -436,7 +453,7 @@ def _conclude(result: Result, say: Say) -> None:
     Warnings name searches without a solution, imbalances of energy and errors of motions.
     """
     programme, length = result.scene.problem.programme, result.scene.model.system.length
-    if result.adapted and result.scenes_of_rows:
+    if result.adapted and result.scenes_of_rows:  # the path has gone on in a larger model
         result.branch_error = _branch_error(result)
         if result.branch_error is None:
             result.remarks.append(REMARK_ON_FIRST_MODEL)
@@ -513,6 +530,7 @@ def _mesh_for_tolerance(
     from magshell_fenicsx.simulate.adapt.choice import Adapted
     from magshell_fenicsx.simulate.adapt.tolerance import adapted
 
+    # an interrupted run has found its mesh already, which takes long
     mesh_file = folder / MESH if folder else None
     saved_content = b""
     if mesh_file:
@@ -529,6 +547,7 @@ def _mesh_for_tolerance(
     except NoResult as e:
         say(f"warning: mesh.tolerance ignored, this run has no scalar result: {e}")
         return None
+    # on a branch in a larger model the result has an error of its own
     if not any(step.load.follows_branch or step.load.branch_points for step in problem.programme):
         return mesh
     try:
@@ -569,6 +588,7 @@ def _sensitivities(result: Result) -> dict[str, float]:
         If the fold cannot be located accurately enough.
     """
     scene, last_row = result.scene, result.rows[result.end]
+    # steps are numbered from 1
     step = (
         scene.problem.programme[int(last_row["step"]) - 1] if last_row["label"] == "fold" else None
     )
@@ -592,6 +612,7 @@ def _barrier(result: Result) -> float | None:
     It is between the states at the step's begin and end; None for other last steps.
     """
     steps, begin = result.scene.problem.programme, result.path_history.begin
+    # until: zero passes the largest load, back to the load zero: the top of the barrier
     if not steps or steps[-1].until != "zero" or begin is None:
         return None
     from magshell_fenicsx.simulate.results import barrier
@@ -628,7 +649,7 @@ def _follow(
         row = row_maker.row(record, time.perf_counter() - output.start)
         number = len(result.rows)
         result.rows.append(row)
-        if record.label == SOLUTION:
+        if record.label == SOLUTION:  # a solution of a search is no point of the path
             result.found[number] = record.point.state
         else:
             result.last_record, result.last, result.end = record, record.point.state, number
@@ -652,6 +673,7 @@ def _line(row: Row) -> str:
 
     `row` is the point's row of path.csv.
     """
+    # column of the amplitude that varied, and the column of the force
     varied, force_column = "", "force"
     if row["amplitude"]:
         varied = amplitude(str(row["amplitude"])).column
@@ -669,6 +691,7 @@ def _line(row: Row) -> str:
     excluded = f" + {row['excluded_pivots']} excluded" if row["excluded_pivots"] else ""
     if row["negative_pivots"] or excluded:
         fields.append(f"unstable {row['negative_pivots']}{excluded}")
+    # the other loads, where they are not zero
     fields += [_value(name, row, formats[name]) for name in formats if name != varied and row[name]]
     if row["w_pole_over_h"] != row["w_over_h"]:
         fields.append(_value("w_pole_over_h", row, "8.4f", "pole"))

@@ -1,4 +1,11 @@
-"""The status of a run, as one line of text: how far it is and how long it may take."""
+"""The status of a run, as one line of text: how far it is and how long it may take.
+
+A programme is the list of load steps of a case; each drives an amplitude (a load parameter), whose
+value is a column of path.csv, up to a target or an event. The conjugate of an amplitude is the
+displacement on which it does work. A row has the columns of path.csv at a point. A step of the
+programme has many points, and the solver takes a step in arc length to each. A scene is the model
+of a problem with its solver.
+"""
 
 import time
 from collections.abc import Callable
@@ -68,7 +75,7 @@ class PathEnd:
         'w/h 5 -> 20'
         """
         shown = shown_quantity(self.column, row)
-        size, unit = 1.0, ""
+        size, unit = 1.0, ""  # of a column without a second one in units
         if shown.name != self.column:
             size = self.sizes.by_unit.get(quantity(self.column).scale, 1.0)
             unit = f" {shown.si}"
@@ -95,8 +102,9 @@ def path_end(scene: Scene, step: ProgrammeStep) -> PathEnd:
     if step.until != "target" or load.target is None:
         return PathEnd(varied_amplitude.column, words=EVENT_WORDS.get(step.until, ""))
     target, value = load.target
-    if target.quantity == "load":
+    if target.quantity == "load":  # size: the amplitude at a target of one
         return PathEnd(varied_amplitude.column, value * load.size(scene.problem.context))
+    # else the conjugate: a column of a part, or a displacement
     for observables in OBSERVABLES:
         if column := observables.conjugates(scene.problem.loads).get(step.name):
             return PathEnd(column, value)
@@ -166,10 +174,11 @@ class RunProgress:
         self._path_ends = [
             replace(path_end(scene, step), sizes=scene.sizes) for step in scene.problem.programme
         ]
-        self._row: Row = {}
-        self._first: Row = {}
-        self._step = 1
-        self._points = self._steps = 0
+        self._row: Row = {}  # of the last point of the path
+        self._first: Row = {}  # of the point where the step of the programme begins
+        self._step = 1  # of the programme
+        self._points = self._steps = 0  # of the run, and of the solver in this step
+        # completed part of the step and time (s), where the speed is measured from and now
         self._at_begin = self._at_present = (0.0, 0.0)
 
     def beginning(self, step: int) -> None:
@@ -189,7 +198,7 @@ class RunProgress:
         """
         present_time = time.perf_counter()
         self._points += 1
-        if row["label"] == SOLUTION:
+        if row["label"] == SOLUTION:  # of a search, beside the path
             return
         self._row = row
         self._steps += row["label"] == "step"
@@ -211,6 +220,7 @@ class RunProgress:
             Length of the step in the arc length s of the path.
         """
         now, h = time.perf_counter(), self._scene.problem.material.h
+        # largest change of an unknown over h, by the tangent du/ds of the path
         step = float(np.abs(here.du).max(initial=0.0)) * abs(length) / h
         remaining = None if self._branched else time_left(self._at_begin, self._at_present)
         time_text = clock(now - self._start)

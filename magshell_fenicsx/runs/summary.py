@@ -1,4 +1,12 @@
-"""The result of a run, summary.json, and the numbers of its snaps."""
+"""The result of a run, summary.json, and the numbers of its snaps.
+
+A row has the columns of path.csv at one point of the path. An amplitude is a load parameter. A
+scene is the model of a problem with its solver; another may follow where an instability breaks the
+symmetry of the model. A record is a point of a history with its scene. k_d (knockdown) is p/p_c at
+the first instability under pressure, λ_m the dimensionless field. A snap is the motion from a fold
+to the next rest. Excluded pivots count unstable directions that the model's symmetry excludes. E,
+h, R, D are Young's modulus, thickness, reference length and bending stiffness.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -52,13 +60,13 @@ def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
             continue
         moving = [fold, *(row for row in rows[i + 1 :] if row["step"] == fold["step"])]
         if moving[-1]["label"] != "target":
-            continue
+            continue  # it has not come to rest
         t, w, dissipated = (
             np.array([float(row[key]) for row in moving])
             for key in ("time", "w_over_h", "dissipated")
         )
         part_of_way = (w - w[0]) / (w[-1] - w[0])
-        # the last two rows are of one time
+        # the last two rows are of one time: the motion, then the equilibrium at rest
         departure, half_time, end_of_jump = (
             _first_at(fraction, t[:-1], part_of_way[:-1]) - t[0]
             for fraction in (JUMP_BEGINS, 0.5, JUMP_ENDS)
@@ -257,6 +265,7 @@ class Result:
         None if there is none, or at held volume.
         """
         steps = self.scene.problem.programme
+        # steps that hold the conjugate of their own amplitude: of a pressure, the volume
         at_held_volume = {step.number for step in steps if step.name in step.load.hold}
         for row in self._instabilities_under("pressure"):
             if row.get("step") not in at_held_volume:
@@ -392,7 +401,7 @@ def solutions(result: Result) -> list[dict[str, Any]]:
             for term in system.terms
         )
         norms = [np.sqrt(dot(system.comm, vector, vector)) for vector in (residual, *forces)]
-        columns_with_units = (
+        columns_with_units = (  # those that may also be there in units
             "p_over_pc",
             "w_over_h",
             "w_pole_over_h",
@@ -438,6 +447,7 @@ def in_units(result: Result) -> dict[str, float]:
         numbers[f"critical_field_{ending}"] = result.critical_field * unit_sizes["λ_m"]
     if "2πD/R" in unit_sizes:
         numbers["unit_force_N"] = unit_sizes["2πD/R"]
+        # D = F R/(2π), with the unit F of forces
         numbers["bending_stiffness_N_m"] = unit_sizes["2πD/R"] * shell.reference / (2 * np.pi)
         numbers["unit_energy_mJ"] = unit_sizes["E h R²"]
         if result.barrier is not None:
@@ -450,7 +460,7 @@ def _dimensions(shell: ShellSection | Surface) -> dict[str, Any]:
 
     `units` says which. Keys that the case does not give are None.
     """
-    if isinstance(shell, ShellSection):
+    if isinstance(shell, ShellSection):  # its lengths always have units
         lengths, is_in_si = {"radius": shell.radius, "thickness": shell.thickness}, True
     else:
         lengths, is_in_si = (

@@ -1,4 +1,8 @@
-"""Faces of simple bodies for pictures: triangles in their own axes, and the poles of magnets."""
+"""Faces of simple bodies for pictures: triangles in their own axes, and the poles of magnets.
+
+In go radii, heights or edges, in any unit of length; out comes a `Solid`. A face is smooth within,
+as its triangles share corners. Faces meet in edges, where each has corners of its own.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -8,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-CIRCLE_POINTS = 48
+CIRCLE_POINTS = 48  # corners on a circle
 AXIS_TOLERANCE = 1e-12  # over the largest radius: a cosine of 90 degrees is not quite zero
 AREA_TOLERANCE = 1e-12  # over the largest area: smaller triangles count as flat
 
@@ -41,6 +45,7 @@ class Solid:
 
     def magnetised(self, polarization: Array, name: str) -> "Solid":
         """Return the body as a magnet of that name with a polarization (3,)."""
+        # heights along the polarization: only their sign is a pole
         middle = (self.points.max(axis=0) + self.points.min(axis=0)) / 2
         size = np.linalg.norm(polarization) or 1.0
         poles = np.asarray((self.points - middle) @ polarization / size)
@@ -74,9 +79,10 @@ def revolved(*profiles: Sequence[tuple[float, float]]) -> Solid:
         for rho, z in profile:
             heights = np.full(CIRCLE_POINTS, z)
             points.append(np.column_stack([rho * np.cos(t), rho * np.sin(t), heights]))
-            # on the axis there is one point
+            # on the axis there is one point: all numbers of the circle are the first
             circles.append(start + np.arange(CIRCLE_POINTS) * (rho > on_axis))
             start += CIRCLE_POINTS
+        # two triangles for each side of a band between circles
         for low, high in pairwise(circles):
             triangles.append(np.column_stack([low, low[next_on_circle], high[next_on_circle]]))
             triangles.append(np.column_stack([low, high[next_on_circle], high]))
@@ -111,6 +117,7 @@ def block(half: Array) -> Solid:
     faces = [
         np.insert(square, axis, side, axis=1) * half for axis in range(3) for side in (-1.0, 1.0)
     ]
+    # each face has four corners of its own
     triangles = [4 * k + np.array([[0, 1, 2], [0, 2, 3]]) for k in range(6)]
     return Solid(np.concatenate(faces), np.concatenate(triangles))
 

@@ -2,6 +2,12 @@
 
 `MeridianChart` is the chart of one meridian, or of those of several shells with one axis. The other
 functions compare a formula of x, y, z, or a field, along many meridians. Lengths are over R.
+
+A meridian is the profile curve of a surface of revolution, in the plane of e1 and e3 (azimuth 0).
+Its parameter s is the first coordinate of its chart; the second is 0. Several shells have one
+interval of s each. A place x of the meridian at another azimuth is `x @ rotation(azimuth)`. A
+narrow place is one at which a formula is known to vary over a short distance, so that samples could
+miss it: it is tested too.
 """
 
 from collections.abc import Callable, Sequence
@@ -161,6 +167,7 @@ def scalar_is_axisymmetric(text: str, meridian: MeridianChart, length: float = 1
     length
         R in the unit of length of the formula.
     """
+    # samples of the meridian at all angles; narrow places against their images at azimuth zero
     f, places = formula(text), length * meridian.interior_sample()
     narrow_places = length * meridian.narrow_places
     at_azimuth_zero = length * _at_azimuth_zero(meridian.narrow_places)[0]
@@ -189,6 +196,7 @@ def vector_is_axisymmetric(
         Whether this is asked beside the surface too, up to `MAX_OFFSET` from it.
     """
     vectors, places = vector_function(components), meridian.interior_sample()
+    # places beside the surface are put back into the plane y = 0
     if in_space:
         places = with_nearby_places(places) * [1.0, 0.0, 1.0]
     # narrow places are compared with their images at azimuth zero
@@ -201,6 +209,7 @@ def vector_is_axisymmetric(
 
 def _at_azimuth_zero(x: Array) -> tuple[Array, Array]:
     """Return places (n, 3) turned about e3 into y = 0, and the rotations (n, 3, 3) that do so."""
+    # cosine and sine of the azimuth; on the axis it is zero
     rho, ones, zeros = np.hypot(x[:, 0], x[:, 1]), np.ones(len(x)), np.zeros(len(x))
     c, s = np.where(rho > 0, x[:, :2].T / np.where(rho > 0, rho, 1.0), [[1.0], [0.0]])
     Q = np.array([[c, s, zeros], [-s, c, zeros], [zeros, zeros, ones]])
@@ -232,6 +241,7 @@ def _turns_with_meridian(
 
     `places` are (n, 3), `angles` are azimuths in radians.
     """
+    # vectors at each azimuth, turned back; then the first without its component along e2
     in_plane = [field(places @ Q) @ Q.T for Q in map(rotation, angles)]
     return _all_equal([*in_plane, in_plane[0] * [1.0, 0.0, 1.0]])
 

@@ -1,7 +1,10 @@
 """Symmetry planes of a shape itself: of a grid's chart, or of a mesh file's triangles.
 
-Both functions return `Mirror`s whose half is the modelled one, with the edges that they map onto
-each other. Lengths are over R.
+`grid_mirrors` and `mesh_mirrors` return `Mirror`s: planes with the half that is modelled, and the
+removed edges, those of the other half, each with its mirror image. A chart is the plane domain of a
+grid, which an embedding maps to space. A side of the grid is glued if it is the same line in space
+as the opposite one. A patch is a mesh of triangles in space, with named edges and named parts
+(`patches`). A loose mirror maps areas onto each other, but not triangles. Lengths are over R.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -28,6 +31,7 @@ FLIPS: tuple[tuple[Flip, tuple[int, ...]], ...] = (
     (lambda s, t: (t, s), (2, 3, 0, 1)),
     (lambda s, t: (1 - t, 1 - s), (3, 2, 1, 0)),
 )
+# of left, right, bottom and top, as (s, t)
 SIDE_MIDDLES = ((0.0, 0.5), (1.0, 0.5), (0.5, 0.0), (0.5, 1.0))
 SAMPLES_PER_AXIS = 8  # of the chart; a power makes them unsymmetric along the second axis
 SAMPLE_POWER = 1.5
@@ -49,6 +53,7 @@ def grid_mirrors(grid: Grid, embedding: Embedding) -> list[Mirror]:
     def places(chart: Array) -> Array:
         return embedding(low + chart * extent)
 
+    # the last two flips exchange both axes, which only a square allows
     mirrors = []
     flips = FLIPS if is_square and not any(grid.glued) else FLIPS[:2]
     for axis, (flip, sides) in enumerate(flips):
@@ -56,6 +61,8 @@ def grid_mirrors(grid: Grid, embedding: Embedding) -> list[Mirror]:
         # a plane is normal to the line between a place and its image
         differences = originals - images
         normal = differences[np.argmax(np.linalg.norm(differences, axis=1))]
+        # around e3 a closed surface has all planes, see `Outline.mirrors`; a flip that moves
+        # nothing has none
         if (axis == 0 and grid.glued[0]) or not normal.any():
             continue
         unit = Mirror.with_normal(normal).normal
@@ -64,6 +71,7 @@ def grid_mirrors(grid: Grid, embedding: Embedding) -> list[Mirror]:
         error = np.abs(mirror.image(originals) - images).max()
         if error > ROUNDING * max(1.0, np.abs(originals).max()):
             continue
+        # right and top are on the half with the larger coordinates
         distances = mirror.signed_distance(places(np.array(SIDE_MIDDLES)))
         if distances[1] + distances[3] < -ROUNDING:
             mirror, distances = mirror.reversed, -distances
@@ -87,6 +95,7 @@ def mirror_lines(
     low, extent = np.array(grid.low), np.subtract(grid.high, grid.low)
     for axis in range(2):
         coordinates = []
+        # a plane cuts a closed line twice: at its ends and its middle, or at its quarters
         for fraction in (0.25, 0.5, 0.75) if grid.glued[axis] else (0.5,):
             chart = np.empty((len(t), 2))
             chart[:, axis], chart[:, 1 - axis] = fraction, t
@@ -108,6 +117,7 @@ def mesh_mirrors(patch: PatchMesh, vectors: Sequence[Array], *, loosely: bool) -
         Whether planes count too that map areas and centres onto each other, but not the triangles.
         Edges of the mesh must lie in them.
     """
+    # a mesh with this edge is a half already
     if SYMMETRY_EDGE in patch.edges:
         return []
     mirrors: list[Mirror] = []
@@ -120,6 +130,7 @@ def mesh_mirrors(patch: PatchMesh, vectors: Sequence[Array], *, loosely: bool) -
         if mirror:
             mirrors.append(mirror)
         elif loosely:
+            # through the vertex nearest to the centre of area, as edges must lie in the plane
             heights = corners @ unit
             nearest = float(heights[np.argmin(np.abs(heights - unit @ area_centre))])
             loose_mirror = Mirror(unit, _rounded(nearest))
@@ -140,7 +151,8 @@ def _candidate_normals(patch: PatchMesh, vectors: Sequence[Array]) -> Iterator[A
     between two of these.
     """
     corners = patch.nodes[np.unique(patch.cells[:, :3])]
-    principal = np.linalg.eigh(np.cov(corners.T))[1].T
+    _, eigenvectors = np.linalg.eigh(np.cov(corners.T))
+    principal = eigenvectors.T
     axes = np.eye(3)
     pairs = ((axes[0], axes[1]), (axes[1], axes[2]), (axes[0], axes[2]))
     diagonals = [a + sign * b for a, b in pairs for sign in (1, -1)]
@@ -162,15 +174,18 @@ def _with_edges(mirror: Mirror, patch: PatchMesh, tree: "scipy.spatial.cKDTree")
     """
     nodes = patch.nodes
     tolerance = ROUNDING * np.ptp(nodes, axis=0).max()
+    # a few nodes exclude most planes in little time
     if tree.query(mirror.image(nodes[:FIRST_NODES]))[0].max() > tolerance:
         return None
     distance, image_numbers = tree.query(mirror.image(nodes))
+    # a plane in which the whole surface lies halves nothing
     if distance.max() > tolerance or np.abs(mirror.signed_distance(nodes)).max() <= tolerance:
         return None
     # patches must be mapped onto themselves
     twin = _image_triangles(patch.cells[:, :3], image_numbers)
     if twin is None or any((mask != mask[twin]).any() for mask in patch.patches.values()):
         return None
+    # each edge must be mapped onto an edge, perhaps itself
     removed_edges = {}
     for name, pairs in patch.edges.items():
         image_names = (
@@ -183,6 +198,7 @@ def _with_edges(mirror: Mirror, patch: PatchMesh, tree: "scipy.spatial.cKDTree")
             return None
         if image_name != name and mirror.signed_distance(nodes[pairs]).mean() < 0:
             removed_edges[name] = image_name
+    # only planes along edges of triangles can be cut
     try:
         cut(patch, mirror)
     except MeshError:

@@ -3,6 +3,15 @@
 An `Outline` says what is meshed, how it is put into space, and which symmetry the surface has.
 `outline` makes the outline of any geometry. `reference_shell_of` makes what imperfections, bodies
 and sources need to know of a shell.
+
+A chart is a plane domain that is meshed: a disc around a pole, a strip, or a rectangle (`Grid`).
+"The chart of a place" is its coordinates (2,) there. A mesh file has no chart: nodes in space stand
+for it. An embedding is the map from charts to places in space. A surface is round if it is closed
+around e3. Its meridian is the profile curve from which an axisymmetric model is made; the length
+along it is a chart of its own. A mirror is a symmetry plane with one of its two halves; a sector
+lies between two planes through e3. A deviation is the distance of the imperfect surface along the
+normal. A grading gives element sizes. Samples are places all over a surface, on which symmetry is
+tested.
 """
 
 from collections.abc import Callable, Sequence
@@ -54,7 +63,7 @@ from magshell_fenicsx.shape.shell_sections import (
 )
 
 Array = NDArray[np.float64]
-Chart = PlaneShape | Grid | MeshFile
+Chart = PlaneShape | Grid | MeshFile  # what is meshed
 ANY_GRADING = Grading([], 1.0)  # where only the chart's extent matters
 ROUNDING = 1e-9  # over R: a coordinate across the symmetry plane that is zero
 CHART_SAMPLES = 41  # along each axis of a chart
@@ -117,9 +126,10 @@ class Outline:
     why_no_meridian: str | None = None
 
     def on_half(self, chart: Array) -> Array:
-        """Return a place of the chart (2,) on its half, off which rounding may have moved it.
+        """Return a place of the chart (2,) on the half with y >= 0, if rounding has moved it off.
 
-        Places of grids and meshes are returned as they are, since these are cut.
+        Places of grids and meshes are returned as they are: there the half is cut off along the
+        symmetry plane itself.
         """
         if self.grid or isinstance(self.chart(None, ANY_GRADING), MeshFile):
             return chart
@@ -134,11 +144,12 @@ class Outline:
     def sample(self) -> Array:
         """Return places (n, 3) all over the surface, its centre, edges and axes among them."""
         if self.meridian and self.meridian.shell_meridians:
+            # of several shells: their meridians, turned about e3
             in_plane = self.meridian.sample()
             azimuths = np.linspace(0, 2 * pi, SAMPLED_AZIMUTHS)
             return np.vstack([*(in_plane @ rotation(a) for a in azimuths), self.extra_samples])
         chart, nodes = self.chart_samples(), self.nodes
-        if chart is None:
+        if chart is None:  # a mesh file
             assert nodes is not None
             return np.vstack([space_embedding(nodes), self.extra_samples])
         return np.vstack([self.embedding(chart), self.extra_samples])
@@ -171,7 +182,7 @@ class Outline:
         shape = self.chart(None, ANY_GRADING)
         if not isinstance(shape, MeshFile):
             return np.asarray(self.normal(chart[None])[0])
-        if isinstance(shape.in_memory, MultiShellMesh):
+        if isinstance(shape.in_memory, MultiShellMesh):  # several shells
             assert shape.in_memory.normal
             return shape.in_memory.normal(chart)
         nodes = read_msh(replace(shape, normals=True), {}).nodes
@@ -184,6 +195,7 @@ class Outline:
         if isinstance(shape, MeshFile):
             return None
         t = np.linspace(0, 1, CHART_SAMPLES)
+        # a disc by radius and azimuth, a strip and a grid along both axes
         if isinstance(shape, DiscShape):
             rho, theta = np.meshgrid(shape.reach * t, 2 * np.pi * t)
             x, y = rho * np.cos(theta), rho * np.sin(theta)
@@ -227,7 +239,7 @@ class Outline:
         circles
             Radii around the pole at which the curvature jumps.
         largest
-            Cell size that resolves the imperfections.
+            Cell size that resolves the imperfections; on a meridian half of it is taken.
         """
         meridian = self.meridian and replace(
             self.meridian,
@@ -270,7 +282,8 @@ def reference_shell_of(shell: Surface | ShellSection) -> ReferenceShell:
         shell.poisson_ratio,
         shell.with_units,
         shell.edge_polar,
-        factor if isinstance(factor, str) else None,
+        factor if isinstance(factor, str) else None,  # only a formula is known at any place
+        # all that the surface depends on, by which it is cached
         (
             shell.model_dump_json(exclude={"imperfections"}),
             shell.digest if isinstance(shell, MeshSurface) else None,
@@ -281,7 +294,7 @@ def reference_shell_of(shell: Surface | ShellSection) -> ReferenceShell:
 
 
 def outline(shell: Surface | ShellSection) -> Outline:
-    """Return the outline of a shell without imperfections."""
+    """Return the outline of a shell without imperfections, by its geometry."""
     if isinstance(shell, MeshSurface):
         return _mesh_outline(shell)
     if isinstance(shell, ShellSection) and shell.width is not None:
@@ -298,6 +311,7 @@ def outline(shell: Surface | ShellSection) -> Outline:
         return _grid_outline(
             grid, plane_embedding, plane_normals, lambda x: np.clip(x[:2], 0.0, high), high
         )
+    # names of the edges at the profile's begin and end; no edge but a pole has the name None
     profile, names = shell.profile_and_edges
     if names[1] is not None:
         return _ring_outline(shell, profile, (names[0], names[1]))
@@ -315,13 +329,14 @@ def outline(shell: Surface | ShellSection) -> Outline:
 
 def _mesh_outline(shell: MeshSurface) -> Outline:
     """Return the outline of a mesh file, of a program's triangles, or of several shells."""
-    scale = (shell.unit or 1.0) / shell.reference
+    scale = (shell.unit or 1.0) / shell.reference  # of the file's lengths over R
     in_memory = shell.files.given.get(shell.path)
     file = MeshFile(shell.path, scale, bool(shell.imperfections), shell.files, in_memory)
     if isinstance(in_memory, MultiShellMesh):
         return _multi_shell_outline(file, in_memory)
 
     def mirrors(vectors: Sequence[Array], loosely: bool) -> list[Mirror]:
+        """Return the planes that map the triangles onto themselves, see `mesh_mirrors`."""
         try:
             patch = read_msh(replace(file, normals=False), {})
             return _with_reversed(mesh_mirrors(patch, vectors, loosely=loosely))
@@ -339,10 +354,14 @@ def _mesh_outline(shell: MeshSurface) -> Outline:
 
 
 def _multi_shell_outline(file: MeshFile, shells: MultiShellMesh) -> Outline:
-    """Return the outline of several shells that take the place of a mesh file."""
+    """Return the outline of several shells that take the place of a mesh file.
+
+    Their meridian is a chart, or a text that says why they have none.
+    """
     meridian = shells.meridian
 
     def chart(mirror: Mirror | None, size: Grading) -> MeshFile:
+        # shells mesh themselves with their own sizes; `size` is not used
         if mirror and shells.symmetric_part:
             return replace(file, in_memory=shells.symmetric_part(mirror))
         return file
@@ -367,8 +386,10 @@ def _strip_outline(width: float) -> Outline:
     tip, corner = np.array([1.0, 0.0]), np.array([0.0, -width / 2])
 
     def inverse(x: Array) -> Array:
+        """Return the chart (2,) of the strip's place nearest to x (3,)."""
         return np.clip(_plane_chart(x), corner, -corner + tip)
 
+    # the mesher takes element sizes itself: `size` is for grids
     return Outline(
         lambda mirror, size: StripShape(width, mirror is not None),
         plane_embedding,
@@ -414,14 +435,17 @@ def _disc_outline(
     """
 
     def chart(mirror: Mirror | None, size: Grading) -> Chart:
+        # a half has one wave between its planes, a sector m; `size` is for grids
         waves = mirror.waves if isinstance(mirror, Sector) else 1
         return DiscShape(edge, mirror is not None, edge=edge_name, waves=waves)
 
     def inverse_in_disc(x: Array) -> Array:
+        """Return the chart of x (3,), moved to the edge if it is beyond."""
         chart = inverse(x)
         return np.asarray(chart / max(np.hypot(*chart) / edge, 1.0))
 
     def locate(chart: Array) -> tuple[float, float]:
+        """Return the meridian's parameter and the azimuth of a chart (2,)."""
         return float(np.hypot(*chart)), float(np.arctan2(chart[1], chart[0]))
 
     meridian = MeridianChart(edge, (), (None, edge_name), embedding, normal, locate, curvature)
@@ -452,9 +476,10 @@ def _ring_outline(
     names
         Names of the edges where the profile begins and ends.
     """
-    first, last = shell.azimuth_range
+    first, last = shell.azimuth_range  # radians
     s = np.linspace(0, profile.length, PROFILE_SAMPLES, dtype=np.float64)
     rho = float(profile(s)[:, 0].max())
+    # whether the grid is closed around e3, and along the profile
     glued = shell.azimuth is None, shell.closed
     low, high = (first * rho, 0.0), (last * rho, profile.length)
     embedding = RevolvedEmbedding(profile, rho)
@@ -472,6 +497,7 @@ def _ring_outline(
         return np.column_stack([along_z, 0 * along_z, -along_r])
 
     def locate(chart: Array) -> tuple[float, float]:
+        """Return the meridian's parameter and the azimuth of a chart (2,)."""
         return profile.length - float(chart[1]), float(chart[0]) / rho
 
     # only a surface closed around e3, with edges, has a meridian
@@ -486,6 +512,7 @@ def _ring_outline(
             locate,
             _largest_curvature(profile),
         )
+    # its element size, 1, is replaced when it is meshed
     grid = Grid(low, high, 1.0, ("left", "right", *names), glued)
     highest = np.array(low if any(glued) else high)
     return _grid_outline(grid, embedding, embedding.normal, inverse, highest, meridian)
@@ -497,6 +524,7 @@ def _largest_curvature(profile: Profile) -> float:
     It is rounded to a thousandth, since it is known no better.
     """
     s = np.linspace(0, profile.length, CURVATURE_SAMPLES, dtype=np.float64)
+    # turn of the tangent over the step s[1]
     changes = np.linalg.norm(np.diff(profile.tangent(s), axis=0), axis=1)
     return max(1.0, round(float(changes.max() / s[1]), CURVATURE_DIGITS))
 
@@ -509,9 +537,15 @@ def _grid_outline(
     highest: Array,
     meridian: MeridianChart | None = None,
 ) -> Outline:
-    """Return the outline of a surface that is charted by a rectangle; see `Outline`."""
+    """Return the outline of a surface that is charted by a rectangle.
+
+    `grid` is the rectangle with the names of its edges and the sides that are glued together. Other
+    parameters are attributes of the outline.
+    """
 
     def chart(mirror: Mirror | None, grading: Grading) -> Chart:
+        """Return the grid to mesh: a sector, or all with lines where a mirror plane cuts it."""
+        # a grid whose size varies places its lines by a function
         size = grading.line_spacing if grading.features else grading.largest
         if isinstance(mirror, Sector):
             return replace(_sector_of_grid(grid, mirror), size=size)
@@ -536,8 +570,9 @@ def _grid_outline(
 def _sector_of_grid(grid: Grid, sector: Sector) -> Grid:
     """Return the part of a grid, closed around e3, between azimuths 0 and 180/m degrees.
 
-    It has at least four quadrilaterals around.
+    It has at least four quadrilaterals around: lines at its quarters.
     """
+    # copies of a sector: 2 m
     end = (grid.high[0] - grid.low[0]) / sector.copies
     quarters = tuple(end * fraction for fraction in (0.25, 0.5, 0.75))
     sides = (SYMMETRY_EDGE, SECOND_SYMMETRY_EDGE, *grid.sides[2:])

@@ -3,6 +3,11 @@
 `ReferenceShell` has the reference surface with and without imperfections, and the scales of the
 case. `locate` turns a direction or a point of the case into a place and the distance from it. The
 lines outline simple bodies around their own axes. Lengths are over R.
+
+An outline is a surface as a chart (coordinates (2,), or a place (3,) for a mesh file) with its map
+to space; `inverse` gives the chart of a place, `highest` the chart of the pole or tip. The surface
+is perfect without its imperfections. `polar` is an angle from e3, `azimuth` one around it. "Refuse"
+means: raise an error that names the key of the case file.
 """
 
 from collections.abc import Callable
@@ -181,6 +186,7 @@ def locate(at: At, ground: ReferenceShell, key: str) -> tuple[Array, Distance]:
     CaseError
         If the place does not lie on the surface, or a direction does not determine it.
     """
+    # four cases: a point, a direction on a sphere, a place that must be a point, the pole or tip
     perfect = ground.perfect
     if at.point is not None:
         place = np.array(at.point) / ground.R
@@ -247,12 +253,14 @@ def refuse_off_surface(
     CaseError
         With a place near it that is on the surface.
     """
+    # the chart of a mesh file is the place itself, and nothing is refused
     chart = outline.inverse(x)
     nearest = x if len(chart) == 3 else outline.embedding(chart[None])[0]
     perfect = outline.perfect(chart[None])[0] if len(chart) == 2 else x
     distances = [float(np.linalg.norm(place - x)) for place in (nearest, perfect)]
     if min(distances) > SAME_PLACE_TOLERANCE:
         unit_size, unit = (1e3 * R, " mm") if with_units else (R, "")
+        # + 0.0 makes zero of a negative zero
         near_place = ", ".join(f"{c * unit_size + 0.0:.13g}{unit}" for c in np.round(nearest, 12))
         hint = "; a number without a unit is in metres here" if with_units else ""
         raise CaseError(
@@ -292,6 +300,7 @@ def box_lines(low: Array, high: Array) -> list[Array]:
 
 def frame_along(axis: Array) -> Array:
     """Return a right-handed orthonormal frame (3, 3) as columns, with `axis` (3,) as the last."""
+    # normal to the axis and to the coordinate axis farthest from it
     first = np.cross(axis, np.eye(3)[np.argmin(np.abs(axis))])
     first = first / np.linalg.norm(first)
     return np.column_stack([first, np.cross(axis, first), axis])

@@ -4,6 +4,11 @@ Here are also the keys that all mid-surfaces share. Lengths are plain numbers of
 user chooses, or all have units and are then in metres. The same holds for Young's modulus, so that
 loads and results are in the user's units or in SI. The docstrings of sections and of their keys are
 the text of docs/case.md.
+
+A section is a part of a case file, checked by pydantic; validators raise ValueError. R is the
+reference length, h the thickness. A profile is a curve (r, z) over R that is turned about e3; its
+ends are edges of the surface or, on the axis, a pole. Azimuths are around e3, polar angles from it.
+An edge's name is None where the profile ends in the pole.
 """
 
 from math import pi, radians
@@ -87,6 +92,7 @@ class SurfaceSection(ShellKeys, MaterialSection):
         Pydantic calls it with the raw `data`; `handler` makes the section of them. It also sets
         `with_units`.
         """
+        # values that are given with a unit are texts; all must be texts or none
         lengths = dict[str, Any]()
         if isinstance(data, dict):
             lengths = {key: data[key] for key in MEASURES if key in data}
@@ -231,6 +237,7 @@ class CapSurface(RoundSection):
         from magshell_fenicsx.mesh.surfaces_of_revolution import ArcProfile
 
         assert self.hole is not None
+        # radius 1; angles from the equator upwards, to the hole's edge
         return ArcProfile(1.0, pi / 2 - radians(self.polar), pi / 2 - radians(self.hole)), (
             "rim",
             "hole",
@@ -278,6 +285,7 @@ class AnnulusSurface(RoundSection):
         """The line from the outer to the inner edge, over R, and the names of its ends."""
         from magshell_fenicsx.mesh.surfaces_of_revolution import StraightProfile
 
+        # inwards: the normal, to the right of a profile's direction, is e3
         return StraightProfile((1.0, 0.0), (self.inner_radius / self.radius, 0.0)), (
             "outer",
             "inner",
@@ -320,6 +328,7 @@ class TorusSurface(RoundSection):
         from magshell_fenicsx.mesh.surfaces_of_revolution import ArcProfile
 
         first, last = self.tube or FULL_TURN
+        # about a centre at the radius 1 from e3
         return ArcProfile(self.tube_radius / self.radius, radians(first), radians(last), 1.0), (
             "bottom",
             "top",
@@ -368,6 +377,7 @@ class ProfileSection(Section):
         assert self.heights is not None
         first, last = self.heights
         z = np.linspace(first, last, PROFILE_SAMPLES, dtype=np.float64)
+        # formulas take x, y and z; only z may matter
         r = formula(self.radius)(0 * z, 0 * z, z)
         on_axis = np.abs(r) < ON_AXIS * np.abs(r).max()
         return np.column_stack([np.where(on_axis, 0.0, r), z])

@@ -1,6 +1,11 @@
 """Sections of all mid-surfaces: the paper's shells, surfaces of revolution, plates and meshes.
 
 The docstrings of sections and of their keys are the text of docs/case.md.
+
+A section is a part of a case file, checked by pydantic; validators raise ValueError. R is the
+reference length, h the thickness. Lengths of a case have units (texts such as "3 mm") or are plain
+numbers; without any length, results are over R and forces over E R². An assembly is several shells
+in one triangulation.
 """
 
 from typing import Annotated, Any, ClassVar, Literal, Self

@@ -3,6 +3,12 @@
 Each part (a load, a support, the shape) states a `SymmetryConstraint`. `common_mirror` and
 `common_sector` find planes that all parts allow. `why_not_axisymmetric` says what forbids the model
 of a meridian (docs/design.md). Lengths are over R.
+
+A mirror is a symmetry plane with the half that is modelled, so that a plane comes twice; a sector
+is the piece of 180/m degrees between two planes through e3 (the code calls m `waves`). "Allowed"
+means: the part is the same at mirror images. An outline is the surface of the shell with its own
+symmetry planes; it is round if it is closed around e3. A round surface has all planes through e3,
+so that vectors and azimuths of the parts choose some as candidates.
 """
 
 from collections.abc import Callable, Iterable, Sequence
@@ -96,12 +102,13 @@ def common_mirror(
     if any(part.mirrors is no_plane for part in parts):
         return None
     vectors = [v for part in parts for v in part.vectors]
-    units = [unit(v) for v in vectors]
+    units = [unit(v) for v in vectors]  # candidates of an outline contain these, if possible
 
     def first_allowed(planes: Sequence[Mirror]) -> Mirror | None:
         allowed = (plane for plane in planes if all(part.mirrors(plane) for part in parts))
         return next(allowed, None)
 
+    # `False`, `True`: whether triangles of a mesh file need not be symmetric
     planes_through_axis = _planes_through_axis(parts, vectors) if outline.round else []
     mirror = first_allowed(planes_through_axis) or first_allowed(outline.mirrors(units, False))
     if mirror is None and loosely:
@@ -117,10 +124,12 @@ def _planes_through_axis(parts: Sequence[SymmetryConstraint], vectors: Vectors) 
     planes = list[Mirror]()
     azimuth = common_azimuth(vectors)
     if azimuth is not None:
+        # both halves of the plane; if no vector chooses it, also those of the plane across
         turns = (0.0, pi) if any(tilted(v) for v in vectors) else (0.0, pi, pi / 2, -pi / 2)
         planes += [Mirror.through_axis(azimuth + turn) for turn in turns]
     azimuths_of_parts = [a for part in parts for a in part.azimuths]
     for a in azimuths_of_parts:
+        # both halves, if the plane contains all vectors
         for turn in (0.0, pi):
             plane = Mirror.through_axis(a + turn)
             if all(abs(plane.normal @ unit(v)) <= PARALLEL for v in vectors):
@@ -147,6 +156,7 @@ def common_sector(
     if outline.round:
         azimuths = [azimuth, *(a for part in parts for a in part.azimuths)]
         azimuths += [atan2(x[1], x[0]) for x in places if tilted(x)]
+        # a sector may begin or end at an azimuth, or begin on its other side
         begins = [a + turn for a in azimuths for turn in (0.0, -pi / waves, pi)]
     else:
         units = [unit(v) for v in (*vectors, *places)]
@@ -184,7 +194,7 @@ def why_not_axisymmetric(parts: Sequence[SymmetryConstraint]) -> str | None:
 def energy_without_mirror(parts: Sequence[SymmetryConstraint], outline: "Outline") -> str | None:
     """Return the name of an energy that alone keeps a case from being a half; None without one.
 
-    The other parts have a common mirror plane.
+    Energies are the user's. The other parts have a common mirror plane, which it does not allow.
     """
     plane = common_mirror([part for part in parts if not part.energy], outline, loosely=True)
     if plane is None:
@@ -237,7 +247,8 @@ def patch_constraint(
 ) -> SymmetryConstraint:
     """Return the constraint of patches that a key names.
 
-    A meridian knows no patch but a whole shell. The message is the same for a patch that is not
+    A meridian knows no patch but a whole shell. So a patch that is none forbids the meridian; only
+    several shells (`assembly`) can be named there. The message is the same for a patch that is not
     there.
     """
     assembly = getattr(shell, "assembly", None)
@@ -252,7 +263,7 @@ def points_constraint(
 ) -> SymmetryConstraint:
     """Return the constraint that named points lie on the half that is modelled.
 
-    If no point is named, the one that is reported must lie there.
+    If no point is named, the one whose displacement is reported must lie there.
 
     Parameters
     ----------

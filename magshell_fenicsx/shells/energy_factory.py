@@ -1,7 +1,19 @@
 """Energies of a thin shell, each integrated from one density over the mid-surface or its meridian.
 
 `EnergyFactory` makes an energy only when a scene asks for it, so unused ones are never compiled.
-Lengths are over R, energies over E h R².
+Lengths are over R, energies over E h R²; h is the thickness, R the reference length.
+
+A jet holds a map's value and derivatives at a point; r0, u, and v denote jets of the placement, the
+displacement, and a test function. A density is a function of jets and of parameters: constants, or
+fields on the mesh. `per_area` turns a density per undeformed area into one per area of the
+coordinates, as `Density.function` needs it. An amplitude is a load parameter, by name; an energy
+with an amplitude is multiplied by it, and one without has the factor 1. A free parameter is a
+`fem.Constant` of the energies that a path may vary.
+
+`group` and `column` of an energy name its group of terms and its column in reported energies. A
+field "in space" is an applied flux density known by its values at displaced places, as of a magnet;
+else the field is uniform or linear in space. The natural shape is the one without stress. A shell
+thins where its thickness follows from the deformation, as in rubber.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -64,7 +76,7 @@ from magshell_fenicsx.parts.natural.shape import Shape, grown
 
 Array = NDArray[np.float64]
 AnyTerm = TypeVar("AnyTerm", bound=FormTerm)
-INTERIOR = "interior edges"
+INTERIOR = "interior edges"  # name of their energy
 
 
 @dataclass(frozen=True)
@@ -85,7 +97,7 @@ class EnergyFactory:
     log
         Log that compiles forms, with their names and compile times.
     thickness
-        Factor (1,) of h; None for 1.
+        Field (1,) of the thickness over h; None where it is h everywhere.
     natural
         The natural shape; None if it is the undeformed one.
     free_constants
@@ -102,10 +114,10 @@ class EnergyFactory:
     creases
         Joints with springs or hinges.
     cell_materials
-        `parameters.ShellMaterial.numbers` (4,) of each cell; None where all shells have one
-        material.
+        Material numbers (4,) of each cell: modulus over the first shell's, Poisson's ratio, mass
+        density over the first shell's, number of the law. None where all shells have one material.
     saturated
-        Magnetisation state of a soft material that saturates, if it was made.
+        Magnetisation state of a soft material that saturates: empty, or one field that was made.
     """
 
     domain: IntegrationDomain
@@ -130,12 +142,14 @@ class EnergyFactory:
         The term's class depends on the energy: a `FormTerm` without a density, a `ShellTerm` with
         one, a `MomentTerm` for a moment on an edge.
         """
+        # the modelled part's energy over the domain's: 2 pi for a meridian
         factor, u = self.domain.revolution_factor, self.domain.jet(self.u)
         form, work = factor * energy.form_of(u), None
-        if energy.work:
+        if energy.work:  # a load without potential
             work = factor * energy.work(u, self.domain.jet(ufl.TestFunction(self.u.function_space)))
 
         def make(kind: Callable[..., AnyTerm], *density: Density) -> AnyTerm:
+            """Return a term of a class, whose constructor takes a density or none."""
             arguments = energy.name, *density, form, self.u, self.log, energy.amplitude
             term = kind(*arguments, linear=energy.linear, work=work)
             term.group, term.column = energy.group or energy.name, energy.column
@@ -157,7 +171,8 @@ class EnergyFactory:
     def prestress(self) -> Density:
         """Return the density of the geometric stiffness, the tangent's part by membrane stress.
 
-        Its first parameter is the membrane strain (3,), constant in each cell.
+        The density takes the jet of a further displacement v after u. Its first parameter is the
+        change (3,) of the membrane strain that makes the stress, constant in each cell.
         """
         strain = fem.Function(fem.functionspace(self.domain.mesh, ("DG", 0, (3,))))
         return self._elastic_density(Density(per_area(densities.prestress), (strain,)))
@@ -172,9 +187,10 @@ class EnergyFactory:
     def interior_edges(self) -> Energy:
         """Return the C0 interior penalty energy of rotation jumps on edges between cells.
 
-        On edges with creases, their springs or hinges take its place. Where creases grow, their
-        rest angle is the free parameter `FOLD`.
+        On edges with creases, their springs or hinges take its place. Where creases grow, the part
+        of the rest angle that has grown, 0 to 1, is the free parameter `FOLD`.
         """
+        # jumps of small rotations, or finite angles between cells
         edge_energy = edges.fold if self.has_folds else edges.interior
         density = self._elastic_density(
             Density(edge_energy, (self._penalty,), ALL_DERIVATIVES, SECOND_DERIVATIVES, sides=2)
@@ -220,12 +236,14 @@ class EnergyFactory:
         `intensity` is the moment per undeformed length, in E h R, at an amplitude of one. The turn
         of the edge is counted from a reference turn, which the term sets.
         """
+        # cosine and sine of the reference angle, zero at first
         reference_turn = self._constant(np.array([1.0, 0.0]))
         density = Density(edges.turning, (self._constant(intensity), reference_turn), facets=facets)
         length = fem.assemble_scalar(self.log.compile(f"{name} length", self.domain.length(facets)))
         total_length = self.domain.revolution_factor * self._over_ranks(length)
+        work_per_radian = intensity * total_length
         return self.domain.energy(
-            name, density, amplitude, reference_turn=(reference_turn, intensity * total_length)
+            name, density, amplitude, reference_turn=(reference_turn, work_per_radian)
         )
 
     def dead_energies(
@@ -250,7 +268,7 @@ class EnergyFactory:
         return energies + [self.user_energy(term, amplitude=name) for term in potentials(loads)]
 
     def antisymmetric_edges(self, facets: Facets, normal: Array) -> HessianTerm:
-        """Return the tangent's term of edges on a mirror plane, for antisymmetric displacements.
+        """Return the edges' term in the tangent that antisymmetric displacements of a half have.
 
         It is the Hessian in v, at v = 0, of the edges' energy with the displacement u + v. `normal`
         (3,) is the plane's unit normal.
@@ -261,16 +279,17 @@ class EnergyFactory:
         )
         v = fem.Function(self.u.function_space)
         jets = domain.j0, domain.jet(self.u), domain.jet(v)
-        arguments = *jets, domain.covector, domain.widths[1], *density.parameters
+        _, boundary_width = domain.widths  # of cells beside interior and boundary edges
+        arguments = *jets, domain.covector, boundary_width, *density.parameters
         energy = density.function(*arguments) * domain.ds(facets)
         return HessianTerm("antisymmetric edges", density, energy, v, self.log)
 
     def magnetic(self, field: Magnetisation) -> list[Energy]:
         """Return the energies of the shell's magnetisation in the applied field.
 
-        A remanence has the chosen energy, linear in the field, with the amplitude lambda_m. A soft
-        magnet has one energy, quadratic in the field. A field in space is known by its values at
-        the displaced places; it is added to `fields`.
+        A remanence has the energy chosen in `field.energy`, linear in the field, with the amplitude
+        lambda_m. A soft magnet has one energy, quadratic in the field. A field in space is known by
+        its values at the displaced places; it is added to `fields`.
         """
         applied = None
         if field.in_space:
@@ -280,6 +299,7 @@ class EnergyFactory:
             self.fields.append(applied)
         if field.soft is None:
             return self.remanent(field, applied)
+        # a soft magnet alone has no remanence
         energies = [] if field.soft.alone else self.remanent(field, applied)
         return [*energies, self.soft_magnetic(field, field.soft, applied)]
 
@@ -288,11 +308,13 @@ class EnergyFactory:
     ) -> Energy:
         """Return the energy of a soft-magnetic shell in the applied field.
 
-        It is quadratic in the amplitudes of the field, which are free parameters. `applied` is a
-        field known by its values, else None.
+        It is quadratic in the amplitudes of the field, or saturates. So no amplitude multiplies it
+        as a whole: they are free parameters within it. `applied` is a field known by its values,
+        else None.
         """
         sheet, scale = Sheet(field), self._constant(soft_magnet.scale)
         law, *parameters = self._of_sheet(sheet, soft_magnet, applied)
+        # only a field that varies in space depends on the place
         parts = FIRST_DERIVATIVES if field.uniform else VALUE_AND_FIRST
         density = Density(per_area(sheet.energy_per_area), (law, scale, *parameters), parts=parts)
         return self.domain.energy(
@@ -311,6 +333,7 @@ class EnergyFactory:
         """
         if field.soft is None:
             return {}
+        # `magnetic`, called before, added the field in space last
         sheet, applied = Sheet(field), self.fields[-1] if field.in_space else None
         law, *parameters = self._of_sheet(sheet, field.soft, applied)
         by_name = {"volume": Density(per_area(lambda r0, u, one: one), (self._constant(1.0),))}
@@ -324,16 +347,17 @@ class EnergyFactory:
     def _of_sheet(
         self, sheet: Sheet, soft_magnet: SoftMagnet, applied: AppliedField | None
     ) -> list[Parameter]:
-        """Return the parameters of a sheet's densities, in the order that `Sheet` takes them.
+        """Return the parameters of a soft-magnetic sheet's densities, in the order of `Sheet`.
 
         First the susceptibility, or the magnetisation state where the material saturates. Then the
         amplitudes, and last the vectors of the field or its polynomial in space.
         """
         chi = soft_magnet.susceptibility
-        if callable(chi):
-            law = pattern_field(
+        if callable(chi):  # a function of the place
+            susceptibility_field = pattern_field(
                 chi, self.domain.r0, name="susceptibility", key="magnetic.susceptibility", size=1
-            )[0]
+            )
+            law = susceptibility_field[0]  # its one component, as a number
         else:
             law = self._constant(chi)
         amplitudes = [
@@ -358,13 +382,17 @@ class EnergyFactory:
     ) -> PointField:
         """Return the magnetisation state of a saturating material at the quadrature points.
 
-        The state holds two polynomials of the energy, at u and at u = 0; see `saturation`.
+        The state holds two Taylor polynomials of the energy in the field, at u and at u = 0; see
+        `saturation`. It is computed again where `followed`, the placement or u, or the field has
+        changed.
         """
         domain, followed = self.domain, (self.domain.r0, self.u)
         saturation = PointField(domain.mesh, domain.rule, 2 * SIZE)
         jets_at_points = domain.tables(domain.r0.function_space, saturation.points)
 
         def places_and_normals() -> list[Array]:
+            """Return undeformed places, displacements, present and undeformed unit normals."""
+            # [:3]: value and both first derivatives
             r0, u = (jets_at_points(f.x.array)[:3] for f in followed)
             # normals of the deformed and of the undeformed surface
             area_vectors = [np.cross(r[1], r[2]) for r in (r0 + u, r0)]
@@ -380,7 +408,8 @@ class EnergyFactory:
         """Return the energies of a remanence, linear in the applied field, with amplitude lambda_m.
 
         A field known by its values (`applied`) has one energy. Otherwise each uniform direction of
-        the field has its own amplitude, and a field gradient one more energy.
+        the field has its own amplitude, and a field gradient one more energy. An approximate energy
+        (`field.energy`) is a sum of several energies, by name.
         """
         pattern, domain, thins = field.remanent, self.domain, self.material.law.thins_somewhere
         full = full_density(field.law, thins=thins)
@@ -390,6 +419,7 @@ class EnergyFactory:
                 field, densities.in_space(full), Br, applied.polynomial, parts=VALUE_AND_FIRST
             )
             return [domain.energy("magnetic", density, "lambda_m", column="magnetic")]
+        # amplitude, suffix of the energy's name, and vector of each uniform part of the field
         directions = [("lambda_m", "", field.applied)]
         for name, Ba in zip(TRANSVERSE_AMPLITUDES, field.across, strict=False):
             directions.append((name, name.replace("lambda_", " "), Ba))
@@ -424,7 +454,9 @@ class EnergyFactory:
     ) -> Density:
         """Return a density of the remanence, weighted with the thickness.
 
-        Where the thickness follows from the deformation, the density has the natural shape too.
+        `density_function` is per undeformed area and takes r0, u and `parameters`; `parts` are the
+        parts of u's jet that it depends on. Where the thickness follows from the deformation, the
+        density has the natural shape too.
         """
         density = Density(per_area(density_function), parameters, parts=parts)
         thins = self.material.law.thins_somewhere and field.law == "deformation"
@@ -433,9 +465,10 @@ class EnergyFactory:
     def pressure(self, *, potential: bool) -> Energy:
         """Return the energy of a live pressure with the amplitude p/p_c.
 
-        With `potential` it is p Delta V. Otherwise its virtual work, that of a follower load, takes
-        the place of the gradient.
+        With `potential` it is p Delta V. Otherwise the virtual work of a follower load takes the
+        place of the energy's gradient.
         """
+        # pressure at an amplitude of one: p_c over E h/R
         unit = self._constant(self.material.classical_pressure / self.material.h)
         swept, follower_work = (
             self._on_pressed(f) for f in (densities.swept_volume, densities.follower_pressure_work)
@@ -454,6 +487,7 @@ class EnergyFactory:
         """
         if self.pressed_sides is None:
             return density_function
+        # the last argument is the field of sides, with one component: 1, -1 or 0
         return lambda *given: given[-1][0] * density_function(*given[:-1])
 
     def swept_volume(self) -> ufl.Form:
@@ -478,7 +512,10 @@ class EnergyFactory:
     def _volume_integral(
         self, density_function: Callable[..., Expr], *parameters: Expr
     ) -> ufl.Form:
-        """Return the integral over the cells of a volume's density, from the initial placement."""
+        """Return the integral over the cells of a volume's density, from the initial placement.
+
+        The initial placement has no imperfection that grows; `parameters` follow the jets.
+        """
         jets = self.domain.jets_from_initial(self.domain.jet(self.u))
         return (
             self.domain.revolution_factor * density_function(*jets, *parameters) * self.domain.dx()
@@ -487,7 +524,7 @@ class EnergyFactory:
     def user_energy(
         self, term: OwnTerm, facets: Facets | None = None, amplitude: str | None = None
     ) -> Energy:
-        """Return the energy of a user's term, or of a part's.
+        """Return the energy of a user's term, or of a term that a part of the package adds.
 
         Parameters
         ----------
@@ -496,7 +533,7 @@ class EnergyFactory:
         amplitude
             Amplitude in place of the term's name.
         """
-        assert term.density
+        assert term.density  # a term without a density only observes
         # parts of the jet that only the placement needs
         reference_parts = tuple(part for part in term.placement_parts if part not in term.parts)
         density_function = _per_coordinates(term, term.at_point(term.density))
@@ -543,6 +580,7 @@ class EnergyFactory:
             distance from the body's axis.
         """
         domain = self.domain
+        # the body's displacement towards the shell over h, an amplitude
         approach = self.free_constants.setdefault(contact.amplitude, self._constant(0.0))
         rule, thins = domain.contact_rule, self.material.law.thins_somewhere
         thins_at = None
@@ -554,6 +592,7 @@ class EnergyFactory:
             contact, self.material.h, domain.r0, self.u, approach, rule, self.thickness, thins_at
         )
         parameters = body_contact.parameters
+        # the gap depends on the place; where the shell thins, on its stretch too
         if thins:
             density = self._thinning(
                 Density(per_area(thinned_energy), parameters, VALUE_AND_FIRST, quadrature=rule)
@@ -590,13 +629,14 @@ class EnergyFactory:
         return float(self.domain.mesh.comm.allreduce(value))
 
     def _with_thickness(self, density: Density) -> Density:
-        """Return a density over E h weighted with the thickness, where that varies."""
+        """Return a density over E h weighted with h(x)/h, where that is not 1."""
         return density if self.thickness is None else thickness_weighted(density, self.thickness)
 
     def _thinning(self, density: Density) -> Density:
         """Return a density of a shell that thins, on the natural shape and by the law of each cell.
 
-        The density's function takes a keyword `thins`, the law's thickness ratio.
+        The density's function takes a keyword `thins`: 1 where the thickness follows from the area,
+        else 0. With laws that differ by shell it is each cell's own.
         """
         law, cell_materials = self.material.law, self.cell_materials
         density = grown(density, self.natural) if self.natural else density
@@ -604,7 +644,8 @@ class EnergyFactory:
             return density
 
         def thinned(*arguments: Expr, **keywords: Any) -> Expr:
-            # the last parameter holds the material's numbers of the cell
+            """Return the density with the keyword `thins` of the cell's own law."""
+            # the last parameter holds the cell's modulus, Poisson's ratio, mass density and law
             *arguments_left, material_numbers = arguments
             return density.function(
                 *arguments_left,
@@ -630,11 +671,13 @@ class EnergyFactory:
         density = self._with_thickness(density)
         if self.cell_materials is None:
             return density
+        # component 2 of the material numbers is the mass density
         return thickness_weighted(density, self.cell_materials, 2)
 
     def _elastic_density(self, density: Density) -> Density:
         """Return an elastic density with the law, the thickness and the natural shape."""
         law = self.material.law
+        # as constants, so that other numbers of the law need no new kernel
         law_constants = (self._constant(number) for number in law.numbers)
         density = elastic_density(
             density, law.with_numbers(*law_constants), self.thickness, self.cell_materials
@@ -656,6 +699,7 @@ def _per_coordinates(term: OwnTerm, density_function: Callable[..., Expr]) -> Ca
         return per_area(density_function)
 
     def on_edge(r0: Jet, u: Jet, m: Expr, width: Expr, *parameters: Expr) -> Expr:
+        # m: the edge's covector; the cell's width is for penalties, of which a term has none
         edge = Edge.of(r0, m)
         return density_function(r0, u, edge, *parameters) * edge.stretch
 

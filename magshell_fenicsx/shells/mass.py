@@ -3,6 +3,11 @@
 Masses are over rho h R^4 with times over R sqrt(rho/E), so that energies are over E h R^2 as all
 others. The displacement is u + E(mu(t)), with E at nodes that move with supports. So the mass is
 that of all nodes: M (u'' + E'') and M (u' + E').
+
+mu are the amplitudes of motions, by name: functions of time. At a kink their first derivative
+jumps, so that a time has a limit from before and one from after. A wave m around an axisymmetric
+shell is U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z, known by coefficients
+(U + V, V, W) at the meridian's nodes. rho is the mass density.
 """
 
 from collections.abc import Callable, Iterable, Mapping
@@ -75,7 +80,8 @@ def displacement_product(model: Model, factor: Expr | float) -> ufl.Form:
 def wave_product(model: "MeridianModel", factor: Expr | float) -> ufl.Form:
     """Return the form of the weighted product of two waves with coefficients (U + V, V, W).
 
-    It does not depend on the wave number m.
+    It does not depend on the wave number m >= 1: the mean of cos² and of sin² around e3 is 1/2,
+    their integral pi. The jets' value has no m, so that m = 1 stands for all.
     """
     V = model.waves.V
     cosine, sine = zip(
@@ -87,8 +93,9 @@ def wave_product(model: "MeridianModel", factor: Expr | float) -> ufl.Form:
 def mass_along(model: Model, phi: Vector, wave: int | None = None) -> FormTerm:
     """Return phi . M phi as a term that depends on the placement.
 
-    `phi` holds this rank's values of a displacement. With a `wave` number they are the coefficients
-    (U + V, V, W) of that wave.
+    Its derivative by the placement tells how a mode's frequency changes with the shape. `phi` holds
+    this rank's values of a displacement. With a `wave` number they are the coefficients (U + V, V,
+    W) of that wave.
     """
     factor = mass_factor(model)
     if wave is None:
@@ -107,9 +114,10 @@ def mass_along(model: Model, phi: Vector, wave: int | None = None) -> FormTerm:
 def _integral(model: Model, f: Expr) -> ufl.Form:
     """Return the integral of f over the undeformed area, on a meridian per radian.
 
-    Of a solid it is the average over the thickness.
+    Of a solid it is the integral over the volume, divided by the thickness.
     """
     domain, degree = model.V.mesh, model.degree
+    # the product has twice the degree, the area ratio some more
     dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree + 2})
     if not model.thin:
         return f / model.material.h * dx
@@ -123,7 +131,7 @@ def mass_matrix(product: fem.Form, constraints: list[fem.DirichletBC]) -> PETSc.
     there. Collective.
     """
     M = fem_petsc.create_matrix(product)
-    # the tangent has no entries in constrained rows
+    # zeros are no entries: the tangent has none in constrained rows either
     M.setOption(PETSc.Mat.Option.IGNORE_ZERO_ENTRIES, True)
     compat.add_matrix(M, product, constraints)
     M.assemble()
@@ -176,7 +184,7 @@ class SupportInertia:
 
         `is_before` takes the limit from before a kink.
         """
-        if t <= 0 and is_before:
+        if t <= 0 and is_before:  # before the begin there are no amplitudes
             return np.zeros(self._system.size) if self._carried is None else self._carried
         mu, rates = self._at(t, is_before)
         return self._sum(rate * self._moving.rate(mu, name) for name, (rate, _) in rates.items())
@@ -187,7 +195,7 @@ class SupportInertia:
         `is_before` takes the limit from before a kink.
         """
         mu, rates = self._at(t, is_before)
-        # E'' = dE/dmu mu'' + d2E/dmu_a dmu_b mu_a' mu_b'
+        # E'' = dE/dmu mu'' + d2E/dmu_a dmu_b mu_a' mu_b', with rates (mu', mu'') of each motion
         from_second_rates = self._sum(
             second_rate * self._moving.rate(mu, name) for name, (_, second_rate) in rates.items()
         )

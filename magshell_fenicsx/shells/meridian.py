@@ -1,7 +1,15 @@
 """The axisymmetric shell as a system of terms on its meridian, and its displacement at one place.
 
-Lengths in R, energies in E h R^2, of the whole shell. Amplitudes as in `ShellModel`:
-"pressure" is p/p_c, "force" is F R/(2 pi D), "lambda_m" is lambda_m.
+Lengths in R, energies in E h R^2, of the whole shell. Amplitudes (load parameters, by name) as in
+`ShellModel`: "pressure" is p/p_c, "force" is F R/(2 pi D), "lambda_m" is lambda_m.
+
+The meridian is the profile curve, with the parameter s; several shells with one axis e3 share one
+parameter. The displacement is u = (U, W) along e_rho and e_z. Ends are the boundary points of the
+meridian off the axis; a condition is an end's support. A body is a shell, or several joined ones.
+Waves are displacements that vary as cos(m theta) around the axis; the model itself has none. A
+growing imperfection is a deviation that an amplitude scales. A lid is the surface that closes a
+moving end under a live pressure. "Numbers" are the values in the forms that one problem has and
+another does not; with those of another problem, the same forms serve it.
 """
 
 from collections.abc import Mapping, Sequence
@@ -89,7 +97,7 @@ class Probe:
         """
         V = r0.function_space
         ends = V.mesh.geometry.x[compat.geometry_dofs(V.mesh), 0]
-        # the cell that s is in, or least far out of
+        # the cell that s is in, or least far out of: rounding may put s beside all cells
         cell = int(np.argmin(np.maximum(ends.min(axis=1) - s, s - ends.max(axis=1))))
         reference_place = np.array([[(s - ends[cell, 0]) / (ends[cell, 1] - ends[cell, 0])]])
         shape_values, shape_slopes = V.element.basix_element.tabulate(1, reference_place)[
@@ -97,6 +105,7 @@ class Probe:
         ]
         nodes = V.dofmap.list[cell]
         turn = np.array([[np.cos(azimuth), np.sin(azimuth), 0.0], [0.0, 0.0, 1.0]])
+        # derivatives of the placement; the normal is the tangent turned by 90 degrees
         rho_s, z_s = shape_slopes @ r0.x.array.reshape(-1, 2)[nodes]
         normal = np.array([-z_s, rho_s]) / np.hypot(rho_s, z_s)
         return Probe(nodes, shape_values, turn, normal @ turn)
@@ -106,7 +115,7 @@ class Probe:
         return np.asarray(self.weights @ u.reshape(-1, 2)[self.nodes] @ self.turn)
 
     def rows(self, size: int) -> Array:
-        """Return the matrix (3, size) that gives u/R at the place from the vector u."""
+        """Return the matrix (3, size) that gives u/R at the place from a vector u of that size."""
         matrix = np.zeros((3, size // 2, 2))
         matrix[:, self.nodes] = np.einsum("n,ki->ink", self.weights, self.turn)
         return matrix.reshape(3, size)
@@ -157,7 +166,7 @@ class MeridianModel(ThinModel):
     thin: Literal[True] = True
     axisymmetric: Literal[True] = True
     multiplicity = 1
-    axes: ClassVar[list[int]] = [0, 2]
+    axes: ClassVar[list[int]] = [0, 2]  # U and W are along e1 and e3, at the azimuth zero
 
     def __init__(
         self,
@@ -219,7 +228,10 @@ class MeridianModel(ThinModel):
         return PlacementAmplitudes(self.r0, shapes, self.material.h) if shapes else None
 
     def _make_factory(self) -> EnergyFactory:
-        """Return the factory that makes the energies of this shell."""
+        """Return the factory that makes the energies of this shell.
+
+        `loads` gets the natural shape cell by cell.
+        """
         meridian, loads = self.meridian, self.loads
         pressed_cells = side_field(loads.pressed_sides, meridian) if loads.pressed_sides else None
         free_constants: dict[str, fem.Constant] = {}
@@ -234,7 +246,8 @@ class MeridianModel(ThinModel):
             self.thickness,
             natural_shape,
             free_constants,
-            meridian.largest_fold(self.r0) > FOLD_ANGLE,
+            # small angles between cells need only jumps of rotations
+            has_folds=meridian.largest_fold(self.r0) > FOLD_ANGLE,
             pressed_sides=pressed_cells,
             creases=Creases.of_joints(loads.joints, meridian) if loads.joints else None,
             cell_materials=self.cell_materials,
@@ -243,7 +256,8 @@ class MeridianModel(ThinModel):
     def _natural_shape(self, free_constants: dict[str, fem.Constant]) -> Shape | None:
         """Return the natural shape, the one without stress; None if it is the undeformed one.
 
-        Its amplitudes are added to `free_constants`, name -> constant, and `loads` is updated.
+        Its amplitudes are added to `free_constants`, name -> constant. `self.loads` gets the shape
+        cell by cell in place of patch by patch.
         """
         if not self.loads.natural:
             return None
@@ -257,8 +271,10 @@ class MeridianModel(ThinModel):
 
         Returns the supports by the name of their end.
         """
+        # energies of several clamped ends need a name each
         clamped_count = list(self.conditions.values()).count("clamped")
         supports_by_end = {}
+        # facets of each end, and the components of (U, W) that are zero there
         for name, (facets, components) in self.held.by_name.items():
             edge, turn = "", None
             if self.conditions[name] == "clamped":
@@ -275,7 +291,8 @@ class MeridianModel(ThinModel):
     def _add_field_and_pressure(self) -> bool:
         """Add the energies of magnetisation and of a live pressure to `energies`.
 
-        Sets `without_potential`; returns whether moving supports close all openings with lids.
+        Sets `without_potential`, the ends at which a live pressure has no potential. Returns
+        whether moving supports close all openings with lids.
         """
         factory, meridian, loads = self.factory, self.meridian, self.loads
         if loads.magnetic:
@@ -290,7 +307,8 @@ class MeridianModel(ThinModel):
     def _add_forces(self) -> None:
         """Add the energies of forces at the pole and of dead loads to `energies`.
 
-        Sets `load_size` and `load_sizes`.
+        Sets `load_size` and `load_sizes`: by amplitude, the sum of the sizes of its dead loads as a
+        number, and as forms that depend on the placement.
         """
         measures = RevolutionIntegrals(self.meridian, self.domain)
         for name, force in self.loads.forces.items():
@@ -309,6 +327,7 @@ class MeridianModel(ThinModel):
         `is_enclosed` tells whether moving supports close all openings.
         """
         factory, loads = self.factory, self.loads
+        # a pressure does work on the volume that the surface sweeps
         has_swept_volume = loads.pressure or is_enclosed
         volume = factory.swept_volume() if has_swept_volume else factory.volume_change(np.zeros(3))
         terms = [factory.term(energy) for energy in self.energies]
@@ -322,12 +341,15 @@ class MeridianModel(ThinModel):
             parameters |= self.growing.parameters(terms, parameters)
         edge_pressure = self._edge_pressure() if is_enclosed else None
         motion = moving(self.r0, self.supports, loads, edge_pressure)
+        # numbers that a state keeps, such as penalty stiffnesses: name -> constant and default
         histories = dict(body_contact.history for body_contact, _ in self.contacts.values())
         self.shell_contacts = self._make_shell_contacts()
         for contact in self.shell_contacts:
             histories |= contact.history
+            # parameters that change a contact too, such as the thickness of a natural shape
             parameters |= contact.entered(parameters)
         self.t_junction_terms = self._make_t_junctions()
+        # requested now, taken below: the system's forms compile meanwhile
         volume_request = self.kernels.request_form("volume energy", underived(volume))
         self.system = FiniteElementSystem(
             self.u,
@@ -348,6 +370,7 @@ class MeridianModel(ThinModel):
         """Return the contacts between parts of the shell; empty without contact pairs."""
         if not self.loads.pairs:
             return []
+        # imported late: few shells have a contact
         from magshell_fenicsx.parts.contact.meridian_contact import (
             ModelMeridian,
             meridian_contacts,
@@ -367,6 +390,7 @@ class MeridianModel(ThinModel):
 
     def _make_t_junctions(self) -> "list[MeridianTJunction]":
         """Return the terms that tie ends to other shells on which they stand."""
+        # a joint without cells of its own is a T-junction
         if all(joint_cells is not None for joint_cells in self.meridian.joints):
             return []
         from magshell_fenicsx.shells.t_junctions import meridian_t_junction_terms
@@ -376,10 +400,11 @@ class MeridianModel(ThinModel):
     def numbers(self) -> dict[str, list[Array]] | None:
         """Return all values that the terms take from the problem: term name -> arrays, as views.
 
-        None if the terms depend on more than such values, as with contact or moving supports. Then
-        the forms cannot serve another problem.
+        "placement" has the nodal values of r0. None if the terms depend on more than such values,
+        as with contact or moving supports. Then the forms cannot serve another problem.
         """
         has_contacts = self.contacts or self.loads.pairs
+        # terms with data that follow the state, or that the forms do not hold
         follows = (
             self.growing
             or has_contacts
@@ -403,7 +428,7 @@ class MeridianModel(ThinModel):
     def with_numbers(
         self, model: "MeridianModel", numbers: SettableNumber, value: float
     ) -> "MeridianModel":
-        """Return a copy of this model that has the numbers of another one.
+        """Return a copy of this model that has the numbers of another one, but its own forms.
 
         Parameters
         ----------
@@ -442,7 +467,10 @@ class MeridianModel(ThinModel):
         return self.meridian.growth(self.V, deviations)
 
     def at_nodes(self, function: Embedding) -> Array:
-        """Return the values (cells, nodes, ...) of a function of the chart at cells' nodes."""
+        """Return the values (cells, nodes, ...) of a function of the chart at cells' nodes.
+
+        The function takes (s, azimuth); the azimuth is zero.
+        """
         s = self.V.tabulate_dof_coordinates()[:, 0]
         return np.asarray(function(np.column_stack([s, 0 * s]))[self.V.dofmap.list])
 
@@ -453,12 +481,14 @@ class MeridianModel(ThinModel):
     def rigid_motions(self, amplitudes: Amplitudes) -> RigidMotions:
         """Return the rigid motions of the undeformed shell that no support or spring resists.
 
-        Where supports leave waves free, it compiles their kernels.
+        Where supports leave waves free, it compiles their kernels. Motions along e3 are
+        axisymmetric; turns about e3 are waves m = 0, motions across e3 waves m = 1.
         """
         state, comm = State(self.zero(), dict(amplitudes)), self.V.mesh.comm
         motions = self.held.rigid_motions(self.r0)
 
         def unresisted_waves(waves: Array, m: int) -> Array:
+            """Return the waves m (n, unknowns) that neither supports nor energy resist."""
             with_zeros = partial(_with_zeros, self.held.unknowns_of_waves(self.r0, m))
             return unresisted(waves, with_zeros, lambda: self.waves.tangent(state, m), comm)
 
@@ -474,6 +504,7 @@ class MeridianModel(ThinModel):
         if len(motions.axial):
             return NOT_HELD + "move along (0, 0, 1)"
         if len(motions.transverse):
+            # [2::3]: coefficients W; a translation across the axis has none
             turns_alone = (
                 len(motions.transverse) == 1
                 and np.abs(motions.transverse[0][2::3]).max() > AXIAL_TOLERANCE
@@ -490,11 +521,15 @@ class MeridianModel(ThinModel):
         return self._probe_by_point[point].rows(self.system.size)
 
     def _edge_pressure(self) -> EdgePressure:
-        """Return the work along e3 of a live pressure on lids, one at each moving end."""
+        """Return the work along e3 of a live pressure on lids, one at each moving end.
+
+        Ends of shells without pressure have none. A lid is a disc of the end's radius, whose normal
+        continues the pressed side.
+        """
         ends = {name: self.meridian.parameter(name) for name in self.meridian.ends}
         lids = [
             Lid.disc(
-                self.meridian.section(np.array([s]))[0, 0],
+                self.meridian.section(np.array([s]))[0, 0],  # radius of the end
                 motions,
                 last=(side > 0) != self.meridian.begins(name),
             )

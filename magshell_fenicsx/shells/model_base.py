@@ -2,6 +2,12 @@
 
 A model joins a displacement, the system of its terms, and what is observed of a state: volume
 change, displacement of named points, contact pressures.
+
+Lengths are over R, energies over E h R², forces over E h R. A state is a displacement u (this
+rank's unknowns) with amplitudes mu, the load parameters by name. An evaluation is the system at one
+state; `evaluate(f)` calls f there, and `integral(form)` sums a form over all ranks. A dead load
+keeps its direction; its size is the sum of its forces' magnitudes, by which the work is divided to
+give the displacement along it. w = -u . n0 is the deflection.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -62,8 +68,8 @@ class ModelBase:
     loads
         All that loads the model.
     load_size, load_sizes
-        By amplitude, the sum of the sizes of its dead loads over E h R, and that sum as forms; see
-        `DeadLoads`.
+        By amplitude, the sum of the sizes of its dead loads over E h R, and that sum as forms,
+        which depend on the placement; see `DeadLoads`.
     kernels
         Log that compiles forms.
     supports
@@ -151,6 +157,7 @@ class ModelBase:
         # dofs of a vertex on the rank that owns it
         V = self.system.u.function_space
         self._probes = {
+            # only the degrees of freedom count; any direction without zeros gives all three
             name: point_entries(V, x, np.ones(3), cells_at_point and cells_at_point(name))[0]
             for name, x in points.items()
         }
@@ -158,7 +165,8 @@ class ModelBase:
     def dead_load_term(self, name: str, dead: DeadLoads) -> LinearTerm:
         """Return the term of an amplitude's dead loads, without its moments.
 
-        Also sets `load_size` and `load_sizes` of the amplitude.
+        `dead` are the assembled loads. Those spread over surfaces and edges also give forms, for
+        derivatives by the placement. Also sets `load_size` and `load_sizes` of the amplitude.
         """
         self.load_size[name], self.load_sizes[name] = dead.size, dead.sizes
         unity, u = fem.Constant(self.V.mesh, 1.0), self.u
@@ -228,7 +236,8 @@ class ModelBase:
     def region(self, state: State, approach: str) -> Region:
         """Return the region where a body touches the shell; collective.
 
-        `approach` is the amplitude of the body's approach, the key of `contacts`.
+        `approach` is the amplitude of the body's approach, the key of `contacts`. The mean radius
+        of the contact is the mean distance from the body's axis, weighted with the pressure.
         """
         body_contact, forms = self.contacts[approach]
         evaluation = self.system.at_state(state)
@@ -237,9 +246,10 @@ class ModelBase:
         return evaluation.evaluate(lambda: body_contact.region(self.system.comm, mean_radius))
 
     def cell_pressures(self, state: State) -> Array | None:
-        """Return the sum of all contact pressures in each local cell, (cells,); see `BodyContact`.
+        """Return the sum of all contact pressures in each local cell, (cells,), over E h/R.
 
-        None without contacts.
+        A cell has the mean pressure of each contact with a body, or of parts of the shell. None
+        without contacts.
         """
         if not (self.contacts or self.shell_contacts):
             return None
@@ -248,20 +258,23 @@ class ModelBase:
         def pressure_of_cells() -> Array:
             pressures = [body_contact.cell_pressures() for body_contact in body_contacts]
             for contact in self.shell_contacts:
-                pressures.append(contact.cell_pressures_and_gaps()[0])
+                cell_pressures, _, _ = contact.cell_pressures_and_gaps()
+                pressures.append(cell_pressures)
             return np.asarray(sum(pressures))
 
         return self.system.at_state(state).evaluate(pressure_of_cells)
 
     def cells_evenly_pressed(self, state: State) -> NDArray[np.bool_]:
-        """Return in which local cells the mean of `cell_pressures` stands for a contact's pressure.
+        """Return a mask (cells,) of the local cells that a contact presses evenly.
 
-        A mask (cells,); see `BodyContact.evenly_pressed`.
+        There the cell's mean, `cell_pressures`, stands for the pressure; see
+        `BodyContact.evenly_pressed`.
         """
         body_contacts = [body_contact for body_contact, _ in self.contacts.values()]
 
         def flags_of_cells() -> NDArray[np.bool_]:
             body_flags = [body_contact.evenly_pressed() for body_contact in body_contacts]
+            # of each contact: pressures, gaps, and whether cells are evenly pressed
             shell_flags = [contact.cell_pressures_and_gaps()[2] for contact in self.shell_contacts]
             return np.asarray(np.any([*body_flags, *shell_flags], axis=0))
 
@@ -270,7 +283,8 @@ class ModelBase:
     def cell_gaps(self, state: State) -> Array | None:
         """Return the least gap over R between parts of the shell in each local cell, (cells,).
 
-        See `SurfaceContact`; None without contact pairs.
+        Where nothing is near it is the contact's reach less the thickness. None without contact
+        pairs.
         """
         if not self.shell_contacts:
             return None
@@ -286,8 +300,9 @@ class ModelBase:
         the displacement along them. Moments alone have none: then it is the deflection of the pole.
         """
         load_unit = self.load_size.get(name, 0.0) if name in self.loads.dead else self.force_unit
-        if not load_unit:
+        if not load_unit:  # moments alone
             return self.deflection(u, "pole")
+        # Pi = -load times displacement, at an amplitude of one
         load = next(term for term in self.system.terms if term.name == name)
         energy = self.system.at_state(State(u, {})).evaluate(load.energy)
         return -float(self.system.comm.allreduce(energy)) / load_unit

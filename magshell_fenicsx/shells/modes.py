@@ -6,6 +6,13 @@ energies in E h R^2 make its unit E h/R^2. A shallow wave of the best length on 
 pressure has lambda = 1 - (p/p_c)^2 in this unit, but for its tangential part.
 
 With the mass of the shell as M, lambda is omega^2 rho R^2/E of small vibrations.
+
+A reduced model (meridian, half or sector) has only some modes of the shell: those with its own
+symmetry. The others come from further tangents: antisymmetric displacements of a half, or waves
+cos(m theta) of a meridian, with coefficients (U + V, V, W) at nodes. A family is all modes that
+share a tangent, constraints and an inner product. A state is a displacement u with amplitudes mu,
+the load parameters. Rigid motions that nothing holds are the tangent's kernel at the undeformed
+state; there they are modes with eigenvalue zero.
 """
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -121,12 +128,8 @@ class _Family:
     product: tuple[str, ufl.Form]
     projection: Projection | None = None
     contains: Callable[[Vector], bool] = lambda vector: True
-    rigid: int = (
-        0  # dimension of the kernel: rigid motions of the undeformed shell that nothing holds
-    )
-    motions: Sequence[
-        Vector
-    ] = ()  # rigid motions in the family, where these are not all of the kernel
+    rigid: int = 0
+    motions: Sequence[Vector] = ()
 
 
 @dataclass
@@ -203,7 +206,9 @@ class ShellModes:
             M = mass_matrix(self._product(family), family.constraints)
             M = family.projection.mass(M) if family.projection else M
             modes = lowest_modes(symmetric_part(family.tangent(state)), M, count, family.rigid)
-            if family.contains is _turns:  # its kernel also has the motion along the axis
+            # modes begin with the kernel; that of torsion also has the motion along the axis, so
+            # `motions` take its place
+            if family.contains is _turns:
                 modes = modes[family.rigid :]
             shell_modes += [
                 ShellMode(family.label, 0.0, _normalised(motion, M)) for motion in family.motions
@@ -231,6 +236,7 @@ class ShellModes:
         ModesNotFound
             See `continuation.modes.null_vector`.
         """
+        # "" is the label of the model's own family
         label = label if label.startswith(SYMMETRY_BREAKING_LABELS) else ""
         family = next(family for family in _families(self.model) if family.label == label)
         return null_vector(family.tangent(state))
@@ -289,11 +295,12 @@ def _families(
                 waves.constraints(0),
                 wave_mass,
                 contains=_turns,
-                rigid=len(torsions)
-                + axial_count,  # the space of torsion has the motion along e3, too
+                # waves m = 0 also have the meridian's own motion along e3
+                rigid=len(torsions) + axial_count,
                 motions=torsions,
             )
         for m in range(1, waves.largest + 1):
+            # motions across the axis are waves m = 1
             rigid = transverse_count if m == 1 else 0
             yield _Family(
                 f"m = {m}",
@@ -305,6 +312,7 @@ def _families(
         return
 
     def free_motion_count(system: FiniteElementSystem) -> int:
+        """Return the number of rigid motions that nothing in a system holds, at rest."""
         return rigid_motions(system, model.r0, rest.mu) if rest else 0
 
     yield family_of_system("", model.system, free_motion_count(model.system))

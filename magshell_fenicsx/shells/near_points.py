@@ -6,6 +6,9 @@ order of h^2 K^2 of the membrane's stiffness, and negative, so that where K exce
 around the point become unstable, at loads that fall with the size of elements there. They are
 known by where they are: the gradient of a mode of the shell extends over sqrt(R h) and more, theirs
 over a part of h.
+
+A mode is a displacement, or a wave m around an axisymmetric shell: U cos(m theta) e_rho + V sin(m
+theta) e_theta + W cos(m theta) e_z, with coefficients (U + V, V, W) at nodes. Lengths are over R.
 """
 
 from collections.abc import Mapping
@@ -28,13 +31,14 @@ MIN_SHARE_AT_POINT = (
 def places_of_point_forces(model: Model, loads: Loads) -> Mapping[str, Array]:
     """Return the undeformed places of all point forces of a shell, by the names of points.
 
-    A place is (3,) over R, on a meridian (2,). A solid has none: there a force is spread over a
-    patch.
+    A place is (3,) over R, on a meridian (rho, z). A solid has none: there a force is spread over a
+    patch. Dead loads (`all_dead`) keep their direction; some are forces at points.
     """
     names = {force.point for force in loads.forces.values() if not force.patch}
     names |= {load.point for load in loads.all_dead if isinstance(load, PointForce)}
     ordered = sorted(names)  # the same order on all ranks
     if model.axisymmetric:
+        # the parameter alone, without the azimuth
         at = {name: model.meridian.points[name][:1] for name in ordered}
         return {name: model.meridian.section(np.array(s))[0] for name, s in at.items()}
     surface = model.midsurface if model.thin else None
@@ -58,9 +62,11 @@ def point_of_mode(
         that number of waves around the axis.
     """
     x, squares = squared_gradient(model, mode, waves)
+    # every rank holds all of a meridian
     comm = model.system.comm if not model.axisymmetric else None
 
     def total(values: Array) -> float:
+        """Return the sum over all ranks."""
         mine = float(values.sum())
         return float(comm.allreduce(mine)) if comm else mine
 
@@ -98,8 +104,10 @@ def squared_gradient(model: Model, mode: Vector, waves: int | None) -> tuple[Arr
         """(1 + dim, cells, points, components) of values at nodes."""
         return np.asarray(np.einsum("dqn,cni->dcqi", shapes, values[nodes]))
 
+    # value and derivatives by reference coordinates of the undeformed places
     r = jets(model.r0.x.array.reshape(-1, V.dofmap.bs))
     if not model.axisymmetric:
+        # |grad v|² = g^ab v,_a . v,_b
         v = jets(model.system.with_ghosts(mode[: model.system.size]).reshape(-1, 3))
         metric = np.einsum("acqi,bcqi->cqab", r[1:], r[1:])
         inverse = np.linalg.inv(metric)
@@ -109,11 +117,13 @@ def squared_gradient(model: Model, mode: Vector, waves: int | None) -> tuple[Arr
         U, W = np.moveaxis(mode[: model.system.size].reshape(-1, 2), 1, 0)
         v = jets(np.column_stack([U, 0 * U, W]))
     else:
-        P, Q, W = np.moveaxis(mode.reshape(-1, 3), 1, 0)
-        v = jets(np.column_stack([P - Q, Q, W]))
+        P, circumferential, W = np.moveaxis(mode.reshape(-1, 3), 1, 0)
+        v = jets(np.column_stack([P - circumferential, circumferential, W]))
+    # speed: length of the meridian per reference coordinate
     m, rho, speed = waves or 0, r[0, ..., 0], np.linalg.norm(r[1], axis=-1)
-    U, Q, W = np.moveaxis(v[0], -1, 0)
-    # derivatives by theta of a wave, by cos and sin
-    around = (U + m * Q) ** 2 + (m * U + Q) ** 2 + (m * W) ** 2
+    U, circumferential, W = np.moveaxis(v[0], -1, 0)
+    # squares of the derivatives by theta: coefficient of cos along e_theta, of sin along e_rho, e_z
+    around = (U + m * circumferential) ** 2 + (m * U + circumferential) ** 2 + (m * W) ** 2
     along = np.sum(v[1] ** 2, axis=-1)
+    # area per radian; the factor of the turn is the same everywhere
     return r[0], (along / speed**2 + around / rho**2) * rho * speed * weights

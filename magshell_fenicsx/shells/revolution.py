@@ -1,4 +1,11 @@
-"""The surface that a meridian sweeps, as flat triangles for pictures and for ParaView."""
+"""The surface that a meridian sweeps, as flat triangles for pictures and for ParaView.
+
+In go a model on a meridian and fields on it, with components (U, W) along e_rho and e_z; out come
+values at the nodes of the triangles. A circle is what one vertex of the meridian sweeps; a band
+lies between the two circles of a cell. At a kink two circles are at one place, so that fields may
+jump. Cells are counted along the meridian (`order`); a cell has two ends. A jet is a field's value
+with its first and second derivatives. Lengths are over R.
+"""
 
 from collections.abc import Sequence
 
@@ -47,13 +54,14 @@ class Revolution:
         # a new circle begins where cells share no vertex, and at kinks
         is_apart = vertices[1:, 0] != vertices[:-1, 1]
         is_apart[np.asarray(kinks, dtype=np.int64) - 1] = True
+        # circle at the begin of each cell: one further for each cell, two where cells are apart
         begin = np.arange(len(vertices)) + np.cumsum([0, *is_apart])
         self.ends = np.column_stack([begin, begin + 1])
         self._at_ends = np.empty((2, self.ends.max() + 1), dtype=np.int64)
-        # a cell that has each circle, and at which of its ends
+        # row 0: a cell that has each circle; row 1: at which of its ends, 0 or 1
         self._at_ends[0, self.ends] = np.arange(len(vertices))[:, None]
         self._at_ends[1, self.ends] = np.arange(2)
-        poles = model.meridian.poles
+        poles = model.meridian.poles  # parameters of the places on the axis
         s = model.meridian.cells[tuple(self._at_ends)]
         self._poles = np.asarray(np.isclose(s[:, None], poles).any(axis=1))
         theta = np.arange(sectors) * 2 * np.pi / sectors
@@ -73,9 +81,11 @@ class Revolution:
     def jets(self, f: fem.Function) -> Array:
         """Return the jets (6, cells, 2, 3) of a field at both ends of all cells.
 
-        Jets are the value and the first and second derivatives, along (e_rho, e_theta, e_z). At a
-        pole the surface has no second direction, so the jet there is taken a little off it.
+        `f` has components (U, W). Jets are the value and the first and second derivatives, along
+        (e_rho, e_theta, e_z). At a pole the surface has no second direction, so the jet there is
+        taken a little off it.
         """
+        # at both ends, then a little within
         values = self._derivatives(f, np.array([[0.0], [1.0], [OFF_POLE], [1 - OFF_POLE]]))
         at_pole = self._poles[self.ends][..., None]
         return _revolved(np.where(at_pole, values[:, :, 2:], values[:, :, :2]))
@@ -98,6 +108,7 @@ class Revolution:
 
         A pole takes the value of its first sector.
         """
+        # a pole is one node
         is_node = np.ones(circles.shape[:2], dtype=bool)
         is_node[self._poles, 1:] = False
         return np.asarray(circles[is_node])
@@ -127,6 +138,8 @@ class Revolution:
         """
         means = self._means(ends, weight)
         circles = np.repeat(means[:, None], len(self._basis), axis=1)
+        # from components along (e_rho, e_theta, e_z) to those in space, at each sector; a vector at
+        # a pole has no direction but e_z
         if means.ndim == 2:
             circles = (circles[:, :, None] @ self._basis)[:, :, 0]
             circles[self._poles] *= [0.0, 0.0, 1.0]
@@ -151,6 +164,7 @@ class Revolution:
     def _swept(self, nodal: Array) -> Array:
         """Return vectors (n, 3) at the nodes from (rho, z) components at the meridian's nodes."""
         components = nodal[self.vertices(self._model.V)]
+        # on the axis there is no component along e_rho
         components = np.where(self._poles[:, None], components * [0.0, 1.0], components)[:, None]
         return self.at_nodes(
             components[:, :, :1] * self._basis[:, 0] + components[:, :, 1:] * self._basis[:, 2]
@@ -165,10 +179,13 @@ class Revolution:
         first = np.cumsum([0, *np.where(self._poles, 1, sectors)])
         sector = np.arange(sectors)
         ring = np.where(self._poles[:, None], 0, sector) + first[:-1, None]
+        # corners of each quadrilateral: a, b at a cell's first end, c, d at its last; b and d are
+        # in the next sector
         (a, c), (b, d) = (
             np.moveaxis(nodes_of_circles[self.ends], 1, 0)
             for nodes_of_circles in (ring, np.roll(ring, -1, axis=1))
         )
+        # a triangle with two corners at a pole is left out
         begins, ends = (~self._poles[nodes_of_circles] for nodes_of_circles in self.ends.T)
         bands = [(ends, (a, c, d)), (begins, (a, d, b))]
         return np.concatenate(

@@ -6,6 +6,11 @@ sector to rounding. Its own tangent and that of its antisymmetric modes count al
 shell. Where nothing but the buckled shape itself distinguishes one azimuth from another, that shape
 may turn about e3 without any force: this one direction is left out of the count, which would depend
 on rounding.
+
+A sector is the part of 180/m degrees between two symmetry planes through e3; m copies of it,
+rotated or mirrored, make the half. To unfold is to make the half's mesh, or its displacement, from
+the sector's. Unstable modes are counted as negative pivots of a factored tangent. A state is a
+displacement u with amplitudes mu, the load parameters.
 """
 
 from collections.abc import Callable, Sequence
@@ -46,10 +51,10 @@ class SectorModes:
         Function of the mid-surface of a half that makes the model of the same shell on it.
     """
 
-    families: Sequence[
-        ModeFamily
-    ] = ()  # modes are counted but not located: the turned shape is always neutral
-    tangents = None  # changes of the counts are not located either
+    # for a `StabilityMonitor`: modes are counted but not located, as the turned shape is always
+    # neutral; changes of the counts are not located either
+    families: Sequence[ModeFamily] = ()
+    tangents = None
 
     def __init__(self, model: "ShellModel", as_half: "Callable[[Midsurface], ShellModel]") -> None:
         self._model, self._as_half = model, as_half
@@ -57,7 +62,10 @@ class SectorModes:
 
     @cached_property
     def half_model(self) -> "ShellModel":
-        """Model of the half, whose tangents are counted; the first access is collective."""
+        """Model of the half, whose tangents are counted; the first access is collective.
+
+        It also sets the maps by which `unfold` takes displacements to the half.
+        """
         sector, patch = self._model.mirror, self._model.midsurface.patch
         assert isinstance(sector, Sector)
         self._folding = unfolding_of(sector, patch)
@@ -68,6 +76,7 @@ class SectorModes:
             )
         )
         comm, chart = self._model.system.comm, half.chart()
+        # charts of all ranks' nodes, in the order in which `unfold` gathers displacements
         nodes = np.concatenate(comm.allgather(self._model.chart()))
         # node of the sector and rotation that give the displacement of each node of the half
         self._numbers = scipy.spatial.cKDTree(nodes).query(self._folding.to_sector(chart))[1]
@@ -93,6 +102,7 @@ class SectorModes:
         modes antisymmetric to the half.
         """
         half, state_of_half = self.half_model, State(self.unfold(state.u), dict(state.mu))
+        # those of the half without those of the sector itself
         self._own.factor(self._model.system.tangent(state.u, state.mu))
         sector_pivots = self._own.negative_pivots
         self._others.factor(half.system.tangent(state_of_half.u, state_of_half.mu))
@@ -115,7 +125,8 @@ class SectorModes:
     def _turning(self, state: State) -> Vector | None:
         """Return e3 x u - du/dtheta, by which the buckled shape turns about e3; collective.
 
-        None where the shell or its loads are not axisymmetric, or the state is axisymmetric itself.
+        It is a displacement of the half, antisymmetric to its plane. None where the shell or its
+        loads are not axisymmetric, or the state is axisymmetric itself. `state` is one of the half.
         """
         half = self.half_model
         system = self.half_model.system
@@ -127,13 +138,15 @@ class SectorModes:
         dofs, element = V.dofmap.list, V.element.basix_element
         table = element.tabulate(1, element.points)[1:, :, :, 0]
         tangents, du = (np.einsum("dqk,nki->nqdi", table, f[dofs]) for f in (r0, u))
+        # change of places per radian about e3
         rotation = np.cross([0.0, 0.0, 1.0], r0[dofs])
-        # du/dtheta: the chart's derivatives along e3 x r0
+        # du/dtheta: derivatives of u by reference coordinates, along e3 x r0 in the surface
         metric = np.einsum("nqdi,nqei->nqde", tangents, tangents)
         components = np.linalg.solve(
             metric, np.einsum("nqdi,nqi->nqd", tangents, rotation)[..., None]
         )[..., 0]
         by_angle = np.einsum("nqd,nqdi->nqi", components, du)
+        # at nodes the mean over the cells that meet
         sums = np.zeros_like(u)
         count = np.zeros(len(u))
         np.add.at(sums, dofs, by_angle)

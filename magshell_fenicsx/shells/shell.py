@@ -1,7 +1,15 @@
 """The model of a thin shell: a system of those terms that its loads and edges call for.
 
-Lengths in R, energies in E h R^2. Amplitudes: "pressure" is p/p_c, "force" is
-F R/(2 pi D), "lambda_m" is lambda_m.
+In go a mid-surface (mesh and placement r0), material, loads and edge conditions. Out comes a model
+with its `system`, the equations that solvers take. Lengths are in R, energies in E h R^2.
+
+A term is a summand of the potential or of the virtual work. An amplitude is a load parameter, by
+name: "pressure" is p/p_c, "force" is F R/(2 pi D), "lambda_m" is lambda_m. A condition is the
+support of an edge: "symmetry" puts the edge on the mirror plane of a half model or a sector,
+"plane" on another plane of symmetry. A growing imperfection is a deviation from the perfect surface
+that an amplitude scales. An opening is an edge where the pressed surface ends; a lid is the surface
+that closes a moving one. A user field is a caller's function on the mesh. "Refuse" means: raise an
+error on every rank.
 """
 
 from collections.abc import Mapping, Sequence
@@ -131,8 +139,11 @@ class ShellModel(ThinModel):
         `parameters.ShellMaterial.numbers` of each cell; None where all shells have one material.
     mirror
         Planes of a half model or a sector.
+    growing
+        The placement with amplitudes of growing imperfections; None without.
     turns
-        Whether its material and all its loads are axisymmetric; whoever makes the model may set it.
+        Whether its material and all its loads are axisymmetric, so that it may turn about its axis;
+        whoever makes the model may set it.
     """
 
     thin: Literal[True] = True
@@ -151,6 +162,7 @@ class ShellModel(ThinModel):
         thickness: Thickness | None = None,
         mirror: Mirror = Y0_PLANE,
     ) -> None:
+        # the order below matters: placement, loads on the mesh, factory, terms, system
         self._arguments = material, degree, conditions, loads, sigma, thickness
         refuse_unknown(midsurface.edges, midsurface.points, midsurface.patches, conditions, loads)
         loads = _magnetisation_by_cell(loads, midsurface)
@@ -211,6 +223,7 @@ class ShellModel(ThinModel):
             name: vertex_normal(self.r0, x, midsurface.cells_of_point(name))
             for name, x in midsurface.points.items()
         }
+        # forces act along the normals
         terms += self._force_terms()
         self.shell_contacts = self._make_shell_contacts()
         terms += self.shell_contacts
@@ -235,8 +248,10 @@ class ShellModel(ThinModel):
     def _refuse_normal_plies(self) -> None:
         """Refuse plies whose direction is normal to the surface of their shell; collective."""
         for shell, laminate in self.material.laminate_by_shell.items():
+            # the only shell of a model has an empty name
             cells = self.midsurface.patches[shell] if shell else slice(None)
-            normals = positions_and_normals(self.r0)[1][cells]
+            _, normals_of_cells = positions_and_normals(self.r0)
+            normals = normals_of_cells[cells]
             laminate.refuse_normal(normals, self.midsurface.mesh.comm)
 
     def _with_functions(self, loads: Loads, cells: CellGeometry) -> Loads:
@@ -247,7 +262,7 @@ class ShellModel(ThinModel):
         """
         for name in ("magnetic", "remanence"):
             magnetisation = getattr(loads, name)
-            if magnetisation and magnetisation.given:
+            if magnetisation and magnetisation.given:  # vectors as a user field
                 vectors = user_field_polynomials(magnetisation.given, self.midsurface, cells)
                 loads = replace(loads, **{name: replace(magnetisation, remanent=vectors)})
         formula_to_field = partial(formula_field, self.r0)
@@ -259,6 +274,7 @@ class ShellModel(ThinModel):
 
     def _put_edges_in_planes(self) -> None:
         """Move the nodes of edges with the condition "plane" into their planes."""
+        # nodes of a mesh file stay where the file has them
         if self.midsurface.from_mesh_file:
             return
         for name, condition in self._conditions.items():
@@ -276,7 +292,10 @@ class ShellModel(ThinModel):
     def _thickness_field(
         self, thickness: Thickness | None, cells: CellGeometry
     ) -> fem.Function | None:
-        """Return h(x)/h as a function (1,) on the mesh; None for 1."""
+        """Return h(x)/h as a function (1,) on the mesh; None for 1.
+
+        `cells` is the geometry in which a user field is projected onto polynomials.
+        """
         if thickness is None:
             return None
         if thickness.user_field:
@@ -285,10 +304,14 @@ class ShellModel(ThinModel):
         return thickness_field(thickness, self.r0, self.midsurface.patches)
 
     def _make_factory(self, cells: CellGeometry) -> EnergyFactory:
-        """Return the factory that makes the energies of this shell."""
+        """Return the factory that makes the energies of this shell.
+
+        `cells` is the geometry in which the natural shape is projected onto polynomials.
+        """
         midsurface, loads = self.midsurface, self.loads
-        free_constants: dict[str, fem.Constant] = {}
+        free_constants: dict[str, fem.Constant] = {}  # the factory's energies add theirs
         natural_shape = self._natural_shape(cells, free_constants)
+        # small angles between cells need only jumps of rotations
         is_folded = midsurface.kinked and largest_fold(self.r0, self.degree) > FOLD_ANGLE
         initial_placement = self.growing and self.growing.initial_placement
         domain = surface_domain(self.r0, initial_placement)
@@ -302,7 +325,7 @@ class ShellModel(ThinModel):
             self.thickness,
             natural_shape,
             free_constants,
-            is_folded,
+            has_folds=is_folded,
             pressed_sides=side_field(loads.pressed_sides, midsurface)
             if loads.pressed_sides
             else None,
@@ -315,20 +338,23 @@ class ShellModel(ThinModel):
     ) -> Shape | None:
         """Return the natural shape, the one without stress; None if it is the undeformed one.
 
-        Its amplitudes are added to `free_constants`, name -> constant, and `loads` is updated.
+        Its amplitudes are added to `free_constants`, name -> constant. `self.loads` gets the shape
+        cell by cell in place of patch by patch. `cells` as in `_make_factory`.
         """
         if not self.loads.natural:
             return None
         natural = self.loads.natural.on_cells(
             self.midsurface.patches,
             _cell_count(self.midsurface),
-            lambda given: user_field_polynomials(given, self.midsurface, cells),
+            lambda user_field: user_field_polynomials(user_field, self.midsurface, cells),
         )
         self.loads = replace(self.loads, natural=natural)
         return Shape.from_field(natural_field(natural, cells, self.V), natural, free_constants)
 
     def _find_openings(self) -> tuple[Mapping[str, NDArray[np.int32]], bool]:
-        """Find the edges where the pressed surface ends; collective. Sets `without_potential`.
+        """Find the edges where the pressed surface ends; collective.
+
+        Sets `without_potential`, the names of edges at which a live pressure has no potential.
 
         Returns
         -------
@@ -338,6 +364,7 @@ class ShellModel(ThinModel):
             Whether moving supports close all openings with lids.
         """
         edges, pressed_cells = self.midsurface.edges, self.factory.pressed_sides
+        # without `pressed_cells` all cells are pressed
         opening_edges = pressed_parts(edges, pressed_cells) if pressed_cells else edges
         free_edges, self.without_potential = edge_openings(self.r0, opening_edges, self._conditions)
         return opening_edges, enclosed(self.loads, free_edges, self.without_potential)
@@ -345,8 +372,9 @@ class ShellModel(ThinModel):
     def _volume_form(self, origin: NDArray[np.float64] | None, *, is_enclosed: bool) -> ufl.Form:
         """Return the form of Delta V/R^3 of the modelled part.
 
-        `origin` (3,) over R lies on all its symmetry planes; None stands for zero. Under a live
-        pressure, or if lids close the shell, the volume is the one that the surface sweeps.
+        `origin` (3,) over R lies on all its symmetry planes; None, where these have no common
+        point, stands for zero. Under a live pressure, or if lids close the shell, the volume is the
+        one that the surface sweeps; a pressure does work on it.
         """
         if self.loads.pressure or is_enclosed:
             return self.factory.swept_volume()
@@ -388,6 +416,7 @@ class ShellModel(ThinModel):
         """Return the contacts between parts of the shell, as terms; empty without contact pairs."""
         if not self.loads.pairs:
             return ()
+        # imported late: few shells have a contact
         from magshell_fenicsx.parts.contact.model_surface import ModelSurface, surface_contacts
 
         factory, edges = self.factory, self.midsurface.edges
@@ -410,6 +439,7 @@ class ShellModel(ThinModel):
         """Return the terms that tie edges to other shells on which they stand; collective."""
         if not (self.loads.joints or self.midsurface.t_junctions):
             return ()
+        # imported late: few shells have junctions
         from magshell_fenicsx.shells.t_junctions import t_junction_terms
 
         return t_junction_terms(self)
@@ -419,7 +449,9 @@ class ShellModel(ThinModel):
         opening_edges: Mapping[str, NDArray[np.int32]],
         origin: NDArray[np.float64] | None,
     ) -> EdgePressure:
-        """Return the work of a live pressure on the lids at moving edges.
+        """Return the work of a live pressure on the lids at moving edges; collective.
+
+        Lids end on edges in planes of symmetry, so these have curves too.
 
         Parameters
         ----------
@@ -440,6 +472,7 @@ class ShellModel(ThinModel):
             for name, facets in opening_edges.items()
             if name in in_planes or motions_of(loads, name)
         }
+        # pressure at an amplitude of one: p_c over E h/R
         unit = self.material.classical_pressure / self.material.h
         return pressed_edges(self.r0, curves, in_planes, loads, unit, origin)
 
@@ -448,8 +481,10 @@ class ShellModel(ThinModel):
     ) -> FiniteElementSystem:
         """Return the system of all terms under constraints.
 
-        Tangents and residuals come from densities at points where terms have densities.
+        Where terms have densities, their tangents and residuals are evaluated at quadrature points
+        by compiled kernels; other terms are assembled as forms.
         """
+        # cells with nodes that supports move, and the tangent's integrals on these cells alone
         moving_cells = None
         if self.moving:
             cells = self.moving.cells
@@ -460,12 +495,13 @@ class ShellModel(ThinModel):
         tangent = FastTangent(self.u, self._hessians, constraints, moving_cells)
         density_terms = [term for term in terms if isinstance(term, ShellTerm)]
         residual = self._point_residual(density_terms)
-        residual.begin(energies=True)
+        residual.begin(energies=True)  # begins to compile its kernels
         for term in density_terms:
             # the form of a pressure on a growing shape measures from the initial placement
             if not (self.growing and term.amplitude == "pressure"):
                 term.points = residual
         parameters = self._free_parameters(terms, density_terms, residual)
+        # numbers that a state keeps, such as penalty stiffnesses: name -> constant and default
         histories = dict(body_contact.history for body_contact, _ in self.contacts.values())
         for contact in self.shell_contacts:
             histories |= contact.history
@@ -494,13 +530,19 @@ class ShellModel(ThinModel):
     def _free_parameters(
         self, terms: Sequence[Term], density_terms: Sequence[ShellTerm], residual: FastResidual
     ) -> dict[str, FreeParameter]:
-        """Return the parameters of energies that may vary, by name."""
+        """Return the parameters of energies that may vary, by name; collective.
+
+        They are constants of densities, amplitudes of moving fields, of contacts and of growing
+        imperfections. `terms` are all terms, `density_terms` those with a density, which `residual`
+        evaluates.
+        """
         factory = self.factory
         residuals_one_by_one = partial(self._point_residual, one_by_one=True)
         parameters: dict[str, FreeParameter] = {
             **point_parameters(factory.free_constants, density_terms, residuals_one_by_one)
         }
         parameters |= field_parameters(factory.fields, terms, self.u, self.kernels)
+        # parameters that change a contact too, such as the thickness of a natural shape
         for contact in self.shell_contacts:
             parameters |= contact.entered(parameters)
         if self.growing:
@@ -523,13 +565,15 @@ class ShellModel(ThinModel):
     def symmetry_breaking_modes(self) -> AntisymmetricModes | SectorModes | None:
         """Modes that break the symmetry of a half model or a sector; None for a whole shell.
 
-        The first access compiles kernels and is collective.
+        Modes of a half are antisymmetric displacements, with another tangent on the mirror plane
+        and other constraints there. The first access compiles kernels and is collective.
         """
         if self.multiplicity == 1:
             return None
         if isinstance(self.mirror, Sector):
             return SectorModes(self, self._as_half)
         edges = self.factory.antisymmetric_edges(self._mirrored_facets, self.mirror.normal)
+        # antisymmetric displacements are normal to the mirror plane on it
         constraints = self._constraints + [
             support_along(self.V, 1, self._mirrored_facets, direction)
             for direction in self.mirror.in_plane_vectors
@@ -554,11 +598,12 @@ class ShellModel(ThinModel):
         )
 
     def _as_half(self, midsurface: Midsurface) -> "ShellModel":
-        """Return the model of half of this shell, from which the sector is a part.
+        """Return the model of half of the shell of which this model is a sector; collective.
 
-        `midsurface` is that of the half.
+        `midsurface` is the half's mesh and placement.
         """
         material, degree, conditions, loads, sigma, thickness = self._arguments
+        # a half has one mirror plane
         conditions = {name: c for name, c in conditions.items() if name != SECOND_SYMMETRY_EDGE}
         plane = Mirror.through_axis(self.mirror.azimuth)
         return ShellModel(midsurface, material, degree, conditions, loads, sigma, thickness, plane)
@@ -575,7 +620,8 @@ class ShellModel(ThinModel):
     def at_nodes(self, function: Embedding) -> NDArray[np.float64]:
         """Return the values (cells, nodes, ...) of a function at the nodes of each cell.
 
-        The function is that of the triangulation's nodes, such as an embedding.
+        The function takes places in the coordinates of the triangulation's nodes, as an embedding
+        does.
         """
         return self.midsurface.evaluate(self.V.element.basix_element.points, function)
 
@@ -594,21 +640,25 @@ class ShellModel(ThinModel):
         """Return one row per owned node from values (cells, nodes, components) in cells."""
         nodes, index_map = self.V.dofmap.list, self.V.dofmap.index_map
         coordinates = np.full((index_map.size_local + index_map.num_ghosts, cells.shape[2]), np.inf)
-        # a node on a seam has two positions: take the first
+        # a node on a seam has two positions: take the smaller coordinates
         np.minimum.at(coordinates, nodes, cells)
         return coordinates[: index_map.size_local]
 
     def _force(self, name: str, force: Force) -> LinearTerm:
-        """Return the term of a force along the inward normal, at a point or over a patch."""
+        """Return the term of a force along the inward normal; collective.
+
+        It acts at a vertex, or over a patch of radius `force.patch` around it. `name` is that of
+        its amplitude.
+        """
         x, inward = self.midsurface.points[force.point], -self.normals[force.point]
         cells_at_point = self.midsurface.cells_of_point(force.point)
         if force.patch:
-            entries = patch_entries(
+            dofs, values = patch_entries(
                 self.r0, x, force.patch, inward, self.degree, self.kernels, cells_at_point
             )
         else:
-            entries = point_entries(self.V, x, inward, cells_at_point)
-        return LinearTerm(name, entries[0], self.force_unit * entries[1], self.u, name)
+            dofs, values = point_entries(self.V, x, inward, cells_at_point)
+        return LinearTerm(name, dofs, self.force_unit * values, self.u, name)
 
 
 def _cell_count(midsurface: Midsurface) -> int:

@@ -2,6 +2,12 @@
 
 Edges, patches and points have conditions by name. An edge that is clamped, or that lies on a mirror
 plane, has an energy too, since a C0 displacement alone does not hold its normal.
+
+A condition is what the case says of an edge, patch or point: "free"; "clamped", with the normal
+held; "symmetry", on a mirror plane of the modelled half or sector; "plane", on a symmetry plane of
+the shell itself; or the displacement components that are zero. A support is what a model holds by a
+condition: constraints of the displacement, and perhaps the energy of an edge with its name and a
+rotation. Facets are the local edges of triangles.
 """
 
 from collections.abc import Mapping
@@ -92,6 +98,7 @@ class ShellSupports:
         # supports on the shell's own planes come last in `by_name`
         on_planes: dict[str, Support] = {}
         for name, condition in conditions.items():
+            # mirror planes have been added above
             if condition in ("free", "symmetry"):
                 continue
             if condition == "plane":
@@ -104,6 +111,7 @@ class ShellSupports:
         """Add the symmetry plane of an edge of the modelled part: energy and constraint."""
         self.planes.append(plane)
         facets = self._midsurface.edges[name]
+        # a name of the energy; the second plane of a sector needs another one
         edge = "mirror edges" if name == SYMMETRY_EDGE else f"{name} mirror edges"
         energy = self._factory.mirror_edges(facets, plane.normal, edge)
         self.mirror_term = self._factory.term(energy)
@@ -132,6 +140,7 @@ class ShellSupports:
         energy = self._factory.mirror_edges(facets, plane.normal, edge)
         self.terms.append(self._factory.term(energy))
         self.constraints.append(support_along(self._V, 1, facets, plane.normal))
+        # the constraint across the plane is above; these only name the support's unknowns
         edge_constraints = held_on(self._V, 1, facets, ALL_COMPONENTS)
         return Support.from_conditions(edge_constraints, edge, kind="plane")
 
@@ -140,13 +149,14 @@ class ShellSupports:
         return [
             laminate
             for shell, laminate in self._laminates.items()
+            # a model's only shell has an empty name
             if not shell or edge.startswith(f"{shell}_")
         ]
 
     def _add_support(self, name: str, condition: Condition) -> Support:
         """Add the support of an edge, patch or point, and return it.
 
-        A clamped edge also gets an energy that holds its normal.
+        A clamped edge also gets an energy that holds its normal, turned by a load that moves it.
         """
         if isinstance(condition, HeldComponents):
             components = condition.components
@@ -154,6 +164,7 @@ class ShellSupports:
             components = ALL_COMPONENTS
         edge, turn = "", None
         if name in self._clamped:
+            # energies of several clamped edges need a name each
             edge = f"{name} clamped edges" if len(self._clamped) > 1 else "clamped edges"
             turn = rotation_of(self._loads, name, self._V)
             facets = self._midsurface.edges[name]

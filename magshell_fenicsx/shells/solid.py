@@ -1,8 +1,16 @@
 """The body of a shell as a three-dimensional solid: a system of terms, with the interface of
 `ShellModel`.
 
-Lengths in R, energies in E h R^2, amplitudes as in `ShellModel`. Displacements are those of nodes
-in the middle of the thickness; the pressure, the volume and the loaded patch are of the outer face.
+Lengths in R, energies in E h R^2, amplitudes (load parameters, by name) as in `ShellModel`.
+Displacements that are reported are those of nodes in the middle of the thickness; the pressure, the
+volume and the loaded patch are of the outer face.
+
+A body has an outer face, and an end above each edge of its mid-surface: a face through the
+thickness. Heights go from 0 inside to 1 outside. A condition is an end's support: "clamped" holds
+the face, "symmetry" (of a half model) and "plane" (of the shell itself) put it in a mirror plane;
+any other but "free" holds the middle line alone, and the end is hinged. A lid closes a moving end
+under a live pressure. The natural shape is the one without stress. Layers are fractions of the
+thickness with a remanence each.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -56,7 +64,7 @@ from magshell_fenicsx.shells.solid_hessians import body_hessian_integrals
 from magshell_fenicsx.shells.solid_terms import SolidDensity, TermFactory, unchanged
 
 Array = NDArray[np.float64]
-MIRRORS = ("symmetry", "plane")
+MIRRORS = ("symmetry", "plane")  # conditions on mirror planes
 
 
 class SolidModel(ModelBase):
@@ -108,6 +116,7 @@ class SolidModel(ModelBase):
         mirror: Mirror = Y0_PLANE,
     ) -> None:
         """Make the terms of the body and its system; parameters are those of the class."""
+        # None where there is none
         magnetic, remanence = (
             field and _in_cells(field, body) for field in (loads.magnetic, loads.remanence)
         )
@@ -124,6 +133,7 @@ class SolidModel(ModelBase):
         user_terms = tuple(term.with_functions(self._formula_field) for term in loads.user_terms)
         self.loads = replace(loads, user_terms=user_terms)
         self.factory = factory = self._make_factory()
+        # the first term is everywhere: its form gives the sparsity pattern
         self._pattern, *areal_distortion = factory.distortions()
         self._held, planes, self.supports = supports(body, self.r0, conditions)
         origin = closing_point([mirror, *planes] if self.multiplicity == 2 else planes)
@@ -144,6 +154,7 @@ class SolidModel(ModelBase):
         edge_pressure = self._edge_pressure(ends, origin) if is_enclosed else None
         self._moving = moving(self.r0, self.supports, self.loads, edge_pressure)
         self.system = self._system(self._held + self._held_on_mirror([mirror.normal]))
+        # under a pressure the volume that points sweep, else that between the face and the origin
         if self.loads.pressure or is_enclosed:
             origin = None
         elif origin is None:
@@ -194,9 +205,9 @@ class SolidModel(ModelBase):
         return terms
 
     def _observed_forms(self) -> dict[str, fem.Form]:
-        """Return the forms that the user's terms observe and those of an induced magnetisation.
+        """Return the compiled forms of observed integrals, by name.
 
-        They are compiled, by name.
+        They are those of the user's terms, and of the polarisation that a field induces.
         """
         factory, kernels = self.factory, self.kernels
         observed = kernels.compile_all(factory.observed(term) for term in self.loads.user_terms)
@@ -208,6 +219,7 @@ class SolidModel(ModelBase):
         """Return the terms of forces on patches, then those of all dead loads; collective."""
         terms: list[Term] = []
         for name, force in self.loads.forces.items():
+            # degrees of freedom around the point, and the shares of a unit force
             dofs, shares = outer_patch(self.body, self.V, force.point, force.patch, self.kernels)
             terms.append(LinearTerm(name, dofs, self.force_unit * shares, self.u, name))
         if not self.loads.dead:
@@ -235,6 +247,7 @@ class SolidModel(ModelBase):
         origin
             Point (3,) over R on all symmetry planes, or None.
         """
+        # the pressed surface ends at the middle line of a hinged end, else at the outer face
         hinged = self._hinged
         in_planes = {name for name, condition in self._conditions.items() if condition in MIRRORS}
         curves = {
@@ -242,6 +255,7 @@ class SolidModel(ModelBase):
             for name in ends
             if name in in_planes or motions_of(self.loads, name)
         }
+        # pressure at an amplitude of one: p_c over E h/R
         unit = self.material.classical_pressure / self.material.h
         return pressed_edges(self.r0, curves, in_planes, self.loads, unit, origin)
 
@@ -285,7 +299,8 @@ class SolidModel(ModelBase):
     def _rim(self, facets: NDArray[np.int32], height: float) -> EdgeCurve:
         """Return the curve at the end of the pressed surface, on the facets of one end.
 
-        `height` is its place in the thickness: 1 is the outer face.
+        `height` is its place in the thickness: 1 is the outer face. All cells that it passes have
+        it at the same fraction of their own thickness.
         """
         cells_of_facets = self.body.mesh.topology.connectivity(2, 3)
         # bounds in the thickness of the cell behind each facet
@@ -295,6 +310,7 @@ class SolidModel(ModelBase):
         return EdgeCurve.from_facets(
             self.V,
             facets[has_height],
+            # a rank may have no such cell; then any fraction will do
             level_sides(float(fraction_of_cell[0]) if len(fraction_of_cell) else 1.0),
         )
 
@@ -312,6 +328,7 @@ class SolidModel(ModelBase):
 
     def _system(self, constraints: list[Constraint]) -> FiniteElementSystem:
         """Return the system of all terms under some constraints."""
+        # cells with nodes that supports move, and the tangent's integrals on these cells alone
         moving_cells, factory, motion = None, self.factory, self._moving
         if motion:
             moving_cells = (
@@ -344,6 +361,7 @@ def _in_cells(field: Magnetisation, body: BodyMesh) -> Magnetisation:
         If the body has no such patch.
     """
     by_cell = field.on_cells(body.patches, len(body.layer_bounds))
+    # patches take the place of layers
     if field.layers and not field.patches:
         return replace(by_cell, remanent=_layered(field.layers, body))
     return by_cell
@@ -356,6 +374,7 @@ def _layered(layers: Sequence[tuple[float, Array]], body: BodyMesh) -> ByPatch:
     fractions end where cells do.
     """
     ends = np.cumsum([fraction for fraction, _ in layers])
+    # the layer of each cell is that around the middle of its height
     middle = body.layer_bounds.mean(axis=1)
     return ByPatch(np.array([vector for _, vector in layers])[np.searchsorted(ends[:-1], middle)])
 
@@ -363,7 +382,8 @@ def _layered(layers: Sequence[tuple[float, Array]], body: BodyMesh) -> ByPatch:
 def grown_in_body(density: SolidDensity, shape: Shape) -> SolidDensity:
     """Return a density on a natural shape, from a density with a keyword `growth`.
 
-    The natural shape's parameters follow those of the density.
+    The growth is the deformation from the undeformed to the natural shape. The natural shape's
+    parameters follow those of the density.
     """
 
     def grown(*arguments: Expr) -> Expr:

@@ -3,6 +3,13 @@ batches.
 
 As on the shell (see `models.shell.element_hessians`), with the jets in reference coordinates: the
 tables of the shape functions are the same for all cells.
+
+A jet is a field's value and its three derivatives by the reference coordinates xi, four vectors:
+the parts 0 to 3. X is the undeformed placement, u the displacement. A term's density is integrated
+over the body, its outer face, or ends (faces above edges). A point kernel gives the Hessian of a
+density by the jet at each point of a batch of cells; the contraction with shape functions makes
+element matrices of it. "Varying" parameters are fields, whose values at points are kept in memos
+and renewed where they have changed.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -55,6 +62,11 @@ class BodyHessianIntegral:
         Terms with one region: body, outer face or end.
     facet
         Number of the face in the reference cell; None for the body.
+
+    Attributes
+    ----------
+    coupling
+        Batches that couple several cells; a solid has none.
     """
 
     coupling: Sequence[EntityBatch] = ()
@@ -68,7 +80,7 @@ class BodyHessianIntegral:
         log: KernelLog,
         facet: int | None = None,
     ) -> None:
-        """Divide the cells into batches and compile the terms' Hessians."""
+        """Divide the cells into batches and compile the terms' Hessians; collective."""
         V = X.function_space
         self._dofs = V.dofmap.list
         cells_per_batch = max(MAX_BATCH_POINTS // len(rule.weights), 1)
@@ -78,11 +90,13 @@ class BodyHessianIntegral:
         self._batches = [
             EntityBatch((group,), rule, np.empty((len(group), 0))) for group in cell_groups
         ]
+        # storage for the largest batch; a rank may have none
         self._points = PointStorage(max([1, *(batch.size for batch in self._batches)]))
         region = terms[0].density.region
         self._geometry = [
             _geometry(self._jets(batch, X.x.array), region, facet) for batch in self._batches
         ]
+        # geometry and jet of u at the points of a batch
         self._g, self._u = self._points.field(SIZES[region]), self._points.field(3 * JET_PARTS)
         self._hessians = {}
         self._pairs: dict[str, BlockPairs] = {}
@@ -90,11 +104,11 @@ class BodyHessianIntegral:
         for term in terms:
             pairs = BlockPairs(tuple(combinations_with_replacement(term.density.parts, 2)))
             # a virtual work is differentiated by its test function, at zero
-            z = self._points.field(3 * JET_PARTS) if term.density.work else self._u
-            W = self._density(term, z)
+            by = self._points.field(3 * JET_PARTS) if term.density.work else self._u
+            density = self._density(term, by)
             self._pairs[term.name] = pairs
             self._hessians[term.name] = point_hessian(
-                term.name, W, z, JET_PARTS, pairs, log, at_zero=z is not self._u
+                term.name, density, by, JET_PARTS, pairs, log, at_zero=by is not self._u
             )
         pairs_of_terms = sorted(
             {pair for pairs in self._pairs.values() for pair in pairs.within_side}
@@ -111,7 +125,9 @@ class BodyHessianIntegral:
     ) -> None:
         """Add factor times the terms' element matrices to `element_matrices`.
 
-        Arguments are those of `models.shell.element_hessians.HessianIntegral.add`.
+        Terms without a factor in `factors` (name -> number) are left out. `u` holds nodal values,
+        `element_matrices` has one matrix for each cell. `couple`, for batches that couple cells, is
+        not used here.
         """
         names = [name for name in self._hessians if factors.get(name)]
         for name in names:
@@ -140,8 +156,9 @@ class BodyHessianIntegral:
     def _density(self, term: SolidTerm, v: fem.Function) -> Any:
         """Return a term's density times the area or volume ratio, as an expression of point fields.
 
-        Of a virtual work it is a function of u and v, whose Hessian in v is the symmetric part of
-        the work's derivative.
+        `v` is the jet by which it is differentiated: that of u itself, or of the test function of a
+        virtual work. Of a virtual work it is a function of u and v, whose Hessian in v is the
+        symmetric part of the work's derivative.
         """
         density, g, z = term.density, self._g, self._u
         at_points, varying = parameters_at(self._points, density.parameters, 1)
@@ -154,9 +171,11 @@ class BodyHessianIntegral:
             return ufl.as_vector([f[start + c] for c in range(3)])
 
         def hessian_density(W: Any) -> Any:
+            """Return the function whose Hessian by v is wanted, from an energy or a work W."""
             return ufl.dot(ufl.diff(W, z), v) / 2 if density.work else W
 
         parameters = [vector(v, 0), *at_points] if density.work else at_points
+        # X, X1, X2, u, u1, u2: both jets without the derivative through the thickness
         if density.region == "outer":
             return hessian_density(
                 function(*(vector(f, 3 * part) for f in (g, z) for part in range(3)), *parameters)
@@ -200,6 +219,7 @@ def body_hessian_integrals(
     for term in nonlinear:
         if term.density.region == "body":
             continue
+        # faces of different numbers in their cells have different tables; all ranks go through all
         cells_at_facets, facet_numbers = _cells_at(body, term.density.facets)
         points, weights = term.density.rule
         for facet in np.flatnonzero(V.mesh.comm.allreduce(np.bincount(facet_numbers, minlength=6))):
@@ -220,6 +240,7 @@ def _rule(V: fem.FunctionSpace, points: Array, weights: Array) -> EntityRule:
 
 def _on_facet(points: Array, facet: int) -> Array:
     """Return points (n, 2) of the reference facet as places (n, 3) in the reference cell."""
+    # three of the four corners span the face
     corners = basix.geometry(basix.CellType.hexahedron)[
         basix.topology(basix.CellType.hexahedron)[2][facet]
     ]
@@ -243,7 +264,9 @@ def _cells_at(
 def _geometry(jets: Array, region: str, facet: int | None) -> Array:
     """Return the geometry (points, SIZES[region]) at points from the placement's jets.
 
-    See `SIZES` for its numbers; dX/dxi inverted is stored by rows.
+    Its numbers are listed above `SIZES`; the inverse of dX/dxi is stored by rows. `jets` are
+    (cells, points, 4, 3). `facet` is the number of the face in the reference cell, None for the
+    body.
     """
     flat = jets.reshape(-1, JET_PARTS, 3)
     if region == "outer":
@@ -254,6 +277,7 @@ def _geometry(jets: Array, region: str, facet: int | None) -> Array:
         return np.column_stack([flat[:, 0], inverse.reshape(-1, 9), volume_ratio])
     # area ratio by Nanson's formula; n along the thickness, t along the edge
     outward = basix.cell.facet_outward_normals(basix.CellType.hexahedron)[facet] @ inverse
+    # the third reference coordinate goes through the thickness
     n, t = flat[:, 3], np.cross(flat[:, 3], outward)
     unit = [v / np.linalg.norm(v, axis=1)[:, None] for v in (n, t)]
     return np.column_stack(

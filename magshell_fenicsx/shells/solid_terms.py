@@ -1,7 +1,16 @@
 """Terms of a solid, each integrated from one density over a body or its faces.
 
 `TermFactory` makes a term only when a scene asks for it; its kernel is compiled once. Lengths are
-over R, energies over E h R².
+over R, energies over E h R²; h is the thickness, R the reference length. Densities per volume are
+over E, so functions divide them by h.
+
+X is the undeformed place, u the displacement, H = grad u, and v a test function. A body has an
+outer face, and an end above each edge of its mid-surface. An end is hinged where only its middle
+line is held. Layers are the surfaces through the thickness; their undeformed normals are n0. A
+density is a function of X, u, H and parameters: constants, or fields on the mesh. An amplitude is a
+load parameter, by name; a term with an amplitude is multiplied by it. `group` and `column` of a
+term name its group of terms and its column in reported energies. A field "in space" is an applied
+flux density known by its values at displaced places, as of a magnet.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,7 +47,7 @@ from magshell_fenicsx.parts.magnetism.saturation import SIZE
 from magshell_fenicsx.parts.magnetism.soft_magnet import TERM, Sheet, SoftMagnet
 
 REDUCED_QUADRATURE_DEGREE = 3  # quadrature degree: two points in each direction
-# parts of a displacement's jet: value, reference derivatives
+# parts of a displacement's jet: value; reference derivatives; value and derivatives on a face
 VALUE, GRADIENT, ON_FACE = (
     (0,),
     (1, 2, 3),
@@ -46,7 +55,7 @@ VALUE, GRADIENT, ON_FACE = (
 )
 Array = NDArray[np.float64]
 Facets = NDArray[np.int32]
-HEIGHT_TOLERANCE = 1e-9
+HEIGHT_TOLERANCE = 1e-9  # rounding of heights, 0 on the inner to 1 on the outer face
 
 
 @dataclass(frozen=True)
@@ -71,7 +80,8 @@ class SolidDensity:
     facets
         Local facets that it is integrated on, of faces.
     upper
-        Whether it is integrated on the outer half of these facets alone.
+        Whether it is integrated on the outer half of these facets alone: of a cell through which
+        the middle line passes.
     work
         Virtual work of a load without potential, on faces; it takes v before the parameters.
     """
@@ -89,7 +99,7 @@ class SolidDensity:
     def rule(self) -> tuple[Array, Array]:
         """Points on the reference facet, and their weights."""
         points, weights = basix.make_quadrature(basix.CellType.quadrilateral, self.degree)
-        if self.upper:
+        if self.upper:  # the second coordinate goes through the thickness
             return ((points + np.eye(2)[1]) / [1.0, 2.0], weights / 2)
         return (points, weights)
 
@@ -124,13 +134,13 @@ class TermFactory:
     hinged
         Ends whose middle line alone is held.
     grown
-        Function that takes a density to the body's natural shape.
+        Function from a density to the same one on the body's natural shape, that without stress.
     free_constants
         Constants of the free parameters, by name.
     fields
         Applied fields, known by values, that were made.
     saturated
-        Magnetisation state of a soft material that saturates, if it was made.
+        Magnetisation state of a soft material that saturates: empty, or one field that was made.
     """
 
     body: BodyMesh
@@ -147,7 +157,8 @@ class TermFactory:
     def distortions(self) -> list[SolidTerm]:
         """Return the terms of distortion without change of volume (Mooney and Rivlin's law).
 
-        A neo-Hookean body has one term, others a second one of areal distortion.
+        A neo-Hookean body has one term, others a second one of areal distortion, which has a share
+        of the shear modulus.
         """
         shear, areal_share = self.material.shear, self.material.share
         densities_and_shares = {
@@ -190,12 +201,14 @@ class TermFactory:
         """
         applied = None
         if field.in_space:
+            # the place itself as a function
             X = fem.Function(self.u.function_space)
             X.interpolate(lambda x: x)
             applied = AppliedField(field.in_space, X, self.u, QUADRATURE_DEGREE, field.driven)
             self.fields.append(applied)
         if field.soft is None:
             return self.remanent(field, applied)
+        # a soft magnet alone has no remanence
         return [
             *([] if field.soft.alone else self.remanent(field, applied)),
             self.soft_magnetic(field, field.soft, applied),
@@ -204,7 +217,12 @@ class TermFactory:
     def soft_magnetic(
         self, field: Magnetisation, soft_magnet: SoftMagnet, applied: AppliedField | None
     ) -> SolidTerm:
-        """Return the term of a soft-magnetic body; see `EnergyFactory.soft_magnetic`."""
+        """Return the term of a soft-magnetic body in the applied field.
+
+        It is quadratic in the amplitudes of the field, or saturates. So no amplitude multiplies it
+        as a whole: they are free parameters within it. `applied` is a field known by its values,
+        else None.
+        """
         sheet, (scale, h) = Sheet(field), self._constants(soft_magnet.scale, self.h)
         law, n0, *parameters = self._of_sheet(sheet, soft_magnet, applied)
         density = SolidDensity(
@@ -224,6 +242,7 @@ class TermFactory:
         """
         if field.soft is None:
             return {}
+        # `magnetic`, called before, added the field in space last
         sheet, applied = Sheet(field), self.fields[-1] if field.in_space else None
         law, n0, *parameters = self._of_sheet(sheet, field.soft, applied)
         densities = {"volume": SolidDensity(lambda X, u, H, one: one, self._constants(1.0))}
@@ -236,14 +255,14 @@ class TermFactory:
     def _of_sheet(
         self, sheet: Sheet, soft_magnet: SoftMagnet, applied: AppliedField | None
     ) -> "list[fem.Constant | fem.Function]":
-        """Return the parameters of the densities of layers, in the order that `Sheet` takes them.
+        """Return the parameters of a soft-magnetic body's densities, in the order of `Sheet`.
 
         First the susceptibility, or the magnetisation state where the material saturates. Then the
         undeformed normals of layers, the amplitudes, and last the vectors of the field or its
         polynomial in space.
         """
         chi, V = soft_magnet.susceptibility, self.u.function_space
-        if callable(chi):
+        if callable(chi):  # a function of the place
             law = field_in_body(
                 chi, V, name="susceptibility", key="magnetic.susceptibility", size=1
             )
@@ -271,7 +290,9 @@ class TermFactory:
     ) -> PointField:
         """Return the magnetisation state of a saturating material at the quadrature points.
 
-        The state holds two polynomials of the energy, at u and at u = 0; see `saturation`.
+        The state holds two Taylor polynomials of the energy in the field, at u and at u = 0; see
+        `saturation`. It is computed again where `followed`, the places or u, or the field has
+        changed.
         """
         V = self.u.function_space
         saturation, X = PointField(V.mesh, QUADRATURE_DEGREE, 2 * SIZE), fem.Function(V)
@@ -282,6 +303,7 @@ class TermFactory:
 
         def places_and_normals() -> list[Array]:
             """Return undeformed places, displacements, and present and undeformed normals."""
+            # (4, cells, points, 3): values, then reference derivatives
             x0, u = (
                 np.einsum("dqk,cki->dcqi", table, f.x.array.reshape(-1, 3)[V.dofmap.list])
                 for f in followed
@@ -314,6 +336,7 @@ class TermFactory:
                 VALUE + GRADIENT,
             )
             return [self._bulk("magnetic", density, "lambda_m", column="magnetic")]
+        # amplitude, suffix of the term's name, and vector of each uniform part of the field
         directions = [("lambda_m", "", field.applied)]
         directions += [
             (name, name.replace("lambda_", " "), Ba)
@@ -326,7 +349,7 @@ class TermFactory:
                 "magnetic" + suffix,
                 density,
                 amplitude,
-                linear=law is body_densities,
+                linear=law is body_densities,  # a rotating remanence is not linear in u
                 group="magnetic",
                 column="magnetic",
             )
@@ -354,6 +377,8 @@ class TermFactory:
             gradient.
         """
         v = None if potential else ufl.TestFunction(self.u.function_space)
+        # the volume that points sweep from their undeformed places; p_c over E h/R is the unit
+        densities = self._volume_densities(classical / self.h, origin=None, potential=potential)
         return [
             SolidTerm(
                 name,
@@ -364,17 +389,16 @@ class TermFactory:
                 "pressure",
                 work=None if v is None else self._on_faces([density], v),
             )
-            for name, density in self._volume_densities(
-                classical / self.h, None, potential=potential
-            ).items()
+            for name, density in densities.items()
         ]
 
     def user_term(self, term: OwnTerm, amplitude: str | None = None) -> SolidTerm:
-        """Return a user's term, or a part's, over the body's volume or on its outer face.
+        """Return a user's term, or one that a part of the package adds.
 
-        `amplitude` takes the place of the term's name as its amplitude.
+        It is integrated over the body's volume or on its outer face (`term.of_volume`). `amplitude`
+        takes the place of the term's name as its amplitude.
         """
-        assert term.density
+        assert term.density  # a term without a density only observes
         if term.of_volume:
             return self._bulk(
                 term.name,
@@ -412,7 +436,7 @@ class TermFactory:
         at_point = term.at_point(density_function)
 
         def per_volume(X: Expr, u: Expr, H: Expr, *parameters: Expr) -> Expr:
-            # the last parameter is h: energies count over E h R²
+            # after the term's own parameters comes h: energies count over E h R²
             return (
                 at_point(Jet(X, *flat), Jet(u, *flat), *parameters[:parameter_count])
                 / parameters[parameter_count]
@@ -431,7 +455,7 @@ class TermFactory:
 
     def _face_density(self, term: OwnTerm, density_function: Callable[..., Expr]) -> SolidDensity:
         """Return a surface term's density on the outer face, per area of the reference cell."""
-        # second derivatives are zero on the face
+        # second derivatives are taken as zero: such a term must not depend on them
         flat = [ufl.zero(3)] * len(SECOND_DERIVATIVES)
 
         def on_face(
@@ -449,7 +473,8 @@ class TermFactory:
     def volume_change(self, origin: Array | None) -> ufl.Form:
         """Return Delta V/R^3 under the outer face of the modelled part.
 
-        It is counted from `origin` (3,) over R; None counts what points sweep on straight ways.
+        It is the change of the volume between the face and `origin` (3,) over R; with None, the
+        volume that points sweep on straight ways from their undeformed places.
         """
         return self._on_faces(list(self._volume_densities(1.0, origin).values()))
 
@@ -460,6 +485,7 @@ class TermFactory:
         traction that is linear through the thickness.
         """
         Q = fem.functionspace(self.body.mesh, ("Lagrange", 2, (1,)))
+        # cosine and sine of the reference angle, zero at first
         weight, reference_turn = fem.Function(Q), self._constants(np.array([1.0, 0.0]))[0]
         body = self.body
         # 6 z (1 - z)/h, z from 0 to 1: its integral over the thickness is one
@@ -469,12 +495,12 @@ class TermFactory:
             body_densities.turning, parameters, region="end", facets=self.body.faces[edge]
         )
         term = EndMoment(name, density, self._on_faces([density]), self.u, self.log, amplitude)
+        # the weight's integral over the end is the edge's length
         length = self.log.compile(
             "end length", weight[0] * face_measure(self.body.mesh, [self.body.faces[edge]])(1)
         )
-        term.set_reference_turn(
-            reference_turn, intensity * self.body.mesh.comm.allreduce(fem.assemble_scalar(length))
-        )
+        total_length = self.body.mesh.comm.allreduce(fem.assemble_scalar(length))
+        term.set_reference_turn(reference_turn, intensity * total_length)
         return term
 
     def _volume_densities(
@@ -488,7 +514,7 @@ class TermFactory:
         Parameters
         ----------
         unit
-            Pressure of an amplitude of one.
+            Pressure of an amplitude of one, over E h/R.
         origin
             Point (3,) over R that the volume is counted from; None for volume swept by straight
             motion.
@@ -496,6 +522,7 @@ class TermFactory:
             Whether the pressure has a potential; otherwise densities also have a virtual work.
         """
         moves_straight, faces = origin is None, self.body.faces
+        # an origin of zero needs no parameter: it is the densities' default
         parameters = self._constants(
             unit, *([origin] if origin is not None and origin.any() else [])
         )
@@ -523,6 +550,7 @@ class TermFactory:
         if self.hinged:
             facets = np.unique(np.concatenate([faces[name] for name in self.hinged]))
             cells_of_facets = self.body.mesh.topology.connectivity(2, 3)
+            # heights of the lower and the upper face of the cell at each facet
             low, high = self.body.layer_bounds[
                 cells_of_facets.array[cells_of_facets.offsets[facets]]
             ].T
@@ -532,6 +560,7 @@ class TermFactory:
                 & (high > MIDSURFACE_HEIGHT + HEIGHT_TOLERANCE),
             }
             for name, is_in_mask in masks.items():
+                # all ranks have the same terms
                 if self.body.mesh.comm.allreduce(int(is_in_mask.sum())):
                     facets_of_part, upper = facets[is_in_mask], name == "upper"
                     densities_by_name[f"pressure {name}"] = SolidDensity(
@@ -556,26 +585,34 @@ class TermFactory:
         group: str = "",
         column: str = "",
     ) -> SolidTerm:
-        """Return the term of a density over the body; an empty group stands for the name."""
+        """Return the term of a density over the body.
+
+        `linear` says whether the energy is linear in u. `group` and `column` are those of the term;
+        an empty group stands for the name.
+        """
         energy = self._over_body(density)
         term = SolidTerm(name, density, energy, self.u, self.log, amplitude, linear=linear)
         term.group, term.column = group or name, column
         return term
 
     def _on_faces(self, densities: Sequence[SolidDensity], v: Expr | None = None) -> ufl.Form:
-        """Return the sum of the densities' integrals on their faces.
+        """Return the sum of the densities' integrals on their faces, at the displacement u.
 
         With the test function `v` it is the virtual work of each density in place of its energy.
+        Densities on the outer face are per area of the reference cell, those on ends per area; see
+        `SolidDensity.function`.
         """
         domain, u = self.body.mesh, self.u
         X, J, H = ufl.SpatialCoordinate(domain), ufl.Jacobian(domain), ufl.grad(u)
         ds, forms = face_measure(domain, [density.facets for density in densities]), []
+        # `face_measure` marks the facets of the first density with 1, and so on
         for tag, density in enumerate(densities, 1):
             function = density.function if v is None else density.work
             assert function
             parameters = density.parameters if v is None else (v, *density.parameters)
             if density.region == "outer":
-                # coordinates of the outer face are the first two of the reference cell
+                # coordinates of the outer face are the first two of the reference cell; division
+                # by the area per reference area makes the measure one of the reference cell
                 area = ufl.cross(J[:, 0], J[:, 1])
                 arguments = X, J[:, 0], J[:, 1], u, ufl.dot(H, J[:, 0]), ufl.dot(H, J[:, 1])
                 forms.append(
@@ -586,6 +623,7 @@ class TermFactory:
             n = J[:, 2] / ufl.sqrt(ufl.dot(J[:, 2], J[:, 2]))
             t = ufl.cross(n, ufl.FacetNormal(domain))
             per_area = function(X, u, H, n, t / ufl.sqrt(ufl.dot(t, t)), *parameters)
+            # the outer half of a facet has its own rule
             points, weights = density.rule
             metadata = {"quadrature_rule": "custom"} | {
                 "quadrature_points": tuple(tuple(x) for x in points),

@@ -7,6 +7,15 @@ shell, whose own displacements stay free: cells need not meet. Both ties are spr
 the other shell, t along the edge, s = t . (n x m) and c = n . m:
 
     k/2 |u - u'|^2 + (q/2) (angle of (c c0 + s s0, s c0 - c s0))^2        per undeformed length.
+
+k and q are the stiffnesses of the tie of places and of the tie of normals, u' is the displacement
+of the other shell, and c0 and s0 are c and s of the undeformed placement. So the angle is the
+change of the angle from n to m, about t.
+
+A place is a point of a mid-surface, known by a cell and reference coordinates in it. "Refuse"
+means: raise an error on every rank. A joint of a case (`Joint`) either connects two edges whose
+cells share nodes, or is a T-junction; T-junctions have None in `Midsurface.joints`. Lengths are
+over R, energies over E h R².
 """
 
 from collections.abc import Mapping, Sequence
@@ -52,11 +61,12 @@ PARAMETER_TOLERANCE = 2e-9  # difference of two parameters that is rounding
 MAX_DISTANCE_IN_THICKNESSES = (
     0.05  # thicknesses: a place of the edge that is farther from the other mid-surface is not on it
 )
-SIDE_CORNERS = np.array([[1, 2], [0, 2], [0, 1]])
-CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])
+SIDE_CORNERS = np.array([[1, 2], [0, 2], [0, 1]])  # corners of each side of a triangle
+CORNERS = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]])  # of the reference triangle
 CELL_RADIUS_FACTOR = 1.2  # radius of a whole cell over that of its nodes, about their centre
 TANGENT_COMPONENTS = 12  # components of both tangents of both shells at a point
-# (U, W) -> vector and its derivative
+# (U, W), the components along e_rho and e_z, -> vector and its derivative by theta, in the frame
+# (e_rho, e_theta, e_z); for `MeridianTJunction._maps`
 AROUND_E3 = np.array([[[1, 0], [0, 0], [0, 1]], [[0, 0], [1, 0], [0, 0]]])
 
 
@@ -107,6 +117,13 @@ class TieTerm:
 
     It is an `assembly.terms.Term` (a summand of the potential) and a `NonlocalTerm` (its tangent
     has entries outside the sparsity pattern). Construction is collective and compiles kernels.
+
+    Attributes
+    ----------
+    amplitude
+        None: no load parameter multiplies the energy.
+    column
+        Column of the energy in the results.
     """
 
     amplitude = None
@@ -120,7 +137,12 @@ class TieTerm:
         tied_points: TiedPoints,
         log: KernelLog,
     ) -> None:
-        """Compile the kernels of the term and take the angles of the placement; collective."""
+        """Compile the kernels of the term and take the angles of the placement; collective.
+
+        `r0` is the placement, `u` the displacement that the term follows. Kernels see the 12
+        components of both tangents of both shells as `_present` + `_moved`. `_moved` is always
+        zero; derivatives are taken by it.
+        """
         V = u.function_space
         self._comm, self._u, self._size = V.mesh.comm, u, V.dofmap.bs
         index = V.dofmap.index_map
@@ -128,22 +150,23 @@ class TieTerm:
         self.name = self.group = f"joint of {' and '.join(joint.edges)}"
         self._unknowns, self._gaps = tied_points.unknowns, tied_points.gap
         self._tangents, self._tie = tied_points.tangents, tied_points.stiffness[:, 0]
-        self._turns = bool(joint.rigid or joint.stiffness)
+        self._turns = bool(joint.rigid or joint.stiffness)  # a hinge has no tie of normals
+        # a rank without points has storage for one, which is never read
         self._points = PointStorage(max(len(self._unknowns), 1))
         self._present = self._points.field(TANGENT_COMPONENTS)
         self._moved = self._points.field(TANGENT_COMPONENTS)
-        # direction along the edge, sine and cosine of the placement, stiffness
+        # 0, 1: direction of the edge; 2, 3: sine and cosine of the placement; 4: stiffness
         self._fixed = fixed_field = self._points.field(5)
         sine_and_cosine = _angle(self._present, self._moved, fixed_field)
         sine = sine_and_cosine[0] * fixed_field[3] - sine_and_cosine[1] * fixed_field[2]
         cosine = sine_and_cosine[1] * fixed_field[3] + sine_and_cosine[0] * fixed_field[2]
-        W = fixed_field[4] / 2 * ufl.atan2(sine, cosine) ** 2
+        energy = fixed_field[4] / 2 * ufl.atan2(sine, cosine) ** 2
         self._moved.x.array[:] = 0.0
         self._kernels: Mapping[str, PointKernel] = {
             "angle": point_values("T-junction angle", sine_and_cosine, log),
-            "energy": point_values("T-junction energy", W, log),
-            "gradient": point_gradient("T-junction gradient", [(W, self._moved)], log),
-            "hessian": full_hessian("T-junction Hessian", W, self._moved, log),
+            "energy": point_values("T-junction energy", energy, log),
+            "gradient": point_gradient("T-junction gradient", [(energy, self._moved)], log),
+            "hessian": full_hessian("T-junction Hessian", energy, self._moved, log),
         }
         self._placed = self._apply(self._tangents, global_values(r0))
         fixed_values = fixed_field.x.array.reshape(-1, 5)[: len(self._unknowns)]
@@ -151,6 +174,7 @@ class TieTerm:
             tied_points.edge_directions,
             tied_points.stiffness[:, 1],
         )
+        # the kernel "angle" reads only the direction, which is set, and takes zero displacement
         fixed_values[:, 2:4] = self._evaluate("angle", 0 * global_values(r0))
 
     # the interface of a term
@@ -164,6 +188,7 @@ class TieTerm:
     def energy(self) -> float:
         """Return the elastic energy of both ties at this rank's points; collective."""
         u = global_values(self._u)
+        # the tie of places, then that of normals
         tie_energy = float(self._tie @ np.sum(self._apply(self._gaps, u) ** 2, axis=1)) / 2
         return tie_energy + (float(self._evaluate("energy", u).sum()) if self._turns else 0.0)
 
@@ -183,14 +208,15 @@ class TieTerm:
         """Add nothing: the assembler of nonlocal terms adds `entries`."""
 
     def entries(self) -> Entries:
-        """Return rows, columns and values of the tangent; see `NonlocalTerm`."""
+        """Return this rank's global rows, columns and values of the tangent; collective."""
         return _entries(self._unknowns, self._second_variation(self._gaps, self._tangents))
 
     def coupled_pairs(self) -> tuple[Longs, Longs]:
         """Return the pairs of global nodes that act on each other, which never change.
 
-        See `NonlocalTerm`.
+        The two arrays hold the first and the second node of each pair.
         """
+        # every block of unknowns begins with a node's first component
         return pairs_of(self._unknowns[:, :: self._size] // self._size)
 
     @property
@@ -222,7 +248,7 @@ class TieTerm:
         return np.asarray(np.einsum("nck,nk->nc", maps, u.ravel()[self._unknowns]))
 
     def _evaluate(self, kernel: str, u: Array) -> Array:
-        """Return a kernel's values (n, ..) at the points, at the displacement u of all nodes.
+        """Return a kernel's values (n, ..) at this rank's n points; u is given at all nodes.
 
         Parameters
         ----------
@@ -246,7 +272,7 @@ class SurfaceTJunction(TieTerm):
     tied_edge
         The edge and the shell on which it stands.
     r0, u
-        Placement and displacement.
+        Placement and displacement over R.
     facets
         Local facets of the edge.
     stiffness
@@ -273,6 +299,7 @@ class SurfaceTJunction(TieTerm):
         edge = surfaces.edge_on_shell(facets, tied_edge.is_other_shell)
         edge.refuse_misplaced(r0.function_space.mesh.comm, material.h, tied_edge.key, joint)
         cell_stiffness = surfaces.cells.gather_values(stiffness)
+        # a tie must be stiff beside the stiffer one of the two cells
         stiffer = np.maximum(cell_stiffness[edge.cell], cell_stiffness[edge.other_cell])
         ties = _tie_stiffness(joint, material, stiffer, edge.length, edge.weight)
         super().__init__(joint, r0, u, _tied_points(surfaces, edge, ties), log)
@@ -287,7 +314,8 @@ class EdgeOnShell:
     cell, other_cell
         (n,) global numbers of the cells of the edge and of the other shell.
     on_edge
-        (3, n, functions): shape functions of the edge's cells at the points, and their derivatives.
+        (3, n, functions): shape functions of the edge's cells at the points, and their derivatives
+        by both reference coordinates.
     x
         (n, 3) the points, undeformed.
     directions
@@ -299,8 +327,8 @@ class EdgeOnShell:
     distances
         (n,) distances to the nearest places over R, inf without a cell.
     clearance
-        Greatest distance of a cell's nodes from the other shell, minimised over the cells beside
-        the edge.
+        For each cell of this rank beside the edge, the greatest distance of its nodes from the
+        other shell; the least of these over the cells. Near zero if a cell lies in the other shell.
     """
 
     cell: Longs
@@ -361,7 +389,7 @@ class MidSurfaces:
         return self.V.element.basix_element
 
     def shapes(self, X: Array) -> Array:
-        """Return shape functions and derivatives (3, n, functions) at places X (n, 2)."""
+        """Return shape functions and both derivatives (3, n, functions) at places X (n, 2)."""
         return np.asarray(self._element.tabulate(1, X)[..., 0])
 
     def edge_on_shell(
@@ -378,6 +406,7 @@ class MidSurfaces:
         """
         first, nodes = self.cells.own_range.start, self.cells.nodes
         cells, ends = _cell_sides(self.V, facets, len(self.cells.own_range))
+        # exact to this degree with as many Gauss points as the element's degree
         s, weights = basix.make_quadrature(basix.CellType.interval, 2 * self._element.degree - 1)
         # Gauss points along each side, in the coordinates of its cell
         X = ends[:, None, 0] + s[None, :, :1] * (ends[:, None, 1] - ends[:, None, 0])
@@ -386,15 +415,16 @@ class MidSurfaces:
         on_edge = self.shapes(X.reshape(-1, 2))
         x = np.einsum("nk,nki->ni", on_edge[0], self.r0[nodes[cell]])
         tangent = np.einsum("na,ank,nki->ni", edge_directions, on_edge[1:], self.r0[nodes[cell]])
+        # a point stands for a part of its side's length; the parts sum to the length
         weight = np.tile(weights, len(cells)) * np.linalg.norm(tangent, axis=1)
         length = np.repeat(np.sum(weight.reshape(-1, len(s)), axis=1), len(s))
+        # global numbers of the other shell's cells
         shell = np.flatnonzero(self.cells.gather_values(is_other_shell))
         other_cell, Y, distances = self.nearest_places(x, shell)
         # a cell all of whose nodes are near the other shell lies in it
         places_of_cells = self.r0[nodes[first + cells]]
-        distances_of_cells = self.nearest_places(places_of_cells.reshape(-1, 3), shell)[2].reshape(
-            places_of_cells.shape[:2]
-        )
+        _, _, distances_of_nodes = self.nearest_places(places_of_cells.reshape(-1, 3), shell)
+        distances_of_cells = distances_of_nodes.reshape(places_of_cells.shape[:2])
         clearance = float(distances_of_cells.max(axis=1, initial=0.0).min(initial=np.inf))
         return EdgeOnShell(
             cell, on_edge, x, edge_directions, weight, length, other_cell, Y, distances, clearance
@@ -429,6 +459,8 @@ class MidSurfaces:
         radii = CELL_RADIUS_FACTOR * np.linalg.norm(nodal_places - centres[:, None], axis=2).max(
             axis=1
         )
+        # the cell whose place is nearest has its centre within its radius of that place; points
+        # farther than a radius from the surface need no place
         if len(cells):
             cells_near = cKDTree(centres).query_ball_point(x, 2 * radii.max())
         else:
@@ -440,9 +472,12 @@ class MidSurfaces:
         )
         if not len(point):
             return nearest, Y, distances
+        # projection needs no corners here: they are for neighbours alone
         surface = Cells(
             self._element, self.cells.nodes[cells], np.zeros((len(cells), 3), dtype=np.int64)
         )
+        # as `nearest_places` takes pairs: cell, position of its first point, number of points (one
+        # each), and the list of points
         candidates = (
             candidate_cells,
             np.arange(len(candidate_cells)),
@@ -474,7 +509,8 @@ class MeridianTJunction(TieTerm):
     r0, u
         Placement and displacement, with components along e_rho and e_z.
     tied
-        Parameters on the meridian chart of the edge and of its place on the other meridian.
+        Parameters s on the meridian chart, the coordinate along all meridians: of the edge, then of
+        its place on the other meridian.
     stiffness
         (cells, 2) E h and E h^3 of each cell over those of the first shell.
 
@@ -502,7 +538,7 @@ class MeridianTJunction(TieTerm):
         self._nodes = dofs[np.concatenate(cells)].reshape(1, -1).astype(np.int64)
         nodal = r0.x.array.reshape(-1, 2)
         rho = _refuse_parallels_apart(r0, tied, material.h, key, joint)
-        foot = int(cells[0][0])
+        foot = int(cells[0][0])  # the edge's cell; its length is that of a straight one
         length = np.abs(ends[foot, 1] - ends[foot, 0]) * np.linalg.norm(
             self._shapes[0][1] @ nodal[dofs[foot]]
         )
@@ -515,13 +551,16 @@ class MeridianTJunction(TieTerm):
         super().__init__(joint, r0, u, tied_points, log)
 
     def entries_of_waves(self, m: float) -> Entries:
-        """Return the entries of the second variation along a wave cos(m theta).
+        """Return the entries of the second variation along a wave; collective.
 
-        Rows and columns number the wave's coefficients (U + V, V, W) at nodes; see `shells.waves`.
+        The wave is U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z. Rows and
+        columns number its coefficients (U + V, V, W) at nodes.
         """
-        # vectors and derivatives around e3 that (U, V, W) make, by cos and sin
+        # coefficients (U, V, W) -> vector and its derivative by theta, in (e_rho, e_theta, e_z),
+        # of (U cos, V sin, W cos)(m theta): the parts with cos, then with sin
         cosine = np.array([[[1, 0, 0], [0, 0, 0], [0, 0, 1]], [[0, 0, 0], [1, m, 0], [0, 0, 0]]])
         sine = np.array([[[0, 0, 0], [0, 1, 0], [0, 0, 0]], [[-m, -1, 0], [0, 0, 0], [0, 0, -m]]])
+        # from (P, V, W) with P = U + V to (U, V, W)
         U_from_P = np.array([[1, -1, 0], [0, 1, 0], [0, 0, 1]])
         H = sum(self._second_variation(*self._maps(part @ U_from_P)) for part in (cosine, sine))
         # half: the mean of cos² and sin² around e3
@@ -535,10 +574,10 @@ class MeridianTJunction(TieTerm):
         """Return `gap` and `tangents` of `TiedPoints`, from the unknowns of both cells.
 
         `components` (2, 3, c) maps the c unknowns of a node to its vector and to that vector's
-        derivative around e3.
+        derivative around e3. The two tangents are the derivatives along the meridian and around e3.
         """
         value, derivative = components
-        gap_blocks, tangent_blocks = [], []
+        gap_blocks, tangent_blocks = [], []  # of the edge, then of the other meridian
         for N, slopes in self._shapes:
             gap_blocks.append(np.kron(N, value))
             tangent_blocks.append(np.vstack([np.kron(slopes, value), np.kron(N, derivative)]))
@@ -571,6 +610,7 @@ def _parallels(
     # at a vertex, the mean of two cells is tied
     cells = [np.flatnonzero(cells_at) for cells_at in is_inside]
     for s, cells_at in zip(tied, cells, strict=True):
+        # s in the reference coordinates of its cells, and slopes by s
         lengths = (ends[cells_at, 1] - ends[cells_at, 0])[:, None]
         N, slopes = V.element.basix_element.tabulate(1, (s - ends[cells_at, :1]) / lengths)[
             ..., 0
@@ -582,7 +622,9 @@ def _parallels(
 def _refuse_parallels_apart(
     r0: fem.Function, tied: tuple[float, float], h: float, key: str, joint: Joint
 ) -> float:
-    """Return the radius over R of an edge's ring, which must be on the other shell.
+    """Check that an edge's ring is on the other meridian, and return its radius over R; collective.
+
+    `tied` holds the parameters of the edge and of its place, `h` is the thickness over R.
 
     Raises
     ------
@@ -591,6 +633,7 @@ def _refuse_parallels_apart(
     """
     V, nodal = r0.function_space, r0.x.array.reshape(-1, 2)
     cells, shapes = _parallels(V, tied)
+    # (rho, z) at both parameters: nodal values times shape functions
     (rho, z), other = (
         N @ nodal[V.dofmap.list[cells_at].ravel()]
         for (N, _), cells_at in zip(shapes, cells, strict=True)
@@ -603,9 +646,9 @@ def _refuse_parallels_apart(
 def refuse_misplaced_parallels(
     joints: Sequence[Joint], meridian: Meridian, r0: fem.Function, h: float
 ) -> None:
-    """Refuse T-junctions of meridians whose edge is off the other shell, as a model would.
+    """Refuse T-junctions of meridians whose edge is off the other shell, before a model is made.
 
-    `h` is the thickness over R.
+    `r0` is the placement and `h` the thickness, both over R.
 
     Raises
     ------
@@ -615,12 +658,12 @@ def refuse_misplaced_parallels(
     for i, (joint, s, joint_cells) in enumerate(
         zip(joints, meridian.tied, meridian.joints, strict=True)
     ):
-        if joint_cells is None:
+        if joint_cells is None:  # a T-junction: no cells of a shared edge
             _refuse_parallels_apart(r0, s, h, f"joints.{i}.edges", joint)
 
 
 def _entries(unknowns: Longs, H: Array) -> Entries:
-    """Return rows, columns and values of matrices H (n, k, k) between unknowns (n, k)."""
+    """Return rows, columns and values of matrices H (n, k, k) between unknowns (n, k), flat."""
     rows, columns = np.broadcast_arrays(unknowns[:, :, None], unknowns[:, None, :])
     return rows.ravel(), columns.ravel(), H.ravel()
 
@@ -632,7 +675,8 @@ def _tied_points(surfaces: MidSurfaces, edge: EdgeOnShell, ties: Array) -> TiedP
     """
     nodes = surfaces.cells.nodes
     nodes_of_pairs = np.concatenate([nodes[edge.cell], nodes[edge.other_cell]], axis=1)
-    points, pair_nodes = len(edge.x), nodes_of_pairs.shape[1]  # a rank may have no point
+    # sizes by name: -1 in `reshape` fails on a rank without points
+    points, pair_nodes = len(edge.x), nodes_of_pairs.shape[1]
     edge_nodes, unknown_count, axes = nodes.shape[1], 3 * pair_nodes, np.eye(3)
     on_other = surfaces.shapes(edge.Y)
     derivatives = np.zeros((points, 4, pair_nodes))
@@ -666,6 +710,7 @@ def _tie_stiffness(
     weight
         (n,) length over R for which each point stands.
     """
+    # a spring has its own stiffness and a hinge none; a rigid joint has one as of an element
     turning_stiffness: Array | float = joint.stiffness
     if joint.rigid:
         turning_stiffness = (
@@ -691,8 +736,10 @@ def _refuse_apart(
     MeshError
         On every rank, with the greatest distance and its place.
     """
-    worst = int(distances.argmax()) if len(distances) else -1
-    worst_of_rank = (float(distances[worst]), x[worst]) if len(distances) else (0.0, np.zeros(3))
+    worst_of_rank = (0.0, np.zeros(3))  # of a rank without points
+    if len(distances):
+        worst = int(distances.argmax())
+        worst_of_rank = (float(distances[worst]), x[worst])
     largest_distance, place = max(
         comm.allgather(worst_of_rank), key=lambda distance_and_place: distance_and_place[0]
     )
@@ -724,8 +771,8 @@ def _cell_sides(V: fem.FunctionSpace, facets: NDArray[np.int32], owned: int) -> 
     to_cell, to_facet = topology.connectivity(1, 2), topology.connectivity(2, 1)
     cells, ends = list[int](), list[Array]()
     for facet in facets:
-        cell = int(to_cell.links(facet)[0])
-        if cell < owned:
+        cell = int(to_cell.links(facet)[0])  # a boundary facet has one cell
+        if cell < owned:  # ghosts are other ranks'
             cells.append(cell)
             ends.append(
                 CORNERS[SIDE_CORNERS[int(np.flatnonzero(to_facet.links(cell) == facet)[0])]]
@@ -754,11 +801,11 @@ def _angle(tangents: fem.Function, increments: fem.Function, edge_direction: fem
 
 
 def _tied_edges(joints: Sequence[Joint], surface: Midsurface) -> list[TiedEdge]:
-    """Return the edges of T-junctions: those of joints, then those of a mesh file."""
+    """Return the edges of T-junctions: first from the case's joints, then from a mesh file."""
     tied = [
         TiedEdge(joint, f"joints.{i}.edges", surface.patches[joint.edges[1]])
         for i, (joint, joint_cells) in enumerate(zip(joints, surface.joints, strict=True))
-        if joint_cells is None
+        if joint_cells is None  # else both edges share nodes and need no tie
     ]
     for name, is_other_shell in surface.t_junctions.items():
         joint = Joint((name, "the sheet"), rigid=True)
@@ -802,10 +849,12 @@ def _refuse_coinciding_shells(
     """
     if len(tied_edges) < 2:
         return
+    # each edge against the shell of each other edge, as if it stood on that shell
     surfaces, comm = MidSurfaces.gather(r0), r0.function_space.mesh.comm
     for (joint, key, _), (other_joint, _, _) in permutations(tied_edges, 2):
         edge, other_edge = joint.edges[0], other_joint.edges[0]
         shell, other_shell = (_shell_of_edge(name, surface) for name in (edge, other_edge))
+        # one shell with two edges, or an edge of a mesh file, whose sheets have no names
         if shell == other_shell or other_shell is None:
             continue
         place = surfaces.edge_on_shell(surface.edges[edge], surface.patches[other_shell])
@@ -818,6 +867,7 @@ def _refuse_coinciding_shells(
 
 def _shell_of_edge(edge: str, surface: Midsurface) -> str | None:
     """Return the shell with whose name an edge's name begins; None for a mesh file's edge."""
+    # an edge's name is its shell's name, a dot or an underscore, and the edge's own
     beginnings = {name: (f"{name}.", f"{name}_") for name in surface.patches}
     return next((name for name, words in beginnings.items() if edge.startswith(words)), None)
 
@@ -846,7 +896,13 @@ def t_junction_terms(model: "ShellModel") -> list[SurfaceTJunction]:
 
 
 def meridian_t_junction_terms(model: "MeridianModel") -> list[MeridianTJunction]:
-    """Return the T-junction terms of a model on a meridian; see `MeridianTJunction`."""
+    """Return the T-junction terms of a model on a meridian; collective.
+
+    Raises
+    ------
+    MeshError
+        If an edge is not on the other meridian.
+    """
     meridian, factors, log = model.meridian, _stiffness_factors(model), model.kernels
     tied = enumerate(zip(model.loads.joints, meridian.tied, meridian.joints, strict=True))
     return [
@@ -854,7 +910,7 @@ def meridian_t_junction_terms(model: "MeridianModel") -> list[MeridianTJunction]
             joint, f"joints.{i}.edges", model.r0, model.u, s, factors, model.material, log
         )
         for i, (joint, s, joint_cells) in tied
-        if joint_cells is None
+        if joint_cells is None  # a T-junction
     ]
 
 
@@ -863,9 +919,11 @@ def _stiffness_factors(model: "ShellModel | MeridianModel") -> Array:
     cells = model.V.mesh.topology.index_map(model.V.mesh.topology.dim)
     factors = np.ones((cells.size_local + cells.num_ghosts, 2))
     if model.thickness is not None:
-        t = model.thickness.x.array[model.thickness.function_space.dofmap.list].mean(axis=1)
-        factors *= np.column_stack([t, t**3])
+        # h(x)/h, its mean in each cell
+        ratio = model.thickness.x.array[model.thickness.function_space.dofmap.list].mean(axis=1)
+        factors *= np.column_stack([ratio, ratio**3])
     if model.cell_materials is not None:
+        # the first of a cell's four material numbers is its modulus over the first shell's
         factors *= model.cell_materials.x.array.reshape(-1, 4)[
             model.cell_materials.function_space.dofmap.list[:, 0], :1
         ]

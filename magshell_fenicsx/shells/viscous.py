@@ -4,6 +4,13 @@ Kelvin and Voigt: the stress of tau dE/dt and tau dK/dt. A branch of Maxwell, a 
 with a dashpot: the stress of g q with dq/dt = dE/dt - q/tau, q of the membrane strain and of the
 curvature. Rates are those of the exact strains, so that rigid motions are not damped. Strains are
 known at the nodes of each cell and interpolated.
+
+Forces are integrated over a step in time from u0 to u1, of length dt. A strain q that decays as
+q/tau is integrated with the mean rate of E in the step and with its change since the last step.
+Viscous stresses are given to forms as the strain whose elastic stress they are, by the law at small
+strains. Interior edges, and those that hold the normal, open by a jump of the rotation, as in C0
+interior penalty; moments do work on it. A jet is a map's value and derivatives at a point.
+u and displacements are over R, stresses over E.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -43,7 +50,7 @@ VELOCITY_STEP_IN_THICKNESSES = (
 
 @dataclass(frozen=True)
 class Branch:
-    """A branch of Maxwell: its modulus over Young's, and its relaxation time."""
+    """A branch of Maxwell: the modulus g of its spring over Young's, and its relaxation time."""
 
     modulus: float
     time: float
@@ -80,7 +87,7 @@ class Viscosity:
     model
         A shell or a meridian.
     mu
-        Amplitudes with the places of supports, which do not move.
+        Amplitudes of the motion, which place the supports; supports do not move in it.
     kelvin
         Relaxation time tau of the Kelvin-Voigt element; zero without.
     branches
@@ -91,7 +98,7 @@ class Viscosity:
     memory
         History variables after the steps so far.
     creep_time
-        `kelvin`.
+        `kelvin`: the longest time in which the forces let a displacement creep to its end.
     """
 
     def __init__(
@@ -122,10 +129,11 @@ class Viscosity:
         self._elastic_terms = [
             term.name for term in model.system.terms if term.column in ("stretching", "bending")
         ]
+        # where the law is linear, the viscous tangent is a multiple of the elastic one
         law = model.material.law
         self._viscous_tangent = _AddedViscousTangent(model) if law.linear != law else None
         self.memory = Memory([np.zeros((*self._places.shape, STRAIN_SIZE)) for _ in branches])
-        # displacements and their strains
+        # displacements and their strains, kept from one call to the next
         self._first_strain: tuple[Vector, Array] = np.empty(0), np.empty(0)
         self._last_strain: tuple[Vector, Array] = self._first_strain
         self._force = np.zeros(model.system.size)
@@ -136,11 +144,11 @@ class Viscosity:
         Parameters
         ----------
         v
-            Velocity there.
+            Velocity at that fraction of the step.
         part
             The fraction, from 0 to 1.
         dt
-            Length of the step.
+            Length of the step; 0 at the begin of a motion.
         """
         displacement = u0 + part * (u1 - u0)
         if self.creep_time:
@@ -153,16 +161,16 @@ class Viscosity:
             ):
                 # q is linear between the ends of the step
                 stress += branch.modulus * (part * end + (1 - part) * q)
-        self._force = self._forces(
-            stress, u0, displacement, self.stiffness(dt, 2 / dt) if dt else 0.0
-        )
+        # edges have no history: in the middle of a step, an opening has the rate 2/dt times it
+        edge_stiffness = self.stiffness(dt, 2 / dt) if dt else 0.0
+        self._force = self._forces(stress, u0, displacement, edge_stiffness)
         return self._force
 
     def tangent(self, u: Vector, mu: Amplitudes, dt: float, rate: float) -> Tangent:
         """Return the system's tangent with the derivative of these forces by u1; collective.
 
-        Viscous forces stiffen the shell, but no body that it touches. `rate` is dv/du at the end of
-        the step, of length `dt`.
+        Viscous forces stiffen the shell, but no body that it touches. So only the elastic terms of
+        the tangent grow. `rate` is dv/du at the end of the step, of length `dt`.
         """
         stiffness = self.stiffness(dt, rate)
         if self._viscous_tangent is None:
@@ -175,7 +183,8 @@ class Viscosity:
     def stiffness(self, dt: float, rate: float) -> float:
         """Return the viscous tangent over the elastic one for a step of length `dt`.
 
-        `rate` is dv/du at the end of the step.
+        `rate` is dv/du at the end of the step. A branch has the share of a step's strain that its
+        spring still holds at the end.
         """
         return self.creep_time * rate + sum(
             b.modulus * (_retained_share(b, dt) + self._bending_share(b, dt) / dt)
@@ -208,6 +217,7 @@ class Viscosity:
         change_of_rate = self._strain_change(u0, u1) / dt - rate
         return self._forces(
             sum(b.modulus * self._bending_share(b, dt) for b in self._branches) * change_of_rate,
+            # from u1 to u1, without stiffness: edges have no part in the estimate
             u1,
             u1,
             0.0,
@@ -219,13 +229,14 @@ class Viscosity:
         Parameters
         ----------
         stress
-            (cells, nodes, 12), as a strain: the elastic law makes the stress of it.
+            (cells, nodes, 12), given as the strain whose elastic stress it is.
         stiffness
             Factor of the elastic stiffness of edges; see `stiffness`.
         """
         prescribed, system = self._prescribed, self._model.system
         self._field.x.array.reshape(-1, STRAIN_SIZE)[self._places] = stress
         prescribed.stiffness.value = stiffness
+        # edges open between these displacements
         for field, displacement in (
             (prescribed.first_displacement, u0),
             (prescribed.last_displacement, u1),
@@ -237,7 +248,8 @@ class Viscosity:
         """Return the strain q of each branch at the end of a step, (cells, nodes, 12).
 
         It integrates dq/dt = dE/dt - q/tau exactly for a strain E that is quadratic in time,
-        through both ends of the step and the begin of the step before.
+        through both ends of the step and the begin of the step before. The last two terms are the
+        parts of E's mean rate and of its curvature in time.
         """
         strain_change, rate = self._strain_change(u0, u1), self.memory.rate
         change_of_rate = 0.0 if rate is None else strain_change / dt - rate
@@ -251,19 +263,24 @@ class Viscosity:
         ]
 
     def _bending_share(self, branch: Branch, dt: float) -> float:
-        """Return the part of a change in the mean strain rate that stays in a branch's spring.
+        """Return the factor from a change in the mean strain rate to the strain of a spring.
 
-        The change is from the last step to this one; the part is a time. Zero without an earlier
-        rate.
+        The change is from the last step to this one, the strain is that at the end of this step.
+        The factor is a time; zero without an earlier rate.
         """
         if self.memory.rate is None:
             return 0.0
+        # the second derivative of E is the change of mean rates over the mean of both steps
         return _curvature_weight(dt / branch.time) * dt * 2 * dt / (dt + self.memory.dt)
 
     def _strain_change(self, u0: Vector, u1: Vector) -> Array:
-        """Return the strain at u1 minus that at u0; the last two displacements are kept."""
+        """Return the strain at u1 minus that at u0; collective.
+
+        The strains of the last two displacements are kept, by identity of the arrays: solvers call
+        this often with the same ones.
+        """
         if self._first_strain[0] is not u0:
-            if self._last_strain[0] is u0:
+            if self._last_strain[0] is u0:  # the next step begins where the last one ended
                 self._first_strain = self._last_strain
             else:
                 self._first_strain = (u0, self._strain(u0))
@@ -289,6 +306,7 @@ class Viscosity:
             self._frame.tensor(S)
             for S in (self._frame.membrane_strain(jets), self._frame.curvature_change(jets))
         ]
+        # xx, yy, zz, xy, xz, yz
         return np.concatenate(
             [S[..., [0, 1, 2, 0, 0, 1], [0, 1, 2, 1, 2, 2]] for S in tensors], axis=-1
         )
@@ -297,14 +315,16 @@ class Viscosity:
 class _AddedViscousTangent:
     """Tangent of viscous forces whose law is not that of the elastic ones.
 
-    It is an `AddedTangent`, a matrix that the system adds to its own. Viscous stresses are those of
-    small strains: they make stiff what the strains of a stretched shell leave soft.
+    It is an `AddedTangent`, a matrix that the system adds to its own. Viscous stresses follow the
+    law at small strains, while the elastic law, as of rubber, changes with the strain. So the
+    viscous tangent is no multiple of the elastic one.
     """
 
     def __init__(self, model: "ShellModel | MeridianModel") -> None:
         """Compile the forms and add this tangent to those of the model's system."""
         self._system, self._stiffness = model.system, fem.Constant(model.V.mesh, 0.0)
         rates, v = _StrainRates(model), ufl.TestFunction(model.V)
+        # displacement about which changes are taken, and the domain's factor
         self._since, factor = rates.since, model.factory.domain.revolution_factor
         self._forms = [
             model.kernels.compile(
@@ -317,7 +337,7 @@ class _AddedViscousTangent:
 
     @contextmanager
     def scaled_by(self, stiffness: float) -> Iterator[None]:
-        """Let the system's tangents have this one, times a stiffness, within the context."""
+        """Add this tangent, times a stiffness, to the system's tangents within the context."""
         self._stiffness.value = stiffness
         try:
             yield
@@ -325,9 +345,9 @@ class _AddedViscousTangent:
             self._stiffness.value = 0.0
 
     def sum(self, K: PETSc.Mat, factors: Factors) -> PETSc.Mat:
-        """Return the tangent K with the viscous one added; collective. See `AddedTangent`.
+        """Return the sparse tangent K plus the viscous one, as a new matrix; collective.
 
-        Outside `scaled_by` it is K itself.
+        Outside `scaled_by` it is K itself. `factors`, of the system's terms, are not used.
         """
         if not self._stiffness.value:
             return K
@@ -374,7 +394,7 @@ class _PrescribedStress:
     first_displacement, last_displacement
         Displacements between which edges open.
     stiffness
-        Viscous stiffness over the elastic one, of the opening edges.
+        Viscous over elastic stiffness of edges; see `Viscosity.stiffness`.
     """
 
     field: fem.Function
@@ -405,7 +425,8 @@ class _PrescribedStress:
 class _StrainRates:
     """Derivatives of strains and jumps along a change of the displacement, a trial function.
 
-    They replace `_PrescribedStress` in the forms of the tangent of viscous forces.
+    They replace `_PrescribedStress` in the forms of the tangent of viscous forces. `since` is the
+    displacement at which the derivatives are taken.
     """
 
     def __init__(self, model: "ShellModel | MeridianModel") -> None:
@@ -413,14 +434,17 @@ class _StrainRates:
         self._jet = model.factory.domain.jet(self.since)
 
     def strain(self, j: Jet, side: str) -> tuple[Expr, Expr]:
-        """Return the changes of strain and curvature; arguments as in `_PrescribedStress`."""
+        """Return the changes of strain and curvature, as in `_PrescribedStress.strain`."""
         E, K = _strains(j, self._jet.side(side) if side else self._jet)
         return ufl.derivative(E, self.since, self._change), ufl.derivative(
             K, self.since, self._change
         )
 
     def stiff_opening(self, domain: IntegrationDomain, jump: Callable[[Jet], Expr]) -> Expr:
-        """Return the change of an edge's jump; arguments as in `_PrescribedStress`."""
+        """Return the change of an edge's jump, as in `_PrescribedStress.stiff_opening`.
+
+        The tangent's stiffness multiplies the whole form instead.
+        """
         return ufl.derivative(jump(domain.j0 + self._jet), self.since, self._change)
 
 
@@ -432,7 +456,8 @@ def _strains(j: Jet, u: Jet) -> tuple[Expr, Expr]:
 def mirrored_jump(r0: Jet, m: Expr, normal: Expr) -> Callable[[Jet], Expr]:
     """Return half the rotation jump across a mirror plane, as a function of the deformed jet.
 
-    `m` is the covector of the edge, `normal` the plane's unit normal.
+    `m` is the covector of the edge, `normal` the plane's unit normal. For small
+    angles it is the angle between the shell's normal and the plane.
     """
     nu1, nu2, _ = kin.conormal(r0, m)
     return lambda r: ufl.dot(kin.normal(r), normal) * ufl.dot(normal, r.r1 * nu1 + r.r2 * nu2)
@@ -441,14 +466,18 @@ def mirrored_jump(r0: Jet, m: Expr, normal: Expr) -> Callable[[Jet], Expr]:
 def held_jump(r0: Jet, m: Expr, n0: Expr) -> Callable[[Jet], Expr]:
     """Return the jump to a held normal n0 at an edge, as a function of the deformed jet.
 
-    `m` is the covector of the edge.
+    `m` is the covector of the edge. The jump, for small angles, is the rotation of the shell's
+    normal from n0 about the edge.
     """
     nu1, nu2, _ = kin.conormal(r0, m)
     return lambda r: -ufl.dot(n0 - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
 
 
 def _jump_of(edge: HeldEdge, r0: Jet, m: Expr) -> Callable[[Jet], Expr]:
-    """Return the opening of an edge as a function of the deformed jet."""
+    """Return the rotation jump of a held edge as a function of the deformed jet.
+
+    `r0` is the jet of the placement, `m` the covector of the edge.
+    """
     if edge.plane is not None:
         return mirrored_jump(r0, m, edge.plane)
     n0 = kin.normal(r0)
@@ -458,8 +487,9 @@ def _jump_of(edge: HeldEdge, r0: Jet, m: Expr) -> Callable[[Jet], Expr]:
 def _works(
     model: "ShellModel | MeridianModel", stresses: _PrescribedStress | _StrainRates
 ) -> list[ufl.Form]:
-    """Return the works of given stresses on strains, and on edges as in C0 interior penalty.
+    """Return the works of viscous stresses on strains, and on edges as in C0 interior penalty.
 
+    `stresses` are numbers for the forces, or the trial function's for their tangent.
     Their gradients by u are the viscous forces. The first form holds cells and interior edges, and
     each further one a held edge. Smooth surfaces have no jumps, so that edges need no memory: each
     step closes the edges that it opens.
@@ -480,13 +510,14 @@ def _small_strain_law(model: "ShellModel | MeridianModel", j: Jet, side: str = "
     if materials is None:
         return law
     material_numbers = materials(side) if side else materials
+    # modulus, Poisson's ratio and law of the cell; 2 is the mass density
     return law.with_material(*(material_numbers[i] for i in (0, 1, 3)))
 
 
 def _work_in_cells(
     model: "ShellModel | MeridianModel", stresses: _PrescribedStress | _StrainRates
 ) -> ufl.Form:
-    """Return the work of given membrane stresses and moments in the cells."""
+    """Return the work of viscous membrane stresses and moments on the strains of u in the cells."""
     domain = model.factory.domain
     r0, u = domain.j0, domain.jet(model.u)
     E, K = _strains(r0, u)
@@ -502,10 +533,11 @@ def _work_in_cells(
 def _work_on_interior_edges(
     model: "ShellModel | MeridianModel", stresses: _PrescribedStress | _StrainRates
 ) -> ufl.Form:
-    """Return the work of given moments on the rotation jumps between cells.
+    """Return the work of viscous moments on the rotation jumps between cells.
 
-    As in C0 interior penalty it has three parts: given moment times jump, opening times moment, and
-    opening times penalty times jump.
+    As in C0 interior penalty it has three parts: viscous moment times jump of u, opening times
+    elastic moment of u, and opening times penalty times jump. The opening is the change of the jump
+    in the step, times the viscous stiffness.
     """
     factory, domain = model.factory, model.factory.domain
     r0, u, m = domain.j0, domain.jet(model.u), domain.covector
@@ -514,13 +546,16 @@ def _work_on_interior_edges(
     conormals = [kin.conormal(j, m(s)) for j, s in zip(r0s, sides, strict=True)]
 
     def jump_of(r: Jet) -> Expr:
+        """Return the rotation jump at the deformed jet; a finite angle if the shell is folded."""
         plus, minus = (r.side(s) for s in sides)
         if factory.has_folds:
             return ufl.atan2(*edges.fold_angle(plus, minus, m("+")))
         return edges.fold_jump(plus, minus, conormals[0][:2], conormals[1][:2])
 
+    # means over both sides; `edge` is the inverse metric, the unit conormal and its square
     given_moment, moment, stiffness = 0, 0, 0
     for j, v, side, (nu1, nu2, _) in zip(r0s, us, sides, conormals, strict=True):
+        # v is the jet of u on this side
         edge, law = (kin.inverse_metric(j), (nu1, nu2), 1), _small_strain_law(model, j, side)
         given_moment += law.edge_moment(*stresses.strain(j, side), *edge) / 2
         moment += law.edge_moment(*_strains(j, v), *edge) / 2
@@ -534,7 +569,10 @@ def _work_on_interior_edges(
 def _works_on_held_edges(
     model: "ShellModel | MeridianModel", stresses: _PrescribedStress | _StrainRates
 ) -> list[ufl.Form]:
-    """Return the works on edges that hold the normal or lie on mirror planes, one form each."""
+    """Return the works on edges that hold the normal or lie on mirror planes, one form each.
+
+    A work has the three parts of `_work_on_interior_edges`, with the moments of one side.
+    """
     factory, domain = model.factory, model.factory.domain
     r0, u, m = domain.j0, domain.jet(model.u), domain.covector
     E, K = _strains(r0, u)

@@ -4,6 +4,13 @@ see.
 Along a wave v every component of a jet is a coefficient times cos(m theta) or sin(m theta),
 so the second variation of an axisymmetric energy is pi times the sum of that of the
 cosine's and of the sine's coefficients: one form on the meridian with m as a number.
+
+Q_m is the second variation along waves m. In go an axisymmetric state and the energies as functions
+of a jet (value and derivatives at a point); out come the matrix of Q_m, its number of negative
+pivots (unstable directions), or all waves with any. A wave has three coefficients (U + V, V, W) at
+each node of the meridian. "Entries" are the values of one triangle of a matrix, block by block, in
+the order of `_sparsity`; the constraints of the axis and the ends are put in later. Lengths are
+over R, energies over E h R².
 """
 
 from collections.abc import Iterable, Sequence
@@ -40,7 +47,7 @@ if TYPE_CHECKING:
     from magshell_fenicsx.shells.t_junctions import MeridianTJunction
 
 Array = NDArray[np.float64]
-DEGREE = 4  # degree in m of a wave's matrix
+DEGREE = 4  # degree in m of a wave's matrix, which five values of m determine
 
 
 class Waves:
@@ -86,7 +93,7 @@ class Waves:
         log: KernelLog,
         nonlocal_terms: "Sequence[MeridianContact | MeridianTJunction]" = (),
     ) -> None:
-        """Make the space of waves and the Hessians of the energies."""
+        """Make the space of waves and the Hessians of the energies; parameters are the class's."""
         self.nonlocal_terms = nonlocal_terms
         degree = system.u.function_space.element.basix_element.degree
         self.V = V = fem.functionspace(meridian.mesh, ("Lagrange", degree, (3,)))
@@ -115,7 +122,7 @@ class Waves:
     def for_system(self, system: FiniteElementSystem, largest: int) -> "Waves":
         """Return the waves of another system with the same terms, which shares their kernels.
 
-        `largest` is its largest m.
+        `largest` is its largest m, on which only the interpolation in m depends.
         """
         _ = self._bands, self._rows_of_matrix  # computed before copying, as both share these
         waves = copy(self)
@@ -125,7 +132,10 @@ class Waves:
         return waves
 
     def tangent(self, state: State, m: int) -> PETSc.Mat:
-        """Return the matrix of Q_m at an axisymmetric state; the next call overwrites it."""
+        """Return the matrix of Q_m at an axisymmetric state; the next call overwrites it.
+
+        It has the constraints of wave m, and the entries of contacts and T-junctions.
+        """
         (entries,) = self._system.at_state(state).evaluate_forms(lambda: self._entries(state, [m]))
         return self._with_nonlocal_entries(state, self._filled("tangent", entries.ravel(), m), m)
 
@@ -136,20 +146,23 @@ class Waves:
         entries = self._system.at_state(state).evaluate(
             lambda: [term.entries_of_waves(m) for term in self.nonlocal_terms]
         )
+        # of each term: rows, columns and values
         rows, columns, values = (np.concatenate(arrays) for arrays in zip(*entries, strict=True))
         is_constrained = np.zeros(K.getSize()[0], dtype=bool)
         is_constrained[self._rows(m)] = True
         return with_entries(K, (rows, columns, values), is_constrained)
 
     def energies_along(self, phi: NDArray[np.float64], m: int) -> list[FormTerm]:
-        """Return the terms of Q_m(phi), functions of the axisymmetric displacement.
+        """Return the terms of Q_m(phi), as functions of the axisymmetric displacement u.
 
-        One for each nonlinear energy of the shell. A later call for other phi (coefficients at
-        nodes) or m changes these terms.
+        Their derivatives, by u or by the placement, tell how the stiffness of a mode changes. There
+        is one term for each nonlinear energy of the shell. phi are a wave's coefficients at nodes.
+        All calls return the same terms: a later call for other phi or m changes them.
         """
         self._phi.x.array[:], self._m.value = phi, m
         if not self._energies:
             for e in self._nonlinear_energies:
+                # twice the derivative by v along phi, at v = 0
                 energy, v = self._of_wave(e)
                 twice = ufl.derivative(ufl.derivative(energy, v, self._phi), v, self._phi)
                 form = ufl.replace(twice, {v: ufl.zero(3)})
@@ -184,6 +197,7 @@ class Waves:
         values = self.sampled_tangents(state)
         if not self.nonlocal_terms:
             return self.counts_from(values)
+        # entries of contacts are no polynomials in m: each wave is factored with its own
         unstable = list[int]()
         for m in range(1, self.largest + 1):
             K = self._filled("interpolated", self._weights[m] @ values, m)
@@ -209,9 +223,10 @@ class Waves:
         return unstable
 
     def indefinite(self, values: NDArray[np.float64]) -> set[int]:
-        """Return m - 1 of each wave whose matrix is not positive definite.
+        """Return the indices m - 1 of the waves whose matrices are not positive definite.
 
-        `values` are matrices that `sampled_tangents` gave.
+        An index is that of a wave's family (`SymmetryBreakingWaves.families`). `values` are
+        matrices that `sampled_tangents` gave.
         """
         ranges = self._ranges
         try:
@@ -227,12 +242,13 @@ class Waves:
         The shape is (waves, pairs of nodes, 3, 3); `waves` are the numbers m, which need not be
         whole.
         """
+        # amplitude (None: 1) -> factor of its energies
         factors = {e.amplitude: factor_of(e.amplitude, state.mu) for e in self._nonlinear_energies}
         return self._points.entries(factors, [float(m) for m in waves])
 
     @cached_property
     def _bands(self) -> "list[BandedMatrices]":
-        """Banded matrices of m = 1, and of all other m."""
+        """Banded matrices of m = 1, and of all other m, which have other constraints."""
         return [BandedMatrices(*self._sparsity, self._rows(m)) for m in (1, 2)]
 
     @cached_property
@@ -241,6 +257,7 @@ class Waves:
 
         They cover one triangle of node pairs, with the full blocks of a node with itself.
         """
+        # rows and columns of the 3 x 3 blocks: those of the nodes, plus the component
         rows, columns = (
             3 * a[:, None, None] + np.zeros((3, 3), dtype=np.int64)
             for a in (self._points.rows, self._points.columns)
@@ -251,7 +268,7 @@ class Waves:
     def _rows_of_matrix(self) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int64]]:
         """The full matrix in compressed rows: row starts, columns, and positions of values.
 
-        A position is the number of the entry in `_sparsity`.
+        A position is the number of the entry in `_sparsity`. So entries of one triangle fill both.
         """
         rows, columns = self._sparsity
         # entries that the other triangle mirrors
@@ -278,7 +295,7 @@ class Waves:
         def is_definite(weights: NDArray[np.float64]) -> bool:
             return bands_of_others.is_positive_definite(matrices_of_others, weights)
 
-        is_definite_wave = cache(lambda m: is_definite(self._weights[m]))
+        is_definite_wave = cache(lambda m: is_definite(self._weights[m]))  # ends are shared
         indefinite = set[int]()
         if not bands_of_one.is_positive_definite(matrix_of_one, np.ones(1)):
             indefinite.add(1)
@@ -287,7 +304,8 @@ class Waves:
         while open_ranges:
             wave_range = open_ranges.pop()
             first, last = wave_range.first, wave_range.last
-            # few waves: each is tested
+            # few waves: each is tested; else the first and the last Bernstein coefficient are those
+            # waves themselves, and `inner` has the others
             if wave_range.short:
                 indefinite |= {m for m in range(first, last + 1) if not is_definite_wave(m)}
             elif not (
@@ -341,14 +359,18 @@ class Waves:
         return {m: count for m, count in pivots.items() if count}
 
     def _of_wave(self, e: Energy) -> tuple[ufl.Form, fem.Function]:
-        """Return the second variation of an energy along a wave v, as a form, and v."""
+        """Return a form whose Hessian in v, at v = 0, is that of an energy along a wave, and v.
+
+        The Hessian of the energy's cosine and sine parts is integrated around e3 with pi.
+        """
         v, u = fem.Function(self.V), domains.revolved_jet(self._system.u)
         cosine, sine = domains.wave_jets(v, self._m)
         return np.pi * (e.perturbed_form(u, cosine) + e.perturbed_form(u, sine)), v
 
 
 def largest_wave_number(meridian: Meridian, length: float) -> int:
-    """Return the largest m that is examined, see `Waves.largest`."""
+    """Return the largest m that is examined, see `Waves.largest`; `length` is h/R."""
+    # 2.2, and 5 more, is a margin over the sphere's 1.73 to 1.86
     return ceil(2.2 * meridian.reach * sqrt(meridian.curvature / length)) + 5
 
 
@@ -377,7 +399,7 @@ class _WaveRange:
         self.inner = np.linalg.solve(np.stack(bernstein, axis=1), weights_at_places)[1:-1]
 
     def halves(self, nodes: NDArray[np.float64]) -> list["_WaveRange"]:
-        """Return both halves of the range, which share their middle wave."""
+        """Return both halves of the range, which share their middle wave, the geometric mean."""
         middle = round(sqrt(self.first * self.last))  # the matrices vary most at small m
         return [_WaveRange(self.first, middle, nodes), _WaveRange(middle, self.last, nodes)]
 
@@ -387,7 +409,7 @@ def _lagrange_weights(
 ) -> NDArray[np.float64]:
     """Return the weights (places, nodes) of Lagrange's interpolation at other places.
 
-    They multiply values at the nodes in the polynomial's value at each place.
+    The polynomial's value at a place is the sum of the weights times the values at the nodes.
     """
     others = [np.delete(nodes, i) for i in range(len(nodes))]
     columns = [
@@ -400,7 +422,8 @@ def _lagrange_weights(
 def _mirrored(entries: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the entries (.., 3, 3) of Q_-m from those of Q_m.
 
-    With -V in place of V, P = U + V becomes P - 2 V.
+    With -V in place of V, P = U + V becomes P - 2 V. So the matrix is S^T Q S with S = ((1, -2, 0),
+    (0, -1, 0), (0, 0, 1)): columns first, then rows.
     """
     mirrored = entries.copy()
     mirrored[..., 1] = -2 * mirrored[..., 0] - mirrored[..., 1]
@@ -484,13 +507,14 @@ class BandedMatrices:
         order = reverse_cuthill_mckee(pattern, symmetric_mode=True)
         place = np.empty(n, dtype=np.int64)
         place[order] = np.arange(n)
+        # entries in constrained rows and columns are left out
         is_free = np.ones(n, dtype=bool)
         is_free[constrained_rows] = False
         self._free_entries = np.flatnonzero(is_free[rows] & is_free[columns])
         rows, columns = rows[self._free_entries], columns[self._free_entries]
         # lower triangle in the order of reverse Cuthill and McKee
         i, j = np.maximum(place[rows], place[columns]), np.minimum(place[rows], place[columns])
-        self._shape = (int((i - j).max(initial=0)) + 1, n)
+        self._shape = (int((i - j).max(initial=0)) + 1, n)  # diagonals of the band, columns
         # in LAPACK's lower band, column by column
         self._band_positions = (i - j) + j * self._shape[0]
         self._held_places = place[constrained_rows]
@@ -514,4 +538,5 @@ class BandedMatrices:
         `bands` are those of the matrices, as `bands` gives them; the weights add up to one.
         """
         band = (weights @ bands).reshape(self._shape, order="F")
-        return bool(lapack.dpbtrf(band, lower=1, overwrite_ab=1)[1] == 0)
+        _, info = lapack.dpbtrf(band, lower=1, overwrite_ab=1)
+        return bool(info == 0)

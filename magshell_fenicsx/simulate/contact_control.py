@@ -3,6 +3,20 @@
 A body approaches until it touches first. Penalties become stiffer where something penetrates too
 much, and shells are cut anew where their points of contact have slid. No shell may pass through
 another one, and no body may go back the way it came. docs/theory.md has the penalty.
+
+Words and symbols:
+
+- A penalty is an energy of penetration, with a stiffness. A contact is one body against the shell
+  (`contact.amplitude` is the approach of the body, over h), or a `Pair` of shells that may touch.
+- Cuts divide cells of shells that touch into segments, each with quadrature points of its own and
+  opposite to one other cell. Each set of cuts has a number.
+- A setting is an entry of `State.mu` that is no load: the present stiffness of a contact
+  (`contact.setting`, `pair.setting`) or the number of a pair's cuts (`pair.cuts`). Functions that
+  change contact return setting -> new value, and the caller solves again.
+- A bound is `max_penetration`, the largest penetration that a contact is meant to have.
+- Points `low` and `high` are two successive points of a path, the earlier one first. Their states
+  are those of the stage, the scene with the solver of a step; `stage.leave` gives the model's.
+- h and R are thickness and reference length.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -80,19 +94,21 @@ def state_at_first_contact(scene: Scene, step: ProgrammeStep, state: State) -> S
         target[1] if target and target[0].quantity == "load" else inf
     )  # of the approach
     region = scene.model.region(state, name)
+    # it touches already, or the step has nowhere to go
     if region.penetration > GAP_TOLERANCE * h or end_of_approach <= state.mu[name]:
         return state
     for _ in range(MAX_APPROACHES):
         gap = -scene.model.region(state, name).penetration / h
         if gap <= GAP_TOLERANCE:
             break
-        # the gap bounds the way to the first contact from below
+        # the body can approach by the gap without passing the first contact
         state = state.with_(state.u, name, state.mu[name] + gap)
         if state.mu[name] + CONTACT_DEPTH >= end_of_approach:
             return state.with_(state.u, name, end_of_approach)
     else:
         raise Stopped("the body does not meet the shell")
     reason = ""
+    # a little beyond, so that there is a force; less far where there is no equilibrium
     for depth in FIRST_CONTACT_DEPTHS:
         approach = state.mu[name] + depth
         outcome = scene.newton.solve(
@@ -120,9 +136,9 @@ def raised_stiffnesses(scene: Scene, state: State) -> dict[str, float]:
             and stiffness < MAX_STIFFENING * contact.stiffness
         ):
             settings[contact.setting] = STIFFENING * stiffness
-    for pair, depth in shell_penetrations(scene, state):
+    for pair, depth in shell_penetrations(scene, state):  # depth over the thickness
         stiffness = state.mu.get(pair.setting, pair.stiffness)
-        if (
+        if (  # between the points of contact shells may be deeper: a part of the bound
             depth > BOUND_AT_POINTS * pair.max_penetration
             and not pair.has_given_stiffness
             and stiffness < MAX_STIFFENING_OF_SHELLS * pair.stiffness
@@ -132,10 +148,12 @@ def raised_stiffnesses(scene: Scene, state: State) -> dict[str, float]:
 
 
 def stiff_for(pair: Pair, speed: float, h: float) -> float:
-    """Return the stiffness with which a pair that meets flat goes `IMPACT_PENETRATION` deep.
+    """Return a stiffness with which shells that hit each other flat penetrate little enough.
 
-    The kinetic energy about the common velocity is then that of the penalty: m v^2 = k s^2, with
-    half the mass per area of the first shell as m.
+    At the penetration s of `IMPACT_PENETRATION` h the penalty has taken all kinetic energy of the
+    relative motion with the speed v: k s^2 = m v^2 per area, where m is half the mass of one of two
+    equal shells (in units where this mass is 1). The stiffness is the pair's own, raised by factors
+    of `STIFFENING` until it is at least k.
 
     Parameters
     ----------
@@ -155,14 +173,13 @@ def stiff_for(pair: Pair, speed: float, h: float) -> float:
 def recall_cuts(stage: Stage, high: Point, numbers: Mapping[str, float]) -> None:
     """Let numbers of cuts stand for the cuts at the displacement of a point; collective.
 
-    Cuts divide cells into segments with quadrature points of their own, and a state has only their
-    number. So an interrupted run that is repeated from its journal has the same cuts under the same
-    numbers.
+    A state has only the number of its cuts. So an interrupted run that is repeated from its journal
+    must make the same cuts again under the same numbers.
 
     Parameters
     ----------
     high
-    Point at whose displacement the cuts are made.
+        Point at whose displacement the cuts are made.
     numbers
         Setting of a pair's cuts -> their number; empty: nothing is done.
     """
@@ -177,10 +194,10 @@ def recall_cuts(stage: Stage, high: Point, numbers: Mapping[str, float]) -> None
 def closer_points(stage: Stage, low: Point, high: Point) -> dict[str, float]:
     """Return setting of a pair's cuts -> number of cuts with closer points of contact.
 
-    It is for two points with an instability between them. The result is empty where closer points
-    would not matter: they change neither the number of unstable directions at both, nor much of the
-    stiffness of their critical modes. Otherwise the instability might be one of the points alone.
-    Collective.
+    Points of contact are quadrature points of segments. Between the two points of the path there is
+    an instability, which might come from too coarse a quadrature. So it is computed again with
+    closer points, unless these hardly change the critical modes at both ends; then the result is
+    empty. Collective.
     """
     scene, state = stage.scene, stage.leave(high.state)
     evaluation = scene.model.system.at_state(state)
@@ -196,9 +213,9 @@ def closer_points(stage: Stage, low: Point, high: Point) -> dict[str, float]:
 def _is_certain(stage: Stage, point: Point, finer: Mapping[str, float]) -> bool:
     """Return whether closer points of contact hardly change the critical mode at a point.
 
-    Its stiffness then changes by less than the part `CERTAIN_STIFFNESS_CHANGE`, and the number of
-    unstable directions not at all. Also True if a mode is not found: then nothing says that closer
-    points would help.
+    The critical mode has the eigenvalue of the tangent that is nearest to zero. This eigenvalue may
+    change by less than the part `CERTAIN_STIFFNESS_CHANGE`, the number of unstable directions not
+    at all. Also True if a mode is not found: then nothing says that closer points would help.
 
     Parameters
     ----------
@@ -225,8 +242,8 @@ def _is_certain(stage: Stage, point: Point, finer: Mapping[str, float]) -> bool:
 def better_cuts(scene: Scene, state: State) -> dict[str, float]:
     """Return setting of a pair's cuts -> number of new cuts, where these are much better.
 
-    Cuts age as shells slide on each other: their segments then no longer face single cells.
-    Collective.
+    As shells slide on each other, segments of old cuts no longer face one cell each, and the
+    quadrature becomes less exact. Collective.
     """
     evaluation = scene.model.system.at_state(state)
     numbers = {
@@ -237,7 +254,10 @@ def better_cuts(scene: Scene, state: State) -> dict[str, float]:
 
 
 def with_cuts_here(scene: Scene, state: State) -> State:
-    """Return a state of another model with cuts made at its own displacement; collective."""
+    """Return a state of another model with cuts made at its own displacement; collective.
+
+    Cuts belong to the mesh of a model, so numbers of another one mean nothing here.
+    """
     evaluation = scene.model.system.at_state(state)
     return State(
         state.u,
@@ -257,14 +277,14 @@ def _with_cuts(scene: Scene) -> list[SurfaceContact]:
         shell_contact
         for shell_contact in scene.model.shell_contacts
         if isinstance(shell_contact, SurfaceContact)
-    ]  # on meridians are no cuts
+    ]
 
 
 def with_own_contact(scene: Scene, state: State) -> State | None:
-    """Return a state with the stiffnesses and cuts that it needs; None if it has them; collective.
+    """Return a state with the stiffnesses and cuts that its displacement needs, to solve it again.
 
-    Contacts become stiffer where shells or bodies penetrate too much. None also where no shells may
-    touch each other.
+    Contacts become stiffer where shells or bodies penetrate too much. None if the state's settings
+    are fit already, or if no shells may touch each other. Collective.
     """
     changed = (
         {**raised_stiffnesses(scene, state), **better_cuts(scene, state)}
@@ -311,7 +331,7 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
         _refuse_through(model.shell_contacts, displacements_of_meridian)
         return
     end = stage.leave(high.state)
-    displacements = [
+    displacements = [  # of all ranks' nodes
         gathered_displacement(stage.scene, state) for state in (stage.leave(low.state), end)
     ]
     undeformed_places = model.r0.x.array[: model.system.size].reshape(-1, 3)
@@ -340,6 +360,7 @@ def refuse_passing(stage: Stage, low: Point, high: Point) -> None:
             plane.signed_distance(undeformed_places),
             plane.signed_distance(deformed_places),
         )
+        # 1 or -1: on which side of the plane the shell is
         side = np.sign(comm.allreduce(float(distance_before.sum())))
         # nodes that were farther than the thickness from the plane, and now are within half of it
         if comm.allreduce(
@@ -365,6 +386,7 @@ def passes(stage: Stage, low: Point | State, high: Point | State) -> bool:
     The way between the two points, or states of the stage's system, is straight. Collective.
     """
     end_points = (
+        # the check reads the state of a point alone; s, the tangent and pivots are zero
         end if isinstance(end, Point) else Point(end, 0.0, 0.0 * end.u, 0.0, 0, 0)
         for end in (low, high)
     )
@@ -402,6 +424,8 @@ def _refuse_through(
 def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
     """Check that the shell passes through no magnet or other source between two points; collective.
 
+    Each applied field compares the places and amplitudes at both ends, on each rank its own nodes.
+
     Raises
     ------
     PathStopped
@@ -427,6 +451,7 @@ def before_passing(stage: Stage, low: State, high: State) -> State:
     """
     if not stage.scene.model.shell_contacts or not passes(stage, low, high):
         return high
+    # parts of the way: without passing, and with
     safe_part, passing_part, displacement = 0.0, 1.0, high.u - low.u
     for _ in range(HALVINGS_BEFORE_PASSING):
         middle = (safe_part + passing_part) / 2
@@ -438,7 +463,8 @@ def before_passing(stage: Stage, low: State, high: State) -> State:
 def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point) -> None:
     """Check that a body does not go back the way it came; collective.
 
-    It would do so behind a fold at which it no longer holds the shell in place.
+    At a fold in its approach the shell may snap away. A path that then follows the same equilibria
+    backwards, or with the body off the shell, is of no use.
 
     Parameters
     ----------
@@ -461,10 +487,12 @@ def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point)
     # the point of the farthest approach, from where the path may turn
     turn = int(np.argmax(np.abs(np.subtract(mu, mu[0]))))
     distance_from_turn = max_abs(comm, high.state.u - points[min(turn, len(points) - 1)].state.u)
+    # `high` is the farthest itself, or too near to the turn to tell the ways apart
     if turn == len(points) or distance_from_turn < RETURN_DISTANCE * h:
         return
     for earlier_point, later_point in pairwise(points[: turn + 1]):
         mu_a, mu_b = earlier_point.state.mu[name], later_point.state.mu[name]
+        # the approach is not between the two, or a slope du/dmu is infinite
         if (mu[-1] - mu_a) * (mu[-1] - mu_b) > 0 or not earlier_point.dmu or not later_point.dmu:
             continue
         # displacement on the way there, at the same approach
@@ -482,9 +510,11 @@ def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point)
                 "approach"
             )
             raise PathStopped(message, low, final=True)
-    if max_abs(comm, high.du) == 0:
-        depths = [model.region(stage.leave(point.state), name).penetration for point in (low, high)]
-        if depths[1] < min(depths[0], 0.0):
+    if max_abs(comm, high.du) == 0:  # the shell does not move with the body
+        depth_low, depth_high = [
+            model.region(stage.leave(point.state), name).penetration for point in (low, high)
+        ]
+        if depth_high < min(depth_low, 0.0):
             message = (
                 "the body has left the shell: at its fold the shell snaps under a given approach"
             )
@@ -550,7 +580,7 @@ def support_motion_limit(scene: Scene, state: State, name: str, end: float) -> t
     model, comm, dim = scene.model, scene.model.system.comm, 2 if scene.model.axisymmetric else 3
     if name not in scene.motions or not model.shell_contacts:
         return end, ""
-    fixed = np.zeros(model.system.size, dtype=bool)
+    fixed = np.zeros(model.system.size, dtype=bool)  # unknowns with a prescribed displacement
     for bc in model.system.clamped:
         dofs = bc.dof_indices()[0]
         fixed[dofs[dofs < len(fixed)]] = True
@@ -579,6 +609,7 @@ def support_motion_limit(scene: Scene, state: State, name: str, end: float) -> t
     first_meeting = next(
         (i for i in range(1, SAMPLES_OF_MOTION) if meeting_shells(parts_of_way[i])), None
     )
+    # shells that overlap from the start are not stopped by the motion
     if first_meeting is None or meeting_shells(0.0):
         return end, ""
     free_part, overlapping_part = parts_of_way[first_meeting - 1 : first_meeting + 1]
@@ -601,7 +632,7 @@ def touching_bodies(scene: Scene, state: State) -> list[ContactBody]:
 
 
 def refuse_touching_shells(scene: Scene, state: State, result: str) -> None:
-    """Check that no shells touch where the second variation of a wave is differentiated.
+    """Check that no shells touch: else the second variation of a wave has no derivative here.
 
     Collective.
 
@@ -646,6 +677,8 @@ def contact_expanded_about(scene: Scene, state: State | None) -> Iterator[None]:
 def with_stiffer_bodies(scene: Scene, state: State, bodies: list[ContactBody]) -> State | None:
     """Return the equilibrium near a state with bodies `STIFFENING` times as stiff; collective.
 
+    All loads and approaches stay.
+
     Parameters
     ----------
     bodies
@@ -660,7 +693,7 @@ def with_stiffer_bodies(scene: Scene, state: State, bodies: list[ContactBody]) -
         contact.setting: STIFFENING * state.mu.get(contact.setting, contact.stiffness)
         for contact in bodies
     }
-    name = bodies[0].amplitude
+    name = bodies[0].amplitude  # the solver needs one amplitude to prescribe; any serves
     outcome = scene.newton.solve(
         State(state.u, {**state.mu, **stiffnesses}), name, PrescribedLoad(name, state.mu[name])
     )
@@ -674,11 +707,11 @@ def with_stiffer_bodies(scene: Scene, state: State, bodies: list[ContactBody]) -
 
 
 def stiffened_equilibrium(scene: Scene, state: State) -> State:
-    """Return the state between bodies so stiff that their stiffness does not matter; collective.
+    """Return the equilibrium with bodies so stiff that their stiffness does not matter; collective.
 
-    A shell that a soft body lets go lies flat on a harder one. So the bodies that touch become
-    stiffer, until the shell moves by at most `RIGID_RATIO` times the penetration. A given stiffness
-    stays.
+    A shell may rest on a soft body otherwise than on a hard one, where it lies flat. So the bodies
+    that touch become stiffer, until the last change moves the shell by at most `RIGID_RATIO` times
+    the penetration before it. A stiffness that the case gives stays.
     """
     for _ in range(MAX_STIFFENINGS):
         bodies = [

@@ -2,6 +2,10 @@
 
 A prediction from before a contact knows nothing of it: shells would lie deep in each other, and
 Newton's method circle. So a step ends just before the first contact, and the next one just behind.
+
+A step event says at which part of its way a step has to end, 1 for its whole way, and whether this
+is behind a contact; and whether contact forces are lost on the way. A gap is the distance of two
+faces, negative where they overlap.
 """
 
 from collections.abc import Callable
@@ -37,7 +41,7 @@ def first_contact(
     here, prediction
         States of the step's system at both ends of the step.
     """
-    # contacts on meridians are no part of it
+    # not of meridians, where steps do without
     contacts = [
         contact for contact in scene.model.shell_contacts if isinstance(contact, SurfaceContact)
     ]
@@ -52,6 +56,7 @@ def first_contact(
             loses_forces |= not at_end.evaluate(contact.penetration)
         else:
             onset = _onset(contact, scene.problem.material.h, begin_displacement, end_displacement)
+            # the earliest; of equal ones that behind a contact
             first_event = min(first_event, onset, key=lambda event: (event[0], not event[1]))
     return StepEvent(*first_event, loses_forces)
 
@@ -91,6 +96,7 @@ def _onset(contact: SurfaceContact, h: float, u: Array, v: Array) -> tuple[float
     if gap_at_low <= 0:
         return 1.0, False
     is_behind, least_thickness = gap_at_low < NEAR_CONTACT * depth, contact.least_thickness()
+    # low and high: parts of the way before and behind the aimed gap; high is 0 while not known
     low, high, gap_at_high, aimed_gap = 0.0, 0.0, 0.0, -depth if is_behind else depth
     for _ in range(MAX_GAP_EVALUATIONS):
         if high:
@@ -108,4 +114,5 @@ def _onset(contact: SurfaceContact, h: float, u: Array, v: Array) -> tuple[float
             return 1.0, False
         else:
             low, gap_at_low = part, gap
+    # not exact enough after all evaluations: the end of the bracket on the wanted side, if known
     return (high if is_behind else low) or low, is_behind

@@ -1,6 +1,11 @@
 """Contacts of a system in steps in time, with bodies and between shells.
 
 Their forces are averaged along a step so that it conserves energy (docs/theory.md, time).
+
+An approach is the amplitude that moves a rigid body, by name in `State.mu`. A setting is the entry
+of `State.mu` with the stiffness of contact between a pair of shells. A contact force follows from
+its arguments, the places of what touches at a state. A sample is a displacement within the step at
+which a contact force is taken.
 """
 
 from collections.abc import Mapping, Sequence
@@ -77,14 +82,14 @@ class ContactsInTime:
         begin
             State where the step begins.
         v
-            Velocity of the unknowns, over that of waves.
+            Velocity of the unknowns, over the speed of waves sqrt(E/rho).
         """
         if not self._shell_contacts:
             return {}
         comm, nodes = self._system.comm, v.reshape(-1, self._system.u.function_space.dofmap.bs)
         largest_of_axes = np.max(
             [nodes, -nodes], axis=1, initial=0.0
-        )  # (2, 3): along each axis and back
+        )  # (2, 2 or 3): along each axis and back
         largest_of_all = np.max(comm.allgather(largest_of_axes), axis=0)
         # no two places move faster relative to each other
         speed = float(np.linalg.norm(largest_of_all.sum(axis=0)))
@@ -102,7 +107,9 @@ class ContactsInTime:
         return settings
 
     def average_along(self, begin: State, end: State, part: float) -> None:
-        """Let contact forces be means over a step in time, as a system takes them within it.
+        """Let contact forces be means over a step in time, until `use_state_forces` is called.
+
+        The mean is along the straight way from the state at the begin to the state at the end.
 
         Parameters
         ----------
@@ -119,7 +126,7 @@ class ContactsInTime:
         for contact, displacement_before, displacement_after in zip(
             self._shell_contacts, places_before.shells, places_after.shells, strict=True
         ):
-            contact.samples = ()
+            contact.samples = ()  # old ones must not be in use while new ones are computed
             contact.samples = samples_of_step(
                 contact, displacement_before, displacement_after, part
             )

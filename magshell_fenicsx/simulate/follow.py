@@ -1,4 +1,17 @@
-"""History of a case: the records of the steps of its programme, one step after the other."""
+"""History of a case: the records of the steps of its programme, one step after the other.
+
+Words and symbols:
+
+- The programme is the list of the case's steps. A record is a point of a path with its label; a
+  located one is a fold or a bifurcation.
+- An amplitude is a load parameter, by name in `State.mu`. Own energies are those that a program
+  defines for its case; each has an amplitude with a given value.
+- A remark is a sentence that the result must not be read without.
+- Excluded modes break a symmetry that the reduced model has. Behind a bifurcation into one of them
+  the history may go on in a larger model: a symmetry switch.
+- A step may release the shell at its instability (`released_by`), to snap to rest.
+- Pivots count unstable directions.
+"""
 
 import warnings
 from collections.abc import Callable, Iterator
@@ -60,6 +73,7 @@ def follow(
         the shell unstable.
     """
     state, steps = scene.unloaded(), scene.problem.programme
+    # energies that are there before any load, and rise from zero first
     energies = energies_moving_the_shell(scene, state)
     state = replace(state, mu=state.mu | dict.fromkeys(energies, 0.0))
     yield from _start(scene, state, has_rise=bool(energies))
@@ -83,6 +97,7 @@ def follow(
             yield from run.records_beyond()
         except (Stopped, NotANumber) as e:
             run.remark_on_point_forces(run.scene)
+            # beyond the instability that was asked for, a stop is a remark alone
             if not run.has_answer or step is not steps[-1]:
                 raise Stopped(run.reason(e)) from None
             remark(f"{BEYOND_INSTABILITY}{run.reason(e)}")
@@ -144,10 +159,11 @@ def _start(scene: Scene, state: State, *, has_rise: bool) -> Iterator[Record]:
 
     try:
         _refuse_not_numbers(scene, state, "")
-    except Stopped:
+    except Stopped:  # the history has its start even then
         yield record(0, 0, {})
         raise
     pivots = 0
+    # free rigid motions have no stiffness: the sign of their pivots is rounding
     if not (scene.allows_rigid_motion or scene.free_in_time):
         pivots = scene.newton.factor_at(state).negative_pivots
     clock = dict[str, float]()
@@ -174,12 +190,12 @@ class _StepRun:
     step
         Step of the programme.
     remark
-        See `follow`.
+        Called with one sentence on what the result must not be read without.
 
     Attributes
     ----------
     scene
-        The scene at its present end; another one behind a symmetry switch.
+        The scene at the present end of the run; another one behind a symmetry switch.
     end
         State at the end, after `records_beyond`.
     label
@@ -228,6 +244,7 @@ class _StepRun:
             if not self.is_at_event:
                 continue
             self.is_unstable = True
+            # an excluded mode may have become unstable before, at a point that was not located
             is_uncertain = bool(self.scene.stability_monitor.unlocated)
             if not (self._first_instability or record.branch or is_uncertain):
                 self._first_instability = record
@@ -244,7 +261,7 @@ class _StepRun:
         fold = self._last
         if not (self._step.load.released_by and fold) or self._is_released_at_bifurcation:
             return ""
-        if fold.label != "fold" or fold.mode:
+        if fold.label != "fold" or fold.mode:  # a mode: one that the model excludes
             raise Stopped(
                 f"then: snap: the step ends at a {fold.mode or fold.label}, not at a fold of the "
                 "model itself"
@@ -263,8 +280,8 @@ class _StepRun:
             return
         records: Records | None = None
         if step.load.released_by:
-            if self._is_released_at_bifurcation:
-                record = symmetry_switch_of_step(self.scene, step, record).record(0)
+            if self._is_released_at_bifurcation:  # on the path itself, branch 0
+                record = symmetry_switch_of_step(self.scene, step, record).record(number=0)
                 self.scene = record.scene or self.scene
                 yield self._completed(record)
             from magshell_fenicsx.simulate.transient import snap_records
@@ -303,6 +320,7 @@ class _StepRun:
         if record.said:
             self._remark(self.place + record.said)
         self.remark_on_point_forces(scene)
+        # with kinetic energy: shells that hit each other may penetrate more for a moment
         is_moving = bool((record.clock or {}).get("kinetic"))
         recorded = scene.journal.recorded_values(
             lambda: RecordedValues({"said": penetration_message(scene, state, moving=is_moving)})
@@ -315,7 +333,8 @@ class _StepRun:
 def energies_moving_the_shell(scene: Scene, state: State) -> dict[str, float]:
     """Return amplitude -> value of the own energies that move the undeformed shell; collective.
 
-    An example is a surface tension. The displacement is that of the linear response.
+    An example is a surface tension. An energy moves the shell if the displacement of the linear
+    response to it is not zero.
     """
     system, energies = scene.model.system, dict[str, float]()
     for term in scene.problem.loads.user_terms:
@@ -349,6 +368,7 @@ def _rise(scene: Scene, name: str, value: float, state: State) -> Records:
         If the path to rest is lost.
     """
     stage = load_stage(scene)
+    # about a quarter of the value in the first step; the value is the scale of the amplitude
     path, start = stage.begin(name, "load", state, value / STEPS_OF_RISE, value)
     try:
         return (yield from follow_path(stage, path, start, ContinuationGoal("target", [value])))
@@ -357,7 +377,7 @@ def _rise(scene: Scene, name: str, value: float, state: State) -> Records:
 
 
 def _buckled_text(scene: Scene, fold: Record, first_instability: Record | None) -> str:
-    """Return a remark on a snap at whose fold modes that the model excludes are unstable.
+    """Return a remark on a snap from a fold at which modes that the model excludes are unstable.
 
     Parameters
     ----------

@@ -1,6 +1,11 @@
 """Loads of a step in time: its amplitudes as functions of time, from the histories of the case.
 
 Times are over R sqrt(rho/E), the unit of time of the model.
+
+A history is a table or formula of the case: the values of one load at times. A level is one of its
+values, in the unit of the case. A curve is a function (t, before) -> value; `before` takes the
+value just before t, where it may jump. Marks are times of kinks and jumps. lambda_m is the strength
+of the magnetic field; an amplitude is a load parameter by name in `State.mu`.
 """
 
 from collections.abc import Callable, Collection
@@ -67,9 +72,11 @@ class LoadsInTime:
         self._curves, self.marks = dict[str, Curve](), set[float]()
         for name, history in histories.items():
             # histories are in the case's own unit of time
+            # a step with this load converts amplitudes to the unit of its target, and back
             step = steps.get(name)
             value = step.in_history(state.mu[name]) if step else state.mu[name]
             level = partial(amplitude_of_level, problem, name)
+            # a formula (text) gives the factor of the field; levels of a table include it already
             strength = problem.lambda_m if isinstance(history, str) and name == "lambda_m" else 1.0
             self._curves[name] = _scaled(
                 curve(history, time_in_case_unit, level, value),
@@ -95,7 +102,7 @@ class LoadsInTime:
     ) -> dict[str, tuple[float, float]]:
         """Return amplitude -> first and second derivative by time, by one-sided differences.
 
-        The differences are of second order.
+        They are of second order, with values at four times on the side of t that is asked for.
 
         Parameters
         ----------
@@ -106,7 +113,7 @@ class LoadsInTime:
         names
             The amplitudes; those without a history are left out.
         """
-        backward = before and t >= 3 * self._difference_step
+        backward = before and t >= 3 * self._difference_step  # no values before time zero
         rates, step = {}, -self._difference_step if backward else self._difference_step
         for name in set(self._curves) & set(names):
             value_0, value_1, value_2, value_3 = (
@@ -124,7 +131,7 @@ class LoadsInTime:
 
 
 def _scaled(history: Curve, size: float, unit: float, amplitude: Callable[[float], float]) -> Curve:
-    """Return a history in the model's unit of time, as an amplitude.
+    """Return a curve of the amplitude in the model's time, from a history in the case's time.
 
     Parameters
     ----------

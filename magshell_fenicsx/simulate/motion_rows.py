@@ -4,6 +4,16 @@ Departures from unstable states magnify the errors of steps, by a factor that th
 alone shows. So where the error at the rows is asked for, a motion is computed with longer steps
 first. The first such run shows when the motion is fastest: until then no step is longer than there.
 Two more show the error, which goes as the square of the steps.
+
+Words and symbols:
+
+- A row is a line of the results at a given time; an event may end the motion between two rows.
+- The journal keeps results of an interrupted run as `Point`s, whose fields then have other
+  meanings: `s` is the time, `du` the velocity, `dmu` the next time step. To replay is to take a
+  result from the journal instead of computing it.
+- Factors are those of the matrix of a step, kept for several steps. Their habit is the choice
+  between two sparse solvers, on which rounding depends.
+- Marks are times at which loads have kinks or jumps.
 """
 
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
@@ -70,6 +80,7 @@ class RefinedSteps:
         u
             The displacement at the row; None at a time between rows.
         """
+        # the coarse run may have ended earlier; its errors go as the square of the steps
         row, square = min(row, len(self.rows) - 1), self.ratio**2
         if u is None or self.ratio > CLEAR_STEP_RATIO:
             return square * self.errors[row]
@@ -89,8 +100,10 @@ class StepRefinement:
 
     Attributes
     ----------
-    scene, held_conjugates, marks
-        See `MotionRows`.
+    held_conjugates
+        Amplitude that is unknown -> its conjugate: the displacement on which it does work.
+    marks
+        Times at which loads have kinks or jumps.
     begin
         Function that returns a new integrator, and the motion at its begin.
     ends
@@ -110,6 +123,10 @@ class StepRefinement:
     def __call__(self, steps: TimeSteps) -> RefinedSteps:
         """Return steps with which the error at all rows is below the tolerance; collective.
 
+        The first run measures speeds, and limits the steps before the fastest time. The second run
+        repeats it with this limit. Further runs have shorter steps by `ratio`, first one half and
+        then a quarter, until the last is fine enough to tell which steps the motion needs.
+
         Parameters
         ----------
         steps
@@ -126,6 +143,7 @@ class StepRefinement:
         longest_step = max(step for speed, _, step in speeds if speed >= FAST_SPEED * largest_speed)
         coarse_steps = replace(coarse_steps, longest=longest_step, fastest=time_of_largest_speed)
         rows = [motion.u for motion, _ in self._rows(coarse_steps)]
+        # lengths of steps over those of the second run, and of a run over those of the run before
         step_factor, ratio = 1.0, 0.5
         while True:
             step_factor *= ratio
@@ -141,6 +159,7 @@ class StepRefinement:
             )
             needed_refinement = min(
                 max(needed_refinement, MIN_STEP_RATIO),
+                # no longer than the tolerance of single steps asks for, whose error is cubic
                 (tolerance / coarse_steps.tolerance) ** (1 / 3),
             )
             if needed_refinement * MAX_STEP_RATIO >= step_factor:
@@ -166,7 +185,10 @@ class StepRefinement:
 
 
 def _progress_point(motion: Motion) -> Point:
-    """Return a motion as a point, for listeners to the progress of a run."""
+    """Return a motion as a point, for listeners to the progress of a run.
+
+    Time is its s, velocity its du; pivots are not known.
+    """
     return Point(State(motion.u, motion.mu), motion.t, motion.v, 0.0, 0, 0)
 
 
@@ -177,7 +199,7 @@ class MotionRows:
     Parameters
     ----------
     held_conjugates
-        Amplitude -> its conjugate, see `make_stage`.
+        Amplitude that is unknown -> its conjugate: the displacement on which it does work.
     steps
         Options of time steps.
     marks
@@ -213,7 +235,7 @@ class MotionRows:
         """
         check = partial(self.scene.journal.check, is_known)
         for mark in [*sorted(mark for mark in self.marks if motion.t < mark < end), end]:
-            # the acceleration after a mark is another one
+            # the acceleration may jump at a mark
             if motion.t in self.marks and self.integrator.begins_anew(motion.t):
                 motion = self.integrator.begin(motion.t, motion.u, motion.v, motion)
             motion, time_step = advance(self.integrator, motion, mark, self.steps, time_step, check)
@@ -242,15 +264,16 @@ class MotionRows:
             return event(known_motions.get(t) or self.advanced(motion, time_step, t)[0])
 
         time = float(scipy.optimize.brentq(event_at, motion.t, end.t, xtol=tolerance))
-        return max(time, motion.t + tolerance)
+        return max(time, motion.t + tolerance)  # time must go on
 
     def journalled(
         self, motion: Motion, time_step: float, end: float
     ) -> tuple[Motion, float, Point]:
         """Return the motion at a later time, from the journal if this has it; collective.
 
-        In the journal a row is three points: the motion, its companion with what it needs besides,
-        and the state to which the latest factors belong.
+        In the journal a row is three points: the motion, a companion with its acceleration and
+        work, and the state to which the latest factors belong. An interrupted run may have left
+        only some of them.
 
         Returns
         -------
@@ -297,6 +320,7 @@ class MotionRows:
             error=error,
             habit=scene.newton.factorisation.habit,
         )
+        # without those that the journal has
         for recorded in (point, *self._companions(motion))[len(points) :]:
             scene.journal.record(recorded)
         return motion, time_step, point
@@ -304,7 +328,8 @@ class MotionRows:
     def _replayed(
         self, point: Point, companion: Point, factored_point: Point
     ) -> tuple[Motion, float, Point]:
-        """Return a row from its three points of the journal, see `journalled`."""
+        """Return motion, next time step and point of a row from its three points of the journal."""
+        # the factors are made again only if the motion goes on from here
         self._factored_point = factored_point
         self.scene.newton.factorisation.habit = point.habit
         motion = Motion(
@@ -323,8 +348,9 @@ class MotionRows:
     def _companions(self, motion: Motion) -> tuple[Point, Point]:
         """Return the two points of the journal that follow the point of a motion.
 
-        The first has acceleration, potentials, work, dissipation and error. The second has the
-        state to which the latest factors belong.
+        The first has the acceleration as u, potentials as mu, work as s, dissipation as dmu, and
+        the error. The second has the state to which the latest factors belong, and as s their time
+        step, which is 0 without such a state.
         """
         zero_vector, integrator = 0.0 * motion.a, self.integrator
         companion = Point(
@@ -380,7 +406,7 @@ class MotionRows:
         # beside a body factors belong to a whole step: each interval makes its own
         if self.integrator.contact:
             self.integrator.factored_state = None
-        if factored_point and factored_point.s and not self.integrator.contact:
+        if factored_point and factored_point.s and not self.integrator.contact:  # s: time step
             state = factored_point.state
             self.integrator.factor(
                 FactoredState(state.u, dict(state.mu), factored_point.s, factored_point.habit)

@@ -1,6 +1,8 @@
 """Refusal of shells that overlap undeformed, and of edges off the shell that they join.
 
-It needs no equations, as a scene does, which refuses the same in the same words.
+It needs the geometry alone: no equations are assembled, as a scene does. A scene refuses the same
+in the same words. r0 is the undeformed placement over the reference length, h the thickness. Parts
+are pieces of the surface that are not connected.
 """
 
 from dataclasses import replace
@@ -58,6 +60,7 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
         refuse_misplaced_parallels(problem.loads.joints, meridian, r0, h)
         thickness = thickness_field(factor, r0, meridian.patches) if factor else None
         rule = meridian_domain(r0).contact_rule
+        # the zero function is the displacement; making the contacts refuses an overlap
         model = ModelMeridian(r0, fem.Function(V), meridian.patches, h, rule, thickness)
         meridian_contacts(pairs, model)
         return
@@ -74,6 +77,7 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
         factor = replace(factor, polynomials=polynomials)
     thickness = thickness_field(factor, r0, surface.patches) if factor else None
     rule = surface_domain(r0).contact_rule
+    # as on a meridian
     surface_contacts(pairs, ModelSurface(r0, fem.Function(V), surface.patches, h, rule, thickness))
 
 
@@ -99,10 +103,10 @@ def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:
 
     surfaces, V = MidSurfaces.gather(r0), r0.function_space
     nodes = surfaces.cells.nodes
-    part_of_cell = component_numbers(V)[V.dofmap.list[: len(nodes), 0]]
-    for number in np.unique(part_of_cell)[1:]:
+    part_of_cell = component_numbers(V)[V.dofmap.list[: len(nodes), 0]]  # by its first node
+    for number in np.unique(part_of_cell)[1:]:  # the first part has no earlier ones
         own_nodes = np.unique(nodes[part_of_cell == number])
         cells_of_earlier_parts = np.flatnonzero(part_of_cell < number)
-        distances = surfaces.nearest_places(surfaces.r0[own_nodes], cells_of_earlier_parts)[2]
+        _, _, distances = surfaces.nearest_places(surfaces.r0[own_nodes], cells_of_earlier_parts)
         if distances.min(initial=np.inf) < OVERLAP_DISTANCE * h:
             raise CaseError(TOO_NEAR)

@@ -3,6 +3,20 @@
 A continuation run gives points. Between each two of them contact is checked; at each of them the
 modes that the model excludes are watched; and where load control fails, the path goes on by arc
 length.
+
+Words and symbols:
+
+- A path varies one amplitude (`path.name`), a load parameter mu. Its control is "load" (mu itself
+  is prescribed), "conjugate" (the displacement on which the load does work) or "arc" (arc length);
+  s is the controlled quantity. A goal says where the path ends (`until`, `targets`).
+- A model with symmetry excludes modes that would break it. The stability monitor counts the
+  unstable ones of these, and locates crossings, where one becomes neutral: excluded instabilities.
+- Located points are folds and bifurcations of the model itself.
+- `low` and `high`, or low and high points, are two successive points of a run.
+- Settings are entries of `State.mu` that are no loads: penalties of contact, and numbers of cuts.
+  Cuts divide cells of shells that touch, for quadrature of their contact.
+- A stage is the scene with the solver of one step; `leave` converts its states to the model's.
+- A generator of records returns the state at its end.
 """
 
 from collections.abc import Generator, Iterable, Iterator, Sequence
@@ -108,6 +122,7 @@ def follow_path(
     """
     run = checked_run(stage, path, start, goal)
     records = RecordStream(_StageRecords(stage, run, branches).records())
+    # `advance` gives a state the history that follows from the state before: angles of edges
     advance = stage.scene.model.system.advance
     earlier_mu = start.state.mu
     for record in records:
@@ -124,7 +139,8 @@ def checked_run(stage: Stage, path: Path, start: Point, goal: ContinuationGoal) 
     points of contact where these move an instability. A shell that passes through a magnet, or a
     body that goes back the way it came, ends the run.
     """
-    checks = _Checks(stage, path, goal.until != "points")
+    # a run of a given number of points may go back on its way
+    checks = _Checks(stage, path, returns=goal.until != "points")
     checks.walk = walk = ContinuationRun(path, start, goal, checks, checks.too_deep)
     return walk
 
@@ -149,7 +165,8 @@ class _Checks:
 
     def __init__(self, stage: Stage, path: Path, returns: bool) -> None:
         self._stage, self._path, self._returns = stage, path, returns
-        self._cut_at = np.nan  # s of the point behind which cuts were last made anew: once for each
+        # s of the first point of the step in which cuts were last made anew: once for each step
+        self._cut_at = np.nan
         # s of the first point, and its negative pivots before anything was changed there
         self._begin = np.nan, 0
 
@@ -167,8 +184,9 @@ class _Checks:
         PathStopped, StepTooLong
             If the second point must not follow the first one.
         """
-        if low.s != self._begin[0]:
+        if low.s != self._begin[0]:  # a new step; otherwise the same one is solved again
             self._begin = low.s, low.negative_pivots
+        # from the journal in a resumed run
         findings = self._path.recorded_values(partial(self._finding, low, high)).values
         if "too_long" in findings:
             raise StepTooLong(findings["too_long"])
@@ -177,7 +195,7 @@ class _Checks:
                 findings["stopped"], high if findings["at_high"] else low, final=findings["final"]
             )
         changed, of_cuts = findings["stiffer"], not findings["stiffer"]
-        if of_cuts:
+        if of_cuts:  # penalties come first: a new depth may need other cuts
             self._cut_at, changed = low.s, findings["cuts"]
             recall_cuts(self._stage, high, changed)
         return State(low.state.u, {**low.state.mu, **changed}) if changed else None
@@ -195,6 +213,7 @@ class _Checks:
         def recorded_message() -> RecordedValues:
             state = self._stage.leave(point.state)
             message = penetration_message(scene, state)
+            # if a penalty can become stiffer, the run shall stop before and solve again with it
             may_rise = bool(message) and bool(raised_stiffnesses(scene, state))
             return RecordedValues({"said": message if may_rise else ""})
 
@@ -221,6 +240,7 @@ class _Checks:
         stiffer = raised_stiffnesses(stage.scene, state)
         may_recut = not stiffer and low.s != self._cut_at  # slid points are better than none
         cuts = better_cuts(stage.scene, state) if may_recut else {}
+        # between the points, or as changed settings at the first point have moved it behind
         has_instability = high.has_instability_since(low) or low.negative_pivots != self._begin[1]
         closer = (
             closer_points(stage, low, high) if has_instability and not (stiffer or cuts) else {}
@@ -240,7 +260,7 @@ class _StageRecords:
     run
         First run.
     branches
-        See `follow_path`.
+        Number of steps for each direction of the branch at the first bifurcation; 0: no branch.
     """
 
     def __init__(self, stage: Stage, run: ContinuationRun, branches: int) -> None:
@@ -249,7 +269,8 @@ class _StageRecords:
         self._goal, self._monitor = run.goal, stage.scene.stability_monitor
         self._branch_switch: BranchSwitch | None = None
         self._fold_text = ""  # of the last fold
-        self._furthest = np.inf  # amplitude, once an excluded mode is unstable
+        self._furthest = np.inf  # largest amplitude, finite once an excluded mode is unstable
+        # why the last run has stopped, "" if it has not; and whether no run may go on from there
         self._stop_reason, self._is_final = "", False
 
     def records(self) -> Records:
@@ -270,7 +291,7 @@ class _StageRecords:
         path, shortest_step = run.path, run.path.options.smallest
         if path.control == "load" and goal.targets:
             run.path = _ending_early(path, path.options.first, shortest_step)
-        for applied in stage.scene.model.fields:
+        for applied in stage.scene.model.fields:  # a place where a field was not known, so far none
             applied.lost = ""
         self._monitor.begin(path, run.points[0], stage.leave)
         records_ahead: list[Record] = []  # a fold that load control cannot pass
@@ -312,6 +333,7 @@ class _StageRecords:
             for label, point in run:
                 is_located = label in LOCATED
                 is_beyond = run.done or abs(point.state.mu[path.name]) > self._furthest
+                # the monitor may skip points in between, but must not skip these
                 crossings = self._monitor.pass_to(point, evaluate=is_located or is_beyond)
                 excluded = list(_excluded_records(stage, path, crossings))
                 if excluded and goal.until == "bifurcation":
@@ -326,10 +348,11 @@ class _StageRecords:
             message = _stop_message(stage.scene, path, e, run.points)
             self._stop_reason = message + self._fold_text + stage.scene.lost_field_text()
             self._is_final = e.final
+        # those on the last part of the way, after the monitor's last evaluation
         excluded = list(_excluded_records(stage, path, self._monitor.end()))
         if excluded and self._stop_reason and goal.until == "bifurcation":
             yield excluded[0]
-            self._stop_reason = ""
+            self._stop_reason = ""  # the goal lies before the stop
             return True
         yield from excluded
         self._limit(path, excluded)
@@ -357,7 +380,7 @@ class _StageRecords:
             by_arc = _arc_length_path(stage, path)
             branch_switch = switch_branch(by_arc, point, partial(passes, stage))
             self._branch_switch = self._branch_switch or branch_switch
-            if branch_switch:
+            if branch_switch:  # None: the branch is not found
                 mode = "symmetric" if branch_switch.symmetric else "asymmetric"
         if label == "fold":
             value = amount(stage.scene, path.name, point.state.mu[path.name])
@@ -419,9 +442,9 @@ def _after_stop(
     if path.control != "load" or not goal.targets:
         return [], None if final else _onward_by_arc(stage, walk)
     shortest = path.options.smallest
-    last_resort = final or shortest <= finest
+    last_resort = final or shortest <= finest  # no run in shorter steps follows
     reach = abs(goal.targets[-1] - last_point.s)
-    if not last_resort:  # the step that failed ends at the next target, or before
+    if not last_resort:  # the fold must be within the failed step, which ends at the next target
         distances = [
             # positive where the target is ahead
             (target - last_point.s) * np.sign(goal.targets[-1] - last_point.s)
@@ -435,9 +458,9 @@ def _after_stop(
 
 
 def _ending_early(path: Path, first: float, finest: float) -> Path:
-    """Return the path with shorter first steps and a shortest step that is reached soon.
+    """Return the path with another first step, and with a shortest step not far below it.
 
-    So a step that fails ends the run early, and a fold is looked for.
+    So a failing step is halved a few times only before the run ends and a fold is looked for.
 
     Parameters
     ----------
@@ -453,8 +476,8 @@ def _onward_by_arc(stage: Stage, walk: ContinuationRun) -> ContinuationRun | Non
     """Return a run by arc length from where another run stopped; None if there is none.
 
     There is none where the run was by arc length already, or has a target: an instability is at the
-    same load under any control, but a target belongs to its control. Step lengths start from the
-    median step of the run that stopped.
+    same load under any control, but a target belongs to its control. The first step is as long as
+    the median step of the run that stopped.
     """
     path, goal, points = walk.path, walk.goal, walk.points
     if path.control == "arc" or goal.targets:
@@ -477,6 +500,7 @@ def _onward_by_arc(stage: Stage, walk: ContinuationRun) -> ContinuationRun | Non
     )
     start = by_arc.start(
         last_point.state,
+        # about the change of the amplitude in the first step, which gives its sense
         last_point.dmu * (last_point.s - points[-2].s if step_lengths else goal.sense),
     )
     return checked_run(stage, by_arc, start, goal)
@@ -487,7 +511,8 @@ def _branches(
 ) -> Iterator[Record]:
     """Yield the records of both directions of a branch.
 
-    Each ends at the target of the path, or after `steps` steps.
+    Each ends at the target of the path, or after `steps` steps. The second direction is followed
+    also if the first one is lost.
 
     Raises
     ------
@@ -576,7 +601,11 @@ def follow_branch(
 
 
 def _arc_length_path(stage: Stage, path: Path) -> Path:
-    """Return the path with arc-length control, whose steps are as long as the first on a branch."""
+    """Return the path with arc-length control and the steps of a branch: first, longest, least.
+
+    Arc lengths are over the scales of the path's displacement and amplitude, so 0.1 is a short step
+    for any case.
+    """
     scale = path.metric.scale
     return stage.path(path.name, "arc", StepOptions(0.1, LONGEST * 0.1, 1e-6), scale)
 
@@ -598,6 +627,7 @@ def _fold_ahead(stage: Stage, walk: ContinuationRun, reach: float) -> list[Recor
     """
     path, points, name = walk.path, walk.points, walk.path.name
     last_point = points[-1]
+    # the change of the load in the last step, or towards the target in a first one
     first_change = np.copysign(path.options.first, walk.goal.targets[-1] - last_point.s)
     load_change = last_point.s - points[-2].s if len(points) > 1 else float(first_change)
     by_arc, start = stage.resume(name, "arc", last_point.state, load_change, path.metric.scale)
@@ -616,15 +646,15 @@ def _fold_ahead(stage: Stage, walk: ContinuationRun, reach: float) -> list[Recor
                         label, name, point, excluded_pivots=stage.scene.stability_monitor.unstable
                     ),
                 ]
-    except PathStopped:
+    except PathStopped:  # as without a fold
         pass
     return []
 
 
 def _label_of(stage: Stage, path: Path, label: Label, point: Point, *, ends: bool) -> Label:
-    """Return the label of a point; an instability under a point force is labelled as a step.
+    """Return the label of a point; an instability local to a point force is labelled as a step.
 
-    Such an instability depends on the mesh, and is noted in `PointForceModes`.
+    Such an instability depends on the mesh. It is noted for a remark (`PointForceModes`).
 
     Parameters
     ----------
@@ -654,7 +684,8 @@ def _label_of(stage: Stage, path: Path, label: Label, point: Point, *, ends: boo
 def _excluded_records(stage: Stage, path: Path, crossings: Iterable[Crossing]) -> Iterator[Record]:
     """Yield records of the points where excluded modes become unstable or stable.
 
-    Crossings of modes under a point force are noted in `PointForceModes` and left out.
+    Crossings of modes that are local to a point force depend on the mesh: they are noted for a
+    remark (`PointForceModes`) and left out.
     """
     for crossing in crossings:
         force_point = point_of_crossing(stage, path, crossing)
@@ -674,7 +705,8 @@ def _excluded_records(stage: Stage, path: Path, crossings: Iterable[Crossing]) -
 def cluster_remark(scene: Scene, walk: ContinuationRun, point: Point) -> str:
     """Return a remark on instabilities too close to each other to be located one by one.
 
-    It stands at the first point of each such cluster of a run; at other points it is "".
+    It stands at the first point of each such cluster of a run; at other points it is "". Where the
+    number of unstable directions changes by less than two over the cluster, one is a fold.
     """
     other_end = next(
         (high_point for low_point, high_point in walk.clusters if low_point is point), None
@@ -726,7 +758,7 @@ def _stop_message(scene: Scene, path: Path, stop: PathStopped, points: list[Poin
     previous = points[-2] if len(points) > 1 else last_point
     if path.control == "arc" or previous.dmu == last_point.dmu:
         return f"the controlled path stopped; {place}"
-    # near a fold in the controlled s, (ds/dmu)^2 falls linearly to zero with s
+    # near a fold in the controlled s, (ds/dmu)^2 falls linearly to zero with s: extrapolate it
     squared_slope_before, squared_slope_last = previous.dmu**-2, last_point.dmu**-2
     distance_ahead = (
         squared_slope_last
@@ -735,7 +767,7 @@ def _stop_message(scene: Scene, path: Path, stop: PathStopped, points: list[Poin
         if squared_slope_before > squared_slope_last
         else np.inf
     )
-    if 0 < distance_ahead / (last_point.s - previous.s) < 10:
+    if 0 < distance_ahead / (last_point.s - previous.s) < 10:  # ahead, and not many steps away
         return (
             "the path turns back in the controlled displacement, "
             f"{distance_ahead / last_point.s:.2%} "

@@ -1,6 +1,11 @@
 """Modes of the perfect shell that a problem has as imperfections.
 
-They are computed once, before a scene is built.
+They are computed once, before a scene is built. In: a problem whose imperfections ask for modes.
+Out: the problem with these modes as functions of the place, inward displacements with the largest
+value 1. The perfect shell is the same shell without imperfections, under the same loads.
+
+A mode with m waves around a meridian has the label "m = 7"; its unknowns are U + V, V and W, with
+the radial, azimuthal and axial displacement U, V and W. The label of an axisymmetric mode is "".
 """
 
 import json
@@ -59,8 +64,9 @@ def with_modes(problem: Problem, comm: MPI.Comm) -> Problem:
     key_of_perfect_shell = json.dumps(
         [count, perfect_problem.document.data, perfect_problem.document.outside]
     )
+    # without data, as of a problem that a program has made, the key says nothing
     if key_of_perfect_shell not in _known or not perfect_problem.document.data:
-        if len(_known) > 3:
+        if len(_known) > 3:  # a few are enough for a sweep
             _known.clear()
         _known[key_of_perfect_shell] = perfect_modes(perfect_problem, count, comm)
     return problem.pending_modes.with_modes(_known[key_of_perfect_shell])
@@ -90,7 +96,7 @@ def perfect_modes(problem: Problem, count: int, comm: MPI.Comm) -> tuple[Mode, .
                 break
     except Stopped:  # the last point that was reached
         pass
-    if not any(state.mu.values()):
+    if not any(state.mu.values()):  # all amplitudes are zero
         raise CaseError(
             "shell.imperfections: kind: modes: are those of a shell under a load, and there is none"
         )
@@ -111,7 +117,8 @@ def perfect_modes(problem: Problem, count: int, comm: MPI.Comm) -> tuple[Mode, .
 def _shape(scene: Scene, mode: ShellMode) -> Mode:
     """Return a mode as a function of the place, with largest value 1; collective.
 
-    Of several shells it has a function for each shell that it moves.
+    The function interpolates inward displacements at nodes. With several shells there is one
+    function for each shell that the mode moves.
     """
     model, mirror = scene.model, None
     if model.axisymmetric:
@@ -123,8 +130,9 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
         places, inward_displacements = _at_nodes(scene, model, mode)
         is_of_shell = all_nodes_of_shells(scene)
         mirror = model.mirror if model.multiplicity > 1 else None
+    # sign: of the mirror image
     node_count, sign = len(places), -1.0 if mode.label == "antisymmetric" else 1.0
-    if mirror:
+    if mirror:  # the other half has its images behind the nodes
         places, inward_displacements = (
             np.vstack([places, mirror.image(places)]),
             np.concatenate([inward_displacements, sign * inward_displacements]),
@@ -137,7 +145,7 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
             return on_meridian(
                 places[nodes],
                 inward_displacements[nodes],
-                int(mode.label.removeprefix("m = ") or 0),
+                int(mode.label.removeprefix("m = ") or 0),  # number of waves
             )
         if not mirror:
             return on_surface(places[nodes], inward_displacements[nodes], places[nodes])
@@ -145,6 +153,7 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
         function = on_surface(
             places[nodes_and_images], inward_displacements[nodes_and_images], places[nodes]
         )
+        # from the model's frame to that of the case
         return in_frame(MirroredMode(function, mirror, sign), -scene.problem.azimuth)
 
     nodes_of_shell = [np.flatnonzero(is_own) for is_own in is_of_shell]
@@ -171,7 +180,7 @@ def _along_meridian(model: "MeridianModel", mode: ShellMode) -> tuple[Array, Arr
         np.argsort(space.tabulate_dof_coordinates()[:, 0]) for space in (V, model.V)
     )
     coefficients = mode.vector.reshape(len(order), -1)[order]
-    in_plane = coefficients
+    in_plane = coefficients  # U and W at azimuth 0
     if mode.label:
         in_plane = np.column_stack([coefficients[:, 0] - coefficients[:, 1], coefficients[:, 2]])
     normal = nodal_normals(model.r0)[order_of_model][:, [0, 2]]
@@ -201,6 +210,6 @@ def _at_nodes(scene: Scene, model: "ShellModel", mode: ShellMode) -> tuple[Array
         [np.bincount(node_numbers, component) for component in normals_of_cells.T]
     )
     n0 = sum_of_normals / np.linalg.norm(sum_of_normals, axis=1)[:, None]
-    # each node once, of the cells that share it
-    first_occurrence = np.unique(node_numbers, return_index=True)[1]
+    # each node once, though several cells share it; ascending, as the rows of n0
+    _, first_occurrence = np.unique(node_numbers, return_index=True)
     return x[first_occurrence], -np.einsum("ij,ij->i", displacements[first_occurrence], n0)

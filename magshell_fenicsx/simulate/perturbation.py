@@ -2,6 +2,11 @@
 
 The problem is the one that a file with this number would give: lengths with units stay, those over
 h or in the unit of a dimple's width change with these.
+
+A key is the path of a number in the case's file, such as "magnetic.remanent.polar"; a section is a
+part of the file. The chart has the coordinates of the undeformed surface; r0 maps it into space.
+Amplitudes are load parameters and stiffnesses of contact, by name in `State.mu`; lambda_m is the
+strength of the magnetic field. A rim is the edge of a dimple.
 """
 
 from collections.abc import Collection, Iterable
@@ -68,7 +73,7 @@ def number_at_key(context: Context, key: str) -> float:
         )
     if key.startswith("shell.laminate.plies.") and key.endswith(".fraction"):
         raise CaseError(f"{key}: the fractions of the plies add up to 1: one alone has no gradient")
-    # of one of several shells, in its own section
+    # shells.NAME.KEY: one of several shells has a KEY of its own
     own_key = key.split(".", 2)[2] if key.startswith("shells.") else key
     section_key, _, key_in_section = own_key.partition(".")
     differentiable_keys = (*MATERIAL_KEYS, *DEVIATION_KEYS)
@@ -93,8 +98,8 @@ def number_at_key(context: Context, key: str) -> float:
 def scale_at_key(context: Context, key: str) -> float:
     """Return the scale of the number at a key; steps of differences are small against this scale.
 
-    It is the number itself; of a zero the largest number of its list, of a zero length R in the
-    case's unit, else one.
+    It is the absolute value of the number. For a zero it is the largest number of the list that has
+    the zero; or else the reference length in the case's unit for a length, and one for others.
     """
     value, is_length_key = _value_and_kind(context, key)
     if magnitude := float(abs(value)):
@@ -110,7 +115,7 @@ def scale_at_key(context: Context, key: str) -> float:
 
 
 def _value_and_kind(context: Context, key: str) -> tuple[Any, bool]:
-    """Return the value at a key, and whether it is a length by the type of its section.
+    """Return the value at a key, and whether its section declares it as a length.
 
     Parameters
     ----------
@@ -122,6 +127,7 @@ def _value_and_kind(context: Context, key: str) -> tuple[Any, bool]:
     CaseError
         If there is no such key.
     """
+    # "imperfections" is made from the sections of the shells: the case has no such key itself
     value: Any = {
         name: section for name, section in context.sections.items() if name != "imperfections"
     }
@@ -146,6 +152,8 @@ def refuse_unknown_parameters(context: Context, names: Iterable[str], start: Sta
 
     Parameters
     ----------
+    names
+        Each is a field of `GRADIENT_FIELDS`, an amplitude, or the key of a number.
     start
         State whose amplitudes are allowed.
 
@@ -203,14 +211,14 @@ def _rims(problem: Problem) -> list[object]:
 
 
 def problem_on_mesh_of(scene: Scene, new: Problem) -> Problem:
-    """Return a problem on the mesh of a scene, with the mesh's places in the chart.
+    """Return a problem on the mesh of a scene, whose nodes stay where they are in the chart.
 
-    The problem may differ from that of the scene in numbers, also in those of imperfections.
+    Their places in space follow from the new problem.
 
     Parameters
     ----------
     new
-        The problem.
+        Problem that differs from the scene's in numbers alone, also of imperfections.
     """
     old, model = scene.problem, scene.model
     meridian, shape = old.meridian, old.shape
@@ -242,8 +250,9 @@ def state_with_new_loads(
 ) -> State:
     """Return a state of the scene `old` with the loads of the scene `new`.
 
-    An amplitude is scaled by the ratio of its targets, its stiffnesses or its initial values in the
-    two scenes.
+    Each amplitude is scaled by a ratio of values in the two scenes. For a load it is the ratio of
+    its targets, for a penalty of the stiffnesses, for a magnetic amplitude of the strengths of the
+    field, and for others of the initial values.
 
     Parameters
     ----------
@@ -263,7 +272,7 @@ def state_with_new_loads(
         old.problem.loads.contacts, new.problem.loads.contacts, strict=True
     ):
         ratios[contact.setting] = new_contact.stiffness / contact.stiffness
-    # stiffnesses of parts are amplitudes too
+    # amplitudes with an initial value, as stiffnesses of parts
     old_values, new_values = old.unloaded().mu, new.unloaded().mu
     ratios |= {
         name: new_values[name] / value
@@ -288,7 +297,8 @@ def target_ratios(
 ) -> dict[str, float]:
     """Return amplitude -> target of the new scene over that of the old one, where they differ.
 
-    A target with a unit may differ as a number of the case changes this unit.
+    Targets are dimensionless. One that the case gives in pascals differs if a number of the case
+    changes the unit of pressures.
 
     Parameters
     ----------
@@ -310,7 +320,10 @@ def target_ratios(
 
 
 def same_chart_bounds(shape: object, other: object) -> bool:
-    """Return whether two shapes have the same bounds of their charts; True if unknown."""
+    """Return whether two shapes have the same bounds of their charts; True if unknown.
+
+    A chart with other bounds needs another mesh.
+    """
     bounds, other_bounds = chart_bounds(shape), chart_bounds(other)
     return (
         bounds is None

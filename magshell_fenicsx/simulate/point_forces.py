@@ -1,6 +1,9 @@
 """Instabilities within a thickness of a point force, which are not reported.
 
-They depend on the mesh, and so they are none of the shell; see `shells.near_points`.
+Their modes are local to the point (within a thickness), where shell theory does not hold, and they
+depend on the mesh; see `shells.near_points`. Excluded modes are those that break a symmetry of the
+model; a family of them shares a tangent; at a crossing one of them becomes neutral. A stage is the
+scene with the solver of one step.
 """
 
 from collections.abc import Callable
@@ -24,9 +27,11 @@ def point_of_crossing(stage: Stage, path: Path, crossing: Crossing) -> str:
     family = next(family for family in modes.families if family.label == crossing.label)
 
     def mode() -> Vector:
-        return nearest_to_zero(family.factor_at(stage.leave(crossing.point.state)))[1]
+        _, vector = nearest_to_zero(family.factor_at(stage.leave(crossing.point.state)))
+        return vector
 
-    return _recorded_point(stage, path, mode, getattr(family, "m", None))
+    # a family of waves has their number m
+    return _recorded_point(stage, path, mode, waves=getattr(family, "m", None))
 
 
 def point_of_instability(stage: Stage, path: Path, label: str, point: Point) -> str:
@@ -54,7 +59,9 @@ def point_of_instability(stage: Stage, path: Path, label: str, point: Point) -> 
 def _recorded_point(
     stage: Stage, path: Path, mode: Callable[[], Vector], waves: int | None = None
 ) -> str:
-    """Return the name of the point force to which a mode is local, or "", also from a journal.
+    """Return the name of the point force to which a mode is local, or "".
+
+    The answer is recorded in the journal of the run, which a resumed run reads.
 
     Parameters
     ----------

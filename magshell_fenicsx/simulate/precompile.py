@@ -25,7 +25,7 @@ SCENES = (
     ("axisymmetric", {"kind": "pressure"}),
     ("half", {"kind": "indentation", "at": {"polar": 45}, "depth": 1, "patch": 5}),
 )
-SOLIDS = SCENES[::2]  # of one degree
+SOLIDS = SCENES[::2]  # those of halves, as a solid is never axisymmetric
 OCTANT: dict[str, Any] = {  # symmetric in three planes, each a kernel of its own
     "shell": {
         "geometry": "cylinder",
@@ -63,7 +63,7 @@ def precompile(degree: int, make_problem: Callable[[Source], Problem]) -> float:
     start = time.perf_counter()
     for data in _cases(degree):
         scene = Scene(make_problem(Source("precompile", data)), MPI.COMM_WORLD)
-        scene.model.symmetry_breaking_modes  # noqa: B018  (compiles theirs)
+        scene.model.symmetry_breaking_modes  # noqa: B018  (the first use compiles its kernels)
     return time.perf_counter() - start
 
 
@@ -84,6 +84,7 @@ def _cases(degree: int) -> Iterator[dict[str, Any]]:
             "loading": loading,
             "mesh": {"refinement": 0.5},
         }
+    # a uniform thickness, and one that varies, have kernels of their own
     for factor in ({}, {"thickness_factor": "1 + z/2"}):
         yield {
             **OCTANT,

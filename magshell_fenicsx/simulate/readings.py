@@ -8,6 +8,17 @@ solved, and a result y has the derivative
 
 with dmu/dp of the load that keeps the place: where its unit depends on p, as the buckling pressure
 does on a thickness.
+
+Words and symbols:
+
+- p is a number of the case, given by its key; a slope is a derivative by p. mu is the load, an
+  amplitude; its conjugate -dPi/dmu is the displacement on which it does work, with the potential
+  energy Pi.
+- A column is one of path.csv, without unit or in a unit of the case. The size of a unit turns the
+  first into the second.
+- A history has the records of a run that its end depends on. An adjoint has what the derivatives of
+  one result by any p need.
+- Low and high are the two points of the path, or values of p, at both sides.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -131,12 +142,13 @@ class PrescribedQuantity:
 
     def __init__(self, scene: Scene) -> None:
         """Find the quantity by the last step, with its columns and the size of its unit."""
-        programme = scene.problem.programme
+        programme = scene.problem.programme  # the list of steps; a motion prescribes no load
         if not programme or programme[-1].load.motion:
             raise CaseError("the case has no last step that prescribes a load or a displacement")
         self.scene, self.step = scene, programme[-1]
         self.name = self.step.name
         self.by_conjugate = self.step.load.by_conjugate(at_target=True)
+        # unit: the value of the amplitude, or of its conjugate, that is 1 in the column
         self._unit, self.dimensionless_column = 1.0, amplitude(self.name).column
         if self.by_conjugate:
             columns = {name: (column, unit) for column, (name, unit) in conjugates(scene).items()}
@@ -173,10 +185,11 @@ class PrescribedQuantity:
         return PrescribedLoad(self.name, value)
 
     def load_rate(self, key: str) -> float:
-        """Return d ln mu/dp of the load that keeps its place, less the rate that gradients have.
+        """Return the rate (dmu/dp)/mu by which the load keeps its place, less that of gradients.
 
-        The unit of a place may depend on p. A gradient by p lets the target of the step change with
-        the case; what is missing for a fixed place is returned.
+        A place is mu times the size of its unit, which may depend on p. So at a fixed place mu
+        changes at the negative rate of this size. A gradient by p already lets the load change with
+        the targets of the case (`_load_factor`); the difference of the two rates is returned.
 
         Parameters
         ----------
@@ -194,16 +207,16 @@ class PrescribedQuantity:
         low_problem, high_problem = (
             problem.with_values({key: value + sign * step}) for sign in (-1, 1)
         )
-        sizes = [
+        low_size, high_size = [
             sizes_in_units(problem_nearby).size(self.dimensionless_column)
             for problem_nearby in (low_problem, high_problem)
         ]
-        factors = [
+        low_factor, high_factor = [
             self._load_factor(problem_nearby) for problem_nearby in (low_problem, high_problem)
         ]
         two_steps = 2 * step
-        needed_rate = -(sizes[1] - sizes[0]) / (two_steps * self._size)
-        rate_of_gradients = (factors[1] - factors[0]) / two_steps
+        needed_rate = -(high_size - low_size) / (two_steps * self._size)
+        rate_of_gradients = (high_factor - low_factor) / two_steps
         if not self.by_conjugate:
             return float(needed_rate - rate_of_gradients)
         if abs(needed_rate - rate_of_gradients) * abs(value or 1.0) > UNIT_RATE_TOLERANCE:
@@ -216,7 +229,8 @@ class PrescribedQuantity:
     def _load_factor(self, other: Problem) -> float:
         """Return the load of a problem over that of the scene, as gradients scale it.
 
-        See `simulate.perturbation.state_with_new_loads`.
+        It is the ratio of the strengths of the field, or of the targets. The loads of states that
+        gradients compare are scaled alike (`simulate.perturbation.state_with_new_loads`).
 
         Parameters
         ----------
@@ -249,7 +263,7 @@ class ResultSampler:
         """Follow the path until all places are passed, or to its end if a reading needs this."""
         self.scene, self._history = scene, History()
         self._records, self._record_at_place = list[Record](), dict[float | None, Record]()
-        self._stop_reason, remarks = "", list[str]()
+        self._stop_reason, remarks = "", list[str]()  # "": the path has not stopped
         places_ahead = {request.at for request in requests if request.at is not None}
         to_end = any(request.at is None for request in requests)
         last_step = len(scene.problem.programme)
@@ -273,6 +287,7 @@ class ResultSampler:
                     break
         except Stopped as e:
             self._stop_reason = str(e)
+        # a path that stops beyond its instability has a remark in place of an error
         remarks_on_end = (text for text in remarks if text.startswith(BEYOND_INSTABILITY))
         self._stop_reason = self._stop_reason or next(remarks_on_end, "")
 
@@ -311,7 +326,9 @@ class ResultSampler:
         ]
 
     def adjoint(self, reading: Reading) -> Adjoint:
-        """Return the adjoint of a reading's result; `change` has no influence on it.
+        """Return the adjoint of a reading's result: at its place, or at the end of the path.
+
+        It is that of the value itself, also where the reading is a change since the begin.
 
         Raises
         ------
@@ -326,10 +343,11 @@ class ResultSampler:
         try:
             if result in FOLDS:
                 begins = self._history.begins
-                _, first_adjoint = instabilities(scene, self._records, result, begins=begins)[0]
-                return first_adjoint
+                _, lowest = instabilities(scene, self._records, result, begins=begins)[0]
+                return lowest
             refuse_moving(scene, self._records[-1], result)
-            return adjoint_at_end(scene, self._history, result)[1]
+            _, adjoint_of_end = adjoint_at_end(scene, self._history, result)
+            return adjoint_of_end
         except FoldLost as e:
             raise LostResult(f"no {result}: {e}") from None
 
@@ -359,7 +377,7 @@ class ResultSampler:
         if not any(has_place) or not (rate := self.prescribed.load_rate(key)):
             return slopes
         name = self.prescribed.name
-        # dy/dmu times dmu/dp of the load that keeps the place
+        # dy/dmu times dmu/dp of the load that keeps the place; `rate` is (dmu/dp)/mu
         slopes_by_place = [
             float(derivative(result_adjoint, name))  # type: ignore[arg-type]
             * result_adjoint.state.mu[name]
@@ -393,7 +411,10 @@ class ResultSampler:
         return self._record_at_place[place]
 
     def _record_at(self, place: float) -> Record:
-        """Return the record of the equilibrium at a place, see `record_at`."""
+        """Return the record of the equilibrium at a place, see `record_at`.
+
+        It is solved between the first two points of the path that have the place between them.
+        """
         path, prescribed = self._path(), self.prescribed
         values = [prescribed.place_of(record.point.state) for record in path]
         tolerance = PATH_END_TOLERANCE * (max(values) - min(values)) if values else 0.0
@@ -420,6 +441,7 @@ class ResultSampler:
             raise UnreadPlace(
                 f"no equilibrium is found at {prescribed.column} = {place:.6g}: {e}", place
             ) from None
+        # gradients read the state alone: s, the tangent and pivots of the point are zero
         point = Point(state, 0.0, 0.0 * state.u, 0.0, 0, 0)
         return Record("target", prescribed.name, point, step=prescribed.step.number)
 
@@ -448,6 +470,7 @@ class ResultSampler:
             If Newton's method fails after all halvings, or leaves the path.
         """
         (low_place, low_state), (high_place, high_state) = low, high
+        # how far the place is from low to high; 1.0 avoids a division by zero
         part = float(np.clip((place - low_place) / ((high_place - low_place) or 1.0), 0.0, 1.0))
         mu = {
             name: (1 - part) * value + part * high_state.mu.get(name, value)
@@ -460,6 +483,7 @@ class ResultSampler:
         row = self.prescribed.constraint(stage.newton.system, place)
         outcome = stage.newton.solve(stage.enter(guess), self.prescribed.name, row)
         state = stage.leave(outcome.state)
+        # a solution farther from the guess than the two states from each other is not on the path
         tolerance = max_abs(comm, high_state.u - low_state.u) + PATH_END_TOLERANCE * system.length
         if outcome.converged and max_abs(comm, state.u - guess.u) <= tolerance:
             return state
@@ -509,6 +533,7 @@ def read(
         If a result has no derivative.
     """
     sampler, fields = ResultSampler(scene, requests), fields or {}
+    # results whose value at the begin of the step is read too, as further rows
     changing = list(dict.fromkeys(request.of for request in requests if request.change))
     adjoints = [sampler.adjoint(request) for request in requests]
     adjoints += [sampler.adjoint_at(sampler.begin, result) for result in changing]
@@ -518,7 +543,7 @@ def read(
     derivatives = np.zeros((len(adjoints), count_of_numbers))
     for i, key in enumerate(keys if slopes else ()):
         derivatives[:, i] = sampler.slopes(adjoints, key, has_place)
-    first_column = len(keys)
+    first_column = len(keys)  # of the numbers of a field
     for field_name, (count, derivatives_by_numbers) in fields.items() if slopes else ():
         for row, result_adjoint in zip(derivatives, adjoints, strict=True):
             row[first_column : first_column + count] = derivatives_by_numbers(

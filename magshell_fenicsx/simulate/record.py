@@ -1,4 +1,9 @@
-"""Records of a history: its points, and where each comes from."""
+"""Records of a history: its points, and where each comes from.
+
+A history is the sequence of equilibria (or moving states) of a case, step by step of its programme.
+An amplitude is a load parameter, by name in `State.mu`. A model with symmetry excludes modes that
+break it.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

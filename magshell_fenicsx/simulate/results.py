@@ -2,6 +2,17 @@
 
 The barrier is what a probing force passes: its work from zero, over its largest value, back to
 zero.
+
+Words and symbols:
+
+- J is a number of a state (u, mu): u is the displacement over the reference length R, mu holds the
+  amplitudes (load parameters) by name. p is any parameter of the case.
+- Pi is the potential energy of the modelled part, R also its residual Pi_u; the whole shell has
+  `multiplicity` such parts.
+- The conjugate of an amplitude is q = -dPi/dmu, the displacement on which it does work.
+- w is the deflection inwards, against the normal n0. h is the thickness, E Young's modulus.
+- A column is one of path.csv; observables are columns of a part of the package, as of magnets.
+- Q rotates from the case's frame into that of the model.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -45,7 +56,7 @@ class Functional:
     energy
         c: J contains c Pi.
     reaction
-        e at supports: J is e . R of the residual of all nodes.
+        e, a motion of supports: J is e . R, with the residual of all nodes, also at supports.
     forms
         Other energies in J that depend on the placement, and their factors.
     deflections
@@ -94,6 +105,7 @@ def functional(scene: Scene, state: State, result: str | Target) -> Functional:
         by_u = scene.problem.length * (_to_case_frame(scene) @ model.probe(point))[axis]
         return Functional(scene.observe(state)[result], system.zero_at_supports(by_u))
     if result in (conjugate_columns := conjugates(scene)):
+        # J = -dPi/dmu over its unit, which may depend on the size of the shell: the forms
         name, conjugate_unit = conjugate_columns[result]
         by_u = np.asarray(-system.load(state.u, state.mu, name) / conjugate_unit)
         value = -system.potential(state.u, state.mu, name) / conjugate_unit
@@ -202,6 +214,7 @@ def _reaction(scene: Scene, state: State, name: str, axis: int, result: str) -> 
     value = dot(system.comm, reaction_vector, system.forces(state.u, state.mu))
     return Functional(
         value,
+        # d(e . R)/du = K e
         system.zero_at_supports(system.at_state(state).stiffness_along(reaction_vector)),
         reaction=reaction_vector,
     )
@@ -218,6 +231,7 @@ def conjugates(scene: Scene) -> dict[str, tuple[str, float]]:
     }
     with_units = {column: (name, scene.conjugate_unit(name)) for column, name in amplitudes.items()}
     for name in (*loads.forces, *loads.dead):
+        # the load for an amplitude of one; 0: a dead load of moments has no displacement in h
         if (
             load_size := model.force_unit
             if name in loads.forces
@@ -236,7 +250,8 @@ def _to_case_frame(scene: Scene) -> Array:
 def offset(scene: Scene, target: Target) -> fem.Function:
     """Return the displacement from the undeformed shell to a target, at the nodes of the model.
 
-    It is a field that follows from the placement, so that it has derivatives by the shape.
+    As a `PlacementField` it can be built again for another placement, which derivatives by the
+    shape need.
     """
     axes, Q = scene.model.axes, rotation(scene.problem.azimuth)
 
@@ -278,6 +293,7 @@ def _misfit(scene: Scene, state: State, target: Target) -> Functional:
     area = evaluation.integral(area_form.energy_form)
     slope = log.compile("misfit slope", over_area(2 * ufl.dot(gap, ufl.TestFunction(model.V))))
     value = evaluation.integral(square.energy_form) / area
+    # derivatives of the quotient by its numerator and its denominator
     forms = [(square, 1 / area), (area_form, -value / area)]
     return Functional(value, np.asarray(evaluation.gradient([slope]) / area), forms=forms)
 
@@ -285,8 +301,8 @@ def _misfit(scene: Scene, state: State, target: Target) -> Functional:
 def barrier(scene: Scene, step: ProgrammeStep, begin: State, end: State) -> float:
     """Return the energy barrier that a step passes, over E h R^2; collective.
 
-    It is the work of the step's load between two states without this load: the change of Pi, plus
-    the integral of q dmu for each other amplitude whose conjugate q is held.
+    The step's own load is zero in both states. So its work is the change of Pi between them, plus
+    the integral of q dmu for each other amplitude that changes as its conjugate q is held.
 
     Parameters
     ----------
@@ -299,6 +315,8 @@ def barrier(scene: Scene, step: ProgrammeStep, begin: State, end: State) -> floa
     for name, q in held_conjugates.items():
         mu_before, mu_after = begin.mu[name], end.mu[name]
         work = (
+            # a gas has q as a function of mu; q(mu) returns value and derivative, quad the integral
+            # and its error
             scipy.integrate.quad(lambda mu, q=q: q(mu)[0], mu_before, mu_after)[0]
             if callable(q)
             else q * (mu_after - mu_before)

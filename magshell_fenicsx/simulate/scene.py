@@ -1,4 +1,20 @@
-"""Scene: the model of a problem, of its mid-surface, its meridian or its body, and the solver."""
+"""Scene: the model of a problem, of its mid-surface, its meridian or its body, and the solver.
+
+A problem goes in: all numbers, formulas and shapes of a case. A scene comes out: the finite element
+model with its solver, which computes equilibria, and what reports read from their states.
+
+Words and symbols:
+
+- A state has the displacement u of its model, over the reference length R, and mu: amplitudes by
+  name. An amplitude is a load parameter or another number that may vary along a path; Pi is the
+  potential energy.
+- The model is a surface, a meridian (an axisymmetric shell) or a body (a solid), in each case the
+  whole or a part with symmetry. `multiplicity` is the number of such parts in the whole.
+- A term is an energy with its form; one that an amplitude multiplies is a load.
+- Observables are the columns and lines that a part of the package (magnets, supports, ...) reads
+  from a state. h is the thickness, E Young's modulus.
+- Own energies and amplitudes are those that a program defines for its case.
+"""
 
 import time
 from collections import defaultdict
@@ -64,8 +80,9 @@ def build_model(problem: Problem, comm: MPI.Comm) -> "ShellModel":
         problem.loads,
         problem.mesh.penalty,
         problem.thickness,
-        problem.mirror or Y0_PLANE,
+        problem.mirror or Y0_PLANE,  # not used by the whole shell
     )
+    # of a case that is axisymmetric in all: what has buckled may turn about e3 freely
     model.turns = problem.turns
     return model
 
@@ -76,7 +93,8 @@ def build_meridian_model(problem: Problem, *, assembled: bool = True) -> Meridia
     Parameters
     ----------
     assembled
-        See `MeridianModel`.
+        Whether the model gets its system of terms; False: its numbers alone, for forms of another
+        model.
     """
     return MeridianModel(
         build_meridian(problem),
@@ -99,13 +117,13 @@ def build_meridian(problem: Problem) -> Meridian:
     assert chart
     points = {}
     for name, place in problem.points.items():
-        # of names for one point, the first
+        # two names for one point have one place object; the first of them locates it
         first_name = next(
             other_name for other_name, other_place in problem.points.items() if other_place is place
         )
         points[name] = chart.locate_named(first_name, place)
     shells = [(shell.name, shell.ends) for shell in chart.shell_meridians]
-    held_names = [
+    held_names = [  # points whose boundary condition supports the shell
         name for name, condition in problem.conditions.items() if condition not in UNHELD_CONDITIONS
     ]
     return make_meridian(
@@ -180,15 +198,15 @@ class Scene:
     warnings
         Warnings of what is unphysical, or may be too large.
     allows_rigid_motion
-        Whether rigid motions may be left free: see `Problem.at_rest`.
+        Whether supports may leave rigid motions free, as nothing loads the shell.
     free_in_time
-        Whether rigid motions are left free in a motion: see `Problem.moves_freely`.
+        Whether supports leave rigid motions free in a step in time; pivots then do not count.
     setup_s
         Time to build the scene in seconds, without compiling kernels.
     """
 
     def __init__(self, problem: Problem, comm: MPI.Comm = MPI.COMM_WORLD) -> None:
-        """Build the model, and check that it is held or may move; collective."""
+        """Build the model, and check that supports hold it, or that it may move; collective."""
         start = time.perf_counter()
         if problem.pending_modes:
             raise CaseError(
@@ -211,7 +229,7 @@ class Scene:
         is_from_file = surface is not None and surface.from_mesh_file
         may_be_free = self.model.axisymmetric or is_from_file or not self.problem.fixed
         self.allows_rigid_motion = may_be_free and self.problem.at_rest
-        motion = ""
+        motion = ""  # words for a rigid motion that the supports leave free
         if may_be_free and not self.allows_rigid_motion:
             motion = self.model.free_motion(self.unloaded().mu)
         if motion and not self.problem.moves_freely:
@@ -224,8 +242,8 @@ class Scene:
         stiffnesses = {pair.setting: pair.stiffness for pair in pairs}
         options = None
         if self.model.contacts or stiffnesses:
-            # a body's penetration changes over far less than h: factors of a state near by are no
-            # tangent's, and the first matrices only find what touches
+            # a penetration changes over far less than h. So factors of a near-by state are of no
+            # use, and the first iterations only find out what touches: patience
             options = NewtonOptions(
                 reuse_distance=0.0, patience=7, stiffnesses=stiffnesses, allows_kinks=True
             )
@@ -253,6 +271,11 @@ class Scene:
         """Return the scene of a problem that differs in numbers alone, with a model that has them.
 
         The solver has the options of this scene's solver.
+
+        Parameters
+        ----------
+        problem, model
+            The other problem, and its model on the same mesh.
         """
         return self._copy(
             problem=problem, model=model, newton=BorderedNewton(model.system, self.newton.options)
@@ -267,6 +290,7 @@ class Scene:
             Name of an attribute -> its new value.
         """
         copied_scene = object.__new__(Scene)
+        # cached properties are in the class too, other attributes in the instance alone
         attributes = {name: value for name, value in vars(self).items() if name not in vars(Scene)}
         vars(copied_scene).update(attributes | changes)
         return copied_scene
@@ -339,8 +363,9 @@ class Scene:
         Amplitudes are zero, except user-defined ones with an initial value.
         """
         field = self.problem.loads.magnetic
+        # amplitudes that turn the field
         turns = (motion.name for motion in field.turns) if field else ()
-        values = self._own_amplitudes
+        values = self._own_amplitudes  # with initial values
         names = {
             *self.motions,
             *self.sources,
@@ -353,7 +378,10 @@ class Scene:
         return State(self.model.zero(), {name: values.get(name, 0.0) for name in sorted(names)})
 
     def displacement(self, state: State) -> fem.Function:
-        """Return the displacement of a state as a dolfinx function, see `Record.u`; collective.
+        """Return the displacement of a state as a dolfinx function; collective.
+
+        It is on the mesh that a program has given, in the lengths of its coordinates; else on the
+        mesh of the model, over R.
 
         Parameters
         ----------
@@ -407,6 +435,7 @@ class Scene:
                 f"this scene has {unloaded.u.size}; take records of follow or trace of the same "
                 "scene"
             )
+        # entries of the history, as angles of edges, come with the first steps of a path
         further_amplitudes = state.mu.keys() - unloaded.mu.keys() - {*self.model.system.history}
         missing_amplitudes = unloaded.mu.keys() - state.mu.keys()
         if missing_amplitudes or (further_amplitudes and not allows_more):
@@ -427,15 +456,15 @@ class Scene:
         self.refuse_foreign(state, allows_more=True)
         model, h, loads = self.model, self.problem.material.h, self.model.loads
         force = loads.forces.get("force")
-        energies = self.energies(state)
+        energies = self.energies(state)  # by group of terms
         pole = model.deflection(state.u, "pole") / h
         deflection = pole
-        if loads.displaced:
+        if loads.displaced:  # the name of the load whose displacement w is reported
             deflection = model.loaded_deflection(state.u, loads.displaced) / h
         energy_of_column = defaultdict[str, float](float)
         for group, column in {term.group: term.column for term in model.system.terms}.items():
             energy_of_column[column] += energies[group]
-        is_split = "stretching" in energy_of_column  # that of a solid is not
+        is_split = "stretching" in energy_of_column  # the energy of a solid is not
         columns = {
             "p_over_pc": state.mu.get("pressure", 0.0),
             "force": 0.0,
@@ -457,9 +486,13 @@ class Scene:
         return columns | self._observe_own_terms(state)
 
     def _observe_own_terms(self, state: State) -> dict[str, float]:
-        """Return column -> integral over the shell that an own energy observes; collective."""
+        """Return column -> integral over the shell that an own energy observes; collective.
+
+        Each own energy of a program may have such integrals beside its density.
+        """
         model, columns = self.model, dict[str, float]()
         for term in self.problem.loads.user_terms:
+            # without a density nothing has this amplitude
             factor = state.mu[term.name] if term.density else 1.0
             for column in term.observed:
                 integral = model.system.at_state(state).integral(model.observed[column])
@@ -469,7 +502,7 @@ class Scene:
     def energies(self, state: State) -> dict[str, float]:
         """Return group of terms -> energy over E h R^2 of the whole shell; collective.
 
-        All terms of one field are one group. Terms of loads have the factor of their amplitude.
+        All terms of one field are one group. A term that an amplitude multiplies has this factor.
         """
         model, by_group = self.model, defaultdict[str, float](float)
         potentials = model.system.energies(state.u, state.mu)
@@ -506,6 +539,9 @@ class Scene:
     def energy_of_shell(self, state: State, energy: float) -> float:
         """Return the energy of the shell itself: without the potentials of the loads.
 
+        The potential of a load is mu dPi/dmu. Coordinates, as positions of supports and free
+        parameters, are amplitudes without a potential of their own.
+
         Parameters
         ----------
         energy
@@ -523,8 +559,8 @@ class Scene:
     def view(self) -> ModelView:
         """The model with the units and the frame of reports, for observables of parts."""
         problem = self.problem
-        sense = copysign(1.0, problem.lambda_m)
-        place = problem.mirror, problem.azimuth
+        sense = copysign(1.0, problem.lambda_m)  # of the magnetic field
+        place = problem.mirror, problem.azimuth  # which part is modelled, and in which frame
         return ModelView(
             self.model, problem.length, problem.modulus, *place, problem.reactions, sense
         )
@@ -545,10 +581,10 @@ class Scene:
         return to_magpylib(self.view, record.point.state, parts)
 
     def conjugate_unit(self, name: str) -> float:
-        """Return the value of -dPi/dmu that counts as one unit of a target for an amplitude.
+        """Return the value of -dPi/dmu that is one unit of the conjugate of an amplitude.
 
-        The unit is ΔV/R³ of a pressure, w/h of a force, and the shell's length of dead loads; 0 for
-        an amplitude that has no such unit.
+        Targets of steps are in this unit: ΔV/R³ of a pressure, w/h of a force, and the shell's
+        length of dead loads. It is 0 for an amplitude that has no such unit.
         """
         units = (observables.conjugate_unit(self.view, name) for observables in OBSERVABLES)
         return next((unit for unit in units if unit is not None), 0.0)
@@ -558,7 +594,7 @@ class Scene:
         displacements: dict[str, float] = {}
         for point in self.problem.context.points:
             u = self.problem.length * self.model.displacement(state.u, point)
-            u = u @ rotation(self.problem.azimuth)
+            u = u @ rotation(self.problem.azimuth)  # from the model's frame to the case's
             displacements |= {
                 f"{point}_u{axis}": float(component)
                 for axis, component in zip("xyz", u, strict=True)
@@ -569,8 +605,8 @@ class Scene:
 def _beyond_memory(problem: Problem, comm: MPI.Comm) -> str | None:
     """Return a warning if a problem comes near the machine's memory, else None; collective.
 
-    Every rank asks its own machine, and all ranks act on the first refusal, see
-    `refuse_beyond_memory`.
+    Every rank asks its own machine. If one of them has too little memory, all ranks raise the same
+    error.
 
     Raises
     ------

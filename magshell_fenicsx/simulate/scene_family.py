@@ -4,6 +4,19 @@ A number that only amplitudes depend on (a field, a stiffness, the factor of an 
 in one scene. Every other one has a scene for each value, on the same mesh in the chart; where the
 chart changes its size, the mesh with it. Of meridians these scenes share forms and kernels
 (`shared_forms`).
+
+Words and symbols:
+
+- p is the number of the case. A boundary of stability is the curve (mu, p) on which one
+  instability, a fold or a bifurcation in the amplitude mu, stays critical; `self.name` is this
+  amplitude. All other amplitudes of a state (load parameters, by name) are functions of p.
+- A wave has m crests around a meridian; the meridian's own axisymmetric model excludes it, so it
+  has a tangent of its own. m = 0 stands for a mode of the model itself.
+- A stage is the scene with the solver of the step in which the instability is. `enter` and `leave`
+  convert states of the model to states of the stage's system and back.
+- The chart has the coordinates of the undeformed surface. A knot of a meridian is a value of its
+  parameter at which cells must end, as at a rim.
+- The programme is the list of the case's steps.
 """
 
 from collections.abc import Callable, Sequence
@@ -68,7 +81,7 @@ class NoInfluence(CaseError):
 
 
 def first_instability(records: Sequence[Record]) -> Record:
-    """Return the first instability of a history's last step, which ends its case.
+    """Return the first instability of a history's last step, from which a boundary is followed.
 
     Parameters
     ----------
@@ -164,7 +177,7 @@ class SceneFamily:
     kind, name
         Kind of the instability, and the amplitude in which it is located.
     mode
-        See `Record`.
+        Name of the mode at the instability; "m = 7" for waves around a meridian.
     m
         Number of waves around a meridian; 0: the mode is one of the model itself.
     has_one_scene
@@ -194,11 +207,12 @@ class SceneFamily:
         self._shared_forms: SharedForms | None = None
         self._linear_amplitudes: _LinearAmplitudes | None = None
         self._refuse_unfollowable(scene)
+        # origin: the scene whose mesh, state and amplitudes all others have
         self._origin, self.has_one_scene = scene, False
         self._test_value = self._choose_test_value(value)
         base = self._origin if self._origin is not scene else self._scene(value)
         point = replace(record.point, state=self._state_in(base, value))
-        self._first = replace(record, point=point)
+        self._first = replace(record, point=point)  # the record in the base, the scene at `value`
         self._record_value = value
         self._stages[value] = self._base = stage_of_record(base, self._first)
         self.has_one_scene = self._depends_by_amplitudes_alone(value)
@@ -208,10 +222,9 @@ class SceneFamily:
             self._linear_amplitudes = self._find_linear_amplitudes(value, self._test_value)
 
     def _find_linear_amplitudes(self, a: float, b: float) -> _LinearAmplitudes | None:
-        """Return the amplitudes if they are linear in p, else None.
+        """Return the amplitudes as linear functions of p, or None if one is not linear.
 
-        Their values at the middle of `a` and `b` are compared with the means of those at the two
-        ends.
+        Values at the middle of `a` and `b` are compared with means of the values at the two ends.
         """
         low, middle, high = (self._amplitudes(p) for p in (a, (a + b) / 2, b))
         for name in low:
@@ -241,7 +254,7 @@ class SceneFamily:
         new_names = names_at[test_value] - names
         if not names_at[test_value] > names:
             return test_value
-        # its scene serves all values
+        # the scene there has all amplitudes, so it becomes the origin
         old_origin, old_state = self._origin, self._record.point.state
         self._origin = scenes[test_value]
         problem = self._origin.problem
@@ -249,6 +262,7 @@ class SceneFamily:
         mu |= {name: problem.lambda_m if name == "lambda_m" else 0.0 for name in new_names}
         point = replace(self._record.point, state=State(u, mu))
         self._record = replace(self._record, point=point, step=len(problem.programme))
+        # another value than that of the new origin
         if len(candidates) > 1:
             return min(candidates, key=lambda p: p == test_value)
         return (value + test_value) / 2
@@ -267,6 +281,7 @@ class SceneFamily:
         if not (self.m and scene.model.axisymmetric):
             refuse_excluded_mode(record.mode)
         earlier_steps, step = programme[: record.step - 1], programme[record.step - 1]
+        # conjugates are held at values of the state before the step, which p would change
         if earlier_steps and any(law != "load" for law in step.load.hold.values()):
             raise CaseError(
                 f"{step.key}.hold: a boundary needs what is held to be held from the start: give "
@@ -292,7 +307,7 @@ class SceneFamily:
             If there is no eigenvector.
         """
         state = self._base.enter(self._first.point.state)
-        if self.m:
+        if self.m:  # waves have a tangent of their own
             return state, self.null_vector(self._record_value, state, self.m)
         try:
             return state, critical_mode(self._base.newton, state).vector
@@ -307,7 +322,8 @@ class SceneFamily:
     def kind_of(self, m: int, at: BoundaryPoint | None = None) -> Kind:
         """Return the kind of a boundary of m waves, or of the model's own mode (m = 0).
 
-        It is a fold where the load does work along the null vector.
+        It is a fold where the load does work along the null vector. Waves are bifurcations, as an
+        axisymmetric load does no work on them.
 
         Parameters
         ----------
@@ -325,7 +341,7 @@ class SceneFamily:
         return "fold" if abs(phi @ load) > MIN_FOLD_WORK * work_scale else "bifurcation"
 
     def mode_at(self, crossing: BoundaryPoint, m: int, m_of_boundary: int) -> Vector:
-        """Return the second neutral mode at a point where two boundaries cross.
+        """Return the other neutral mode at a point where two boundaries cross.
 
         Parameters
         ----------
@@ -362,7 +378,8 @@ class SceneFamily:
         p, state
             Number, and state of the stage's system, at which waves are nearly neutral.
         other_mode
-            Mode to which the result is orthogonal; None: no such mode.
+            Neutral mode of as many waves that is known already; the result is orthogonal to it.
+            None: no such mode.
         """
         factors = self.factored_tangent(p, state, m)
         # a fixed start without symmetries, so that runs repeat
@@ -390,7 +407,7 @@ class SceneFamily:
         return float(v @ self._times_tangent(self._stage_at(p), state, m, v))
 
     def counts(self, p: float, state: State) -> list[int]:
-        """Return the number of unstable directions of each wave m = 1, 2, ... at p and a state.
+        """Return the number of unstable directions for each number of waves m = 1, 2, ...
 
         Part of the interface that `continuation.symmetry_breaking` needs.
         """
@@ -442,13 +459,14 @@ class SceneFamily:
         """
         step = DIFFERENCE_STEP * abs(self._range[1] - self._range[0])
         central = [(0.5 / step, p + step), (-0.5 / step, p - step)]
-        if self._linear_amplitudes:
+        if self._linear_amplitudes:  # no problem is made for these values
             return central
         if low_order:
             step = step if self._has_problem(p + step) else -step
             return [(1 / step, p + step), (-1 / step, p)]
         if self._has_problem(p - step) and self._has_problem(p + step):
             return central
+        # (-3 f(p) + 4 f(p + step) - f(p + 2 step))/(2 step)
         step = step if self._has_problem(p + 2 * step) else -step
         return [(-1.5 / step, p), (2 / step, p + step), (-0.5 / step, p + 2 * step)]
 
@@ -474,12 +492,12 @@ class SceneFamily:
             except CaseError as e:
                 raise NoSystem(str(e)) from None
             while len(self._problems) > MAX_PROBLEMS:
-                self._problems.pop(next(iter(self._problems)))
+                self._problems.pop(next(iter(self._problems)))  # the oldest
         return self._problems[p]
 
     def _stage(self, p: float) -> Stage:
         """Return the stage of the scene at p; the latest `MAX_STAGES` are remembered."""
-        stage = self._stages.pop(p, None)
+        stage = self._stages.pop(p, None)  # put back at the end: the least used is the first
         if stage is None:
             scene = self._scene(p)
             if self._base.device or self._base.parametrised:
@@ -507,6 +525,7 @@ class SceneFamily:
             )
         try:
             on_mesh = problem_on_moved_mesh(self._origin, new)
+            # None where the shared forms cannot serve this problem
             if self._shared_forms and (scene := self._shared_forms.scene_at(p, on_mesh)):
                 return scene
             return Scene(on_mesh, self._origin.comm)
@@ -524,9 +543,9 @@ class SceneFamily:
     def _amplitudes(self, p: float) -> dict[str, float]:
         """Return amplitude of the model -> its value at the instability, for the number p.
 
-        Loads that earlier steps have driven to their targets take the targets of the problem at p.
-        So do amplitudes that still have their initial values, and magnetic amplitudes scale with
-        the strength of the field.
+        An amplitude changes with p in three cases. It is at the target of an earlier step: it takes
+        the target of the problem at p. It still has its initial value: it takes the initial value
+        at p. It is a component of the magnetic field: it scales with the strength of the field.
         """
         if self._linear_amplitudes:
             return self._linear_amplitudes.at(p)
@@ -538,6 +557,7 @@ class SceneFamily:
             )
             if not (old_target and new_target) or old_target[0].quantity != "load":
                 continue
+            # a later step may have moved it away from the target
             if isclose(mu.get(old_step.name, np.nan), old_target[1], rel_tol=1e-9):
                 mu[old_step.name] = new_target[1]
         old_values, new_values = own_amplitudes(old.loads), own_amplitudes(new.loads)
@@ -558,8 +578,9 @@ class SceneFamily:
     def _depends_by_amplitudes_alone(self, value: float) -> bool:
         """Return whether p enters the forces by amplitudes alone; collective.
 
-        Then the scene at `value` has, with the amplitudes at the test value, the same forces as the
-        scene at the test value.
+        The forces of the scene at a test value of p are computed. They are compared with the forces
+        of the scene at `value`, once with its own amplitudes and once with the amplitudes at the
+        test value. Only in the second case may they be equal.
 
         Raises
         ------
@@ -578,8 +599,9 @@ class SceneFamily:
     def _share_forms(self, value: float) -> None:
         """Let the scenes at all p share the forms of one meridian, if forces stay the same.
 
-        Forces at values that have a scene of their own are compared before and after, relative to
-        their change by p. If they differ, each value keeps a scene of its own.
+        The values of p that have a scene so far serve as a test: forces with shared forms must
+        equal those of their own scenes, relative to the change of forces by p. Otherwise each value
+        keeps a scene of its own.
         """
         shared_forms = SharedForms.of_scene(self._base.scene)
         if shared_forms is None:
@@ -599,9 +621,10 @@ class SceneFamily:
         self._shared_forms, self._stages = None, stages
 
     def _forces(self, stage: Stage, p: float) -> Vector:
-        """Return residual, load, and tangent times null vector, in one vector on this rank.
+        """Return the quantities of a stage at p that a boundary depends on, in one vector.
 
-        They are those of a stage at p, at the displacement of the first instability.
+        They are residual, load, and tangent times the null vector, at the displacement of the first
+        instability, on this rank. Two scenes with equal ones count as the same.
         """
         system, (state, phi) = stage.newton.system, self.start
         mu = {**self._other_amplitudes(stage, p), self.name: state.mu[self.name]}
@@ -611,7 +634,7 @@ class SceneFamily:
         elif stage.scene.model.axisymmetric:
             # its matrices cost little, and differences are less exact
             product = stage.newton.factor_at(state_at_p).times(phi)
-        else:
+        else:  # by differences of residuals
             product = times_tangent(system, state_at_p, phi)
         return np.concatenate(
             [system.residual(state.u, mu), system.load(state.u, mu, self.name), product]
@@ -648,6 +671,7 @@ def problem_on_moved_mesh(scene: Scene, new: Problem) -> Problem:
         assert on_mesh.meridian
         vertices = on_mesh.meridian.vertices
         assert vertices is not None
+        # parameters at which cells must end, such as rims
         knots, new_knots = old.meridian.knots, new.meridian.knots
         if knots.shape != new_knots.shape:
             raise NoSystem("a rim of a dimple appears or vanishes on the way")
@@ -656,10 +680,11 @@ def problem_on_moved_mesh(scene: Scene, new: Problem) -> Problem:
     if scene.model.midsurface and not same_chart_bounds(old.shape, new.shape):
         patch = scene.model.midsurface.with_embedding(new.embedding)
         old_bounds, new_bounds = chart_bounds(old.shape), chart_bounds(new.shape)
+        # nodes of a mesh file have three coordinates
         if old_bounds is None or new_bounds is None or patch.nodes.shape[1] != 2:
             raise NoSystem("the mesh of this shape cannot move with the number")
-        old_low, old_size = old_bounds[0], old_bounds[1] - old_bounds[0]
-        new_low, new_size = new_bounds[0], new_bounds[1] - new_bounds[0]
+        (old_low, old_high), (new_low, new_high) = old_bounds, new_bounds
+        old_size, new_size = old_high - old_low, new_high - new_low
         nodes = new_low + (patch.nodes - old_low) / old_size * new_size
         return replace(on_mesh, shape=replace(patch, nodes=nodes), points=new.points)
     return on_mesh

@@ -69,8 +69,10 @@ def update_fields(scene: Scene, problem: Problem) -> bool:
     """
     model, old = scene.model, scene.problem
     has_same_data = _data_without_fields(old) == _data_without_fields(problem)
+    # without data, as of a problem that a program has made, nothing can be compared
     if not (old.document.data and has_same_data):
         return False
+    # models with contacts or dead loads are always built anew
     if not model.thin or model.contacts or model.shell_contacts or old.loads.dead:
         return False
     symmetries = [(each.axisymmetric, each.mirror, each.azimuth) for each in (old, problem)]
@@ -81,6 +83,7 @@ def update_fields(scene: Scene, problem: Problem) -> bool:
     _set_fields(model, problem)
     model.loads = problem.loads
     scene.problem = problem
+    # without what was known of the old fields: factors, and the state of the monitor
     scene.newton = BorderedNewton(model.system, scene.newton.options)
     scene.__dict__.pop("stability_monitor", None)
     return True
@@ -97,7 +100,11 @@ def _data_without_fields(problem: Problem) -> dict[str, Any]:
 
 
 def _fields(problem: Problem) -> tuple[bool | str | float, ...]:
-    """Return which fields the terms of a problem have, to be compared with another problem."""
+    """Return which fields the terms of a problem have, to be compared with another problem.
+
+    They are flags of remanence and thickness, the scale of a soft material (0.0 without one), and
+    the amplitudes of the natural shape.
+    """
     magnetic, natural = problem.loads.magnetic, problem.loads.natural
     amplitudes = natural.amplitudes if natural else ()
     soft_scale = magnetic.soft.scale if magnetic and magnetic.soft else 0.0
@@ -125,7 +132,7 @@ def _set_fields(model: "ShellModel | MeridianModel", problem: Problem) -> None:
         for coefficient in term.form.coefficients()
     }
     if magnetic and callable(magnetic.remanent):
-        remanence = spatial_fields.pattern_field(magnetic.remanent, r0)[0]
+        remanence, *_ = spatial_fields.pattern_field(magnetic.remanent, r0)
         coefficients["Br"].x.array[:] = remanence.x.array
     if problem.thickness and model.thickness:
         patches = model.midsurface.patches if model.midsurface else {}

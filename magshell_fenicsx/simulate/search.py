@@ -5,6 +5,12 @@ A guess is the shell with a part of it mirrored in a plane, as Pogorelov's dents
 part is an isometric copy of itself, so only the fold around it costs energy. The plane is parallel
 to that of the supports; the fold is as wide as the boundary layer of a sphere, sqrt(2 h H) for a
 dent of depth H.
+
+A guess settles where its energy is let fall, until Newton's method can find an equilibrium near.
+Deflation removes known solutions from the equations, so that others are found. h is the thickness,
+lengths are over the reference length R. A stage is the scene with the solver of a step; `enter`
+and `leave` convert states of the model to states of the step's system and back. A fold is here the
+narrow bent edge of a dent.
 """
 
 import time
@@ -56,7 +62,8 @@ def dented_states(scene: Scene, state: State) -> Iterator[State]:
     curved_shells = [shell for shell in shells if shell.top > MIN_HEIGHT * h]
     for depth in DEPTHS:
         dents = [shell.dent(depth, h) for shell in curved_shells]
-        for dent in [*dents, np.sum(dents, axis=0)] if len(dents) > 1 else dents:
+        all_at_once = [np.sum(dents, axis=0)] if len(dents) > 1 else []
+        for dent in [*dents, *all_at_once]:
             yield State(state.u + system.zero_at_supports(dent.ravel()), dict(state.mu))
 
 
@@ -99,7 +106,7 @@ class CurvedShell:
         height = x @ normal - level
         top = float(comm.allreduce(float(height[is_own].max(initial=0.0)), MPI.MAX))
         bottom = float(comm.allreduce(float(height[is_own].min(initial=0.0)), MPI.MIN))
-        if -bottom > top:  # it hangs down
+        if -bottom > top:  # it hangs down: the normal is reversed
             return cls(is_own, -normal, -height, -bottom)
         return cls(is_own, normal, height, top)
 
@@ -114,9 +121,11 @@ class CurvedShell:
             The thickness over R.
         """
         width = FOLD_WIDTH * np.sqrt(2 * h * depth * self.top)
+        # a fold at the supports could not bend; shallow shells have it half way up
         lowest_plane = min(SUPPORT_DISTANCE * width, self.top / 2)
         height_above = self.height - max((1 - depth) * self.top, lowest_plane)
-        # log(1 + exp) is a smooth max(0, height above the plane): the fold is rounded
+        # a mirrored point moves by twice its height above the plane. width log(1 + exp(height /
+        # width)) is a smooth max(0, height), so that the fold is rounded
         displacement_along_normal = np.where(
             self.is_own, -2 * width * np.logaddexp(0.0, height_above / width), 0.0
         )
@@ -124,9 +133,11 @@ class CurvedShell:
 
 
 def _plane(scene: Scene, x: Array, is_own: NDArray[np.bool_]) -> tuple[Array, float]:
-    """Return the unit normal of the plane of the supports, and its height along it; collective.
+    """Return the unit normal of the plane of the supports, and its distance from the origin.
 
-    For a shell without supports it is the best plane through the shell.
+    It is the plane with the least mean square distance from the supports, whose normal is the
+    eigenvector of the covariance with the least eigenvalue. If the supports are on a line or are
+    none, the plane through them that is nearest to the whole shell is taken. Collective.
 
     Parameters
     ----------
@@ -143,16 +154,18 @@ def _plane(scene: Scene, x: Array, is_own: NDArray[np.bool_]) -> tuple[Array, fl
         return np.array([0.0, 1.0]), float(x[is_held, 1].mean()) if is_held.any() else 0.0
     centre, covariance = _moments(scene, x[is_held])
     variances, axes = np.linalg.eigh(covariance)
-    # on one line: the plane through it that is nearest to the shell
+    # ascending: supports with one variance that is not zero are on a line, along the last axis
     if variances[1] <= FLATNESS_TOLERANCE * variances[2]:
         _, covariance = _moments(scene, x[is_own])
+        # zero for a single point: no direction is given
         direction = np.outer(axes[:, 2], axes[:, 2]) if variances[2] > 0 else np.zeros((3, 3))
         projection = np.eye(3) - direction
+        # the large eigenvalue along the line keeps the normal across it
         variances, axes = np.linalg.eigh(
             projection @ covariance @ projection + direction * np.trace(covariance)
         )
     normal = np.where(np.abs(axes[:, 0]) < ROUNDING, 0.0, axes[:, 0])
-    # the largest component is positive
+    # the largest component is positive, so that the sense does not depend on rounding
     normal /= np.linalg.norm(normal) * np.sign(normal[np.argmax(np.abs(normal))])
     return normal, float(centre @ normal)
 
@@ -170,7 +183,7 @@ def _moments(scene: Scene, x: Array) -> tuple[Array, Array]:
     comm, mirror = scene.model.system.comm, scene.problem.mirror
     if mirror:
         x = mirror.with_images(x)
-    count = max(comm.allreduce(len(x)), 1)
+    count = max(comm.allreduce(len(x)), 1)  # without places both are zero
     mean = comm.allreduce(x.sum(axis=0)) / count
     return mean, comm.allreduce((x - mean).T @ (x - mean)) / count
 
@@ -214,8 +227,13 @@ def solutions(
     ----------
     most
         Largest number of solutions.
-    guesses, stable, seconds
-        See `SearchSection`.
+    guesses
+        Largest number of guesses that are tried.
+    stable
+        Whether each guess goes down in energy until it rests at a stable solution; only stable ones
+        count then.
+    seconds
+        Time after which the search ends; None: without a limit.
 
     Raises
     ------
@@ -258,6 +276,7 @@ def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> 
         is_late = search.seconds is not None and time.perf_counter() - start > search.seconds
         return bool(scene.comm.bcast(is_late))
 
+    # no steps are taken along it: the path corrects states at the present amplitude
     path = stage.path(name, "load", StepOptions(1.0, 1.0, 1.0))
     guesses = [partial(dents.settled, number) for number in range(dents.count)]
     limits = SearchLimits(search.solutions, search.guesses, is_over)
@@ -275,8 +294,8 @@ def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> 
 def _rules(stage: Stage) -> AcceptanceRules:
     """Return the rules by which a search accepts solutions.
 
-    A solution has penalties and cuts of its own, within the bound, and no shell passes through
-    another on the way to it.
+    Where shells may touch, a solution must have the penalties and cuts (quadrature of contact) that
+    fit its own displacement, and no shell may pass through another on the straight way to it.
     """
     scene = stage.scene
     if not scene.model.shell_contacts:

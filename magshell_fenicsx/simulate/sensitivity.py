@@ -7,6 +7,19 @@ dr0/dp))/(2 s): where the chart's nodes stay, r0 alone depends on an imperfectio
 rough in p beside it, but R is smooth in r0. Differences of folds converge to these derivatives on
 the same mesh: for depths with the square of their step, for what moves a rim with the step itself.
 Between new meshes, whose edges follow the rim, they have the meshes' noise over the step.
+
+Words and symbols:
+
+- R is the residual Pi_u, the derivative of the potential energy by the displacement u; phi is the
+  left null vector of the tangent at the fold. mu holds the amplitudes (load parameters) by name.
+- A load column of a parameter p is the vector R_p, zero at supports. One dot product with phi turns
+  it into the derivative of the fold's amplitude.
+- r0 is the undeformed mid-surface, a function of the chart (its coordinates). A deviation w0 is its
+  distance from the perfect surface. A rim is the edge of a dimple; it may separate patches.
+- h and R are thickness and reference length; lambda_m is the strength of the magnetic field.
+- A stage is a scene with the solver of one step, whose system may have further unknowns; `leave`
+  converts its states to states of the model.
+- In a case of several shells each one is a member shell, with sections of its own.
 """
 
 from collections.abc import Mapping, Sequence
@@ -88,12 +101,14 @@ def stage_of_record(scene: Scene, record: Record) -> Stage:
 
 
 def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dict[str, float]:
-    """Return derivatives of a fold's amplitude (p/p_c for pressure, so d k_d); collective.
+    """Return derivatives of a fold's amplitude; collective.
+
+    For a pressure they are derivatives of p/p_c, the knock-down factor.
 
     Parameters
     ----------
     record
-        The record of the fold, if its step holds conjugates.
+        The record of the fold, if its step holds conjugates; None: all amplitudes are loads.
 
     Returns
     -------
@@ -110,10 +125,11 @@ def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dic
     columns = {
         name: system.load(state.u, state.mu, name)
         for name in state.mu
+        # entries of the history, as angles of edges, are no parameters
         if name not in (fold.name, *history)
     }
     by_patch = _remanence_columns(scene, replace(fold, state=stage.leave(state)))
-    columns |= {
+    columns |= {  # columns of the model get zeros for unknown amplitudes
         name: stage.padded(column)
         for name, column in (by_patch | _field_column(scene, state)).items()
     }
@@ -126,11 +142,11 @@ def sensitivities(scene: Scene, fold: Fold, record: Record | None = None) -> dic
 
 
 def _field_column(scene: Scene, state: State) -> dict[str, Vector]:
-    """Return "lambda_m" -> load column of a field whose strength is zero in the problem.
+    """Return "lambda_m" -> R_lambda_m at lambda_m = 0, the load column of a field; collective.
 
-    Collective. The column is the slope of the residual by lambda_m. Empty without a section
-    `magnetic`, with a field that is not zero, and where the field preserves less symmetry than the
-    model has.
+    It serves a case whose section `magnetic` has the strength zero, so that the model has no such
+    amplitude. Empty without this section, with another strength, and where the field would preserve
+    less symmetry than the model has.
 
     Parameters
     ----------
@@ -140,7 +156,7 @@ def _field_column(scene: Scene, state: State) -> dict[str, Vector]:
     problem = scene.problem
     if problem.context.section_of(MagneticSection) is None or "lambda_m" in state.mu:
         return {}
-    without_field = dict.fromkeys(
+    without_field = dict.fromkeys(  # None: not given, as lambda_m replaces them
         ("magnetic.remanent.flux_density", "magnetic.applied.flux_density")
     )
     with_field = problem.with_values({"magnetic.lambda_m": NONZERO_FIELD, **without_field})
@@ -149,6 +165,7 @@ def _field_column(scene: Scene, state: State) -> dict[str, Vector]:
     assert with_field.loads.magnetic
     if not is_whole and symmetries[0] != symmetries[1]:
         return {}
+    # unknown amplitudes stand behind the displacements
     model_state = State(state.u[: scene.model.system.size], state.mu)
     return {"lambda_m": _magnetic_column(scene, model_state, with_field.loads.magnetic)}
 
@@ -176,8 +193,9 @@ class _RemanenceWithin:
 def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
     """Return name of a sensitivity -> load column mu_i dPi_i/du of the remanence of one patch.
 
-    Pi_i is the magnetic energy, mu_i its amplitude. Empty without a remanence, of a soft material
-    alone, and where magnets interact. Collective.
+    Pi_i is the magnetic energy, mu_i its amplitude. So the column belongs to a relative change of
+    the remanence in this patch. Empty without a remanence, with a soft material alone, and where
+    magnets interact, as the energy then is quadratic in the remanence. Collective.
 
     Parameters
     ----------
@@ -195,6 +213,7 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
 
     def factor_of(patch: str) -> WithinRims:
         """Return the factor that is 1 within a patch, and 0 elsewhere."""
+        # three equal components, one for each of the remanence
         rims = tuple(
             (rim, unit_factor if name == patch else 0 * unit_factor)
             for name, rim in rims_by_patch.items()
@@ -226,7 +245,7 @@ def _remanence_columns_of_shells(
         Shell -> its remanence.
     """
     model = scene.model
-    patches_of_cells: Mapping[str, NDArray[np.bool_]]
+    patches_of_cells: Mapping[str, NDArray[np.bool_]]  # shell -> which cells are its own
     if model.midsurface:
         cell_map = model.midsurface.mesh.topology.index_map(2)
         patches_of_cells, cell_count = (
@@ -270,8 +289,8 @@ def _magnetic_column(scene: Scene, state: State, field: Magnetisation) -> Vector
             term.add_residual(column.x.array, state.mu.get(term.amplitude, 1.0))
 
     system.at_state(state).evaluate(add)
-    column.x.scatter_reverse(InsertMode.add)
-    for support in system.clamped:
+    column.x.scatter_reverse(InsertMode.add)  # contributions of other ranks at shared nodes
+    for support in system.clamped:  # zero, as u = 0 there
         support.set(column.x.array)
     return np.array(column.x.array[: model.system.size])
 
@@ -298,6 +317,7 @@ def _magnetic_terms_and_fields(
     A soft material alone has neither; beside a remanence it is left out.
     """
     model, log, fields = scene.model, KernelLog(), list[AppliedField]()
+    # the factory appends to `fields` the applied fields of the terms that it makes
     factory = replace(model.factory, log=log, fields=fields)
     if field.soft and field.soft.alone:
         return [], fields
@@ -310,10 +330,11 @@ def _magnetic_terms_and_fields(
 def imperfection_sensitivities(stage: Stage, fold: Fold) -> dict[str, float]:
     """Return derivatives of a fold's amplitude by numbers of imperfections; collective.
 
-    The keys of the numbers are those below `shell`; angles are in degrees.
+    The keys are those of the case below `shell`, as "defect.amplitude"; angles are in degrees.
 
-    A number of a rim that separates patches of a remanence or of a natural shape is left out: the
-    mesh has no place for a rim that moves. What a half or a meridian excludes by symmetry is zero.
+    Numbers that move a rim between patches of a remanence or of a natural shape are left out: edges
+    of the mesh lie on this rim. A derivative is zero where its imperfection would break a symmetry
+    that the half or the meridian has.
     """
     problem = stage.scene.problem
     return {
@@ -335,9 +356,10 @@ def _varies(problem: Problem, section: ImperfectionSection, name: str) -> bool:
     name
         Number of the section, such as "width" or "at.polar".
     """
+    # the depth of a dimple, its amplitude, leaves the rim where it is
     if section.patch and problem.patched and name != "amplitude":
         return False
-    if not name.startswith("at."):
+    if not name.startswith("at."):  # it is no number of the centre
         return True
     assert isinstance(section, LocalSection)
     spherical = problem.context.shell.geometry in ("hemisphere", "cap") and section.at.point is None
@@ -345,10 +367,10 @@ def _varies(problem: Problem, section: ImperfectionSection, name: str) -> bool:
 
 
 def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
-    """Return the derivative of a fold's amplitude by one number of an imperfection; collective.
+    """Return the derivative of a fold's amplitude by one number p of an imperfection; collective.
 
-    The deviation changes along dw0/dp, by two nested central differences: `tiny` for dw0/dp, `step`
-    for the residual.
+    Two central differences are nested. One with the width `tiny` gives dw0/dp, as exact as rounding
+    allows. The other one moves the surface along dw0/dp by +-`step`, wide enough for the residual.
 
     Parameters
     ----------
@@ -357,7 +379,7 @@ def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
     """
     scene = stage.scene
     if scene.problem.axisymmetric and name.startswith("at."):
-        return 0.0
+        return 0.0  # to first order an axisymmetric shell does not feel a centre beside the axis
     problem = scene.problem
     unit = _unit(problem, key, name)
     step, tiny = RESIDUAL_STEP * unit, DEVIATION_STEP * unit
@@ -382,10 +404,11 @@ def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
 
 
 def _load_change(stage: Stage, fold: Fold, other: Scene) -> float:
-    """Return -(left . R)/(left . R_mu) of a fold's state in a scene with a slightly other shell.
+    """Return -(phi . R)/(phi . R_mu) of a fold's state in a scene with a slightly other shell.
 
-    It is the change of the fold's amplitude to first order, with the left null vector and the
-    residual R. Places in contact are those of the fold's state, see `expand_contact`. Collective.
+    It is the change of the fold's amplitude to first order: at the fold's own displacement and
+    amplitudes the other shell has a residual R that is not zero. Places in contact stay the same as
+    in the fold's state (`expand_contact`). Collective.
 
     Parameters
     ----------
@@ -409,21 +432,20 @@ def expand_contact(scene: Scene, other: Scene, state: State) -> None:
     """Expand all contact in another scene into polynomials about a state of the first scene.
 
     Places in contact then stay, so that differences of residuals are smooth. Both scenes have the
-    same mesh. Collective.
+    same mesh. Contact of bodies is expanded about the gap at the state. Collective.
     """
     expand_shell_contact(scene, other, state)
     evaluation = scene.model.system.at_state(state)
     for name, (pressing, _) in scene.model.contacts.items():
-        other.model.contacts[name][0].expand_about(
-            evaluation.evaluate(partial(getattr, pressing, "gap"))
-        )
+        other_pressing, _ = other.model.contacts[name]
+        other_pressing.expand_about(evaluation.evaluate(partial(getattr, pressing, "gap")))
 
 
 def expand_shell_contact(scene: Scene, other: Scene, state: State) -> None:
     """Expand contact between shells in another scene into polynomials about a state of the first.
 
-    Both scenes have the same mesh. Where the first scene holds an expansion, the other one takes
-    it. Collective.
+    Both scenes have the same mesh. If contact of the first scene is an expansion already, the other
+    scene takes this one. Collective.
     """
     assert np.array_equal(scene.model.V.dofmap.list, other.model.V.dofmap.list), (
         "contact is given by numbers of cells"
@@ -448,7 +470,7 @@ def member_shell_sensitivities(stage: Stage, fold: Fold) -> dict[str, float]:
         for index, section in enumerate(member.shell.imperfections):
             for number in section.parameters:
                 key = f"shells.{name}.shell.imperfections.{index}.{number}"
-                if not number.startswith("at."):
+                if not number.startswith("at."):  # numbers of a centre are left out
                     derivatives[key] = _derivative_by_number(stage, fold, key)
     return derivatives
 
@@ -456,7 +478,8 @@ def member_shell_sensitivities(stage: Stage, fold: Fold) -> dict[str, float]:
 def _derivative_by_number(stage: Stage, fold: Fold, key: str) -> float:
     """Return the derivative of a fold's amplitude by a number of the case; collective.
 
-    It is a central difference of residuals, with a scene for each of two values.
+    It is a central difference of the change of this amplitude to first order, with a scene for each
+    of two values of the number.
 
     Parameters
     ----------
@@ -475,7 +498,8 @@ def _derivative_by_number(stage: Stage, fold: Fold, key: str) -> float:
 def _unit(problem: Problem, key: str, name: str) -> float:
     """Return the scale of a number of an imperfection, over which differences take their steps.
 
-    It is the width itself, the half-width in degrees of an angle, and 1 (over h) of a depth.
+    Widths have their own value as the scale, angles of a centre the half-width of the imperfection
+    in degrees, and depths the thickness h, which is 1 in their unit.
     """
     section, shell = problem.imperfections[key], problem.context.shell
     if name == "width":
@@ -527,7 +551,7 @@ class DeviationDifference:
     forward, backward
         The other deviation for two values of its number.
     factor
-        What multiplies their difference.
+        Factor of their difference: a change of the number over the distance of the two values.
     """
 
     forward: Deviation
@@ -562,7 +586,7 @@ def _deviation(scene: Scene, sections: Imperfections, key: str) -> Deviation:
         All imperfections, and the key of the one in question.
     """
     problem, number = scene.problem, list(sections).index(key)
-    # by number: the geometries have random dimples one by one
+    # by number, not by key: each dimple of random ones has a geometry of its own, with other keys
     geometries = imperfection_geometries(sections, reference_shell_of(problem.context.shell))
     geometry = list(geometries.values())[number]
     turned_deviation = in_frame(geometry.deviation, problem.azimuth)
@@ -572,7 +596,10 @@ def _deviation(scene: Scene, sections: Imperfections, key: str) -> Deviation:
 
 
 def with_deviation(scene: Scene, deviation: Deviation) -> Scene:
-    """Return the scene on the same mesh in the chart, with one more deviation; collective."""
+    """Return the scene on the same mesh in the chart, with one more deviation; collective.
+
+    The deviation is added to those that the embedding, the map from the chart into space, has.
+    """
     problem, model = scene.problem, scene.model
 
     def deviated(embedding: object) -> DeviatedEmbedding:

@@ -2,7 +2,7 @@
 
 Terms take what differs between two cases from the placement and from the parameters of their
 densities. So where two models have these alike, one of them serves both: each evaluation puts the
-values of its case in place first.
+values of its case in place first. Numbers are such values: arrays, for each term in a fixed order.
 """
 
 from dataclasses import dataclass, field
@@ -66,6 +66,7 @@ class SharedForms:
 
     def __init__(self, scene: Scene, model: MeridianModel, places: Numbers) -> None:
         self._scene, self._model = scene, model
+        # inf stands for the first scene, as no other scene has this p
         self._numbers = _NumbersOfForms(places, {np.inf: _copied(places)})
 
     @staticmethod

@@ -2,6 +2,11 @@
 
 A step may hold conjugates of loads, or vary several amplitudes together. Then its system has other
 unknowns than the model, and a stage translates states between the two.
+
+An amplitude is a load parameter, by name in `State.mu`; its conjugate is the displacement on which
+it does work. Where a conjugate is held, a `Device` makes the amplitude an unknown behind the
+displacements. A `ParametrisedSystem` has one amplitude in place of several that are functions of
+it.
 """
 
 from collections.abc import Mapping
@@ -69,7 +74,7 @@ class Stage:
         return replace(point, state=self.leave(point.state), du=self.displacement(point.du))
 
     def on_scene(self, scene: Scene) -> "Stage":
-        """Return the stage of the same step on another scene, with the same held values.
+        """Return the stage of the same step on another scene, with the same held conjugates.
 
         Parameters
         ----------
@@ -110,7 +115,7 @@ class Stage:
         options
             Lengths of steps.
         scale
-            See `Path`.
+            Value of the amplitude that counts as of order one in the arc length.
 
         Raises
         ------
@@ -133,7 +138,7 @@ class Stage:
         Parameters
         ----------
         name, control, scale
-            See `path`.
+            As of `path`: the amplitude, what is prescribed, and the unit of the amplitude.
         first
             About the change of the amplitude in the first step.
         """
@@ -143,9 +148,10 @@ class Stage:
         self, name: str, control: Control, state: State, first: float, scale: float = 1.0
     ) -> tuple[Path, Point]:
         """Return a path and its first point as `begin` does, from a state of the step's system."""
+        # lengths of steps follow from the tangent at the start, which a path is needed for
         path = self.path(name, control, StepOptions(1.0, 1.0, 1.0), abs(scale))
         start = path.start(state, first)
-        step = abs(first / start.dmu)
+        step = abs(first / start.dmu)  # of the controlled quantity s
         longest = LONGEST if control == "arc" else LONGEST_CONTROLLED
         return path.with_step_options(StepOptions(step, longest * step, SHORTEST * step)), start
 
@@ -198,6 +204,7 @@ def make_stage(
     device, parametrised = None, None
     if held_conjugates:
         factors = scene.newton.factor_at(state)
+        # units of the unknown amplitudes, so that they are comparable with displacements
         scale = {name: natural_scale(system, factors, state, name) for name in held_conjugates}
         system = device = Device(system, held_conjugates, scale)
     if curves:

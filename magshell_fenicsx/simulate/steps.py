@@ -1,4 +1,17 @@
-"""Steps of a programme: what each holds and drives, and the records of its path."""
+"""Steps of a programme: what each holds and drives, and the records of its path.
+
+Words and symbols:
+
+- The programme is the list of a case's steps. A step has a name: the amplitude that it drives, a
+  load parameter in `State.mu`. `step.load` is its section of the case.
+- The conjugate q = -dPi/dmu of an amplitude mu is the displacement on which it does work, with the
+  potential energy Pi. A step may hold conjugates; their amplitudes are then unknowns.
+- A course says how a step goes on from where it begins; its drive has targets, control and first
+  change of the amplitude. The scale of an amplitude is a value of order one.
+- A stage is the scene with the solver of one step. Curves are amplitudes that the step varies
+  together, as functions of its own one.
+- A located record is a fold or a bifurcation. Own modes are those that the model itself has.
+"""
 
 from dataclasses import replace
 
@@ -59,7 +72,7 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
     course = load.course(_step_start(scene, step, state))
     if course.impossible:
         raise Stopped(course.impossible)
-    if step.name in load.hold:
+    if step.name in load.hold:  # the step's own load is then an unknown
         return (yield from _at_held_conjugate(scene, step, state, course.drive))
     drive, limit_reason = _within_support_limits(scene, step, state, course.drive)
     held_conjugates = held_conjugates_of_step(scene, step, state)
@@ -67,7 +80,7 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
     path, start = stage.begin(step.name, drive.control, state, drive.first, drive.scale)
     path = _with_step_options(scene, path, course, drive)
     is_to_target = course.until == "target" or load.limit_target
-    if drive.end is not None and not drive.targets and is_to_target:  # it is there
+    if drive.end is not None and not drive.targets and is_to_target:  # it is there already
         yield Record("target", step.name, stage.point(start))
         return state
     goal = ContinuationGoal(
@@ -89,7 +102,8 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
         raise Stopped(forbidden or limit_reason)
     if load.branch_points and first_instability and is_symmetry_breaking(first_instability):
         branch_goal, scale = off_path(goal, load.branch_points), abs(drive.scale)
-        yield from follow_switched_branch(stage, first_instability, branch_goal, scale, 1)
+        # as branch 1, beside the path of the step
+        yield from follow_switched_branch(stage, first_instability, branch_goal, scale, number=1)
     return stream.end
 
 
@@ -113,6 +127,7 @@ def _within_support_limits(
     Stopped
         If no target is within the limit.
     """
+    # without a target, or with one of the conjugate, the way of the supports is not known
     if drive.end is None or drive.quantity != "load":
         return drive, ""
     limit, shells = support_motion_limit(scene, state, step.name, drive.end)
@@ -131,7 +146,7 @@ def _within_support_limits(
 
 def _with_step_options(scene: Scene, path: Path, course: StepCourse, drive: Drive) -> Path:
     """Return a path with lengths of steps that suit its course, and contact between shells."""
-    if drive.step is not None:
+    if drive.step is not None:  # first, longest and shortest step
         path = path.with_step_options(StepOptions(drive.step, 2 * drive.step, 1e-4 * drive.step))
     if course.finer:
         path = path.with_step_options(course.finer(path.options))
@@ -162,7 +177,9 @@ def follow_branch_of_step(scene: Scene, step: ProgrammeStep, bifurcation: Record
         goal = ContinuationGoal("points", steps=step.load.points)
     else:
         goal = ContinuationGoal("target", [drive.end], drive.quantity)
-    return (yield from follow_switched_branch(stage, bifurcation, goal, abs(drive.scale), 0))
+    scale = abs(drive.scale)
+    # 0: its records are those of the path itself, which goes on here
+    return (yield from follow_switched_branch(stage, bifurcation, goal, scale, number=0))
 
 
 def symmetry_switch_of_step(
@@ -188,7 +205,8 @@ def is_symmetry_breaking(record: Record) -> bool:
 def _at_held_conjugate(scene: Scene, step: ProgrammeStep, state: State, drive: Drive) -> Records:
     """Yield the records to the first instability, where the step drives a held conjugate.
 
-    The conjugate of the step's load varies as an amplitude of its own, and the load is unknown.
+    The conjugate of the step's load varies as an amplitude with a name of its own, and the load is
+    an unknown. Records have the name of the load, as records of other steps.
 
     Parameters
     ----------
@@ -204,6 +222,7 @@ def _at_held_conjugate(scene: Scene, step: ProgrammeStep, state: State, drive: D
     q = -scene.model.system.potential(state.u, state.mu, name)
     # conjugates besides that of the step's own load
     other_conjugates = {key: conjugate for key, conjugate in held_conjugates.items() if key != name}
+    # the path under the load itself says how long steps are
     path_of_load, _ = make_stage(scene, state, other_conjugates).begin(
         name, "arc", state, drive.first, drive.scale
     )
@@ -245,6 +264,9 @@ def held_conjugates_of_step(
 def enclosed_gas(scene: Scene, section: GasSection, state: State) -> EnclosedGas:
     """Return the gas that is enclosed at a state in equilibrium.
 
+    By Boyle's law the change of volume, the conjugate of the pressure, is a function of the
+    pressure; the gas fits pressure and volume of the state.
+
     Parameters
     ----------
     section
@@ -262,7 +284,7 @@ def _drive(scene: Scene, step: ProgrammeStep, state: State) -> Drive:
 
 
 def _step_start(scene: Scene, step: ProgrammeStep, state: State) -> StepStart:
-    """Return the begin of a step at a state, with what a load reads of model and problem."""
+    """Return the begin of a step at a state: model, problem and state as its section reads them."""
     model, problem = scene.model, scene.problem
 
     def potential(name: str) -> float:

@@ -5,6 +5,18 @@ in that sector, where a part has not these planes in a half, and else in the who
 that is antisymmetric to a half is one of the whole shell. The state and the mode are carried over,
 and the bifurcation is located again (`continuation/bifurcation.py`): its load, energy and
 displacement differ by the error of the two meshes alone.
+
+Words and symbols:
+
+- A reduced model is a meridian, a sector or a half, which excludes modes without its symmetry. The
+  name of a mode in a record is "m = 7" for waves around a meridian, "antisymmetric" for a half, or
+  one of `OWN_MODES` for a mode that the model itself has.
+- phi is the mode of the bifurcation, the null vector of the tangent; u is the displacement.
+- A stage is a scene with the solver of one step. `enter` and `leave` convert states of the model to
+  states of the step's system and back, which may have amplitudes among its unknowns; `padded` does
+  so with a vector.
+- The scale of a path is the unit of its amplitude in arc length.
+- Settled contact has the cuts (quadrature of shells that touch) and penalties that fit its state.
 """
 
 from dataclasses import dataclass, replace
@@ -110,7 +122,7 @@ def switch_symmetry(stage: Stage, bifurcation: Record, scale: float) -> Symmetry
     bifurcation
         Its record.
     scale
-        See `continuation.path.Path`.
+        Unit of the amplitude in the arc length of the branch, see `continuation.path.Path`.
 
     Raises
     ------
@@ -131,6 +143,7 @@ def switch_symmetry(stage: Stage, bifurcation: Record, scale: float) -> Symmetry
     u, phi = _carried_over(stage.scene, new_scene, bifurcation, mode)
     mu = {**new_scene.unloaded().mu, **bifurcation.point.state.mu}
     path = _arc_length_path(new_stage, bifurcation.amplitude, scale)
+    # a guess with contact at rest, then the bifurcation; at each of them a text if it fails
     located: Point | State | str = _settled_contact(new_stage, path, State(u, mu), phi)
     if isinstance(located, State):
         located = path.recorded(partial(_located, new_stage, path, located, phi))
@@ -147,10 +160,14 @@ def switch_symmetry(stage: Stage, bifurcation: Record, scale: float) -> Symmetry
 def _switch_in_same_model(stage: Stage, bifurcation: Record, scale: float) -> SymmetrySwitch:
     """Return the bifurcation of a record whose mode the model itself has; collective.
 
+    Nothing is located again: the record's point is exact in this model.
+
     Parameters
     ----------
-    stage, bifurcation, scale
-        See `switch_symmetry`.
+    stage, bifurcation
+        Scene with the solver of the step, and the record of the bifurcation.
+    scale
+        Unit of the amplitude in the arc length of the branch.
 
     Raises
     ------
@@ -184,7 +201,7 @@ def model_with_mode(scene: Scene, mode: str) -> Scene:
         If no larger model can be built.
     """
     symmetries: list[int | str] = ["none"]
-    if mode.startswith(WAVES):
+    if mode.startswith(WAVES):  # from the smallest model: the sector of 180/m degrees
         symmetries = [int(mode.removeprefix(WAVES)), "half", "none"]
     first_reason = ""
     for symmetry in symmetries:
@@ -209,12 +226,14 @@ def follow_switched_branch(
 
     Parameters
     ----------
-    stage, bifurcation, scale
-        See `switch_symmetry`.
+    stage, bifurcation
+        Scene of the reduced model with the solver of the step, and its record of the bifurcation.
     goal
         Where the branch ends.
+    scale
+        Unit of the amplitude in the arc length of the branch.
     number
-        See `Record.branch`.
+        Number of the branch in its records; 0: the path itself goes on along it.
 
     Returns
     -------
@@ -233,6 +252,7 @@ def follow_switched_branch(
     if crossing is None:
         raise Stopped(f"the branch at the bifurcation ({bifurcation.mode}) is not found")
     system, u, phi = switch.scene.model.system, at_switch.state.u, at_switch.du
+    # the direction along the mode, not against it
     start = max(crossing.starts, key=lambda point: dot(system.comm, point.state.u - u, phi))
     records = RecordStream(follow_branch(new_stage, switch.path, start, goal, number))
     earlier_mu = at_switch.state.mu
@@ -245,14 +265,14 @@ def follow_switched_branch(
 
 
 def _arc_length_path(stage: Stage, name: str, scale: float) -> Path:
-    """Return a path by arc length with the steps of a branch.
+    """Return a path by arc length with the steps of a branch: first, longest and shortest.
 
     Parameters
     ----------
     name
         The amplitude that varies.
     scale
-        See `continuation.path.Path`.
+        Value of the amplitude that counts as of order one in the arc length.
     """
     return stage.path(
         name, "arc", StepOptions(FIRST_STEP, LONGEST * FIRST_STEP, 1e-5 * FIRST_STEP), scale
@@ -276,17 +296,19 @@ def _point_along(
     unstable
         Number of unstable directions.
     error, load_error
-        See `Point`.
+        Estimated errors of the displacement, over the system's length, and of the amplitude.
     """
     direction = np.asarray(phi * path.system.length / max_abs(path.system.comm, phi))
+    # s = 0 here, and dmu = 0: along the mode the load does not change to first order
     return Point(state, 0.0, direction, 0.0, unstable, unstable, error=error, load_error=load_error)
 
 
 def _settled_contact(stage: Stage, path: Path, guess: State, phi: Vector) -> State | str:
-    """Return a state near a guess that is at rest, but for a force along the mode; collective.
+    """Return a state near a guess that is in equilibrium, but for a force along the mode.
 
-    The guess comes from another model. Shells that touch get cuts and penalties of this model.
-    Without contact the state is the guess itself.
+    The guess comes from another model. Shells that touch get cuts and penalties of this model; the
+    force keeps the state from running off along the neutral mode meanwhile. Without contact the
+    state is the guess itself. Collective.
 
     Parameters
     ----------
@@ -316,6 +338,8 @@ def _settled_contact(stage: Stage, path: Path, guess: State, phi: Vector) -> Sta
 
 def _at_rest(stage: Stage, path: Path, guess: State, mode: Vector) -> Point | str:
     """Return the point near a guess that a force along a mode holds at rest, or why there is none.
+
+    Its number of unstable directions is not known, and is set to 0.
 
     Parameters
     ----------
@@ -374,7 +398,7 @@ def _differences(old: Scene, event: Record, switch: SymmetrySwitch) -> str:
     energy_change = abs(new_row["energy"] - old_energy) / max(abs(old_energy), TINY)
     deflection_change = abs(new_row["w_over_h"] - old_row["w_over_h"])
     count_text = ""
-    if new_scene.problem.is_half:
+    if new_scene.problem.is_half:  # a half or a sector counts modes of the whole shell too
         exception = ", but for its turning about e3" if new_scene.problem.turns else ""
         count_text = f"; its excluded_pivots are those of all other modes of the shell{exception}"
     return (
@@ -420,16 +444,18 @@ def _carried_over(
 
 
 def _along_meridian(old: Scene, new: Scene) -> tuple[Array, Array]:
-    """Return meridian parameters and azimuths (rad) of a surface's nodes, in its model's frame.
+    """Return where a surface's nodes are on its meridian: parameters s, and azimuths (rad).
 
     Parameters
     ----------
     old, new
         Scenes of the meridian and of the surface.
     """
-    chart = old.problem.meridian
-    assert chart
-    s, theta = np.array([chart.locate(place) for place in new.model.chart()]).reshape(-1, 2).T
+    meridian_chart = old.problem.meridian
+    assert meridian_chart
+    places = new.model.chart()
+    # (n, 2), also of a rank without nodes
+    s, theta = np.array([meridian_chart.locate(place) for place in places]).reshape(-1, 2).T
     return s, theta
 
 
@@ -438,8 +464,9 @@ def _revolved(
 ) -> tuple[Array, Array]:
     """Return displacement and wave of a meridian at places of a surface, (n, 3) each.
 
-    The wave is U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z. Its sign is such
-    that the largest crest of u . n at theta = 0 is inwards.
+    The wave is U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z, in cylindrical
+    coordinates. Its unknowns are U + V, V and W, as U + V is zero on the axis. Its sign is such
+    that the largest crest at theta = 0 is inwards.
 
     Parameters
     ----------
@@ -468,8 +495,9 @@ def _revolved(
 
 
 def _sign(model: MeridianModel, wave: Vector) -> float:
-    """Return the sign with which a wave's largest crest at azimuth 0 is inwards."""
+    """Return the sign, 1 or -1, with which a wave's largest crest at azimuth 0 is inwards."""
     V = model.symmetry_breaking_modes.waves.V
+    # along the meridian, so that of two equal crests always the same one counts
     values = wave.reshape(-1, 3)[np.argsort(V.tabulate_dof_coordinates()[:, 0])]
     # U at azimuth 0; a little of W decides where U is zero
     crests = values[:, 0] - values[:, 1] + 1e-3 * values[:, 2]
@@ -497,6 +525,7 @@ def _evaluated(model: MeridianModel, V: fem.FunctionSpace, x: Vector, s: Array) 
     local_coordinate = np.clip(
         (s - cell_ends[cells, 0]) / (cell_ends[cells, 1] - cell_ends[cells, 0]), 0.0, 1.0
     )
+    # (places, nodes): the element's basis functions, without derivatives
     table = V.element.basix_element.tabulate(0, local_coordinate[:, None])[0, :, :, 0]
     values_at_nodes = x.reshape(-1, V.dofmap.bs)[V.dofmap.list[cells]]
     return np.asarray(np.einsum("np,npc->nc", table, values_at_nodes))
@@ -505,7 +534,8 @@ def _evaluated(model: MeridianModel, V: fem.FunctionSpace, x: Vector, s: Array) 
 def _mirrored(old: Scene, new: Scene, u: Vector, mode: Vector) -> tuple[Array, Array]:
     """Return displacement and antisymmetric mode of a half at the nodes of the whole shell.
 
-    Both are extended to the other half, the displacement symmetrically. Collective.
+    Both are extended to the other half: the displacement by its mirror image, the mode by the
+    negative of this image. Then they are interpolated at the new nodes. Collective.
 
     Parameters
     ----------
@@ -527,7 +557,7 @@ def _mirrored(old: Scene, new: Scene, u: Vector, mode: Vector) -> tuple[Array, A
         np.concatenate(comm.allgather(local_vector.reshape(-1, 3)))
         for local_vector in local_vectors
     )
-    has_image = mirror.signed_distance(places) > PLANE_TOLERANCE
+    has_image = mirror.signed_distance(places) > PLANE_TOLERANCE  # others are their own image
     reflection = mirror.reflection
     places_of_both_halves = np.concatenate([places, mirror.image(places[has_image])])
     values = np.hstack(
@@ -540,7 +570,8 @@ def _mirrored(old: Scene, new: Scene, u: Vector, mode: Vector) -> tuple[Array, A
     # from the new frame to the old one
     rotation_to_old = rotation(old.problem.azimuth) @ rotation(new.problem.azimuth).T
     new_places = new.model.r0.x.array[: new.model.system.size].reshape(-1, 3) @ rotation_to_old.T
-    new_values = np.zeros((len(new_places), 6))
+    new_values = np.zeros((len(new_places), 6))  # three components of each field
+    # shells that touch must not be mixed
     for old_nodes, new_nodes in nodes_by_shell(old, new):
         if new_nodes.any():
             nodes = np.concatenate([old_nodes, old_nodes[has_image]])
@@ -553,8 +584,8 @@ def _mirrored(old: Scene, new: Scene, u: Vector, mode: Vector) -> tuple[Array, A
 def interpolated_on_surface(x: Array, values: Array, places: Array) -> Array:
     """Return values (n, k) on a smooth surface at places near its nodes.
 
-    At each place a cubic polynomial in the tangent plane is fitted to the nearest nodes, with
-    weights that fall with distance.
+    At each place a cubic polynomial in the tangent plane is fitted to the nearest nodes by least
+    squares, with weights that fall with distance.
 
     Parameters
     ----------
@@ -573,9 +604,10 @@ def interpolated_on_surface(x: Array, values: Array, places: Array) -> Array:
     first_coordinate, second_coordinate = np.moveaxis(
         np.einsum("nki,nji->nkj", offsets, axes) / radius[:, None, None], 2, 0
     )
-    basis = np.stack(
+    basis = np.stack(  # the ten monomials up to degree 3, the constant first
         [first_coordinate**i * second_coordinate**j for i in range(4) for j in range(4 - i)], axis=2
     )
+    # at the farthest of the nodes, at distance 1, it is 0.02
     weight = np.exp(-4 * (first_coordinate**2 + second_coordinate**2))[..., None]
     coefficients = np.linalg.pinv(weight * basis) @ (weight * values[neighbours])
     # the constant of the polynomial is its value at the place

@@ -1,6 +1,10 @@
 """A path in any amplitude of a scene from any state, for notebooks.
 
 Targets are numbers, or text with a unit where the case has units.
+
+An amplitude is a load parameter, by name in `State.mu`. Pi_i is the derivative of the potential
+energy by amplitude i; the conjugate -Pi_i is the displacement on which it does work. An amount is a
+number or such a text. The scale of a quantity is the name of its unit in the model, such as "p_c".
 """
 
 import warnings
@@ -59,7 +63,7 @@ def target_values(
 
 
 def _number(scene: Scene, name: str, place: str, amount: Any, of_load: bool) -> float:
-    """Return an amount as a number of the model, see `target_values`.
+    """Return one amount of an amplitude, or of its conjugate, as a number of the model.
 
     Parameters
     ----------
@@ -67,6 +71,8 @@ def _number(scene: Scene, name: str, place: str, amount: Any, of_load: bool) -> 
         Begin of a message.
     amount
         Number, or text with a unit.
+    of_load
+        Whether it is an amount of the amplitude, rather than of its conjugate.
 
     Raises
     ------
@@ -79,8 +85,10 @@ def _number(scene: Scene, name: str, place: str, amount: Any, of_load: bool) -> 
         raise ValueError(f'{place}: must be a number, or text with a unit such as "100 Pa"')
     column = amplitude(name).column if of_load else amplitude(name).conjugate
     unit, scale = scene.sizes.unit(column), quantity(column).scale
+    # conjugates with a unit: the change of volume of a pressure, the displacement of a force
     forces = (*scene.model.loads.forces, *scene.model.contacts)
     may_have_unit = of_load or name == "pressure" or name in forces
+    # a unit of the case, or one of the same dimension for messages
     text = (
         unit.text
         if unit
@@ -96,6 +104,7 @@ def _number(scene: Scene, name: str, place: str, amount: Any, of_load: bool) -> 
         number = in_units(text)(amount) / scene.sizes.by_unit[unit.key]
     except ValueError as e:
         raise ValueError(f"{place}: {e}") from None
+    # a conjugate in its own unit is made a value of -Pi_i
     return number if of_load else number * scene.conjugate_unit(name)
 
 
@@ -130,7 +139,7 @@ def trace(  # noqa: PLR0913
         (`scene.model.system.potential` gives Pi_i); "arc": prescribe the arc length, which passes
         folds of both.
     until
-        The end of the path, see `ContinuationGoal`: "limit" at the first instability or the last
+        The end of the path: "limit" at the first instability or the last
         target, "bifurcation", "target" at the last target, "points" after `steps` steps.
     targets
         Values to be reached by the prescribed quantity or, with arc length, by `quantity`: numbers,
@@ -176,7 +185,7 @@ def trace(  # noqa: PLR0913
         raise Stopped(
             f"there is no equilibrium to start from near the given state: {outcome.reason}"
         )
-    if control == "conjugate":
+    if control == "conjugate":  # a load that moves nothing has a conjugate that stays zero
         displacement = scene.newton.response(
             outcome.state, name, PrescribedLoad(name, 0.0), exact=True
         ).du
@@ -187,6 +196,7 @@ def trace(  # noqa: PLR0913
                 f"{name} moves nothing at the start, so nothing is conjugate to it: follow it by "
                 "arc length"
             )
+    # ten first steps are about the distance to a target: the scale of the amplitude
     path, first_point = load_stage(scene).begin(name, control, outcome.state, first, 10 * first)
     if targets and control == "conjugate":
         step = abs(targets[-1] - first_point.s) / 10
@@ -212,6 +222,7 @@ def _with_reached(
     targets
         Targets in order; each has a record with the label "target" if it is reached.
     """
+    # each record is held back until there is a next one, so that the last is known
     last_record, targets_ahead = next(records), len(targets)
     for record in records:
         yield last_record

@@ -1,4 +1,9 @@
-"""Transfer of displacements between scenes with the same kind of model, as an initial guess."""
+"""Transfer of displacements between scenes with the same kind of model, as an initial guess.
+
+Places of nodes are compared in the chart: the coordinates of the undeformed surface, (n, 1) along a
+meridian, (n, 2) of a surface, with the rim (edge) of a dimple as a circle about the pole. Between
+dimpled spheres whose rims differ the chart is stretched (`_Stretch`).
+"""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -22,8 +27,8 @@ ROUNDING = 1e-9
 def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
     """Return a displacement of one scene in the unknowns of another; collective.
 
-    On the same mesh it is copied. Otherwise it is interpolated in the chart and scaled with the
-    thickness or, on dimpled spheres, like a shallow shell, see `_Stretch`.
+    On the same mesh it is copied. Otherwise it is interpolated in the chart. Then it is scaled with
+    the thickness; or between dimpled spheres with the ratio of the rims' radii (`_Stretch`).
 
     Parameters
     ----------
@@ -75,10 +80,11 @@ def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
     """
     values_at_x: Array = np.zeros((len(x), values.shape[1]))
     polar_of_nodes, polar = np.linalg.norm(nodes, axis=1), np.linalg.norm(x, axis=1)
+    # masks of nodes and of places; nodes on the rim belong to both sides
     within_rim = polar_of_nodes < rim * (1 + ROUNDING), polar < rim * (1 + ROUNDING)
     beyond_rim = polar_of_nodes > rim * (1 - ROUNDING), polar > rim * (1 - ROUNDING)
     dim = nodes.shape[1]
-    # cubic polynomials may vanish on a surface in space
+    # a cubic polynomial in space may vanish on a surface, and so would not be determined by it
     kernel, degree = ("quintic", 3) if dim < 3 else ("linear", 0)
     for is_source, is_target in (within_rim, beyond_rim):
         if is_target.any():
@@ -99,9 +105,9 @@ def same_mesh(source: Scene, target: Scene) -> bool:
 
 
 def _matching(source: Scene, target: Scene) -> NDArray[np.int64] | None:
-    """Return the number of each node of this rank among all nodes of the source; collective.
+    """Return the number of each node of the target on this rank among all nodes of the source.
 
-    None on all ranks if the nodes differ.
+    None on all ranks if the nodes of the two scenes differ. Collective.
     """
     return matching(_all_nodes(source), chart(target), source.model.system.comm)
 
@@ -116,9 +122,9 @@ def matching(
     Parameters
     ----------
     nodes
-        Coordinates of all nodes.
+        Coordinates (n, k) of the nodes of all ranks.
     chart_places
-        Coordinates of this rank's places.
+        Coordinates (m, k) of this rank's places; those of all ranks together must be the nodes.
     """
     distance, number = scipy.spatial.cKDTree(nodes).query(chart_places)
     equal = (
@@ -166,6 +172,7 @@ class _Stretch:
         """
         polar = np.linalg.norm(x, axis=1, keepdims=True)
         azimuth = x / np.maximum(polar, TINY) if x.shape[1] == 2 else np.ones_like(polar)
+        # normal and meridian direction at the source, and at the target
         from_frame, to_frame = _frame(self._polar(polar), azimuth), _frame(polar, azimuth)
         normal_part, meridian_part = (np.sum(u * e, axis=1, keepdims=True) for e in from_frame)
         sideways = u - normal_part * from_frame[0] - meridian_part * from_frame[1]
@@ -209,13 +216,13 @@ def _frame(polar: Array, azimuth: Array) -> tuple[Array, Array]:
 
 def _stretch(source: Scene, target: Scene) -> _Stretch | None:
     """Return the map between the charts of two dimpled spheres; None for other surfaces."""
-    rims, edges = [], []
+    rims, edges = [], []  # polar angles of target and source
     for scene in (target, source):
         embedding, shape = scene.problem.embedding, scene.problem.shape
         spherical = (
             isinstance(embedding, DeviatedEmbedding) and embedding.perfect is sphere_embedding
         )
-        if (
+        if (  # only spheres with one dimple about the pole
             not spherical
             or not isinstance(shape, DiscShape)
             or len(shape.circles) != 1
@@ -245,7 +252,10 @@ def all_nodes_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
 
 
 def nodes_of_shells(scene: Scene) -> list[NDArray[np.bool_]]:
-    """Return a mask for each shell: which of this rank's nodes belong to it; one shell has all."""
+    """Return a mask for each shell: which of this rank's nodes belong to it; one shell has all.
+
+    A node belongs to the shells of its cells, ghosts included.
+    """
     model = scene.model
     nodes, count = model.V.dofmap.list, model.system.size // model.V.dofmap.bs
     return [

@@ -3,6 +3,18 @@
 A motion begins along a mode of vibration or with a velocity by formulas. Each of its rows has the
 energies since the begin, whose balance shows the error. Times are over R sqrt(rho/E), the unit of
 time of the model. docs/theory.md has the integrator.
+
+Words and symbols:
+
+- A row is a line of the results, at a given time or at an event, where a column passes a value. Its
+  columns in time are called the clock: time, and energies since the begin.
+- Amplitudes mu are load parameters by name. A held conjugate is the displacement on which a load
+  does work, kept constant; the load is then an unknown.
+- A step in time drives amplitudes as functions of time. Marks are times at which these have kinks.
+- A snap is a motion from an instability, under constant loads, to rest.
+- Excluded pivots count unstable directions that the model excludes by its symmetry.
+- h and R are thickness and reference length, rho the density. `time_unit` is the unit of time in
+  seconds; None or 1 for a case without units.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -73,7 +85,7 @@ def motion_records(
     state
         State where the motion begins: a `MovingState`, or a state at rest.
     held_conjugates
-        Amplitude -> its conjugate, as of `make_stage`.
+        Amplitude that is unknown -> its conjugate: a number, or a function of the amplitude.
 
     Returns
     -------
@@ -96,12 +108,12 @@ def motion_records(
     end_of_motion = _MotionEnd(load, integrator, _event_function(scene, load.event, state))
     marks = start.loads.marks
     refinement = None
-    if load.errors == "motion" and steps.fixed is None:
+    if load.errors == "motion" and steps.fixed is None:  # coarser runs show the error at the rows
         refinement = StepRefinement(
             scene, held_conjugates, marks, start.begin, row_times, end_of_motion
         )
     rows = MotionRows(scene, integrator, held_conjugates, steps, marks, refinement)
-    time_step, ending = steps.first, ""
+    time_step, ending = steps.first, ""  # ending: the word of `until` that has come true
     for row_time in row_times:
         previous, first_step = motion, time_step
         motion, time_step, point = rows.journalled(previous, first_step, row_time)
@@ -129,6 +141,7 @@ def motion_records(
             return state_at_rest
         if ending:
             supports = integrator.supports
+            # True: the velocity just before this time, at which it may jump
             velocity = supports.velocity(motion.t, True) if supports else None
             return MovingState(point.state.u, point.state.mu, motion.v, velocity)
     if load.until == "rest":
@@ -150,10 +163,12 @@ def snap_records(
 
     Parameters
     ----------
+    snap
+        The section of the snap: its push over h, damping ratio and tolerance.
     fold
         Record at the fold or bifurcation.
     held_conjugates
-        Amplitude -> its conjugate, as of `make_stage`.
+        Amplitude that is unknown -> its conjugate: a number, or a function of the amplitude.
 
     Returns
     -------
@@ -167,6 +182,7 @@ def snap_records(
     """
     state, system, unit = fold.point.state, scene.model.system, scene.problem.time_unit or 1.0
     lowest_modes = ShellModes(scene.model).lowest(state, 3)
+    # without modes of other symmetries, which have a label; the first one is neutral here
     eigenvalues = [mode.eigenvalue for mode in lowest_modes if not mode.label]
     omega = float(np.sqrt(max(eigenvalues[1:])))
     load = TimeSection(
@@ -188,7 +204,8 @@ def _time_steps(scene: Scene, load: TimeSection) -> TimeSteps:
     """Return the options for the lengths of time steps, over the unit of time of the model."""
     duration = dimensionless_time(scene.problem, load.duration)
     fixed = None if load.step is None else dimensionless_time(scene.problem, load.step)
-    return TimeSteps(fixed, load.tolerance, fixed or duration / load.points / 10, load.balance)
+    first = fixed or duration / load.points / 10  # a tenth of a row; then the error controls steps
+    return TimeSteps(fixed, load.tolerance, first, load.balance)
 
 
 class _MotionStart:
@@ -200,8 +217,10 @@ class _MotionStart:
     ----------
     load
         The section of the step.
-    state, held_conjugates
-        See `motion_records`.
+    state
+        State where the motion begins: a `MovingState`, or a state at rest.
+    held_conjugates
+        Amplitude that is unknown -> its conjugate.
 
     Attributes
     ----------
@@ -220,7 +239,7 @@ class _MotionStart:
         self._scene, self._load, self._state, self._held = scene, load, state, held_conjugates
         self.loads = LoadsInTime(scene.problem, load, state, scene.motions)
         unit = scene.problem.time_unit or 1.0
-        self._drag = float(in_units("1/second")(load.drag)) * unit
+        self._drag = float(in_units("1/second")(load.drag)) * unit  # force over mass and velocity
         u, v = state.u, state.v if isinstance(state, MovingState) else 0.0 * state.u
         if load.push:
             u, v = pushed_along_mode(scene, load.push, state, v)
@@ -231,7 +250,8 @@ class _MotionStart:
     def begin(self) -> tuple[Integrator, Motion]:
         """Return a new integrator, and the motion at time zero; collective."""
         scene, state, load = self._scene, self._state, self._load
-        viscous = viscosity(scene, state)
+        viscous = viscosity(scene, state)  # None of an elastic shell
+        # makes amplitudes with held conjugates unknowns; None without
         device = make_stage(scene, state, self._held).device
         supports = self._support_inertia(is_viscous=viscous is not None)
         body_contacts = {name: contact for name, (contact, _) in scene.model.contacts.items()}
@@ -269,7 +289,8 @@ class _MotionStart:
         return SupportInertia(
             scene.model.system,
             mass_with_supports(scene.model),
-            lambda t, previous: (loads(t, previous), loads.rates(t, previous, moving)),
+            # amplitudes and their rates at a time, or just before it
+            lambda t, before: (loads(t, before), loads.rates(t, before, moving)),
             state.ground if isinstance(state, MovingState) else None,
         )
 
@@ -347,6 +368,7 @@ class _Energies:
         self.kinetic = self._integrator.kinetic(motion)
         self.largest_kinetic = max(self.largest_kinetic, self.kinetic)
         stored_energy = self._scene.model.system.stored_energy(motion.u, motion.mu)
+        # of the balance of energy since the begin: the error of the time steps
         imbalance = self.kinetic + stored_energy + motion.dissipated - motion.work - self._at_begin
         return {
             "time": motion.t * (self._scene.problem.time_unit or 1.0),
@@ -369,7 +391,7 @@ class _Energies:
             The equilibrium.
         """
         system, multiplicity = self._scene.model.system, self._scene.model.multiplicity
-        # constant loads do work on the way to rest
+        # constant loads do work on the way to rest: -mu times the change of dPi/dmu
         changes = {
             name: system.potential(rest.u, rest.mu, name) - potential
             for name, potential in motion.potentials.items()
@@ -405,7 +427,7 @@ def _event_function(
     Parameters
     ----------
     state
-        A state, by which columns are known.
+        Any state of the scene: it shows which columns there are.
 
     Raises
     ------
@@ -435,7 +457,7 @@ def _equilibrium_near(
     Penalties of contact become stiffer until nothing penetrates too much. Collective.
     """
     stage, comm = make_stage(scene, state, held_conjugates), scene.model.system.comm
-    # a load that does no work stands for the amplitude that the solver expects
+    # the solver prescribes one amplitude: here one that nothing has
     start = stage.enter(state)
     start, new_settings = start.with_(start.u, NO_LOAD, 0.0), dict[str, float]()
     while True:
@@ -449,8 +471,9 @@ def _equilibrium_near(
             break
         new_settings |= stiffer
         start = State(outcome.state.u, {**outcome.state.mu, **new_settings})
-    if stage.newton.factor_at(outcome.state).negative_pivots:
+    if stage.newton.factor_at(outcome.state).negative_pivots:  # unstable
         return None
+    # without the solver's own amplitude
     return State(
         state_at_rest.u,
         state.mu | {name: state_at_rest.mu[name] for name in (*held_conjugates, *new_settings)},
@@ -466,9 +489,9 @@ def viscosity(scene: Scene, state: State) -> Viscosity | None:
     if shell.viscosity is None and not shell.relaxation:
         return None
     model, branches = scene.model, list[Branch]()
-    for branch in shell.relaxation:
+    for branch in shell.relaxation:  # springs with dashpots in series
         modulus = float(in_units("pascal")(branch.modulus))
-        relative_modulus = (
+        relative_modulus = (  # a text has a unit; a number is over E already
             modulus / (shell.youngs_modulus or 1.0) if isinstance(branch.modulus, str) else modulus
         )
         branches.append(Branch(relative_modulus, dimensionless_time(problem, branch.time)))
@@ -491,14 +514,15 @@ def pushed_along_mode(
     """
     comm = scene.model.system.comm
     modes = ShellModes(scene.model)
+    # modes of other symmetries have a label
     symmetric_modes = [mode for mode in modes.vibrations(state, push.mode) if not mode.label]
-    if len(symmetric_modes) < push.mode:  # modes of other symmetries were lower
+    if len(symmetric_modes) < push.mode:  # those of other symmetries were lower
         symmetric_modes = [mode for mode in modes.lowest(state, push.mode) if not mode.label]
     mode = symmetric_modes[push.mode - 1].vector
     phi = np.asarray(mode / max_abs(comm, mode))
     deflection = scene.model.deflection(phi, "pole")
     if abs(deflection) < MIN_POLE_DEFLECTION:
-        # where the pole rests, the larger crests give the sign
+        # where the pole rests, the larger crests give the sign: the sum of cubes
         deflection = dot(comm, phi, phi**2)
     signed_thickness = np.copysign(scene.problem.material.h, deflection)
     unit = scene.problem.time_unit or 1.0
@@ -521,6 +545,7 @@ def velocity_by_formula(scene: Scene, components: Sequence[str]) -> Vector:
     Vector
         Unknowns of this rank, over R and the unit of time.
     """
+    # Q turns vectors of the case's frame into the model's
     model, R, Q = scene.model, scene.problem.length, rotation(scene.problem.azimuth)
     unit, axes = scene.problem.time_unit or 1.0, model.axes
     places = vectors_in_space(model.r0.x.array, len(axes))
@@ -532,11 +557,12 @@ def velocity_by_formula(scene: Scene, components: Sequence[str]) -> Vector:
 def initial_clock(scene: Scene, load: TimeSection, state: State) -> dict[str, float]:
     """Return the columns in time of the state before a step in time: its kinetic energy.
 
-    It is empty if the step has no initial velocity. Collective.
+    The dictionary is empty if the step has no initial velocity. The energy is v . M v/2 of the
+    whole shell, over E h R^2, with the mass matrix M. Collective.
     """
     velocity = velocity_by_formula(scene, load.velocity) if load.velocity else 0.0 * state.u
     if load.push and load.push.velocity:
-        velocity = pushed_along_mode(scene, load.push, state, velocity)[1]
+        _, velocity = pushed_along_mode(scene, load.push, state, velocity)
     if not max_abs(scene.comm, velocity):
         return {}
     M = mass(scene.model)

@@ -1,6 +1,18 @@
 """The boundary of stability of a case: its instability, followed in a second key.
 
 Results are a table and a picture, with cusps and other special points.
+
+A boundary of stability is a curve of instabilities (folds or bifurcations) in the plane of a number
+of the case, its key, and a load. An amplitude is a load parameter, by name; mu has those of a
+state. A mode is the null vector of an instability, by name: "" for one of the model itself, "m = 3"
+for waves around a meridian (family m; 0 for the model's own modes), "antisymmetric" for one that a
+half shell excludes. A crossing is a point where another family becomes critical first. A scene is
+the model of a case with its solver; a `SceneFamily` has the scenes for all values of the key. The
+journal of a part ("start", "whole", "up", "down") keeps its solves, so that an interrupted boundary
+goes on.
+
+`begin` is plain data of the instability at the start: label ("fold", "bifurcation" or "" for none),
+mode, amplitude, step, its value, and the state (u as text, mu).
 """
 
 import copy
@@ -122,6 +134,7 @@ def parse_range(text: str) -> Range:
     try:
         if not re.fullmatch(r"\w+(\.\w+)*", key) or len(bounds_and_steps) not in (2, 3):
             raise ValueError
+        # the unit of the first bound that has one counts for both
         unit = number_and_unit(bounds_and_steps[0])[1] or number_and_unit(bounds_and_steps[1])[1]
         first, last = (in_unit(bound, unit) for bound in bounds_and_steps[:2])
         steps = int(bounds_and_steps[2]) if len(bounds_and_steps) == 3 else STEPS
@@ -146,9 +159,9 @@ class StabilityBoundary:
     Attributes
     ----------
     rows
-        As in boundary.csv, from one end of the boundary to the other.
+        Rows of boundary.csv, from one end of the boundary to the other.
     content
-        As in boundary.json.
+        The content of boundary.json.
     """
 
     rows: list[dict[str, Any]]
@@ -180,7 +193,7 @@ def boundary(
 
     The case is run once. From its instability both directions are followed, through turning points,
     until the key leaves its range. Points that the folder has of an interrupted boundary are kept.
-    See `continuation.boundary`.
+    The method is that of `continuation.boundary`.
 
     Parameters
     ----------
@@ -208,6 +221,7 @@ def boundary(
     span = parse_range(over)
     source = on_first_rank(comm, lambda: read_source(Path(file), settings))
     begun_at, source = on_first_rank(comm, lambda: start_from(start, source))
+    # the case of another run takes the place of the file, and so of its settings
     for setting in settings if start else ():
         override(source, setting)
     folder, name = user_folder(out), Path(file).name
@@ -222,16 +236,18 @@ def boundary(
             comm, lambda: _begin(source, span, value, make_case, journal("start"), say, begun_at)
         )
         name_of_mode = begin["mode"]
+        # a half cannot follow a mode that it excludes; to the whole shell the mode is its own
         if name_of_mode == "antisymmetric":
             say_on_first_rank("the instability is antisymmetric: the whole shell is modelled")
             override(source, "symmetry=none")
-            half_source = begun_at.anywhere()
+            whole_start = begun_at.anywhere()  # points have other numbers there
             begin = access_disk(
                 comm,
-                lambda: _begin(source, span, value, make_case, journal("whole"), say, half_source),
+                lambda: _begin(source, span, value, make_case, journal("whole"), say, whole_start),
             )
         if not begin["label"]:
-            first_instability([])
+            first_instability([])  # raises the error that there is none
+        # the name is that of the first run, unless the whole shell has found a fold
         name_of_mode = name_of_mode if begin["label"] == "bifurcation" else begin["mode"]
         begin = {**begin, "name_of_mode": name_of_mode, "is_first": not begun_at.text}
         say_on_first_rank(
@@ -284,6 +300,7 @@ def _value(source: Source, span: Range, make_case: MakeCase, may_be_outside: boo
         If the key is a section, a list or a truth value, or its value is outside.
     """
     key_path = span.key.split(".")
+    # as written, else the default
     value_in_case = value_at(source.data, key_path)
     value_in_case = (
         value_at(make_case(source).model_dump(mode="json"), key_path)
@@ -292,7 +309,7 @@ def _value(source: Source, span: Range, make_case: MakeCase, may_be_outside: boo
     )
     try:
         value = in_unit(str(value_in_case), span.unit)
-    except ValueError:
+    except ValueError:  # no number in this unit
         if isinstance(value_in_case, dict | list | bool):
             raise CaseError(
                 f"--over {span.key}: is no number in the case, but {type(value_in_case).__name__}"
@@ -357,8 +374,8 @@ def _begin(
 
     Returns
     -------
-    Label, mode, amplitude, step and load of the instability, and its state as text; the label is ""
-    if there is none.
+    `begin` as the module describes it, with the load in units and the work; the label is "" if
+    there is no instability.
 
     Raises
     ------
@@ -367,7 +384,7 @@ def _begin(
     Stopped
         If the path is lost before the instability.
     """
-    for end in span.ends:
+    for end in span.ends:  # raises errors before anything is computed
         _problem(source, span, make_case, end)
     if journal.outcome:
         return journal.outcome
@@ -423,7 +440,8 @@ def _followed(
     sense
         Direction of the key: -1 falling, 1 growing.
     begin
-        The instability at the start, see `_begin`.
+        The instability at the start, with two more keys: `name_of_mode`, as reported, and
+        `is_first`, whether it is meant to be the first instability of the case.
     part_journal
         Journal that replays the solves of an interrupted boundary.
 
@@ -441,7 +459,10 @@ def _followed(
     """
     scene = Scene(_problem(source, span, make_case, value), MPI.COMM_SELF)
     u = vector_of(begin["u"])
-    point = Point(State(u, begin["mu"]), 0.0, 0.0 * u, 0.0, 0, 0)
+    # only the state of the point is known, and needed
+    point = Point(
+        State(u, begin["mu"]), s=0.0, du=0.0 * u, dmu=0.0, negative_pivots=0, negative_pivots_held=0
+    )
     record = Record(begin["label"], begin["amplitude"], point, begin["mode"], step=begin["step"])
     try:
         family = SceneFamily(
@@ -449,6 +470,7 @@ def _followed(
         )
     except (CaseError, NoSystem) as e:
         raise CaseError(f"--over {span.key}: {e}") from None
+    # changes of load and key that count as of order one in the arc length of the boundary
     scales = (abs(begin["value"]) or 1.0, span.ends[1] - span.ends[0])
     rows: list[dict[str, Any]] = []
     start_time, end = time.perf_counter(), span.ends[sense > 0]
@@ -457,7 +479,7 @@ def _followed(
         """Append a point of the boundary to `rows`, and say it with the remaining time."""
         row = _row(family, label, locus, mode, begin["name_of_mode"])
         rows.append(row)
-        # of the way, which may turn back
+        # largest part of the way so far, as the boundary may turn back
         covered_part = max((row_of_curve["key"] - value) / (end - value) for row_of_curve in rows)
         remaining = (
             remaining_time_text((time.perf_counter() - start_time) * (1 / covered_part - 1))
@@ -472,7 +494,10 @@ def _followed(
         )
 
     def curve(m: int, start_point: BoundaryPoint | None = None) -> Boundary:
-        """Return the boundary of modes with m waves around a meridian; 0: of the model itself."""
+        """Return the boundary of modes with m waves around a meridian; 0: of the model itself.
+
+        `start_point` is the crossing at which it begins, if it does.
+        """
         kind = family.kind_of(m, start_point)
         return Boundary(
             family, family.name, kind, scales, part_journal.recorded, m, family.excludes
@@ -481,7 +506,7 @@ def _followed(
     try:
         mode = curve(family.m)
         start = mode.start(value, *family.start)
-        if begin["is_first"]:
+        if begin["is_first"]:  # another mode at nearly the same load may come before
             mode, start = first_mode(curve, family.mode_at, mode, start)
         rows.append(_row(family, "start", start, mode, begin["name_of_mode"]))
         for label, locus, points_of_curve in critical_boundary(
@@ -489,7 +514,7 @@ def _followed(
         ):
             take(label, locus, points_of_curve)
     except (BoundaryLost, NoSystem) as e:
-        if not rows:
+        if not rows:  # not even the start
             raise Stopped(str(e)) from None
         return {"rows": rows, "stopped": f"{span.key}: {e}", "alone": family.has_one_scene}
     return {"rows": rows, "stopped": "", "alone": family.has_one_scene}
@@ -500,7 +525,7 @@ def _row(
 ) -> dict[str, Any]:
     """Return a row of boundary.csv.
 
-    The model's own mode has its name in path.csv of the case, also if the whole shell is modelled.
+    The unstable directions do not count the modes that are neutral at the point.
 
     Parameters
     ----------
@@ -509,9 +534,11 @@ def _row(
     mode
         The boundary that the point is on.
     name_of_mode
-        Name of the model's own mode.
+        Name of the model's own mode, as in path.csv of the case.
     """
+    # at a crossing two families are neutral: this boundary's and the one that it meets
     wave_numbers = sorted({mode.m, locus.met} if label == "crossing" else {mode.m})
+    # name of the model's own mode, if it is followed; at a crossing with waves its kind
     mode_name = "" if family.m else name_of_mode
     if len(wave_numbers) > 1 and not wave_numbers[0]:
         mode_name = family.kind_of(0, locus)
@@ -548,11 +575,13 @@ def _put_together(
     outcomes
         Direction (-1 or 1) -> what `_followed` returns.
     begin
-        The instability at the start, see `_begin`.
+        The instability at the start, with its `name_of_mode`.
     name
         Name of the case file.
     """
+    # a direction is missing where the start is at that end of the range
     down, up = (outcomes.get(sense, {"rows": [], "stopped": ""}) for sense in (-1, 1))
+    # both directions begin with the start, which is taken once
     rows = [*reversed(down["rows"]), *up["rows"][1 if down["rows"] else 0 :]]
     special = [row for row in rows if row["kind"] in SPECIAL]
 

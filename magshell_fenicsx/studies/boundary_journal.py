@@ -1,4 +1,9 @@
-"""Journal of the solves of a boundary, from which an interrupted one goes on."""
+"""Journal of the solves of a boundary of stability, from which an interrupted one goes on.
+
+The boundary is a curve of instabilities in the plane of a load and a key of the case. A part of it
+is the search of its start, or one direction from there. A solve gives a point of the boundary (a
+locus), or a reason why there is none; solves of a part have numbers in their order.
+"""
 
 import base64
 from collections.abc import Callable
@@ -52,6 +57,7 @@ class Journal:
 
         A result is a point of the boundary, or the reason why there is none.
         """
+        # solves come in the same order when a part is repeated, so a number identifies one
         name, self._count = f"{self._name}-{self._count:04d}", self._count + 1
         if (saved := self._stored_outcome(name)) is not None:
             return _locus(saved) if "state" in saved else str(saved["reason"])

@@ -1,4 +1,8 @@
-"""A map of boundaries of stability: the boundary in a key, for each value of a second one."""
+"""A map of boundaries of stability: the boundary in a key, for each value of a second one.
+
+A boundary of stability is a curve of instabilities in the plane of a key of the case and a load.
+Special points are its cusps, turning points, second modes and crossings.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -88,7 +92,7 @@ def boundary_map(
     make_case
         Makes a case of its source.
     start
-        See `boundary`; only for one key.
+        Another start than the end of the case, "DIR:POINT" as for `boundary`; only for one key.
 
     Returns
     -------
@@ -97,7 +101,7 @@ def boundary_map(
     Raises
     ------
     CaseError
-        See `boundary`; or if there is an instability at no value of the second key.
+        If a case or a range is not valid, or there is an instability at no value of the second key.
     """
     if len(overs) == 1:
         return boundary(file, overs[0], settings, out, comm, say, make_case=make_case, start=start)
@@ -134,11 +138,11 @@ def boundary_map(
                     say,
                     make_case=make_case,
                 )
-            except (ExcludedInstability, NoInstability, Stopped) as e:
+            except (ExcludedInstability, NoInstability, Stopped) as e:  # other values go on
                 without[value] = str(e)
                 say_on_first_rank(f"{axis.name} = {value}: no boundary: {e}")
                 continue
-            except CaseError as e:
+            except CaseError as e:  # the user gave --over, not --set
                 raise CaseError(
                     str(e).replace(f"--set {line_settings[-1]}", f"--over {line_settings[-1]}")
                 ) from None
@@ -198,7 +202,7 @@ def _content(
         "units": [first_content["unit"], axis.unit],
         "range": [first_content["from"], first_content["to"]],
         "values": [axis.number(value) for value in axis.values],
-        "load": max(loads, key=loads.count),
+        "load": max(loads, key=loads.count),  # the most frequent amplitude
         "kinds": {
             value: f"{line.content['kind']} {line.content['mode']}".strip()
             for value, line in lines.items()

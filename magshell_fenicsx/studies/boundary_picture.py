@@ -1,4 +1,11 @@
-"""The picture of a boundary of stability: load over key, with the names of the regions."""
+"""The picture of a boundary of stability: load over key, with the names of the regions.
+
+A boundary is a curve of instabilities in the plane of a key of the case and a load. Regions are the
+parts of the plane beside it ("stable", "snaps", "buckles", "bistable"). A map has a boundary for
+each value of a second key (`second`). Rows are those of boundary.csv: key, load, kind, mode, and
+the number of other unstable directions. At a crossing another mode comes first, and takes over the
+boundary. The arms are the two folds that begin at a cusp.
+"""
 
 from collections.abc import Mapping, Sequence
 from itertools import groupby, pairwise
@@ -24,7 +31,7 @@ LEGEND: Mapping[str, Any] = {
     "loc": "upper left",
     "bbox_to_anchor": (1.0, 1.0),
 }
-# of the width of the picture: a region that has no place for more than its mode, or for that
+# parts of the picture's width: in a narrower region only its mode is written, or outside of it
 NARROW, LOW = 0.25, 0.08
 Row = Mapping[str, Any]
 
@@ -35,7 +42,7 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
     Parameters
     ----------
     rows, content
-        As in boundary.csv and boundary.json.
+        Rows of boundary.csv, and the content of boundary.json.
     file
         Name of the picture file.
     """
@@ -47,7 +54,8 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
     rows, label = _in_units(rows, content["load"])
     figure, plot = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
     mode_parts = [part for _, part in _by_mode(rows)]
-    for smooth_part in mode_parts:  # with a corner where two bifurcations cross
+    for smooth_part in mode_parts:  # the boundary has a corner where two bifurcations cross
+        # intervals, dashed if an end has other unstable modes; lines join intervals of one style
         pairs = groupby(
             pairwise(smooth_part), key=lambda each: bool(each[0]["unstable"] or each[1]["unstable"])
         )
@@ -60,7 +68,7 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
     for x, y, region_name in _regions(rows, content, plot.get_ylim()):
         plot.annotate(region_name, (x, y), ha="center", va="center", color="0.35")
     arms = _arms(rows)
-    if arms:
+    if arms:  # shade the region between two folds
         low, high = arms
         x, y = (
             np.concatenate([lower_point, upper_point[::-1]])
@@ -82,7 +90,7 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
     Parameters
     ----------
     rows, content
-        As in boundary.csv and map.json.
+        Rows of boundary.csv, and the content of map.json.
     file
         Name of the picture file.
     """
@@ -92,6 +100,7 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
     import matplotlib.pyplot as plt
 
     rows, label = _in_units(rows, content["load"])
+    # at some second values another load may lead to the instability
     rows_of_other_loads = [row for row in rows if row["amplitude"] != content["load"]]
     values_without_boundary = sorted(set(content["values"]) - {row["second"] for row in rows})
     with_plane = bool(
@@ -156,6 +165,7 @@ def _plane(
     for value, group in groupby(rows, key=lambda row: float(row["second"])):
         line = [*group]
         load_quantity = quantity(amplitude(line[0]["amplitude"]).column).words
+        # another colour where another load leads to the instability
         colour = "C0" if line[0]["amplitude"] == content["load"] else "C1"
         draw([row["key"] for row in line], value, f"by the {load_quantity}", color=colour, lw=2)
     for value in empty:
@@ -231,8 +241,8 @@ def _regions(
 ) -> list[tuple[Any, ...]]:
     """Return the regions beside a boundary, each as key, load and name.
 
-    Beyond a boundary of several modes each has its own. A bifurcation after other instabilities
-    divides nothing that is stable, so it is left out.
+    Beyond a boundary of several modes each mode has its own region. A bifurcation after other
+    instabilities divides nothing that is stable, so it is left out.
 
     Parameters
     ----------
@@ -251,10 +261,12 @@ def _regions(
         kind = next(
             (row["kind"] for row in part if row["kind"] in ("fold", "bifurcation")), content["kind"]
         )
+        # only the first, the region beyond the boundary
         for x, y, words in _regions_of_mode(part, {**content, "kind": kind, "mode": mode}, limits)[
             :1
         ]:
             width = np.ptp([row["key"] for row in part]) / extent
+            # limit of the axis on the side of the region
             outer = limits[1] if y > 0 else limits[0]
             y = (y + outer) / 2 if width < LOW else y  # beside the names of its neighbours
             regions.append((x, y, mode if width < NARROW and mode else words))
@@ -277,7 +289,7 @@ def _regions_of_mode(
         "snaps" if content["kind"] == "fold" else f"buckles {_mode(content['mode'])}".rstrip()
     )
     x = float(np.mean([min(row["key"] for row in rows), max(row["key"] for row in rows)]))
-    # loads of the boundary at the middle of its range of keys
+    # loads of the boundary at the middle of its range of keys, several if it turns back
     loads_at_middle = sorted(
         lower_row["load"]
         + (x - lower_row["key"])
@@ -303,6 +315,7 @@ def _regions_of_mode(
     if len(loads_at_middle) > 1:
         middle_words = "bistable" if content["kind"] == "fold" else instability_words
         regions.append((x, (loads_at_middle[0] + loads_at_middle[-1]) / 2, middle_words))
+        # beyond the second bifurcation the shell is stable again
         if content["kind"] != "fold":
             regions[0] = (x, (outermost_load + outer) / 2, "stable")
     return regions
@@ -316,6 +329,7 @@ def _by_mode(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
         (next((row["mode"] for row in row_group if row["kind"] != "crossing"), None), row_group)
         for row_group in row_groups
     )
+    # a part of crossings alone has no mode
     return [(mode, row_group) for mode, row_group in mode_parts if mode is not None]
 
 

@@ -1,4 +1,9 @@
-"""The start of a boundary: the end of its case, or a located point of another run of it."""
+"""The start of a boundary: the end of its case, or a located point of another run of it.
+
+A boundary of stability is a curve of instabilities; it starts at one of them. A record is a point
+of a history, a row of path.csv; a located one is a fold or a bifurcation. An amplitude is a load
+parameter, by name.
+"""
 
 import re
 from collections.abc import Sequence
@@ -62,6 +67,7 @@ class Start:
             for r in records
             if r.label in LOCATED and isclose(_load(r), self.load, rel_tol=LOAD_TOLERANCE)
         ]
+        # equal sources give equal numbers; another processor may have added points
         if self.complete(records) and records[self.point] in candidates:
             return records[self.point]
         if not candidates:
@@ -110,4 +116,5 @@ def start_from(text: str | None, source: Source) -> tuple[Start, Source]:
         )
     row = located[point]
     load = float(row[amplitude(row["amplitude"]).column])
+    # places in the file, for messages, are not those of the stored case
     return Start(text, point, load), replace(source, data=data, places={})

@@ -1,4 +1,12 @@
-"""Comparison of a case as a shell and as a solid: curve against curve, error against run time."""
+"""Comparison of a case as a shell and as a solid: curve against curve, error against run time.
+
+Each model is run on several meshes, given by their refinements; the element size is proportional to
+the inverse. A curve is the load over the displacement w/h in the last part of the path, in which
+the last amplitude (load parameter) varies. Loads are compared at places, displacements that both
+models reach; one of these, the judged place, or a scalar (a named number of a run) gives the number
+whose error is estimated. A run of the same request (case, settings, sources) is not repeated. h and
+R are thickness and reference length, nu Poisson's ratio, lambda_m the size of the magnetic load.
+"""
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
@@ -127,11 +135,12 @@ def run_model(
             results = read_summary(folder), read_lines(folder / "path.csv")
         except (OSError, Damaged) as e:
             reason = str(e)
+    # the same but for the sources
     elif usage and usage.asked | {"sources": request["sources"]} == request:
         reason = "the folder has results of other sources of magshell_fenicsx"
     if reason:
         say(f"{model} at refinement {refinement:g}: computed again, {reason}")
-    if not (usage and results):
+    if not (usage and results):  # no stored run serves
         name = _case_in(folder)
         if name and Path(name).stem != case.stem:
             raise CaseError(
@@ -142,14 +151,17 @@ def run_model(
         measured = measure(
             "magshell_fenicsx", ["run", str(case), *arguments, "--out", str(folder), "--overwrite"]
         )
+        # exit code 3: stopped early, with results
         if not (folder / "summary.json").exists() or measured.code not in (0, 3):
             raise NothingLeft(
                 f"model: {model}: {measured.last_error or f'exit code {measured.code}'}"
             )
         results = read_summary(folder), read_lines(folder / "path.csv")
+        # the sources that the run has recorded itself
         usage = Used({**request, "sources": results[0]["sources"]}, measured.cpu_s, measured.wall_s)
         keep(folder / "usage.json", asdict(usage))
     summary, rows = results
+    # the time for the compilation of kernels, which later runs do not need
     compiling = float(summary["timing"]["jit_s"])
     return ModelRun(
         model, refinement, summary, rows, usage.cpu_s - compiling, usage.wall_s - compiling
@@ -215,7 +227,7 @@ def loaded(run: ModelRun) -> list[dict[str, str]]:
     stretches the thickness. The displacement since the end of the field excludes this.
     """
     load_name = amplitude_of(run)
-    # the same point in both models
+    # the same point in both models: of a force where it acts
     displacement_column = "w_point_over_h" if load_name == "force" else "w_pole_over_h"
     first = next(i for i, row in enumerate(run.rows) if row["amplitude"] == load_name)
     row_before = run.rows[max(first - 1, 0)]
@@ -242,6 +254,7 @@ def places(runs: Sequence[ModelRun]) -> list[float]:
     if not all(any(row["label"] == "target" for row in loaded(run)) for run in runs):
         return []
     end = min(max(curve(run)[0]) for run in runs)
+    # the tolerance is for an end that is a whole number but for rounding
     return [float(w) for w in range(1, int(end + 1e-6) + 1)] or [end]
 
 
@@ -306,7 +319,7 @@ def time_at(error: float, runs: Sequence[tuple[float, float]]) -> float | None:
     errors_and_seconds = sorted((e, s) for e, s in runs if e > 0)
     if not errors_and_seconds or not errors_and_seconds[0][0] <= error <= errors_and_seconds[-1][0]:
         return None
-    e, s = np.log(np.array(errors_and_seconds)).T
+    e, s = np.log(np.array(errors_and_seconds)).T  # logarithms of errors and seconds
     return float(np.exp(np.interp(np.log(error), e, s)))
 
 
@@ -363,13 +376,14 @@ def compare(
         If a run left no results.
     """
     file, folder, scalar = Path(file), user_folder(out), parse_scalar(result) if result else None
+    # both must be valid; the programme of loads is the same
     for model in MODELS:
         case = make_case(read_source(file, [*settings, f"model={model}", *WITHOUT[model]]))
     load_name = case.programme[-1].name if case.programme else ""
     if (
         not load_name
         or load_name in UNCOMPARED
-        or (load_name == "lambda_m" and case.loading is None)
+        or (load_name == "lambda_m" and case.loading is None)  # a field alone
     ):
         raise CaseError(
             "compare: needs a load whose curve can be compared: pressure, indentation or field"
@@ -387,7 +401,7 @@ def compare(
             f"{model} at refinement {refinement:g}: {model_run.dofs} unknowns, "
             f"{model_run.cpu_s:.1f} s CPU"
         )
-        if not amplitude_of(model_run):
+        if not amplitude_of(model_run):  # "" at the start of the path
             raise NothingLeft(
                 f"the {model} did not leave its undeformed state: {model_run.summary['stopped']}"
             )
@@ -399,7 +413,7 @@ def compare(
             for refinement in sorted(set(refinements[model]))
         ]
         compute(tasks, computed, MPI.COMM_SELF, say)
-        shell, solid = (runs[model][-1] for model in MODELS)
+        shell, solid = (runs[model][-1] for model in MODELS)  # the finest ones
         if amplitude_of(shell) != amplitude_of(solid):
             ends = [amplitude_of(run) for run in (shell, solid)]
             raise CaseError(
@@ -502,6 +516,7 @@ def _content(
     times = [seconds[model] for model in MODELS]
     return {
         "result": name,
+        # solid over shell
         "difference": final_values[1] / final_values[0] - 1 if None not in final_values else None,
         "largest_difference_of_the_curves": max((abs(d.relative) for d in differing), default=None),
         "limits": limits,
@@ -533,6 +548,7 @@ def extrapolated(values: Sequence[float | None], refinements: Sequence[float]) -
     if len(last_values) < 3:
         return None
     error, order = estimated_error([1 / r for r in refinements[-3:]], last_values)
+    # the limit lies beyond the last value, in the direction of the last change
     return (
         last_values[2]
         if error is None or order is None

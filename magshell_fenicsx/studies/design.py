@@ -3,6 +3,12 @@
 Every evaluation is kept, and the best case is verified on a finer mesh. Evaluations are known by
 their variables. A design that is started again takes the evaluations in its folder, follows the
 same course, and goes on where it was interrupted.
+
+The p variables are a vector x of scaled numbers (see `design_variables`). An evaluation has the
+results of the case at x with their gradients, and no values if there are none. A wanted shape has a
+target, a map from undeformed to wanted places; a curve is approached in stages of growing
+curvature. The remanence is given by vectors at control points, in a file. A fold is a result that
+is a critical load.
 """
 
 import hashlib
@@ -79,7 +85,7 @@ class Design:
     tried
         The variables and the evaluations of the present stage, in order.
     stage
-        Number of the wanted shape, from 1; 0 for the last.
+        Number of the present stage, from 1; 0 for the last one.
     seconds
         Wall time of each new evaluation.
     """
@@ -98,9 +104,11 @@ class Design:
     def __call__(self, x: Array) -> DesignEvaluation:
         """Return the evaluation of a vector of variables, stored or new; collective."""
         x = np.array(self.comm.bcast(x))
+        # the optimiser may ask for a vector again
         for earlier_x, evaluated in reversed(self.tried):
             if np.array_equal(earlier_x, x):
                 return evaluated
+        # the targets of a stage before the last give other results for the same x
         stage = f"{self.stage}".encode() if self.stage else b""
         name = hashlib.sha256(x.tobytes() + stage).hexdigest()[:16]
         file, vectors = (self.folder / "points" / f"{name}.{ending}" for ending in ("json", "csv"))
@@ -120,14 +128,16 @@ class Design:
         return evaluation
 
     def begin(self, stage: int, targets: Sequence[Mapping[str, Target]]) -> None:
-        """Begin a stage, counted from 0, whose targets are those of the next of several shapes.
+        """Begin a stage: set its targets, and forget the evaluations of the stage before.
 
         Parameters
         ----------
+        stage
+            Number of the stage, from 0.
         targets
             For each stage: result -> map from undeformed to wanted places.
         """
-        self.stage = (stage + 1) % len(targets)
+        self.stage = (stage + 1) % len(targets)  # 0 for the last
         self.goal.targets = targets[stage]
         self.tried.clear()
 
@@ -174,7 +184,7 @@ class Design:
             **evaluation.seen,
             "objective": self.goal.objective(evaluation) if solved else None,
             "violation": self.goal.violation(evaluation) if solved else None,
-            "best": bool(best and best[0] is x),
+            "best": bool(best and best[0] is x),  # the vector just added
             **self.variables.numbers(x),
             **({"stage": self.stage or "last"} if self.goal.stages else {}),
             "note": evaluation.note,
@@ -194,6 +204,7 @@ class Design:
     @property
     def _time_left(self) -> str:
         """Text of the time for the remaining iterations, one evaluation each; "" if short."""
+        # the first evaluation is no iteration
         remaining_iterations = self.goal.section.iterations + 1 - len(self.rows)
         return (
             remaining_time_text(
@@ -219,8 +230,9 @@ class Design:
 
         The least violation of the constraints counts first, then the objective.
         """
-        solved = [evaluated for evaluated in self.tried if evaluated[1].values]
-        return min(solved, key=lambda evaluated: self.goal.merit(evaluated[1])) if solved else None
+        solved = [(x, evaluation) for x, evaluation in self.tried if evaluation.values]
+        # of each pair (vector, evaluation) the evaluation counts
+        return min(solved, key=lambda pair: self.goal.merit(pair[1])) if solved else None
 
 
 def design(
@@ -268,6 +280,7 @@ def design(
             design_goal_of(case, case.design),
         )
         with FOLDER.locked(folder, comm, Path(file).name):
+            # without `resume` stored evaluations are taken too
             if resume and not access_disk(comm, lambda: any((folder / "points").glob("*.json"))):
                 raise CaseError(f"{folder}: has no evaluation to resume")
             with heard(comm, say) as progress:
@@ -303,7 +316,7 @@ def _designed(search: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]
     )
     first_evaluation, best, x, ended = _optimised(search)
     angle_steps = section.remanence.steps if section.remanence else None
-    if angle_steps:
+    if angle_steps:  # angles that can be made: the rounded design is evaluated once more
         x = vary.rounded(x, angle_steps)
         unrounded, best = best, search(x)
         if not best.values:
@@ -335,6 +348,7 @@ def _designed(search: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]
     )
     access_disk(comm, draw_result)
     access_disk(comm, lambda: write_object(folder / "summary.json", content))
+    # the summary is written before and after the long run of the verification
     content["verified"] = verified(search, best, comm)
     targets: Sequence[Callable[[Array], Array] | None] = [*design_goal.targets.values()] or [None]
     for target in targets:
@@ -394,12 +408,17 @@ def _optimised(search: Design) -> tuple[DesignEvaluation, DesignEvaluation, Arra
             f"no variable has an influence on {', '.join(goal.results)} where the design starts"
         )
     for stage in range(len(targets)):
-        if stage:
+        if stage:  # begin from the best of the stage before
             search.begin(stage, targets)
             goal.begin(search(x))
         is_last = stage == len(targets) - 1
         ended = search_optimum(
-            search, goal, vary, x, iterations if is_last else -(-iterations // STAGES_PART)
+            search,
+            goal,
+            vary,
+            x,
+            # a part, rounded up
+            iterations if is_last else -(-iterations // STAGES_PART),
         )
         assert search.best
         x, best = search.best
@@ -445,11 +464,13 @@ def _from_here(part: Any, old: Path, new: Path) -> None:
 
     The data are changed in place.
     """
+    # sections and lists; a value has no parts
     for key, value in (
         part.items()
         if isinstance(part, dict)
         else enumerate(part if isinstance(part, list) else [])
     ):
+        # best.csv is in the new folder already
         if key == "file" and isinstance(value, str) and value != "best.csv":
             part[key] = os.path.relpath(old / value, new)
         _from_here(value, old, new)
@@ -474,13 +495,15 @@ def verified(search: Design, best: DesignEvaluation, comm: MPI.Intracomm) -> dic
         return search.variables.make_case(on_first_rank(comm, lambda: read_source(file, settings)))
 
     case = best_case()
+    # the mesh of a file cannot be refined
     if case.several or case.shell.geometry != "mesh":
         settings = [f"mesh.refinement={case.mesh.refinement * goal.section.verify:.6g}"]
         case = best_case()
     how = ", ".join(settings) or "on the mesh of the file"
-    # the folder is the design's
+    # overwrite: the folder is the design's own
     result = run(case.problem(), search.folder / "verified", comm, overwrite=True)
     values = {name: _value(result, name) for name in goal.results if name not in goal.targets}
+    # a shape: root mean square and largest distance from the wanted places
     extra_results = dict[str, float]()
     for target in goal.targets.values():
         extra_results["rms_distance"], extra_results[DISTANCE] = distances(
@@ -496,7 +519,7 @@ def verified(search: Design, best: DesignEvaluation, comm: MPI.Intracomm) -> dic
                 f"verified ({how}): {name} = {value:.9g}, {_difference_words(relative_difference)} "
                 f"the design's {designed:.9g}"
             )
-            if abs(relative_difference) > OTHER_RESULT_DIFFERENCE:
+            if abs(relative_difference) > OTHER_RESULT_DIFFERENCE:  # no matter of the mesh's error
                 say(
                     f"warning: {name} is another one there: the mesh is too coarse, or there are "
                     "several equilibria"
@@ -518,8 +541,8 @@ def verified(search: Design, best: DesignEvaluation, comm: MPI.Intracomm) -> dic
 def _value(result: Result, name: str) -> float | None:
     """Return a result of a run; None if the run lacks it.
 
-    For a fold it is the first instability of its amplitude, excluded modes too, in the result's
-    unit.
+    For a critical load it is the first instability of this load on the path, excluded modes too,
+    in the result's unit.
     """
     if name == MASS:
         return mass(result.scene).value
@@ -535,6 +558,7 @@ def _value(result: Result, name: str) -> float | None:
         return None
     row = result.rows[-1]
     try:
+        # None if the name is no frequency
         omega2 = vibration_at_end(result.scene, result.path_history, name)
     except LostResult:
         return None

@@ -1,4 +1,12 @@
-"""Blocks of design variables: numbers of the case, vectors of the remanence, scalar fields."""
+"""Blocks of design variables: numbers of the case, vectors of the remanence, scalar fields.
+
+A variable runs from 0 to 1 between the bounds of its value, or is an angle. A field is given by
+values at control points, as their mean with weights that fall with distance. On a meridian the
+points are (rho, z) and vectors have two components. A `FieldGradient` has the derivatives of a
+result by a field at the nodes of the mesh ("forces"); transposed interpolation gives those by the
+values at control points. Plain data are those of the case file. h and R are thickness and reference
+length, |B^r| is the size of the remanence.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -71,6 +79,8 @@ class NumberVariable(Bounded):
         ----------
         gradients
             Key -> derivative by the number in SI units; a missing one is zero.
+        x, scene
+            Not used: the derivative is constant. Other blocks need them.
         """
         slope = gradients.get(self.name, 0.0)
         return np.array([slope * si_size(self.unit) * (self.bounds[1] - self.bounds[0])])
@@ -144,6 +154,7 @@ class Vectors:
     @property
     def start_values(self) -> Array:
         """Variables at the start: angles in radians, then scaled lengths."""
+        # the polar angle is from z; in a plane it has a sign, and there is no azimuth
         horizontal = self.start[:, 0] if self.planar else np.hypot(*self.start[:, :2].T)
         angles_and_lengths = [np.arctan2(horizontal, self.start[:, -1])]
         if not self.planar:
@@ -164,7 +175,8 @@ class Vectors:
 
     def vectors(self, x: Array) -> Array:
         """The vectors at the control points, (n, 3) or (n, 2), for variables x."""
-        return self._polar(x)[0]
+        vectors, _ = self._polar(x)
+        return vectors
 
     def gradient(self, x: Array, scene: Scene, gradients: GradientsByName) -> Array:
         """Return the gradient of a result by the variables; collective.
@@ -179,12 +191,16 @@ class Vectors:
         if not isinstance(field_gradient := gradients.get(self.name), FieldGradient):
             return np.zeros(len(x))
         forces = by_components(scene, field_gradient)
-        return np.concatenate(
-            [np.sum(forces * angle_derivative, axis=1) for angle_derivative in self._polar(x)[1]]
-        )
+        _, derivatives = self._polar(x)
+        # chain rule: angles of a vector change that vector alone
+        return np.concatenate([np.sum(forces * derivative, axis=1) for derivative in derivatives])
 
     def _polar(self, x: Array) -> tuple[Array, list[Array]]:
-        """Return vectors (n, 3 | 2), and their derivatives (n, 3 | 2) by angles and lengths."""
+        """Return vectors (n, 3 | 2) for variables x, and their derivatives (n, 3 | 2).
+
+        There is one array of derivatives for each kind of variable: polar angles, azimuths unless
+        the vectors stay in a plane, lengths if they vary.
+        """
         polar, *other_variables = x.reshape(-1, len(self.start))
         s, c = np.sin(polar), np.cos(polar)
         length, length_range = np.linalg.norm(self.start, axis=1), 0.0
@@ -195,11 +211,13 @@ class Vectors:
         if self.planar:
             # in the plane of x and z the vectors have y = 0; on a meridian no y at all
             no_component = [] if self.controls.is_axisymmetric else [0 * s]
+            # unit vectors, and their derivatives by the polar angle
             unit, polar_derivative = (
                 np.stack(v, axis=1) for v in ([s, *no_component, c], [c, *no_component, -s])
             )
             derivatives = [length_column * polar_derivative]
         else:
+            # cosine and sine of the azimuth
             a, b = np.cos(other_variables[0]), np.sin(other_variables[0])
             unit = np.stack([s * a, s * b, c], axis=1)
             derivatives = [
@@ -212,7 +230,10 @@ class Vectors:
         ]
 
     def put(self, data: dict[str, Any], x: Array) -> None:
-        """Let the case have a remanence of kind `points`, whose file is named later."""
+        """Let the case have a remanence of kind `points`, whose file is named later.
+
+        The vectors for x are in that file, so x is not used.
+        """
         remanent = data["magnetic"].get("remanent") or {}
         flux_density = (
             {"flux_density": remanent["flux_density"]} if "flux_density" in remanent else {}
@@ -257,6 +278,7 @@ class ControlPointField(Bounded):
         """
         if not isinstance(field_gradient := gradients.get(self.name), FieldGradient):
             return np.zeros(len(x))
+        # from the model's frame, turned about e3, to that of the case
         places = field_gradient.places.reshape(-1, 3) @ rotation(scene.problem.azimuth)
         forces = field_gradient.forces.reshape(len(places), -1)[:, : self.start.shape[1]]
         if self.name == "thickness" and self.shells:
@@ -264,6 +286,7 @@ class ControlPointField(Bounded):
         comm = field_gradient.field.function_space.mesh.comm
         # transposed interpolation: from places on the mesh to control points
         gradient_at_points = comm.allreduce(np.asarray(self.controls.weights(places).T @ forces))
+        # a deviation is over h here, and over R in the model
         length_unit = scene.problem.material.h if self.name == "deviation" else 1.0
         return np.asarray(
             gradient_at_points * length_unit * (self.bounds[1] - self.bounds[0])
@@ -276,8 +299,10 @@ class ControlPointField(Bounded):
             formulas = [
                 self._formula(component, self.controls, self.length) for component in values
             ]
+            # the third component is the twist
             data["natural"] = {**(data.get("natural") or {}), "curvature": [*formulas, 0]}
             return
+        # shell's section, control points in its frame, and its thickness over h
         single_shell = {"": (data["shell"], self.controls, 1.0)} if not self.shells else {}
         several_shells = {
             name: (data["shells"][name]["shell"], *self._controls_on_shell(*pose_and_ratio))
@@ -287,6 +312,7 @@ class ControlPointField(Bounded):
             if self.name == "thickness":
                 shell["thickness_factor"] = self._formula(values[0], controls)
                 continue
+            # the deviation is one more imperfection; `defect` is short for a single one
             defect = [shell.pop("defect")] if shell.get("defect") else []
             imperfection = {"kind": "formula", "w0": self._formula(values[0] / ratio, controls)}
             shell["imperfections"] = [*defect, *(shell.get("imperfections") or ()), imperfection]
@@ -297,6 +323,7 @@ class ControlPointField(Bounded):
         The second value is the shell's thickness over h.
         """
         control_points = self.controls.places
+        # points of a meridian become (rho, 0, z), and (rho, z) again afterwards
         places_in_shell = place.to_shell_frame(
             np.insert(control_points, 1, 0.0, axis=1)
             if self.controls.is_axisymmetric
@@ -336,7 +363,7 @@ class ControlPointField(Bounded):
         R
             Length R in the unit of the formula's coordinates; values are over 1/R then.
         """
-        if np.ptp(values) == 0:
+        if np.ptp(values) == 0:  # the mean of equal values is a constant
             return repr(float(values[0] / R))
         squared_width = repr(float(controls.width * R) ** 2)
         weights = [

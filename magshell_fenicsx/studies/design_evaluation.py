@@ -1,4 +1,12 @@
-"""The results of a design's case and their gradients by its variables."""
+"""The results of a design's case and their gradients by its variables.
+
+A path is a sequence of equilibria, its records, up to where a result is taken; it is lost where no
+further point is found. Gradients are by the adjoint method: an `Adjoint` is a result with the
+multipliers by which it is differentiated by any number or field of the case, by name. The design's
+p variables stand for such numbers and fields. A critical load (`FOLDS`: result -> load) is the
+lowest of several instabilities, which may cross; a frequency likewise. A target is a map from
+undeformed to wanted places. A scene is the model of a case with its solver.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -50,8 +58,8 @@ class DesignEvaluation:
     values, gradients
         Result -> its value and its gradient (p,); empty if the path was lost.
     beside
-        Result -> values and gradients of the instabilities next to the lowest one, which is the
-        result.
+        Result -> values and gradients of the instabilities or frequencies next above the lowest
+        one, which is the result.
     seen
         Further numbers: the largest distance to a wanted shape.
     note
@@ -109,6 +117,7 @@ def evaluate(
             if result == MASS:
                 _add_mass(evaluation, scene, variables, slope)
                 continue
+            # a critical load may lie before the place where the path is lost
             if path.lost_reason and result not in FOLDS:
                 return DesignEvaluation(note=notes[0])
             adjoints, note = _adjoints(scene, path, result, targets)
@@ -120,13 +129,15 @@ def evaluate(
                 )
                 for _, adjoint_of_mode in adjoints
             ]
+            # the lowest is first, and all others stand beside it
             evaluation.values[result], evaluation.gradients[result] = values[0]
             if result in LOWEST:
                 evaluation.beside[result] = values[1:]
     except (LostResult, FoldLost) as e:
         return DesignEvaluation(note="; ".join([f"no {result}: {e}", *notes]))
     for target in targets.values():
-        evaluation.seen[DISTANCE] = distances(scene, path.records[-1].point.state, target)[1]
+        _, largest_distance = distances(scene, path.records[-1].point.state, target)
+        evaluation.seen[DISTANCE] = largest_distance
     return replace(evaluation, note="; ".join(notes))
 
 
@@ -179,6 +190,7 @@ def _follow_until_enough(scene: Scene, results: Sequence[str]) -> _ComputedPath:
                 break
     except Stopped as e:
         path.lost_reason = str(e)
+    # a path that ends beyond an instability has no result at its end either
     remarks_on_end = (text for text in remarks if text.startswith(BEYOND_INSTABILITY))
     path.lost_reason = path.lost_reason or next(remarks_on_end, "")
     return path
@@ -198,6 +210,7 @@ def _add_mass(
         Gradient (p,) by the variables from derivatives by names of numbers and fields.
     """
     functional = mass(scene)
+    # fields and numbers of the shell alone change its mass
     keys = [name for name in variables.names if name in WITH_MASS or "shell." in name]
     derivatives = {name: derivative(functional, name) for name in keys if functional.forms}
     evaluation.values[MASS], evaluation.gradients[MASS] = functional.value, slope(derivatives)
@@ -222,7 +235,7 @@ def _adjoints(
             for mode, adjoint_of_mode in adjoints
         )
         return adjoints, f"lowest: {', '.join(modes)}"
-    target = targets.get(result, result)
+    target = targets.get(result, result)  # the map of a wanted shape, else a name
     refuse_moving(scene, path.records[-1], target)
     kind, adjoint = adjoint_at_end(scene, path.history, target)
     return [(kind, adjoint)], f"{result}: {kind}" if kind else ""
@@ -256,6 +269,7 @@ def _enough(records: Sequence[Record], results: Sequence[str]) -> bool:
     Folds of one load need the path up to `MAX_LOAD_RATIO` times the lowest instability. All other
     results need the whole path.
     """
+    # loads of the results; None for one that needs the whole path
     amplitudes = {FOLDS.get(result) for result in results if result != MASS}
     if None in amplitudes or len(amplitudes) > 1:
         return False

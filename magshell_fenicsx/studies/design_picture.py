@@ -1,4 +1,10 @@
-"""design.png: results over the evaluations, the wanted shape, the remanence and varying fields."""
+"""design.png: results over the evaluations, the wanted shape, the remanence and varying fields.
+
+A design varies p variables (`vary`) that stand for numbers of the case, the remanence (vectors at
+control points) and scalar fields at control points. Rows are those of design.csv, one for each
+evaluation. A target is a map from undeformed to wanted places. Places are over R. On a meridian
+they are (rho, z).
+"""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -68,11 +74,12 @@ def reached_shape(folder: Path, target: Callable[[Array], Array] | None) -> Reac
         return None
     surface, _ = read_point(folder / "fields", numbers[-1])
     distance_from_plane = np.abs(surface.r0[:, 1])
+    # the nodes nearest to the plane y = 0, by rising x
     points_in_plane = np.flatnonzero(distance_from_plane <= distance_from_plane.min() + IN_PLANE)
     points_in_plane = points_in_plane[np.argsort(surface.r0[points_in_plane, 0], kind="stable")]
     target_points, edges = (
         target(surface.r0[points_in_plane]) if target else None,
-        edge_lines(replace(surface, u=0 * surface.u)),
+        edge_lines(replace(surface, u=0 * surface.u)),  # undeformed
     )
     return ReachedShape(
         target_points, (surface.r0 + surface.u)[points_in_plane], surface.r0[points_in_plane], edges
@@ -107,7 +114,7 @@ def draw_design(
     """
     from matplotlib.figure import Figure
 
-    units = dict.fromkeys(map(_unit, results))
+    units = dict.fromkeys(map(_unit, results))  # each once, in order: an axis for each
     panels = (
         1
         + (shape is not None and shape.target is not None)
@@ -136,6 +143,7 @@ def draw_design(
         _draw_shape(further_axes.pop(0), shape, shape.target)
     if vary.controls and vary.remanence:
         _draw_remanence(further_axes[0], vary, x, shape)
+    # the last panels are those of the fields
     for axes, field in zip(
         further_axes[len(further_axes) - len(vary.fields) :], vary.fields, strict=True
     ):
@@ -172,9 +180,10 @@ def _draw_history(
         values = np.array(
             [np.nan if row[result] is None else row[result] for row in rows], dtype=float
         )
-        # lines that lie on each other are all seen
+        # the first lines are wider, so that lines that lie on each other are all seen
         colour, line_width = f"C{i}", 1.6 + 1.6 * (len(results) - 1 - i)
         axes.plot(number, values, "o", color=colour, markersize=4, alpha=0.4, markeredgewidth=0)
+        # the line of the best goes on to the last evaluation
         evaluation_numbers = np.append(number[best], number[-1:] if best.any() else [])
         best_values = np.append(values[best], values[best][-1:])
         axes.plot(
@@ -242,12 +251,14 @@ def _draw_remanence(axes: Any, vary: Variables, x: Array, shape: ReachedShape | 
     names = (r"\rho", "z") if vary.controls.is_axisymmetric else ("x", "y", "z")
     widest = np.argsort(-np.ptp(places, axis=0), kind="stable")[:2]
     planar = vary.remanence is not None and vary.remanence.planar
+    # planar vectors lie in the plane of x (or rho) and z
     first, second = (0, len(names) - 1) if planar else sorted(int(i) for i in widest)
     horizontal, up = places[:, first], places[:, second]
     line_style = "-" if vary.controls.is_axisymmetric or not places[:, 1:].any() else ""
     axes.plot(horizontal, up, line_style + ".", color="0.6", markersize=3, linewidth=1)
     if shape is not None and not vary.controls.is_axisymmetric:
         axes.plot(*shape.edges[:, [first, second]].T, color="0.6", linewidth=0.8)
+    # arrows as long as a part of the shell's extent, drawn in the units of the places
     longest = float(np.hypot(vectors[:, first], vectors[:, second]).max()) or 1.0
     size = ARROW * float(np.ptp(places, axis=0).max()) / longest
     right, vertical = size * vectors[:, first], size * vectors[:, second]
@@ -284,6 +295,7 @@ def _unit(result: str) -> str:
         return {"omega2": "omega2", "hertz": "Hz"}[matched[1]]
     if result_and_unit := split_unit(result):
         return result_and_unit[1]
+    # dimensionless results: what they are scaled with stands for a unit
     own_units = {
         "critical_field": quantity("lambda_m").scale,
         "barrier": quantity("energy").scale,
@@ -303,7 +315,7 @@ def _draw_field(axes: Any, field: ControlPointField, values: Array) -> None:
         (n, components) values at the control points.
     """
     places, title = field.controls.places, TITLES[field.name]
-    if field.controls.is_axisymmetric or not places[:, 1:].any():
+    if field.controls.is_axisymmetric or not places[:, 1:].any():  # a meridian, or a strip along x
         arc_length = np.concatenate(
             [[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))]
         )

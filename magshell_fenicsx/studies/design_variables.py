@@ -1,4 +1,12 @@
-"""The variables of a design as one vector, and the case that a vector stands for."""
+"""The variables of a design as one vector, and the case that a vector stands for.
+
+Numbers and fields of the case vary; each is a block of the vector, with values scaled to 0 to 1
+between their bounds, or angles. A field is given by values at control points: each place has their
+mean, weighted by distance over the filter width. The fields are the remanence (vectors over |B^r|),
+the thickness over h, the natural curvatures 11 and 22 over 1/R, and the deviation w0 of the shape
+over h. On a meridian, where a field turns with the azimuth, points are (rho, z). A scene is the
+model of a case with its solver. Places are over R.
+"""
 
 import copy
 from collections.abc import Mapping, Sequence
@@ -73,6 +81,7 @@ class Variables:
     @property
     def blocks(self) -> dict[str, slice]:
         """Name of a block -> slice of its variables in the vector."""
+        # where blocks begin and end
         ends = np.cumsum([0, *(part.start_values.size for part in self.parts)])
         return {part.name: slice(*ends[i : i + 2]) for i, part in enumerate(self.parts)}
 
@@ -93,10 +102,10 @@ class Variables:
 
     @property
     def smooth(self) -> list[str]:
-        """Keys of the case whose formulas have no details between samples of the surface.
+        """Keys of the case whose formulas are smooth, so that no narrow details are searched for.
 
-        The fields are means over the distance of their control points, unless a filter is given. So
-        no narrow details need to be searched for; see `Case.problem`.
+        The fields are means over the distance of their control points, unless a filter is given.
+        `Case.problem` takes these keys.
         """
         smooth_fields = [
             name
@@ -113,6 +122,7 @@ class Variables:
 
     def numbers(self, x: Array) -> dict[str, float]:
         """Return key, with its unit if it has one -> value, of the numbers that vary."""
+        # numbers are the first blocks, with one variable each
         return {
             part.label: float(part.values(x[i : i + 1])[0]) for i, part in enumerate(self.scalars)
         }
@@ -144,6 +154,7 @@ class Variables:
             Number of steps of a full turn, to which angles are rounded.
         """
         assert self.remanence
+        # angles are the first variables of the remanence, whose block follows the numbers
         x, begin = np.array(x), len(self.scalars)
         angles = slice(begin, begin + self.remanence.angles)
         x[angles] = np.round(x[angles] * steps / (2 * np.pi)) * 2 * np.pi / steps
@@ -219,8 +230,9 @@ def refuse_unfit_numbers(
             value, text = number_at_key(case.context, key), value_at(source.data, key.split("."))
         except CaseError as e:
             raise CaseError(f"design.numbers: {e}") from None
+        # a number without text is a default or a bare number
         start = value / si_size(unit)
-        if isinstance(text, str):
+        if isinstance(text, str):  # check that the case has the unit of the bounds
             try:
                 value = in_unit(text, unit)
             except ValueError:
@@ -281,7 +293,7 @@ def _fields(case: Case, design: DesignSection) -> tuple[ControlPointField, ...]:
                 f"beyond {low:g} to "
                 f"{high:g}"
             )
-        points = places[:, [0, 2]] if problem.meridian else places
+        points = places[:, [0, 2]] if problem.meridian else places  # (rho, z)
         fields.append(
             ControlPointField(
                 name,
@@ -309,6 +321,7 @@ def _curvatures(problem: Problem, places: Array) -> Array:
             "design.curvature: natural.curvature starts by patches: start from numbers or formulas"
         )
     if callable(natural_curvature):
+        # a function of places and normals (cells, nodes, 3); places stand for the normals
         return np.asarray(natural_curvature(places[:, None], places[:, None])[:, 0, :2])
     return np.tile(
         np.zeros(2) if natural_curvature is None else natural_curvature[:2], (len(places), 1)
@@ -324,6 +337,7 @@ def _spread(case: Case, problem: Problem, count: int, width: float | None) -> tu
         Filter width over R; None: the median distance of neighbouring points.
     """
     places = _places(case, problem, count)
+    # [2]: the second nearest point, as the nearest one is the point itself; [0]: distances
     return places, width or float(np.median(scipy.spatial.cKDTree(places).query(places, [2])[0]))
 
 
@@ -337,8 +351,8 @@ def _remanence(case: Case, section: RemanenceVariables) -> Vectors:
     """
     controls, start = controls_of(case, section.points, section.filter, "design.remanence")
     sizes, length_bounds = np.linalg.norm(start, axis=1), section.magnitude
-    if length_bounds is None:
-        return Vectors(controls, start, None)
+    if length_bounds is None:  # lengths stay as they are
+        return Vectors(controls, start, lengths=None)
     low, high = length_bounds
     if not (low - 1e-9 <= sizes.min() and sizes.max() <= high + 1e-9):
         raise CaseError(
@@ -346,7 +360,7 @@ def _remanence(case: Case, section: RemanenceVariables) -> Vectors:
             f"{sizes.max():g}, beyond "
             f"{low:g} to {high:g}"
         )
-    return Vectors(controls, start, (low, high))
+    return Vectors(controls, start, lengths=(low, high))
 
 
 def controls_of(
@@ -376,6 +390,7 @@ def controls_of(
         If no remanence has an influence, or `count` is None and there are no points.
     """
     magnetic = case.magnetic
+    # a sensor, or another magnet, feels the remanence without an applied field
     needs_space = case.sensors or (magnetic and magnetic.interaction != "none")
     if magnetic is None or magnetic.remanent is None or not (case.lambda_m or needs_space):
         raise CaseError(
@@ -383,7 +398,7 @@ def controls_of(
             "so no result "
             "depends on it"
         )
-    if count is None:
+    if count is None:  # a remanence of kind `points` has its own
         if not (magnetic.remanent and magnetic.remanent.file):
             raise CaseError(f"{key}: give points, or magnetic.remanent of kind: points")
         places, vectors = read_vectors(
@@ -400,6 +415,7 @@ def controls_of(
     if callable(field.remanent):
         # outward directions of the points from the origin
         normals = places / np.maximum(np.linalg.norm(places, axis=1, keepdims=True), 1e-300)
+        # a function of places and normals (cells, nodes, 3)
         vectors = np.array(field.remanent(places[:, None], normals[:, None])[:, 0])
     else:
         vectors = np.tile(np.asarray(field.remanent, dtype=float), (count, 1))
@@ -412,6 +428,7 @@ def _places(case: Case, problem: Problem, count: int) -> Array:
     """Return points (n, 3) along a meridian or a strip, or far from each other on the surface."""
     if problem.meridian:
         sample = problem.meridian.sample()
+        # in the plane y = 0
         return np.asarray(
             sample[np.linspace(0, len(sample) - 1, count).round().astype(int)] * [1.0, 0.0, 1.0]
         )

@@ -1,6 +1,13 @@
 """The goal of a design, and the search for the best variables by SciPy's optimisers.
 
 The goal is an objective to be minimised, and constraints that must not be negative.
+
+A design varies p variables x, and an evaluation has the results of the case at x with their
+gradients; it has no values if the equilibrium path is lost. The slack of a constraint is the
+difference to its bound. A wanted shape is given by a target, a map from undeformed to wanted
+places; a wanted curve is approached in stages of growing curvature. A result may be the lowest of
+several instabilities or frequencies, which may cross; `beside` has the others of an evaluation.
+Results are scaled with their absolute values at the start. Places are over R.
 """
 
 import itertools
@@ -36,8 +43,8 @@ AT_ROOT = 1e-6
 class Limit:
     """An inequality constraint on a result.
 
-    Without `other` it is sign (result - bound) >= 0; with `other` it is sign (result - other's
-    value) + margin >= 0.
+    Without `other` it is sign (result - bound) >= 0. With `other` it is sign (result - other's
+    value) + margin >= 0: two of these, with both signs, make an equality.
 
     Attributes
     ----------
@@ -45,6 +52,8 @@ class Limit:
         Names of results; `other` is "" for a bound that is a number.
     sign
         1 for a lower bound, -1 for an upper one.
+    bound, margin
+        A number, and the largest difference from `other`.
     """
 
     of: str
@@ -97,7 +106,7 @@ def limits_of(section: LimitSection, scale: Mapping[str, float]) -> list[Limit]:
         for bound_value, sign in sides
         if bound_value is not None
     ]
-    if section.same_as:
+    if section.same_as:  # equal up to a margin
         margin = EQUALITY_TOLERANCE * max(
             scale.get(result, 0.0) for result in (section.of, section.same_as)
         )
@@ -120,7 +129,7 @@ def target_of(section: ShapeSection, case: Case, bent: float = 1.0) -> Target:
     CaseError
         If a curve is wanted of another shell than a strip, or begins elsewhere than at its root.
     """
-    if section.components:
+    if section.components:  # the wanted place as three formulas
         components = [formula(text) for text in section.components]
         return lambda x: np.stack([f(*x.T) for f in components], axis=-1)
     if case.shell.geometry != "strip":
@@ -150,6 +159,7 @@ class Curve:
 
     def __init__(self, points: Array, bent: float = 1.0) -> None:
         """Make the spline of the target over its arc length, from 0 at the root to 1 at the tip."""
+        # parameter: the length along the chords
         chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
         spline = scipy.interpolate.CubicSpline(chord, points)
         dense_points = spline(np.linspace(0.0, chord[-1], SPLINE_POINTS))
@@ -157,12 +167,16 @@ class Curve:
         arc_length = np.concatenate(
             [[0.0], np.cumsum(np.linalg.norm(np.diff(dense_points, axis=0), axis=1))]
         )
+        # place over arc length, both over the length of the curve
         self._at = scipy.interpolate.CubicSpline(
             arc_length / arc_length[-1], dense_points / arc_length[-1]
         )
 
     def __call__(self, x: Array) -> Array:
-        """Return the wanted places (n, 3) of undeformed places (n, 3) over R."""
+        """Return the wanted places (n, 3) of undeformed places (n, 3) over R.
+
+        An undeformed strip lies along x from 0 to 1, so x is the arc length.
+        """
         return np.asarray(self._at(x[:, 0])) + x[:, 1:2] * [0.0, 1.0, 0.0]
 
 
@@ -175,9 +189,10 @@ def _with_part_of_curvature(points: Array, part: float) -> Array:
     steps = np.diff(points, axis=0)
     length = np.linalg.norm(steps, axis=1, keepdims=True)
     tangents = steps / length
-    # from the frame of the curve to that of the bent one
+    # turns directions of the given curve to those of the curve with less curvature
     directions, rotation = [tangents[0]], np.eye(3)
     for direction, next_tangent in itertools.pairwise(tangents):
+        # the turn from one tangent to the next, as axis times angle
         axis_times_sine = np.cross(direction, next_tangent)
         angle = np.arctan2(np.linalg.norm(axis_times_sine), direction @ next_tangent)
         rotation_vector = axis_times_sine * (
@@ -202,9 +217,9 @@ class DesignGoal:
     section
         The section `design` of the case.
     targets
-        Name of a shape -> target of the last stage, a map from undeformed to wanted places.
+        Name of a shape -> target of the present stage; at first that of the last one.
     stages
-        Such targets of the stages before the last.
+        For each stage before the last: such targets.
     scale
         Name of a result -> its absolute value at the start.
     """
@@ -225,17 +240,21 @@ class DesignGoal:
 
     def objective(self, evaluation: DesignEvaluation) -> float:
         """Return the scaled objective; the least value is the best."""
-        return self._objective(evaluation)[0]
+        objective, _ = self._objective(evaluation)
+        return objective
 
     def slope(self, evaluation: DesignEvaluation) -> Array:
         """Return the gradient (p,) of the scaled objective by the variables."""
-        return self._objective(evaluation)[1] * np.array(
-            evaluation.gradients[self.section.objective.result]
-        )
+        _, derivative = self._objective(evaluation)
+        return derivative * np.array(evaluation.gradients[self.section.objective.result])
 
     def _objective(self, evaluation: DesignEvaluation) -> tuple[float, float]:
-        """Return the scaled objective, to be minimised, and its derivative by the result."""
+        """Return the scaled objective, to be minimised, and its derivative by the result.
+
+        With a wanted value it is the squared relative difference.
+        """
         objective = self.section.objective
+        # of several results, which are maximised, the lowest counts
         value = min(evaluation.values[result] for result in objective.results)
         scale = self._scale or abs(value) or 1.0
         if objective.value is not None:
@@ -272,7 +291,8 @@ class DesignGoal:
     def lowest_values(self, evaluation: DesignEvaluation) -> Array:
         """Return the values (n,) of which the lowest is maximised, over the scale.
 
-        Their number is constant: missing instabilities are replaced by an upper bound.
+        They are the objective's results, each with the instabilities or frequencies next to it.
+        Their number is constant: missing ones are replaced by an upper bound.
         """
         groups = [
             _value_and_close_ones(evaluation.values[result], evaluation.beside.get(result))
@@ -286,7 +306,7 @@ class DesignGoal:
         )
 
     def lowest_slopes(self, evaluation: DesignEvaluation) -> Array:
-        """Return the gradients (n, p) of `lowest_values`."""
+        """Return the gradients (n, p) of `lowest_values`, in the same order."""
         results = self.section.objective.results
         groups = [
             _value_and_close_ones(
@@ -325,7 +345,7 @@ class DesignGoal:
         ]
 
     def _size(self, limit: Limit) -> float:
-        """Return the size that scales the slack of a constraint: bound or result at the start."""
+        """Return what scales the slack of a constraint: its bound, else its result at the start."""
         return (
             abs(limit.bound)
             or max(self.scale.get(result, 0.0) for result in (limit.of, limit.other))
@@ -361,6 +381,7 @@ class DesignGoal:
                 )
                 sentences.append(f"{request}: the nearest found is {value:.6g}")
         for limit in self._limits:
+            # the margin of an equality is in its slack
             if limit.slack(evaluation.values) < -CONSTRAINT_TOLERANCE * self._size(limit):
                 sentences.append(
                     f"{limit.words} is not kept: the nearest found is "
@@ -374,7 +395,7 @@ def _value_and_close_ones(
     close_values: Sequence[tuple[float, list[float]]] | None,
     slope: Sequence[float] = (),
 ) -> list[tuple[float, Sequence[float]]]:
-    """Return a result and the values beside it, each with its gradient (p,).
+    """Return a result and the values next to it, each with its gradient (p,).
 
     Parameters
     ----------
@@ -426,6 +447,7 @@ def search_optimum(
     iterations
         Largest number of the optimiser's steps.
     """
+    # results whose number or order changes; several smooth results; else one smooth result
     if goal.crossed:
         return raise_lowest(evaluated, goal, vary.limits, first, iterations)
     if goal.lowest:
@@ -437,7 +459,8 @@ def search_optimum(
         evaluation = evaluated(x)
         if not evaluation.values:
             # a lost path counts as worse than all, uphill from the best point
-            direction = x - min(tried, key=lambda evaluated_point: evaluated_point[1])[0]
+            best_x, _ = min(tried, key=lambda evaluated_point: evaluated_point[1])
+            direction = x - best_x
             uphill = np.asarray(direction / max(float(np.linalg.norm(direction)), 1e-300))
             return max(value for _, value in tried) + WORSE, uphill
         value = goal.objective(evaluation)
@@ -445,12 +468,15 @@ def search_optimum(
         return value, goal.slope(evaluation)
 
     def constraint_values(x: Array) -> Array:
-        return goal.constraints(evaluate_or_last(x)[0])
+        evaluation, _ = evaluate_or_last(x)
+        return goal.constraints(evaluation)
 
     def constraint_gradients(x: Array) -> Array:
-        return goal.constraint_slopes(evaluate_or_last(x)[0])
+        evaluation, _ = evaluate_or_last(x)
+        return goal.constraint_slopes(evaluation)
 
     evaluate_or_last, method_options = _last_known(evaluated), dict[str, Any]()
+    # L-BFGS-B is better without constraints, but takes only bounds
     if goal.section.constraints:
         method_options = {
             "method": "SLSQP",
@@ -477,7 +503,8 @@ def _raise_lowest_smooth(
 ) -> str:
     """Raise the lowest of several results: maximise t with all results above t, for (x, t).
 
-    Where two results cross, their minimum has a corner, and this problem has none.
+    Where two results cross, their minimum has a corner, at which an optimiser of smooth functions
+    stops. This problem has none.
 
     Parameters
     ----------
@@ -498,11 +525,13 @@ def _raise_lowest_smooth(
         values: Array = np.concatenate(
             [goal.lowest_values(evaluation) - z[-1], goal.constraints(evaluation)]
         )
+        # where the path is lost all constraints are violated, so the optimiser goes back
         return values if converged else np.full_like(values, -WORSE)
 
     def slopes(z: Array) -> Array:
         """Return the gradients (n + constraints, p + 1) of `values_above_level`."""
         evaluation, _ = evaluate_or_last(z[:-1])
+        # derivatives by x, and by t
         gradients_by_x_and_t = (
             (goal.lowest_slopes(evaluation), -1.0),
             (goal.constraint_slopes(evaluation), 0.0),
@@ -516,7 +545,7 @@ def _raise_lowest_smooth(
         )
 
     start = np.append(first, goal.lowest_values(evaluated(first)).min())
-    down = np.append(0 * first, -1.0)
+    down = np.append(0 * first, -1.0)  # gradient of the objective -t
     ended = scipy.optimize.minimize(
         lambda z: (-z[-1], down),
         start,
@@ -537,7 +566,7 @@ def _last_known(
     Where the path is lost, it returns the last evaluation with values, and False; else the new
     evaluation, and True.
     """
-    last: list[DesignEvaluation] = []
+    last: list[DesignEvaluation] = []  # one item, which the inner function replaces
 
     def evaluate_or_last(x: Array) -> tuple[DesignEvaluation, bool]:
         """Return the evaluation at x and True; else the last one with values, and False."""

@@ -4,6 +4,11 @@ A sample takes the cheapest way that leads to its result. A knockdown is the fol
 known sample on the same mesh, continued; else the fold that Newton's method finds from one of the
 first points of the path; else the fold at its end. Each ends in Newton's method for the fold, so
 that a knockdown is the same to 1e-9 by all ways. Every other result needs the path.
+
+A knockdown is the pressure of the first fold over the classical one. A sample is a case with drawn
+values; its key is a hash of its problem, and a variant of it lacks the weakest defects. A scalar is
+the number of a run that is wanted, an outcome what a run leaves. A scene is the model of a case
+with its solver; a record is a point of its path. A part is what one of several jobs computes.
 """
 
 import time
@@ -142,11 +147,12 @@ def ensemble(  # noqa: PLR0913 - what a user gives
             for deleted in sorted({0, delete_weakest})
         ]
 
+    # one list of samples, or two: without weak defects as well
     variants = on_first_rank(comm, drawn_samples)
     samples_by_key = {sample.key: sample for variant in variants for sample in variant}
     folder, name = user_folder(out), Path(file).name
     part_folders = [Path(place) for place in merge]
-    if resume or merge:
+    if resume or merge:  # the folders must belong to this ensemble
         access_disk(
             comm,
             lambda: _refuse_strange(part_folders or [folder], samples_by_key, merge=bool(merge)),
@@ -271,6 +277,7 @@ def _copy(keys: Mapping[str, Sample], places: Sequence[Path], folder: Path) -> N
         source_file = next(
             (file for place in places if stored_outcome_of_case(file := _file(place, key))), None
         )
+        # one of the parts may be in the folder itself
         if source_file and source_file.resolve() != _file(folder, key).resolve():
             write_whole(_file(folder, key), source_file.read_bytes())
 
@@ -288,13 +295,14 @@ def _row(variants: Sequence[Sample], folder: Path, scalar: Scalar) -> Row:
         make_row(sample, stored_outcome_of_case(_file(folder, sample.key)), scalar)
         for sample in variants
     ]
-    row = rows[0]
-    if len(rows) > 1:
-        row[WITHOUT] = rows[1]["result"]
+    row, *further_rows = rows
+    for variant_row in further_rows:  # at most one
+        row[WITHOUT] = variant_row["result"]
+        # a sample counts only if both results are there
         if row["status"] == "found" and row[WITHOUT] is None:
             row |= {
-                "status": rows[1]["status"],
-                "why": f"without the weakest defects: {rows[1]['why']}",
+                "status": variant_row["status"],
+                "why": f"without the weakest defects: {variant_row['why']}",
             }
     return row
 
@@ -327,6 +335,7 @@ def solve(sample: Sample, scalar: Scalar, folds: KnownFolds) -> Outcome:
 
 def _solved(sample: Sample, scalar: Scalar, folds: KnownFolds) -> Outcome:
     """Compute a sample: a knockdown from a known fold if possible, else along the path."""
+    # imperfections may be modes of the perfect shell, which are computed first
     problem = with_modes(sample.case.problem(), MPI.COMM_SELF)
     if scalar.name != "knockdown" or not has_knockdown(sample.case):
         return _outcome(run(problem, comm=MPI.COMM_SELF))
@@ -347,14 +356,16 @@ def _along_path(sample: Sample, scene: Scene, folds: KnownFolds) -> Outcome:
     try:
         for record in follow_alone(scene, search=True, remark=result.remarks.append):
             result.rows.append(row_maker.row(record, 0.0))
+            # points of the pressure's path alone lead to its fold
             if record.amplitude != "pressure" or record.mode or record.label == "bifurcation":
                 continue
             guess = (
                 FoldGuess(record.point.state, record.point.du) if record.label == "fold" else None
             )
+            # a stable point may already show the fold ahead
             if record.label == "step" and tries and not record.point.negative_pivots:
                 guess = fold_ahead(scene.newton, record.point, "pressure")
-                tries -= guess is not None
+                tries -= guess is not None  # only a guess costs a try
             if guess is None:
                 continue
             try:

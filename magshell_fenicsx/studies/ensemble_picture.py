@@ -1,4 +1,9 @@
-"""ensemble.png: the distribution of a result over random samples, and what it depends on most."""
+"""ensemble.png: the distribution of a result over random samples, and what it depends on most.
+
+Rows and their columns are those of samples.csv, one row for each random case. The distribution
+function is the probability of a smaller value, the density its derivative. A Weibull distribution
+is fitted to the results. Some results are without the weakest defects of the sample.
+"""
 
 from collections.abc import Sequence
 from pathlib import Path
@@ -42,7 +47,7 @@ def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
         correlations(rows).items(), key=lambda item: abs(item[1]["spearman"]), default=None
     )
     weibull = fit(values) if len(values) else None
-    # marks alone have none
+    # marks of few samples alone need no panel
     with_density = weibull is not None or len(values) >= MIN_SAMPLES_FOR_HISTOGRAM
     panels = 1 + with_density + (strongest is not None)
     figure = Figure(figsize=(4.2 * panels, 3.6), dpi=160, layout="constrained")
@@ -64,6 +69,7 @@ def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
 def _places(values: Array, weibull: Weibull) -> Array:
     """Return the values at which a fitted curve is drawn, from the lowest likely value on."""
     smallest_value = float(values.min())
+    # not farther below the samples than they extend
     low = max(weibull.quantile(TAIL), smallest_value - np.ptp(values))
     return np.linspace(min(low, smallest_value), values.max() + 0.1 * np.ptp(values), 400)
 
@@ -102,7 +108,7 @@ def _draw_function(function: Any, values: Array, without: Array, weibull: Weibul
     sorted_values = np.sort(values)
     probabilities = np.arange(len(values) + 1) / len(values)
     function.step(
-        np.append(sorted_values[:1], sorted_values),
+        np.append(sorted_values[:1], sorted_values),  # the step at the first value begins at zero
         probabilities,
         where="post",
         color="C0",
@@ -145,6 +151,7 @@ def _draw_correlation(axes: Any, rows: Sequence[Row], key: str, label: str) -> N
     )
     rho, chance = correlation(*pairs.T)
     axes.plot(*pairs.T, ".", color="C0", markersize=5)
+    # of so strong a correlation by chance
     probability_text = "$p$ < 0.001" if chance < 1e-3 else f"$p$ = {chance:.2g}"
     number = f"{rho:.2f}".replace("-", "−")
     axes.set(xlabel=words(key), ylabel=label)
@@ -169,6 +176,7 @@ def correlation(x: Array, y: Array) -> tuple[float, float]:
     rho, chance = spearmanr(x, y)
     if len(x) >= MIN_SAMPLES_FOR_HISTOGRAM or np.isnan(rho):
         return float(rho), float(chance)
+    # centred ranks: their product is Spearman's correlation up to a factor
     ranks, other_ranks = (rankdata(sample) - (len(x) + 1) / 2 for sample in (x, y))
 
     def rank_product(values: Array, axis: int = -1) -> Array:

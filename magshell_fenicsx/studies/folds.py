@@ -1,6 +1,12 @@
 """Folds of the pressure, followed from case to case.
 
 They are followed along a parameter, or from the nearest case whose fold is known.
+
+A fold is a state at which the pressure is stationary along the path, found by Newton's method for
+the state and the null vector phi of its tangent. An amplitude is a load parameter, by name; mu has
+those of a state, and u is the displacement. A scene is the model of a case with its solver. The
+inertia is the number of unstable directions. A sample is a random case, its values what was drawn.
+lambda_m is the size of the magnetic load.
 """
 
 import json
@@ -35,7 +41,7 @@ def has_knockdown(case: Case) -> bool:
     by_one_mesh = case.mesh.tolerance is None and case.shell.geometry != "mesh"
     if getattr(loading, "kind", "") != "pressure":
         return False
-    # where the way ends before a fold, none is to be followed there
+    # with branches or a target the run may end elsewhere than at its fold
     return (
         by_one_mesh
         and loading.until == "limit"
@@ -57,7 +63,7 @@ def refuse_later(scene: Scene, fold: Fold, reference_mode: Vector) -> None:
     Parameters
     ----------
     reference_mode
-        The null vector of the fold that it was continued from.
+        The null vector of the fold that it was continued from, which its own must resemble.
 
     Raises
     ------
@@ -66,19 +72,23 @@ def refuse_later(scene: Scene, fold: Fold, reference_mode: Vector) -> None:
         direction.
     """
     comm, fold_mode, mode = scene.newton.system.comm, fold.phi, reference_mode
+    # cosine of the angle between both null vectors
     if dot(comm, fold_mode, mode) < LEAST_COSINE * np.sqrt(
         dot(comm, fold_mode, fold_mode) * dot(comm, mode, mode)
     ):
         raise FoldLost("another fold was found")
     if fold.value <= 0 or fold.curvature >= 0:
         raise FoldLost("the fold is not a maximum of the pressure")
-    modes = scene.model.symmetry_breaking_modes
+    modes = scene.model.symmetry_breaking_modes  # those that a reduced model excludes
     if fold.unstable or (modes and modes.is_unstable(fold.state)):
         raise FoldLost("another instability comes before the fold")
 
 
 def _held_amplitudes(scene: Scene) -> dict[str, float]:
-    """Return name -> value of the amplitudes beside the pressure, with the full magnetic field."""
+    """Return name -> value of the amplitudes that stay while the pressure grows.
+
+    The magnetic field has its full strength by then; others are as in the unloaded state.
+    """
     amplitudes = dict(scene.unloaded().mu)
     return amplitudes | ({"lambda_m": scene.problem.lambda_m} if "lambda_m" in amplitudes else {})
 
@@ -102,7 +112,7 @@ class Continuation:
 
     def __init__(self, p: float, scene: Scene, state: State) -> None:
         fold = find_fold(scene.newton, FoldGuess(state), "pressure")
-        refuse_later(scene, fold, fold.phi)
+        refuse_later(scene, fold, fold.phi)  # there is no earlier mode to compare with
         self._known, self._scene = [(p, fold)], scene
 
     def follow(self, p: float, scene: Scene) -> Fold:
@@ -121,7 +131,8 @@ class Continuation:
         transferred = [(q, self._transferred(fold, scene)) for q, fold in self._known]
         guess = predict_fold(scene.newton.system, transferred, p, _held_amplitudes(scene))
         fold = find_fold(scene.newton, guess, "pressure")
-        refuse_later(scene, fold, transferred[-1][1].phi)
+        _, last_fold = transferred[-1]
+        refuse_later(scene, fold, last_fold.phi)
         self._known, self._scene = [*transferred, (p, fold)][-MAX_PREDICTOR_FOLDS:], scene
         return fold
 
@@ -154,7 +165,7 @@ class _StoredFold:
     values
         Key -> drawn value of the sample.
     nodes
-        (n, d) chart coordinates of the nodes, to recognise the mesh.
+        (n, d) coordinates of the nodes in the chart of the surface, to recognise the mesh.
     u, phi
         Displacement and null vector.
     pressure
@@ -217,7 +228,8 @@ class KnownFolds:
         Raises
         ------
         FoldLost
-            If no known fold is on this mesh; and see `refined`.
+            If no known fold is on this mesh, none is found from the nearest one, or it is not seen
+            to be the first instability.
         """
         amplitudes = _held_amplitudes(scene)
         if amplitudes.keys() - {"pressure", "lambda_m"}:
@@ -226,6 +238,7 @@ class KnownFolds:
         for neighbour in sorted(
             self._known, key=lambda neighbour: self._distance(values, neighbour.values)
         ):
+            # the same nodes may have other numbers
             node_order = (
                 matching(neighbour.nodes, nodes) if neighbour.nodes.shape == nodes.shape else None
             )
@@ -234,12 +247,8 @@ class KnownFolds:
             u, phi = (
                 v.reshape(len(nodes), -1)[node_order].ravel() for v in (neighbour.u, neighbour.phi)
             )
-            return self.refined(
-                values,
-                scene,
-                FoldGuess(State(u, amplitudes | {"pressure": neighbour.pressure}), phi),
-                phi,
-            )
+            guess = FoldGuess(State(u, amplitudes | {"pressure": neighbour.pressure}), phi)
+            return self.refined(values, scene, guess, reference_mode=phi)
         raise FoldLost("no fold is known on this mesh")
 
     def _distance(self, a: Values, b: Values) -> float:
@@ -264,6 +273,7 @@ class KnownFolds:
                 for located in self._known
                 if isinstance(v := located.values.get(key), float | int)
             ]
+            # over the standard deviation; 1 if all values are the same
             total += ((value_a - value_b) / (float(np.std([*known_numbers, value_a])) or 1.0)) ** 2
         return total
 
@@ -286,7 +296,7 @@ class Scenes:
             If the case cannot be meshed.
         """
         key = _apart_from_strength(case)
-        earlier_scene = self._kept.pop(key, None)
+        earlier_scene = self._kept.pop(key, None)  # and put back as the last one used
         if earlier_scene:
             scene = earlier_scene.with_field_strength(case.context)
         else:
@@ -309,11 +319,12 @@ def _apart_from_strength(case: Case) -> str:
     """
     data = case.model_dump(mode="json") | case.outside
     if magnetic := data.get("magnetic"):
-        # then their ratio counts
+        # with both, the ratio of remanence and susceptibility counts
         has_both = magnetic["susceptibility"] is not None and magnetic["remanent"] is not None
         magnetic.pop("lambda_m", None)
         if magnetic["remanent"] and not has_both:
             magnetic["remanent"].pop("flux_density", None)
-        if not case.sources:  # otherwise it is that of the field beside them
+        # with magnets or coils as sources, it is the flux density of a field beside them
+        if not case.sources:
             magnetic["applied"].pop("flux_density", None)
     return json.dumps([data, bool(case.lambda_m)], sort_keys=True)

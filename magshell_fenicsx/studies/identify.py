@@ -2,6 +2,13 @@
 
 Every evaluation is kept: an identification that is started again takes those in its folder and goes
 on.
+
+A parameter is a number of the case; p parameters are a vector x, in which the numbers of a
+remanence field follow the keys. A prior is what is known of a parameter before: mean and standard
+deviation. A reading is a result of the case at a place, a value of what its last step prescribes.
+Settings `key=value` say for which case a reading is. A candidate is a reading that may be measured
+next. A programme is another history that is predicted with the fit. The noise of a column of data
+is the standard deviation of its errors. |B^r| is the size of the remanence.
 """
 
 from collections.abc import Callable, Sequence
@@ -107,7 +114,8 @@ def identify(
     Parameters
     ----------
     data
-        A CSV file; see `IdentifySection`.
+        A CSV file: each column is a result of the case, what its last step prescribes, or a key;
+        see `IdentifySection`.
     out
         Folder of identify.json, identify.csv (data, predictions and bands), identify.png and
         points/; of a field also remanence.csv, its vectors.
@@ -150,6 +158,7 @@ def identify(
         ]
         with FOLDER.locked(folder, comm, name):
             say_on_first_rank: Say = say if comm.rank == 0 else lambda line: None
+            # predictions do not change the fit, whose stored evaluations stay valid
             mark = identity(make_case(_without_predictions(extended_source))) + repr(
                 [item.key for item in parameters]
             )
@@ -181,10 +190,7 @@ def identify(
 
 
 def _without_predictions(source: Source) -> Source:
-    """Return the case without `identify.predict`, on which the fit does not depend.
-
-    So another prediction leaves stored evaluations of the fit valid.
-    """
+    """Return the case without `identify.predict`, on which the fit does not depend."""
     section = {key: value for key, value in source.data["identify"].items() if key != "predict"}
     return replace(source, data={**source.data, "identify": section})
 
@@ -206,6 +212,7 @@ def _refuse_few(table: MeasuredTable, parameters: Sequence[Parameter]) -> None:
             f"({', '.join(bare)}): give prior and deviation of {len(bare) - len(table.data)} of "
             "them, or more data"
         )
+    # a key that a column of the data gives is known
     keys = {setting.partition("=")[0] for settings in table.readings for setting in settings}
     if parameter_in_data := next(
         (parameter.key for parameter in parameters if parameter.key in keys), None
@@ -215,6 +222,7 @@ def _refuse_few(table: MeasuredTable, parameters: Sequence[Parameter]) -> None:
         )
     for number, column in enumerate(table.columns):
         count = int((table.column == number).sum())
+        # residuals must be more than parameters for a noise to be estimated
         if np.isnan(column.noise) and count <= len(bare):
             raise _no_noise(table, number, len(bare))
 
@@ -268,7 +276,7 @@ def _fit_and_predict(
     predictor
         Predicts the readings of the data for a vector of parameters.
     others
-        Candidates: reading, its unit, and the noise of such a measurement.
+        Candidates: reading, its unit, and the standard deviation of such a measurement.
     flux_scale
         |B^r| and its unit, in which a remanence field is reported.
 
@@ -298,11 +306,11 @@ def _fit_and_predict(
         table.data, table.column, noise, mean, deviation, field.smooth if field else None
     )
     finite = np.where(np.isfinite(deviation), deviation, np.abs(start))
-    # scale of each parameter, for well-conditioned steps
+    # scale of each parameter, for well-conditioned steps: deviation of its prior, else its start
     size = np.where(finite > 0, finite, 1.0)
-    size[len(parameters) :] = 1.0
+    size[len(parameters) :] = 1.0  # numbers of a field are over |B^r|
     first = predictor(start)
-    if first.note:
+    if first.note:  # nothing is predicted
         raise (CaseError if first.invalid else Stopped)(
             f"the case itself does not predict the data: {first.note}"
         )
@@ -333,6 +341,7 @@ def _fit_and_predict(
         ) from None
     except NoNoise as e:
         raise _no_noise(table, e.column, len(parameters)) from None
+    # is the posterior normal? this takes values alone
     misfit_difference, lost_count = nonlinearity(partial(model, slopes=False), posterior)
     content = _content(predictor, table, posterior)
     content["remanence"] = field.summary(posterior, flux_scale) if field else None
@@ -377,12 +386,13 @@ def _refuse_idle(
     """
     # (p,) largest change of a result by each parameter, relative to the largest result
     strongest = np.abs(slopes * size).max(axis=0) / (np.abs(values).max() or 1.0)
+    # the numbers of a field count together, by the strongest of them
     field_changes = strongest[len(parameters) :]
     changes = [
         *zip([p.key for p in parameters], strongest, strict=False),
         (NAME, field_changes.max(initial=np.inf)),
     ]
-    changes = changes if field_changes.size else changes[:-1]
+    changes = changes if field_changes.size else changes[:-1]  # without a field
     if idle := [key for key, change in changes if change < INFLUENCE_TOLERANCE]:
         raise CaseError(
             f"identify.parameters: {', '.join(idle)}: has no influence on these data where the "
@@ -473,7 +483,7 @@ def _predict_candidates(
     Parameters
     ----------
     others
-        Candidates: reading, its unit, and the noise of such a measurement.
+        Candidates: reading, its unit, and the standard deviation of such a measurement.
 
     Returns
     -------
@@ -485,8 +495,9 @@ def _predict_candidates(
     """
     if not others:
         return [], None
-    keys = [row_or_key.key for row_or_key in predictor.parameters]
+    keys = [parameter.key for parameter in predictor.parameters]
     deviations = _deviations_by_key(keys, posterior.deviation)
+    # by default narrow the parameter with the largest relative deviation
     size = np.where(posterior.x != 0, np.abs(posterior.x), 1.0)
     relative_deviations = {key: deviations[key] / size[i] for i, key in enumerate(keys)}
     narrowed_key = section.narrow or (
@@ -498,7 +509,7 @@ def _predict_candidates(
             predictor.source,
             predictor.make_case,
             predictor.parameters,
-            {(): [reading]},
+            {(): [reading]},  # of the case itself, without settings
             predictor.folder,
             predictor.mark,
             predictor.comm,
@@ -529,10 +540,10 @@ def _predict_candidates(
                 "deviations_then": narrowed,
             }
         )
-    predicted_rows = [row_or_key for row_or_key in rows if "value" in row_or_key]
+    predicted_rows = [predicted for predicted in rows if "value" in predicted]
     if not predicted_rows:
         return rows, None
-    best = min(predicted_rows, key=lambda row_or_key: row_or_key["deviations_then"][narrowed_key])
+    best = min(predicted_rows, key=lambda predicted: predicted["deviations_then"][narrowed_key])
     narrowing = {
         "parameter": narrowed_key,
         "from": deviations[narrowed_key],
@@ -565,13 +576,14 @@ def _curves(
     prediction, curves = predictor(posterior.x), dict[str, list[tuple[float, float]]]()
     for result, curve in prediction.curves.items():
         if result.startswith(OF_POINTS):
-            continue
+            continue  # displacements of a measured shape have no curve
         places = [
             r.at
             for readings in table.readings.values()
             for r in readings
             if r.of == result and r.at is not None
         ]
+        # the first point beyond all places of the data
         end_index = next(
             (i for i in range(len(curve)) if i and abs(curve[i][0]) >= max(map(abs, places))),
             len(curve) - 1,
@@ -601,7 +613,7 @@ def _write(
             folder, identified.fit, identified.content["noise"]
         )
         identified.content["programmes"][programme_of_case.name] = prediction.content
-        identified.content["said"] += prediction.said
+        identified.content["said"] += prediction.said  # sentences that are printed at the end
         prediction.write(folder)
     write_object(folder / "identify.json", identified.content)
     rows = identified.content["rows"]

@@ -1,7 +1,12 @@
 """Input of `magshell identify`: measured columns as readings of a case, and parameters with priors.
 
-A reading (`simulate.readings.Reading`) is a result of the case at one place of its last step. A
-place is a value of the load or displacement that this step prescribes.
+A reading (`simulate.readings.Reading`) is a result of the case, `of`, at a place of its last step.
+A place is a value of the load or displacement that this step prescribes. A setting is an assignment
+`key=value` to a key of the case. A fold is a result that is a critical load (`FOLDS`: name -> load;
+`SCALES` has those with a unit). A measured shape is given by points on the undeformed shell with
+their displacements; the points are added to the case's named points. A noise is the standard
+deviation of errors of measurement. A column that `changes` names counts from the begin of the last
+step. A location is the key or file with which an error message begins.
 """
 
 import re
@@ -35,6 +40,7 @@ from magshell_fenicsx.studies.points import value_at
 from magshell_fenicsx.studies.runner import Case
 
 Array = NDArray[np.float64]
+# a header in the data: a name, and perhaps a unit in brackets
 HEADER = re.compile(r"\s*([\w.]+)\s*(?:[\[(]\s*([^\])]+?)\s*[\])])?\s*")
 MOST_READINGS = 10_000
 # columns of a shape: places, and what they are displaced by
@@ -84,7 +90,7 @@ class MeasuredColumn:
     header
         Name in the file, without the unit.
     of
-        Name of the result; for a displacement of a shape its ending after the point's name.
+        Name of the result; for a displacement of a shape its ending after the point's name ("_ux").
     unit
         Unit of the result in the case; "" if it has none.
     noise
@@ -174,7 +180,7 @@ class ResultNames:
             If there is no such result, or a unit is missing or of another dimension.
         """
         scene = self.scene
-        # name of a result with a unit -> (its name without unit, its unit)
+        # name of a result in units of the case -> (its dimensionless name, its unit)
         units_by_result = {
             q.name: (base, q.si) for base in self._bare if (q := scene.sizes.column(base))
         }
@@ -183,7 +189,7 @@ class ResultNames:
         } | {"hertz_1": ("hertz_1", "Hz")}
         if unit is None:
             unknown = name not in self._bare and name not in FOLDS
-            # a result with a unit that the bare name may mean, for the message
+            # a result with a unit that a name without one may mean, for the message
             nearest = next(
                 (
                     result_name
@@ -212,12 +218,13 @@ class ResultNames:
                     f"{location}: {name}: has the unit {unit}, but no result of this name has one "
                     "in this case"
                 )
-            result = min(fitting, key=len)
+            result = min(fitting, key=len)  # the name with nothing but a unit behind it
             case_unit = units_by_result[result][1]
             try:
                 factor = column_size(name, unit, case_unit)
             except TableError as e:
                 raise CaseError(f"{location}: {e}") from None
+        # the place of a reading is no result
         if self.places is None or result != self.places.column:
             refuse_no_result(scene, [result], location)
             if result in SCALES:
@@ -247,6 +254,7 @@ class ResultNames:
             *self._bare,
             *units,
             *FOLDS,
+            # critical loads without their unit
             *(base_name.rpartition("_")[0] for base_name in FOLDS if base_name in SCALES),
             *MOVED,
         ]
@@ -276,7 +284,9 @@ class ResultNames:
         return float(number) * factor
 
     def _of_unit(self, result_name: str, unit: str, location: str) -> tuple[str, str, float]:
-        """Return what `result_of` does for a bare name of a result, but the factor for a unit.
+        """Return result, its unit in the case, and the size of another unit in this unit.
+
+        Unlike `result_of` it takes a name as the case has it, which may end with a unit already.
 
         Raises
         ------
@@ -333,7 +343,7 @@ def parameters_of(source: Source, case: Case, section: IdentifySection) -> tuple
     for key, parameter_section in section.parameters.items():
         location = f"identify.parameters.{key}"
         try:
-            number_at_key(case.context, key)
+            number_at_key(case.context, key)  # raises an error if there is no number
             start, unit = _number_as_written(source, case, key)
             mean, deviation = (
                 _in_unit_of(unit, amount, key)
@@ -345,6 +355,7 @@ def parameters_of(source: Source, case: Case, section: IdentifySection) -> tuple
             refuse_size(deviation, parameter_section.deviation, f"{location}.deviation")
         prior = (mean, deviation) if parameter_section.prior is not None else (start, np.inf)
         parameters.append(
+            # bounds 0 and 1: the variable of a design is then the number itself
             Parameter(NumberVariable(key, np.array([start]), (0.0, 1.0), unit), *prior)
         )
     return tuple(parameters)
@@ -422,7 +433,7 @@ def with_shape(file: Path, source: Source) -> tuple[Source, list[str], dict[str,
     ]
     for axis in SHAPE:
         _refuse_missing(axis, columns[axis], table.lines, location)
-    # equal points get the number of their first row: reversed, it is written last
+    # equal points get the number of their first row, which in reversed order is written last
     point_names = {tuple(row): f"{OF_POINTS}{i}" for i, row in reversed(list(enumerate(rows, 1)))}
     shape = {point_names[tuple(row)]: row for row in rows}
     texts = {
@@ -461,7 +472,7 @@ def _refuse_missing(name: str, values: Array, lines: Sequence[int], location: st
     CaseError
         With the first row without a number.
     """
-    for row in np.flatnonzero(np.isnan(values))[:1]:
+    for row in np.flatnonzero(np.isnan(values))[:1]:  # the first one, if any
         raise CaseError(f"{location}: line {lines[row]}: {name}: has a row without a number")
 
 
@@ -522,9 +533,9 @@ def table_of(
     Parameters
     ----------
     rows
-        Name of the point of each row, as of `with_shape`; empty without a measured shape.
+        Name of the point of each row, from `with_shape`; empty without a measured shape.
     shape
-        Name of a point -> its coordinates in the file's units, as of `with_shape`.
+        Name of a point -> its coordinates in the file's units, from `with_shape`.
 
     Raises
     ------
@@ -535,8 +546,9 @@ def table_of(
     columns, units = rows_of_file.columns, rows_of_file.units
     names, location, headers_by_result = ResultNames(case), f"--data {file}", dict[str, str]()
     place_values: Array = np.full(0, np.nan)
+    # key -> unit and values of a column of settings; measured columns with their values
     keys, results = dict[str, tuple[str, Array]](), list[tuple[MeasuredColumn, Array]]()
-    places = length = ""
+    places = displacement_unit = ""
     for header, values in columns.items():
         header_match = HEADER.fullmatch(header)
         name, unit = (
@@ -549,8 +561,9 @@ def table_of(
             keys[name], headers_by_result[name] = (unit or "", values), header
             continue
         if rows and name in SHAPE:
-            continue
+            continue  # `with_shape` has read these columns
         is_displacement = bool(rows) and name in MOVED
+        # displacements of all points have one unit; the first point stands for them
         result, case_unit, factor = names.result_of(
             f"{rows[0]}_{name}" if is_displacement else name, unit, location
         )
@@ -565,7 +578,7 @@ def table_of(
             np.nan if noise is None else names.amount(noise, result, f"identify.noise.{name}")
         )
         result = result.removeprefix(rows[0]) if is_displacement else result
-        length = case_unit if is_displacement else length
+        displacement_unit = case_unit if is_displacement else displacement_unit
         if noise is not None:
             refuse_size(deviation, noise, f"identify.noise.{name}")
         results.append((MeasuredColumn(name, result, case_unit, deviation), values * factor))
@@ -575,17 +588,18 @@ def table_of(
     table = _listed(
         results, keys, place_values, places, section, location, rows, rows_of_file.lines
     )
-    # of the file's units of coordinates, in the unit of displacements
-    unit_factors = (
-        [column_size(axis, units[axis] or length, length) if length else 1.0 for axis in SHAPE]
-        if shape
-        else []
-    )
+    # sizes of the file's units of coordinates in the unit of displacements
+    unit_factors = list[float]()
+    for axis in SHAPE if shape else ():
+        axis_unit = units[axis] or displacement_unit
+        unit_factors.append(
+            column_size(axis, axis_unit, displacement_unit) if displacement_unit else 1.0
+        )
     return replace(
         table,
         shape={
-            name: [a * b for a, b in zip(place_values, unit_factors, strict=True)]
-            for name, place_values in (shape or {}).items()
+            name: [a * b for a, b in zip(coordinates, unit_factors, strict=True)]
+            for name, coordinates in (shape or {}).items()
         },
     )
 
@@ -644,6 +658,7 @@ def _listed(
     CaseError
         If there are no numbers, too many, or not finite ones.
     """
+    # by settings, so that all readings of one case are taken in one run
     readings, data = dict[tuple[str, ...], list[Reading]](), dict[tuple[str, ...], list[float]]()
     column, rows = dict[tuple[str, ...], list[int]](), dict[tuple[str, ...], list[str]]()
     for row in range(len(results[0][1])):
@@ -655,7 +670,7 @@ def _listed(
             value = float(values[row])
             if np.isnan(value):
                 continue
-            # folds, frequencies and the barrier are numbers of a whole path
+            # folds, frequencies and the barrier are numbers of a whole path, without a place
             at_place = (
                 place is not None
                 and measured_column.of not in FOLDS
@@ -738,7 +753,8 @@ def candidate(
     CaseError
         If there is no such result or place, or a unit is wrong.
     """
-    result, unit, _ = names.result_of(section.of, None, f"{key}.of")
+    # a candidate is named as the case names it, with its unit in the name
+    result, unit, _ = names.result_of(section.of, unit=None, location=f"{key}.of")
     noise = names.amount(section.noise, result, f"{key}.noise")
     refuse_size(noise, section.noise, f"{key}.noise")
     if section.at is None:

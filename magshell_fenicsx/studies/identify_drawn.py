@@ -1,6 +1,7 @@
 """Parameters drawn from a posterior, and the band of what is computed with each of them.
 
-Knows no shell.
+The axes of a posterior are the principal axes of its ellipsoid, in parameters over their standard
+deviations. Knows no shell.
 """
 
 import numpy as np
@@ -22,11 +23,12 @@ def posterior_samples(posterior: Posterior, count: int) -> Array:
     size = posterior.deviation
     spread, axes = np.linalg.eigh(posterior.correlation)
     spread = np.maximum(spread, 0.0)
-    rng = np.random.default_rng(0)
-    # Latin hypercube: each axis has its quantiles
+    rng = np.random.default_rng(0)  # the same samples in each run
+    # Latin hypercube: along each axis there is one sample in each of `count` equal quantiles
     stratified = [(rng.permutation(count) + 0.5) / count for _ in size]
     normal = _decorrelated(scipy.stats.norm.ppf(np.transpose(stratified)), np.argsort(-spread))
-    # half widths of Student's t over those of a normal distribution
+    # half widths of Student's t over those of a normal distribution, along each axis; a parameter
+    # without deviation does not vary
     width_ratio = (
         posterior.quantiles(axes.T * np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0))
         / NORMAL
@@ -37,10 +39,13 @@ def posterior_samples(posterior: Posterior, count: int) -> Array:
 def _decorrelated(normal: Array, longest: NDArray[np.int64]) -> Array:
     """Return normal numbers (count, p) without correlations among the longest axes.
 
-    Only as many axes as half the number of samples can be treated.
+    Correlations that samples have by chance are removed. Only as many axes as half the number of
+    samples can be treated.
 
     Parameters
     ----------
+    normal
+        Samples along each axis, with independent normal distributions.
     longest
         (p,) axes, the longest first.
     """

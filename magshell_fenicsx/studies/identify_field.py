@@ -1,4 +1,9 @@
-"""The remanence as a field that is identified: its numbers, and what is reported of them."""
+"""The remanence as a field that is identified: its numbers, and what is reported of them.
+
+The remanence is given by vectors at control points; each place of the shell has their weighted
+mean. Its numbers are the components that may vary, over |B^r|, the size of the remanence. By their
+prior the field is smooth (see `smooth`).
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -80,7 +85,8 @@ class RemanenceField:
 
     def put(self, data: dict[str, Any], file: Path) -> None:
         """Set the remanence in plain data of a case to the vectors of a file."""
-        Vectors(self.controls, self.start, None).put(data, self.start)
+        # the vectors are in the file; the block needs no lengths, and does not use its variables
+        Vectors(self.controls, self.start, lengths=None).put(data, self.start)
         data["magnetic"]["remanent"]["file"] = str(file.absolute())
 
     def summary(self, posterior: Posterior, flux_scale: tuple[float, str]) -> dict[str, Any]:
@@ -95,10 +101,11 @@ class RemanenceField:
         assert prior
         shape = (len(self.start), len(self.free_components))
         lower_ends, upper_ends = (v[block].reshape(shape) for v in posterior.band)
+        # deviation and length that were not given, and ended at a bound of the search
         fields_at_bounds = [
             name for name in prior.at_bounds() if np.isnan(getattr(self.smooth, name))
         ]
-        # trace of C Q: the number of values that the prior determines
+        # trace of C Q, Q the prior's inverse covariance: the number of values that it determines
         prior_share = np.trace(posterior.local[block, block] @ prior.rows.T @ prior.rows)
         return {
             "places": self.controls.places.tolist(),
@@ -136,6 +143,7 @@ def field_of(
         return None, source
     controls, start = controls_of(case, section.points, section.filter, FIELD_KEY)
     in_plane = controls.is_axisymmetric or case.shell.geometry == "strip"
+    # on a meridian rho and z, on a strip x and z
     free_components = (0, 1) if controls.is_axisymmetric else (0, 2) if in_plane else (0, 1, 2)
     if len(start) * len(free_components) > MAX_FIELD_NUMBERS:
         raise CaseError(
@@ -155,10 +163,10 @@ def field_of(
         first,
         distances,
         len(free_components),
-        section.deviation or np.nan,
+        section.deviation or np.nan,  # the data choose what is not given
         section.length or np.nan,
     )
-    if not in_plane:
+    if not in_plane:  # identified vectors have no symmetry
         source = Source(
             source.name,
             {**source.data, "symmetry": "none"},

@@ -1,4 +1,10 @@
-"""The pictures of an identification: data and predictions with their bands, and the parameters."""
+"""The pictures of an identification: data and predictions with their bands, and the parameters.
+
+A place is the load or displacement at which a result was measured. A measured shape is a set of
+points with their displacements. A programme is another history that is predicted with the fit. The
+band of a value has it with 95 % probability; a measured value has a wider one than the curve, by
+the noise. `plot` is always matplotlib's axes.
+"""
 
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -43,12 +49,14 @@ def draw_identified(
     panels = list[Callable[[Any], None]]()
     rows, shape, field = content["rows"], content["shape"], content["remanence"]
     shape_rows = [row for row in rows if row["result"].startswith(OF_POINTS)]
+    # a shape in one direction only is drawn as data
     if len({row["column"] for row in shape_rows}) > 1:
         panels.append(partial(_shape, rows=shape_rows, shape=shape))
         rows = [row for row in rows if not row["result"].startswith(OF_POINTS)]
     sorted_rows = sorted(rows, key=lambda row: str(row["column"]))
     for _, column_rows in groupby(sorted_rows, key=lambda row: str(row["column"])):
         column = list(column_rows)
+        # a result of a measured point has the name of its column instead
         result = column[0]["result"].partition(OF_POINTS)[0] or column[0]["column"]
         panels.append(
             partial(
@@ -88,6 +96,7 @@ def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]])
         sorted(sorted(largest_by_axis, key=lambda name: -largest_by_axis[name])[:2]),
         False,
     )
+    # one shape for each state of the shell; the legend names the first one alone
     for _, of_shape in groupby(sorted(rows, key=_which), key=_which):
         rows_by_point = dict[str, dict[str, Row]]()
         for row in of_shape:
@@ -171,11 +180,11 @@ def _field(plot: Any, field: Row, number: int) -> None:
         if flux_scale["unit"]
         else rf"{symbol} over $|B^\mathrm{{r}}|$"
     )
-    if places.shape[1] == 2 or not places[:, 1:].any():
+    if places.shape[1] == 2 or not places[:, 1:].any():  # a meridian, or a strip along x
         arc_length = np.concatenate(
             [[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))]
         )
-        half_width = 1.96 * flux_scale["value"] * field["prior"]["deviation"]
+        half_width = 1.96 * flux_scale["value"] * field["prior"]["deviation"]  # 95 %
         plot.fill_between(
             arc_length, mean - half_width, mean + half_width, color="0.9", lw=0, label="prior, 95 %"
         )
@@ -189,6 +198,7 @@ def _field(plot: Any, field: Row, number: int) -> None:
         )
         plot.legend(frameon=False, fontsize=8)
         return
+    # the two directions in which the points extend most
     first, second = sorted(int(i) for i in np.argsort(-np.ptp(places, axis=0), kind="stable")[:2])
     points = plot.scatter(
         places[:, first], places[:, second], c=value, s=10 + 240 * deviation / deviation.max()
@@ -215,6 +225,7 @@ def _data(
     has_places = all(row["at"] != "end" for row in rows)
     rows = sorted(rows, key=lambda row: (row["settings"], row["at"])) if has_places else rows
     x = np.array([row["at"] for row in rows]) if has_places else np.arange(1.0, len(rows) + 1)
+    # values of several cases do not lie on one curve: they are drawn with error bars
     on_one_curve = len({row["settings"] for row in rows}) == 1 and has_places
 
     def get(name: str) -> Array:
@@ -233,6 +244,7 @@ def _data(
         plot.fill_between(
             x, get("low"), get("high"), color="C0", alpha=0.35, lw=0, label="95 %, curve"
         )
+        # the computed path within the data, and the predictions on it
         fitted_curve = [(a, b) for a, b in curve if min(x) <= a <= max(x)]
         fitted_curve = sorted([*fitted_curve, *zip(x, get("predicted"), strict=True)])
         plot.plot(*zip(*fitted_curve, strict=True), color="C0", lw=1.2, label="fitted")
@@ -265,7 +277,7 @@ def _parameters(plot: Any, parameters: Mapping[str, Row]) -> None:
         if prior:
             middle, half_width = (
                 prior["mean"] / size - np.sign(parameter["value"]),
-                1.96 * prior["deviation"] / size,
+                1.96 * prior["deviation"] / size,  # 95 %
             )
             plot.barh(
                 i, 200 * half_width, left=100 * (middle - half_width), height=0.5, color="0.85"
@@ -291,7 +303,7 @@ def draw_programme(rows: Sequence[Row], name: str, place: str, file: Path) -> No
     Parameters
     ----------
     rows
-        As in the table of the programme.
+        Rows of identify_NAME.csv: step, place, result, predicted and measured value, ends of bands.
     name
         Name of the programme, the title.
     place
@@ -309,7 +321,8 @@ def draw_programme(rows: Sequence[Row], name: str, place: str, file: Path) -> No
         1, len(columns), figsize=(4.6 * len(columns), 3.6), layout="constrained", squeeze=False
     )
     for plot, column in zip(plots[0], columns, strict=True):
-        labels = {"95 %, data", "95 %, curve", "predicted", "measured"}  # each once
+        # labels that the legend shall have, each once
+        labels = {"95 %, data", "95 %, curve", "predicted", "measured"}
         result_rows = [row for row in rows if row["result"] == column]
         for _, of_step in groupby(result_rows, key=lambda row: int(row["step"])):
             _programme_of_step(
@@ -328,7 +341,7 @@ def _programme_of_step(plot: Any, rows: Sequence[Row], place: str, labels: set[s
     Parameters
     ----------
     rows
-        Rows of the programme's table, sorted by place.
+        Rows of the table of one result and step, sorted by place.
     place
         The column of the places.
     labels

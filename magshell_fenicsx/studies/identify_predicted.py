@@ -1,4 +1,10 @@
-"""Predictions of a case for values of its parameters; each evaluation is stored in a folder."""
+"""Predictions of a case for values of its parameters; each evaluation is stored in a folder.
+
+Parameters are a vector x (p,): numbers of the case, in the units of its file, then the numbers of
+a remanence field. A reading is a result of the case at a place, a value of what its last step
+prescribes. Settings are assignments `key=value`, which make a case of each row of data. A slope is
+a derivative by the parameters.
+"""
 
 import hashlib
 import json
@@ -39,7 +45,7 @@ class PredictedReadings:
     values, slopes
         (n,) and (n, p), in the units of data and parameters.
     curves
-        Result -> places and values along the path, of the first case.
+        Result -> places and values along the path, of the case with the first settings.
     note
         Why nothing is predicted; "" otherwise.
     invalid
@@ -101,6 +107,7 @@ class Predictor:
                 for settings, readings in self.readings.items()
             ]
         )
+        # a file is known by the parameters, and by all that a prediction depends on
         text = f"{self.mark} {settings_and_readings} {slopes}".encode()
         file = (
             self.folder / "points" / f"{hashlib.sha256(x.tobytes() + text).hexdigest()[:16]}.json"
@@ -161,12 +168,13 @@ class Predictor:
                     invalid=not isinstance(e, LostResult) or isinstance(e, PlaceOutsidePath),
                 )
             prediction.values += [float(v) for v in readings.values]
-            # the number of a key needs no scene
+            # derivatives are by numbers in SI units; None, as a number needs no scene for its unit
             slopes_of_keys = (
                 parameter.number.gradient(x, None, {parameter.key: 1.0})  # type: ignore[arg-type]
                 for parameter in self.parameters
             )
             unit_sizes = [float(slope[0]) for slope in slopes_of_keys]
+            # numbers of a field have no unit
             unit_sizes += [1.0] * (readings.slopes.shape[1] - len(unit_sizes))
             prediction.slopes += [list(map(float, row)) for row in readings.slopes * unit_sizes]
             prediction.curves = prediction.curves or readings.curves
@@ -212,7 +220,7 @@ def source_with_numbers(source: Source, numbers: Sequence[NumberVariable], x: Ar
     x
         Values in the order and in the units of `numbers`.
     """
-    data = json.loads(json.dumps(source.data))
+    data = json.loads(json.dumps(source.data))  # a deep copy of plain data
     data.pop("identify", None)
     for number, value in zip(numbers, x, strict=True):
         number.put(data, np.array([value]))

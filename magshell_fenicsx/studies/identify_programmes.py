@@ -1,8 +1,15 @@
 """Prediction of another history of the sample from an identification, with bands.
 
-The case is run at the fit, and for parameters drawn from the posterior. Between the quantiles of
-these runs lie 95 % of them. If a snap comes earlier in some runs, the band is wide there, where
-slopes would say nothing.
+A programme is a case whose history is predicted: the identified case with other settings, or
+another one with the same parameters. It is run at the fit, and for parameters drawn from the
+posterior. Between the quantiles of these runs lie 95 % of them: the band of a result. If a snap
+comes earlier in some runs, the band is wide there, where slopes would say nothing.
+
+A column is a result along a step, a column of path.csv; a scalar is a number of a whole run. A
+place is a value of the load or displacement of a step, or of the time, at which columns are
+compared with data. The fit has parameters x. The number 0 of a run is the run at the fit. An
+outcome is the stored result of a run. The noise of a column is the standard deviation of errors of
+measurement. A location is the key with which an error message begins.
 """
 
 import copy
@@ -45,6 +52,7 @@ from magshell_fenicsx.studies.runner import (
 )
 
 Array = NDArray[np.float64]
+# columns that are read from every run, to find its steps and leave out branches
 ALWAYS = ("step", "branch", "mode", "amplitude")
 
 
@@ -165,9 +173,9 @@ class Programme:
                 )
                 case.problem()
             except CaseError as e:
-                if not number:
+                if not number:  # the fit itself
                     raise CaseError(f"identify.predict.{self.name}: at the fit: {e}") from None
-                self.keys.append("")
+                self.keys.append("")  # a run that cannot be made
                 continue
             self.keys.append(identity(case))
             cases[self.keys[-1]] = case
@@ -215,6 +223,7 @@ class Programme:
             *place_and_results,
             *(name for item in self.scalars for name in (item.column, item.at)),
         ]
+        # a scalar of the summary has no column; "end" stands for the last point of the path
         return dict.fromkeys(name for name in names if name not in ("", "end"))
 
     def _outcome(self, folder: Path, key: str) -> Outcome | None:
@@ -258,8 +267,9 @@ class Programme:
         runs = [item for item in drawn_outcomes if item and item.curve]
         curves = [_PathCurve(item.curve, self.place) for item in (fit_run, *runs)]
         places, steps = self.places, self.steps
-        if places is None:
-            places = np.array(curves[0].along_step(self.last)[0])
+        if places is None:  # without data: all points of the last step of the fit
+            fit_places, _ = curves[0].along_step(self.last)
+            places = np.array(fit_places)
             steps = np.full(places.size, self.last, dtype=np.int64)
         rows = [
             row
@@ -272,6 +282,7 @@ class Programme:
             item.name: self._number(item, fit_run, runs, len(drawn_outcomes))
             for item in self.scalars
         }
+        # data with a band; an empty number is ""
         measured = [row for row in rows if row["measured"] != "" and row["low_measured"] != ""]
         count_inside = int(
             sum(row["low_measured"] <= row["measured"] <= row["high_measured"] for row in measured)
@@ -353,7 +364,8 @@ class Programme:
     ) -> Iterator[dict[str, Any]]:
         """Yield the rows of a column in the table of the prediction, one for each place.
 
-        A missing number is "". The bands of measured values add the noise to the runs' quantiles.
+        A missing number is "". The band of a measured value is wider than that of the runs (low,
+        high): half widths of runs and of noise add as roots of squares.
 
         Parameters
         ----------
@@ -364,7 +376,7 @@ class Programme:
         noise
             Standard deviation of a measurement of the column.
         samples
-            Number of drawn parameter vectors, with those whose run has failed.
+            Number of drawn parameter vectors, of which some runs may have failed.
         """
         # (runs, places), the fit first
         predicted_values = np.array([curve.values_at(column, places, steps) for curve in curves])
@@ -404,7 +416,7 @@ class Programme:
         runs
             Outcomes of drawn parameters that have a path.
         samples
-            Number of drawn parameter vectors, with those whose run has failed.
+            Number of drawn parameter vectors, of which some runs may have failed.
         """
         values = np.array(
             [np.nan if (v := outcome.value(scalar)) is None else v for outcome in runs]
@@ -437,6 +449,7 @@ class _PathCurve:
 
         Without a column the values are the places. Both are empty if the run has no such step.
         """
+        # the row before the first one of a step is the point where the step begins
         rows_of_step = [i for i, row in enumerate(self._rows) if row["step"] == step]
         rows = (
             self._rows[max(rows_of_step[0] - 1, 0) : rows_of_step[-1] + 1] if rows_of_step else []
@@ -457,7 +470,7 @@ class _PathCurve:
             if x.size < 2:
                 continue
             y = y - y[0] if column.change else y
-            slack = 1e-9 * np.ptp(x)
+            slack = 1e-9 * np.ptp(x)  # rounding at the ends of an interval
             for i in np.flatnonzero(steps == step):
                 low, high = np.minimum(x[:-1], x[1:]) - slack, np.maximum(x[:-1], x[1:]) + slack
                 # intervals of the path that have the place within
@@ -465,7 +478,7 @@ class _PathCurve:
                     (low <= places[i]) & (places[i] <= high) & (x[1:] != x[:-1])
                 )
                 if passed.size:
-                    k = passed[0]
+                    k = passed[0]  # the first interval counts
                     values[i] = y[k] + (y[k + 1] - y[k]) * np.clip(
                         (places[i] - x[k]) / (x[k + 1] - x[k]), 0, 1
                     )
@@ -509,7 +522,7 @@ def programme(
             base = read_source(source.folder / section.case)
         for setting in section.settings:
             override(base, setting)
-        for key in ("identify", "ensemble", "design"):
+        for key in ("identify", "ensemble", "design"):  # a run does not need them
             base.data.pop(key, None)
         if lacking := next(
             (p.key for p in parameters if value_at(base.data, p.key.split(".")) is None), None
@@ -522,6 +535,7 @@ def programme(
         raise CaseError(f"{location}: {e}") from None
     names = _PathColumnNames(problem)
     last_step = len(problem.programme)
+    # without data the last step's load is the place of its columns
     load_column = (
         names.in_case_units(amplitude(problem.programme[-1].name).column) if last_step else ""
     )
@@ -533,14 +547,17 @@ def programme(
             source.folder / section.data, names, last_step, f"{location}.data"
         )
     measured = {key.of for key in columns}
-    for result in section.of:
-        if "@" not in result and result in names.all:
-            column_in_units = names.in_case_units(result)
-            columns += (
-                []
-                if column_in_units in measured
-                else [PathColumn(result, column_in_units, np.zeros(0), change=False)]
-            )
+    # a name with "@" is a number at one place, a scalar; columns without data have no values
+    further_columns = [
+        (result, names.in_case_units(result))
+        for result in section.of
+        if "@" not in result and result in names.all
+    ]
+    columns += [
+        PathColumn(result, column, np.zeros(0), change=False)
+        for result, column in further_columns
+        if column not in measured
+    ]
     scalars = [
         _scalar(result, location)
         for result in section.of
@@ -588,7 +605,7 @@ def refuse_unfit_programmes(
 
 
 def _scalar(result: str, location: str) -> Scalar:
-    """Read the name of a number of a run; see `parse_scalar`.
+    """Read the name of a number of a run, as of `--result`.
 
     Raises
     ------
@@ -654,7 +671,7 @@ class _PathColumnNames:
                 )
             return name, 1.0
         fitting = [column for column in in_units if column == name or column.startswith(f"{name}_")]
-        for column in sorted(fitting, key=len):
+        for column in sorted(fitting, key=len):  # the shortest: nothing but a unit behind the name
             try:
                 return column, column_size(name, unit, in_units[column])
             except TableError as e:
@@ -713,6 +730,7 @@ def _measured(
         headers_by_result[result] = header
     (_, place, factor, place_values), *measured_results = measured
     steps = np.asarray(columns.get("step", np.full(place_values.size, last)))
+    # the first row without a place or with a wrong step
     for row in np.flatnonzero(np.isnan(place_values) | ~np.isin(steps, np.arange(1, last + 1)))[:1]:
         raise CaseError(
             f"{location}: line {rows.lines[row]}: a row has no place, or no step of 1 to {last}"

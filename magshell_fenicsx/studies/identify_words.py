@@ -1,4 +1,8 @@
-"""Sentences about the results of an identification."""
+"""Sentences about the results of an identification.
+
+Content is that of identify.json. A band has the true value with 95 % probability. A prior is what
+was known of a parameter before; the noise of a column is the standard deviation of its errors.
+"""
 
 from typing import Any
 
@@ -53,7 +57,7 @@ def _sentences_of_parameters(content: dict[str, Any]) -> list[str]:
 def _sentences_of_correlations(keys: list[str], posterior: Posterior) -> list[str]:
     """Return a sentence for each pair of parameters that the data hardly tell apart."""
     lines = list[str]()
-    for i, j in zip(*np.triu_indices(len(keys), 1), strict=True):
+    for i, j in zip(*np.triu_indices(len(keys), 1), strict=True):  # pairs i < j
         correlation = float(posterior.correlation[i, j])
         if abs(correlation) > HIGH_CORRELATION:
             lines.append(
@@ -79,6 +83,7 @@ def _sentences_of_noise(content: dict[str, Any], table: MeasuredTable) -> list[s
 def _warnings(content: dict[str, Any], posterior: Posterior, table: MeasuredTable) -> list[str]:
     """Return warnings of a misfit beyond the noise, of rough bands, and of a fit not converged."""
     measured, lines = posterior.measured, list[str]()
+    # estimated noise always fits the residuals; only given noise can be too small
     if not np.isnan(measured.noise).any():
         deviations = (measured.data - posterior.y) / posterior.noise[table.column]
         chi_squared = float((deviations**2).sum())
@@ -88,6 +93,7 @@ def _warnings(content: dict[str, Any], posterior: Posterior, table: MeasuredTabl
                 "model does not describe these data, or their noise is larger; leave it out to "
                 "have it estimated"
             )
+    # by how much the misfit differs from a parabola, and where nothing is predicted
     bent, lost_count = content["normal"]["difference"], content["normal"]["lost"]
     if bent > NORMAL or lost_count:
         nowhere = f", and at {lost_count} such places nothing is predicted" if lost_count else ""

@@ -9,7 +9,13 @@ and the posterior near it is normal with the covariance C = (J^T J/s^2 + 1/t^2)^
 Tarantola, Inverse Problem Theory, SIAM 2005, section 3.2). Where s is estimated, from the residuals
 of a column over its degrees of freedom f, quantiles are those of Student's t. A variance V that is
 the sum of parts V_c, one of the noise of each column and one of priors, has the degrees of freedom
-V^2/sum (V_c^2/f_c) (F. E. Satterthwaite, Biometrics Bulletin 2, 110, 1946). Knows no shell.
+V^2/sum (V_c^2/f_c) (F. E. Satterthwaite, Biometrics Bulletin 2, 110, 1946).
+
+n data are in columns, each with one noise, the standard deviation of its errors; p parameters x
+have the prediction y(x) (n,) and slopes J (n, p). The misfit is F at the fit. A residual or slope
+is weighed when it is over its standard deviation. A field is a block of parameters with a common
+prior, whose strengths are a deviation and a length (see `smooth`). The size of a parameter is its
+scale, by which it is multiplied for good conditioning. Knows no shell.
 """
 
 from collections.abc import Callable
@@ -45,7 +51,13 @@ NORMAL = (
 
 
 class NotSeen(ValueError):
-    """Data and priors leave a combination of parameters open, those with these numbers."""
+    """Data and priors leave a combination of parameters open.
+
+    Attributes
+    ----------
+    numbers
+        Indices of the parameters of this combination.
+    """
 
     def __init__(self, numbers: NDArray[np.int64]) -> None:
         self.numbers = [int(number) for number in numbers]
@@ -75,7 +87,7 @@ class Measured:
     mean, deviation
         (p,) mean and standard deviation of the priors; the deviation is infinite without a prior.
     field
-        The prior of a field among the parameters, whose deviations are infinite here.
+        The prior of a field among the parameters; `deviation` is infinite for its numbers.
     """
 
     data: Array
@@ -98,9 +110,10 @@ class Measured:
         return np.asarray(W)
 
     def rows(self, y: Array, J: Array, x: Array, noise: Array) -> tuple[Array, Array]:
-        """Return residuals (n + p,) and slopes (n + p, p) over standard deviations.
+        """Return residuals (n + p,) and slopes (n + p, p) over their standard deviations.
 
-        The rows of the data are first, then those of the priors.
+        The rows of the data are first, then those of the priors. The squared length of the
+        residuals is the misfit F(x).
 
         Parameters
         ----------
@@ -178,17 +191,18 @@ class Posterior:
     def quantiles(self, slopes: Array, column: NDArray[np.int64] | None = None) -> Array:
         """Return half widths of 95 % bands over standard deviations, (k,) quantiles of Student's t.
 
-        The degrees of freedom are Satterthwaite's, from the parts that the columns have in the
-        variance.
+        The bands are those of k numbers that are linear in the parameters. The degrees of freedom
+        are Satterthwaite's, from the parts that the columns have in the variance.
 
         Parameters
         ----------
         slopes
             (k, p) derivatives of k numbers by the parameters.
         column
-            (k,) index of the column whose noise each number has too, as a measured number does.
+            (k,) index of the column whose noise each number has besides, if it is a measured one;
+            None: the numbers are predictions without noise.
         """
-        # (k, n) part of each datum's noise in the variance of each number
+        # (k, n) part of the variance of each number that is due to the noise of each datum
         data_variances = (slopes @ self.covariance @ self.slopes.T / self.noise[self.group]) ** 2
         columns = np.arange(len(self.noise))
         column_variances = np.array(
@@ -201,9 +215,9 @@ class Posterior:
                 column_variances + noise_variance[:, None] * (column[:, None] == columns),
                 variance + noise_variance,
             )
-        # of each column, (k, columns)
+        # V_c/V, (k, columns)
         variance_shares = column_variances / np.where(variance > 0, variance, 1.0)[:, None]
-        with np.errstate(divide="ignore"):
+        with np.errstate(divide="ignore"):  # infinite freedom if the noise of all columns is given
             freedom = 1 / (variance_shares**2 / self.freedom).sum(axis=1)
         return np.asarray(scipy.stats.t.ppf((1 + BAND_PROBABILITY) / 2, freedom))
 
@@ -226,7 +240,7 @@ class Posterior:
             (p,) derivatives of the measured number, and the standard deviation of its noise.
         """
         slope_covariance = self.covariance @ slope
-        # variance of the measured number; C - g g^T/gain is the new covariance
+        # variance of the measured number; with g = C slope, C - g g^T/gain is the new covariance
         gain = noise**2 + slope @ slope_covariance
         return np.asarray(
             np.sqrt(
@@ -248,8 +262,12 @@ def fit_posterior(
 ) -> Posterior:
     """Fit the parameters by Gauss-Newton; steps are halved until the misfit falls.
 
+    After each step, noise that is not given and strengths of a field's prior are estimated anew.
+
     Parameters
     ----------
+    model
+        Parameters (p,) -> prediction and slopes; None where there is none.
     start, size
         (p,) where the iteration starts, and the scale of each parameter, for conditioning.
     max_steps
@@ -266,6 +284,7 @@ def fit_posterior(
     """
     first_prediction = model(start)
     assert first_prediction, "there is a prediction at the start"
+    # `initial` keeps nan for what is unknown; `measured` has its present estimate
     x, (y, J), initial = np.array(start), first_prediction, measured
     measured, noise, freedom = _weighed(initial, measured, x, y, J, _guessed(measured, y), size)
     ended = f"{max_steps} steps"
@@ -274,7 +293,7 @@ def fit_posterior(
         _refuse_unseen(A * size)
         misfit = float(scaled_residuals @ scaled_residuals)
         report_step(step, x, misfit / len(measured.data))
-        if step == max_steps:
+        if step == max_steps:  # the last pass only reports
             break
         dx = size * np.linalg.lstsq(A * size, scaled_residuals, rcond=None)[0]
         covariance = _covariance(A, size)
@@ -294,10 +313,11 @@ def fit_posterior(
             break
         x, (y, J) = next_x, prediction
         measured, noise, freedom = _weighed(initial, measured, x, y, J, noise, size)
+    # columns whose residuals are left almost no freedom by the parameters
     if (silent := np.flatnonzero(freedom < MIN_NOISE_FREEDOM)).size:
         raise NoNoise(int(silent[0]))
     covariance = _covariance(measured.rows(y, J, x, noise)[1], size)
-    if measured.field:
+    if measured.field:  # the strengths of its prior are uncertain too
         covariance = _Strength(initial, measured, x, y, J, noise, size).covariance()
     return Posterior(
         x,
@@ -315,12 +335,12 @@ def fit_posterior(
 
 
 def _covariance(A: Array, size: Array) -> Array:
-    """Return (A^T A)^-1, (p, p), by the singular values of A.
+    """Return the covariance C = (A^T A)^-1, (p, p), by the singular values of A.
 
     Parameters
     ----------
     A
-        (rows, p) slopes over standard deviations, see `Measured.rows`.
+        (rows, p) slopes of data and priors over standard deviations.
     size
         (p,) scale of each parameter, for conditioning.
     """
@@ -335,7 +355,7 @@ def _refuse_unseen(A: Array) -> None:
     Parameters
     ----------
     A
-        (rows, p) slopes over standard deviations, of scaled parameters.
+        (rows, p) slopes of data and priors over standard deviations, by scaled parameters.
 
     Raises
     ------
@@ -345,16 +365,23 @@ def _refuse_unseen(A: Array) -> None:
     length = np.linalg.norm(A, axis=0)
     if (idle := np.flatnonzero(length == 0)).size:
         raise NotSeen(idle)
-    # the last row of V is the combination with the least influence
+    # the last row of V is the combination with the least influence; columns are scaled to one
     _, s, V = np.linalg.svd(A / length, full_matrices=False)
     if len(s) < A.shape[1] or s[-1] < RANK_TOLERANCE * s[0]:
         raise NotSeen(np.flatnonzero(np.abs(V[-1]) > MIN_NAMED_COMPONENT))
 
 
 def _guessed(measured: Measured, y: Array) -> Array:
-    """Return the initial noise of the columns: as given, or the deviation of the residuals."""
+    """Return the noise of the columns to begin with: as given, or from the residuals.
+
+    Parameters
+    ----------
+    y
+        (n,) prediction at the start.
+    """
     noise = np.array(measured.noise)
     for column in np.flatnonzero(np.isnan(noise)):
+        # 1 if the start fits exactly, so that it can be divided by
         noise[column] = np.sqrt(np.mean((measured.data - y)[measured.group == column] ** 2)) or 1.0
     return noise
 
@@ -362,7 +389,10 @@ def _guessed(measured: Measured, y: Array) -> Array:
 def _weighed(
     initial: Measured, measured: Measured, x: Array, y: Array, J: Array, noise: Array, size: Array
 ) -> tuple[Measured, Array, Array]:
-    """Choose the strength of a field's prior, and estimate noise that is not given.
+    """Choose the strengths of a field's prior, and estimate noise that is not given.
+
+    With a field both are found together, as the most likely ones; else the noise is that of the
+    residuals.
 
     Parameters
     ----------
@@ -378,22 +408,24 @@ def _weighed(
     Returns
     -------
     measured
-        With the strength of a field's prior that the data choose; unchanged without a field.
+        Data and priors with the strengths that the data choose; unchanged without a field.
     noise, freedom
         Noise of each column, and its degrees of freedom.
     """
     if measured.field:
         measured, noise = _Strength(initial, measured, x, y, J, noise, size).best()
-        return measured, noise, _estimated(measured, y, J, noise, size)[1]
+        _, freedom = _estimated(measured, y, J, noise, size)
+        return measured, noise, freedom
     return measured, *_estimated(measured, y, J, noise, size)
 
 
 @dataclass(frozen=True)
 class _Strength:
-    """Search for strengths of a field's prior, its deviation and length, and for noise of columns.
+    """Search for the strengths of a field's prior and the noise of columns that data make likely.
 
-    Only those that are not given vary; z has their logarithms: strengths first, then noises. See
-    the module `smooth`.
+    The strengths are the deviation and the length of the prior (module `smooth`). Only strengths
+    and noises that are not given vary. The vector z has their logarithms: strengths first, then
+    noises. With the model linear about x, the probability p(d) of the data is known for each z.
 
     Attributes
     ----------
@@ -418,7 +450,7 @@ class _Strength:
 
     @property
     def fields_of_priors(self) -> tuple[Smooth, Smooth]:
-        """The field's prior as given, and where the search begins."""
+        """The field's prior as given, with nan for what is unknown, and where the search begins."""
         assert self.initial.field
         assert self.measured.field
         return self.initial.field, self.measured.field
@@ -426,9 +458,8 @@ class _Strength:
     @property
     def unknown_strengths(self) -> NDArray[np.int64]:
         """Indices of the strengths that are not given: 0 deviation, 1 length."""
-        return np.flatnonzero(
-            np.isnan([self.fields_of_priors[0].deviation, self.fields_of_priors[0].length])
-        )
+        given_prior, _ = self.fields_of_priors
+        return np.flatnonzero(np.isnan([given_prior.deviation, given_prior.length]))
 
     @property
     def unknown(self) -> NDArray[np.int64]:
@@ -436,18 +467,25 @@ class _Strength:
         return np.flatnonzero(np.isnan(self.initial.noise))
 
     def z(self, deviation: float, length: float) -> Array:
-        """Return the logarithms of unknown strengths, and of the unknown noise at the begin."""
+        """Return the vector z of a deviation and a length, with the noise at the begin.
+
+        Of deviation and length it has only what is unknown.
+        """
         return np.log(
             [*np.array([deviation, length])[self.unknown_strengths], *self.noise[self.unknown]]
         )
 
     def weighed(self, z: Array) -> tuple[Measured, Array]:
-        """Return data and priors with the strengths of z, and the noise of each column of z."""
+        """Return data and priors with the strengths of z, and the noise of each column.
+
+        What z does not have is as given.
+        """
         given_prior, _ = self.fields_of_priors
         strengths, noise = (
             np.array([given_prior.deviation, given_prior.length]),
             np.array(self.noise),
         )
+        # z has logarithms: strengths first, then noises
         strengths[self.unknown_strengths], noise[self.unknown] = (
             np.exp(z[: len(self.unknown_strengths)]),
             np.exp(z[len(self.unknown_strengths) :]),
@@ -457,13 +495,13 @@ class _Strength:
         ), noise
 
     def surprise(self, z: Array) -> float:
-        """Return -2 ln p(d), up to a constant, with p(d) the evidence of the data for strengths z.
+        """Return -2 ln p(d), up to a constant: how surprising the data are for strengths z.
 
-        The parameters are integrated over; see the module `smooth`.
+        The parameters are integrated over; the module `smooth` has the formula.
         """
         (measured, noise), (residuals, A) = self.weighed(z), self._rows(z)
         assert measured.field
-        # A = Q R: its determinant is that of R, the misfit is what Q does not span
+        # A = Q R: det A^T A = (det R)^2, and the least misfit is what Q does not span
         Q, R = np.linalg.qr(A * self.size)
         smallest_misfit = residuals @ residuals - np.sum((Q.T @ residuals) ** 2)
         noise_term = 2 * np.log(noise[measured.group]).sum()
@@ -475,19 +513,23 @@ class _Strength:
         )
 
     def _rows(self, z: Array) -> tuple[Array, Array]:
-        """Return residuals and slopes over their standard deviations for strengths z."""
+        """Return residuals and slopes over their standard deviations, at x, for strengths z."""
         measured, noise = self.weighed(z)
         return measured.rows(self.y, self.J, self.x, noise)
 
     def best(self) -> tuple[Measured, Array]:
-        """Return data and priors, and the noise of each column, for the most likely strengths."""
+        """Return data and priors, and the noise of each column, for the most likely strengths.
+
+        The search begins at the best of several starts.
+        """
         given_prior, start_prior = self.fields_of_priors
         z = min((self.z(*start) for start in start_prior.starts(given_prior)), key=self.surprise)
-        if len(z):
+        if len(z):  # else all is given
             bounds = [given_prior.bounds[i] for i in self.unknown_strengths]
             smallest_noise = MIN_RELATIVE_NOISE * float(np.abs(self.measured.data).max())
             bounds += [(smallest_noise, 1e3 * float(self.noise[i])) for i in self.unknown]
             limits = np.log(bounds)
+            # first simplex: strengths and noises vary by exp(0.5)
             simplex = np.vstack([z, z + 0.5 * np.eye(len(z))]).clip(*limits.T)
             options = {
                 "initial_simplex": simplex,
@@ -503,8 +545,9 @@ class _Strength:
     def covariance(self) -> Array:
         """Return the posterior covariance (p, p), averaged over strengths and noises by likelihood.
 
-        The average is over weighted samples about the best strengths (H. Rue, S. Martino and N.
-        Chopin, J. R. Stat. Soc. B 71, 319, 2009, section 3).
+        So the uncertainty of strengths and noises is in it. The average is over weighted samples
+        about the best strengths, where the search begins (H. Rue, S. Martino and N. Chopin, J. R.
+        Stat. Soc. B 71, 319, 2009, section 3).
         """
         _, start_prior = self.fields_of_priors
         z, count = (
@@ -515,15 +558,17 @@ class _Strength:
             return _covariance(self._rows(z)[1], self.size)
 
         def second_difference(a: Array, b: Array) -> float:
-            """Return the second derivative of -ln p(d) along the steps a and b, by differences."""
+            """Return the second derivative of -ln p(d) along two axes, with steps a and b."""
             differences = [
                 sa * sb * self.surprise(z + sa * a + sb * b) for sa in (-1, 1) for sb in (-1, 1)
             ]
             return sum(differences) / (8 * LOG_STRENGTH_STEP**2)
 
+        # samples are normal, as wide as the curvatures say and a little wider
         step = LOG_STRENGTH_STEP * np.eye(count)
         curvatures, axes = np.linalg.eigh([[second_difference(a, b) for b in step] for a in step])
         scaled_axes = axes * WIDER / np.sqrt(np.maximum(curvatures, SUREST))
+        # quasi-random; the first point of the sequence, zero, would be at infinity
         normal_samples = scipy.stats.norm.ppf(
             scipy.stats.qmc.Halton(count, scramble=False).random(SAMPLES + 1)[1:]
         )
@@ -538,7 +583,7 @@ class _Strength:
         for weight, sample in zip(weights / weights.sum(), samples, strict=True):
             residuals, A = self._rows(sample)
             offset = self.size * np.linalg.lstsq(A * self.size, residuals, rcond=None)[0]
-            # scatter within a sample, and of its best parameters about x
+            # scatter of the parameters for this sample, and the offset of their best values from x
             total += weight * (_covariance(A, self.size) + np.outer(offset, offset))
         return total
 
@@ -548,15 +593,16 @@ def _estimated(
 ) -> tuple[Array, Array]:
     """Estimate the noise of columns where it is not given, and its degrees of freedom.
 
-    The freedom of a column is the number of its data, less their share in determining the
-    parameters: the diagonal of J C J^T/s^2. It is infinite where noise is given.
+    A noise is the root of the squared residuals over their degrees of freedom. The freedom of a
+    column is the number of its data, less their share in determining the parameters: the diagonal
+    of J C J^T/s^2. It is infinite where noise is given.
 
     Parameters
     ----------
     y, J
         (n,) and (n, p), prediction and its derivatives.
     noise
-        Noise of each column at the last step, for the shares.
+        Noise s of each column at the last step, for the shares.
     size
         (p,) scale of each parameter.
 
@@ -572,7 +618,7 @@ def _estimated(
     )
     C = _covariance(np.vstack([J / noise_of_data[:, None], measured.prior]), size)
     shares = np.einsum("ni,ij,nj->n", J, C, J) / noise_of_data**2
-    for column in np.flatnonzero(np.isnan(measured.noise)):
+    for column in np.flatnonzero(np.isnan(measured.noise)):  # not given
         in_column = measured.group == column
         freedom[column] = in_column.sum() - shares[in_column].sum()
         estimated[column] = max(
@@ -587,15 +633,17 @@ def _estimated(
 def nonlinearity(model: Model, posterior: Posterior) -> tuple[float, int]:
     """Compare the misfit with its parabola, at the ends of bands along the longest axes.
 
-    If the difference is small, the posterior is normal, and the bands are right.
+    The axes are those of the posterior's ellipsoid, in parameters over their deviations. If the
+    difference is small, the posterior is normal, and the bands are right.
 
     Returns
     -------
     worst
-        Largest relative difference.
+        Largest difference over the parabola's rise.
     lost_count
         Number of these ends at which nothing is predicted.
     """
+    # the misfit is for the noise and the strengths of the fit, and so must be its parabola
     posterior = replace(posterior, covariance=posterior.local)
     size = posterior.deviation
     spread, axes = np.linalg.eigh(posterior.correlation)

@@ -5,6 +5,11 @@ to point. An optimiser of smooth functions stops there. Here every value and its
 evaluated point, define a plane. The next point is the highest one under all planes, in a box about
 the best point so far. This is a bundle method with a trust region (Schramm and Zowe, SIAM J. Optim.
 2, 121-152, 1992). SciPy's linear programming finds the point. See docs/theory.md.
+
+The p variables x are scaled: y is x over half the range of each, so that the box has the side
+2 size in y. The height of a point is its lowest value, less the penalty of violated constraints;
+the gain of a step is the increase of the height, predicted by the planes. An evaluation has no
+values if the equilibrium path is lost.
 """
 
 from collections.abc import Callable, Sequence
@@ -54,7 +59,7 @@ class _EvaluatedPoint:
     y
         (p,) variables over half their ranges.
     values, constraints
-        (n,) and (m,).
+        (n,) values, of which the lowest counts, and (m,) constraints.
     slopes, constraint_slopes
         (n, p) and (m, p) derivatives by y.
     """
@@ -91,7 +96,9 @@ def raise_lowest(
         Largest number of evaluations after that of `first`.
     """
     low, high = (np.array(side, dtype=float) for side in zip(*limits, strict=True))
+    # no bound: None has become nan
     low, high = np.where(np.isnan(low), -np.inf, low), np.where(np.isnan(high), np.inf, high)
+    # half the ranges; 1 for variables without bounds, such as angles
     span = np.where(np.isfinite(high - low) & (high > low), (high - low) / 2, 1.0)
 
     def evaluate_point(x: Array) -> _EvaluatedPoint | None:
@@ -114,8 +121,9 @@ def raise_lowest(
         step, gain, violation = _predicted_step(best, earlier_points[-MAX_PLANES:], box, penalty)
         while violation > CONSTRAINT_TOLERANCE and penalty < max_penalty:
             penalised_step = _predicted_step(best, earlier_points[-MAX_PLANES:], box, 10 * penalty)
+            _, _, penalised_violation = penalised_step
             # a larger penalty hardly lowers the violation within the box
-            if penalised_step[2] > violation / 2:
+            if penalised_violation > violation / 2:
                 break
             penalty, (step, gain, violation) = 10 * penalty, penalised_step
         if gain < MIN_GAIN:
@@ -130,12 +138,12 @@ def raise_lowest(
         )
         if gain_ratio > ACCEPTED_GAIN_RATIO:
             assert next_point
-            best, next_point = next_point, best
+            best, next_point = next_point, best  # the old best is then an earlier point
         earlier_points += [next_point] if next_point else []
         if gain_ratio > GROWING_GAIN_RATIO:
             size = min(2 * size, MAX_BOX_SIZE)
         elif gain_ratio <= ACCEPTED_GAIN_RATIO:
-            size /= 2 if gain_ratio > -1 else 4
+            size /= 2 if gain_ratio > -1 else 4  # by more where the prediction was far off
     return "iteration limit reached"
 
 
@@ -165,6 +173,7 @@ def _predicted_step(
     violation
         Largest violation of constraints that remains.
     """
+    # heights of the planes at the best point, and their slopes
     planes, slopes = [best.values], [best.slopes]
     for other in others:
         offset = best.y - other.y
@@ -180,7 +189,8 @@ def _predicted_step(
     constraint_rows = np.column_stack(
         [-best.constraint_slopes, np.zeros(constraint_count), -np.ones(constraint_count)]
     )
-    # unknowns: the step, the height, and the largest violation of the constraints
+    # unknowns: the step, the height (below all planes), and the largest violation of the linearised
+    # constraints (at least zero)
     program = scipy.optimize.linprog(
         np.concatenate([np.zeros(variable_count), [-1.0, penalty]]),
         A_ub=np.vstack([below_planes, constraint_rows]),

@@ -1,4 +1,9 @@
-"""The measurements of a point of a study: repeated runs in separate processes, kept on disk."""
+"""The measurements of a point of a study: repeated runs in separate processes, kept on disk.
+
+A point is a case on a number of ranks. A sample has the times of one run: wall and CPU time of the
+process, the phases of summary.json, and the peak memory. An origin has the sources and the mesh
+file: keys of summary.json with their values.
+"""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -26,7 +31,7 @@ class Timings:
     Attributes
     ----------
     machine
-        The machine, see `fingerprint`.
+        Fingerprint of the machine: processor, cores, memory, BLAS and versions.
     first
         The first run, which may compile kernels; it is not among the samples.
     samples
@@ -113,7 +118,7 @@ def complete(
     file
         File that keeps the measurements.
     origin
-        Sources and mesh file; if they change during the study, it is a failure.
+        Sources and mesh file; if a run is of others, they were changed during the study: a failure.
 
     Raises
     ------
@@ -125,7 +130,7 @@ def complete(
         if measured.summary is not None and not _is_of(origin, measured.summary):
             measured.summary, measured.rows = None, []
             measured.failure = "the program or the mesh file was changed during the study"
-        if measured.first is None:
+        if measured.first is None:  # it may have compiled kernels, so its times do not count
             measured.first = sample
         elif not measured.failure:
             measured.samples.append(sample)
@@ -146,6 +151,7 @@ def _run_once(measured: Timings, arguments: Sequence[str], ranks: int) -> Sample
         except OSError:
             measured.summary, measured.rows = None, []
             measured.failure = f"exit code {usage.code}: {usage.last_error or 'no message'}"
+    # a failed run has no times of phases
     timing: dict[str, float] = (measured.summary or {}).get("timing", {})
     return {
         "wall_s": usage.wall_s,

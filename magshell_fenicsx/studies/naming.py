@@ -1,4 +1,8 @@
-"""Keys and results as a paper names them, for pictures."""
+"""Keys and results as a paper names them, for pictures.
+
+A key is a path of words with dots into the case; a result is a column of path.csv or a number of a
+run, whose name may end with its unit. An amplitude is a load parameter, by name.
+"""
 
 import re
 from collections.abc import Mapping
@@ -42,7 +46,8 @@ def key_words(key: str, unit: str = "") -> str:
         return "  ".join(part for part in NAMES[name] if part)
     if name == "amplitude" and not unit:
         return "amplitude over $h$"
-    *_, parent, last_word = ("", *key.split("."))
+    *_, parent, last_word = ("", *key.split("."))  # a key of one word has the parent ""
+    # a flux density says of what field, and a number of which list
     words = f"{parent} {last_word}" if last_word == "flux_density" or last_word.isdigit() else name
     if last_word in UNITS:
         words = f"{last_word} angle of {parent}" if parent else f"{last_word} angle"
@@ -86,6 +91,7 @@ def load_text(row: Mapping[str, Any], name: str) -> str:
     >>> load_text({"load": 0.5, "pressure_Pa": 61.25}, "pressure")
     'p = 61.25 Pa'
     """
+    # the column in units, if the row has it
     load_quantity = shown_quantity(amplitude(name).column, row)
     return f"{load_quantity.ascii_symbol} = {row.get(load_quantity.name, row['load']):.9g}" + (
         f" {load_quantity.si}" if load_quantity.name in row else ""
@@ -138,6 +144,7 @@ def result_label(result: str) -> str:
     >>> result_label("applied_mT"), result_label("tip_uz_mm"), result_label("hertz_1")
     ('applied field  $B_\\mathrm{a}$  (mT)', '$u_z$ of tip  (mm)', 'frequency 1  (Hz)')
     """
+    # a registered quantity, or one of its columns in units, has its own label
     for column_quantity in QUANTITIES.values():
         for column in (column_quantity, *column_quantity.in_units):
             if column.name == result:

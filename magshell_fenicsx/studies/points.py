@@ -1,4 +1,9 @@
-"""The points of a study: axes of `--over`, their product, each a valid case."""
+"""The points of a study: axes of `--over`, their product, each a valid case.
+
+An axis is one direction of a sweep: a key of the case with its values, or several keys that are
+tied with `+` and take the same values. A point has a value for each axis. A key is a path of words
+with dots into the case; a source is a case file with settings `key=value`.
+"""
 
 import copy
 import hashlib
@@ -141,6 +146,7 @@ def _range(text: str, values: str) -> tuple[str, ...]:
         raise CaseError(f"--over {text}: start and stop must be finite")
     if not 2 <= count <= MOST_POINTS:
         raise CaseError(f"--over {text}: count is {count}; allowed 2 to {MOST_POINTS}")
+    # + 0.0: no -0
     return tuple(f"{value + 0.0:.12g} {unit}".rstrip() for value in np.linspace(start, stop, count))
 
 
@@ -246,6 +252,7 @@ def make_point(
         refuse_beyond_memory(case.problem())  # raises its errors, such as a missing mirror plane
     except CaseError as e:
         message = str(e)
+        # the user gave --over, not --set
         for assignment in assignments:
             message = message.replace(f"--set {assignment}", f"--over {assignment}")
         raise CaseError(f"{message}\nin the point {', '.join(assignments)}") from None
@@ -253,11 +260,14 @@ def make_point(
 
 
 def identity(case: Case) -> str:
-    """Return a hash of the problem: the resolved case, without a zero field, and its mesh file."""
+    """Return a hash of the problem: the resolved case, without a zero field, and its mesh file.
+
+    A magnetic section that has no effect does not count.
+    """
     data = case.model_dump(mode="json") | case.outside
     magnetic = case.magnetic
     if not (
-        case.lambda_m
+        case.lambda_m  # the size of the magnetic load
         or case.sensors
         or case.field_maps
         or (magnetic and magnetic.interaction != "none")

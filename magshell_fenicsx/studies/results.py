@@ -1,4 +1,10 @@
-"""The number of a run that `--result` names."""
+"""The number of a run that `--result` names: a scalar.
+
+It is a number of summary.json, or COLUMN@COLUMN=VALUE: a column of path.csv at the point of the
+path where another column (the place) first has a value. A critical field is the value of lambda_m,
+the size of the magnetic load, at an instability; a snap is a jump of a motion in time. Rows of
+branches and of excluded modes are no part of the path.
+"""
 
 import math
 import re
@@ -13,6 +19,7 @@ from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.output.store.table import COLUMNS, TEXTS
 from magshell_fenicsx.quantities.registry import IN_TIME, OWN_MODES, quantity
 
+# columns with numbers: without units, and with those in units
 BARE = (*(column for column in COLUMNS if column not in TEXTS), *(q.name for q in IN_TIME))
 NUMBERS = (*BARE, *(each.name for name in BARE for each in quantity(name).in_units))
 OF_SNAPS = {"snap_time": "time", "snap_departure": "departure", "snap_jump": "jump"}
@@ -53,6 +60,7 @@ class Scalar:
         if self.name in ("knockdown", "barrier"):
             return _number(summary[self.name])
         if self.name == "critical_field":
+            # the first limit point of the field
             points = (
                 point["value"]
                 for point in summary["limit_points"]
@@ -65,6 +73,7 @@ class Scalar:
                 first_snap.get(OF_SNAPS[self.name])
             )  # earlier versions have `time` alone
         path = [row for row in rows if row["branch"] == "0" and row["mode"] in OWN_MODES]
+        # "end" is no column
         if not path or not {self.column, self.at} - {"end"} <= set(path[0]):
             return None
         if self.at == "end":
@@ -116,7 +125,7 @@ def parse_scalar(text: str) -> Scalar:
 def _crossing(
     path: Sequence[Mapping[str, str]], column: str, place_column: str, value: float
 ) -> float | None:
-    """Return a column where `place_column` first has a value, by cubic interpolation; None without.
+    """Return a column at the first place with a value, by cubic interpolation; None without one.
 
     The interpolation uses points of one load, because the curve has a corner at the end of the
     field. At a requested point of the path the result is the number in its row.
@@ -125,8 +134,11 @@ def _crossing(
     ----------
     path
         Rows of path.csv without branches.
+    place_column, value
+        Column that has the value at the place.
     """
     places = [float(row[place_column]) for row in path]
+    # the first interval (i, i + 1) of the path that has the value within
     i = next(
         (
             i
@@ -139,13 +151,14 @@ def _crossing(
         # a target is reached within the solver's tolerance
         target_reached = bool(places) and math.isclose(places[-1], value, rel_tol=1e-9)
         return float(path[-1][column]) if target_reached else None
+    # one more point on either side, if the same load varies there
     first, last = i, i + 1
     if i and path[i]["amplitude"] == path[i + 1]["amplitude"]:
         first -= 1
     if i + 2 < len(path) and path[i + 2]["amplitude"] == path[i + 1]["amplitude"]:
         last += 1
     window = slice(first, last + 1)
-    # linear between the two points around the place
+    # where the place turns back, linear between the two points around it
     if not _monotone(places[window]):
         window = slice(i, i + 2)
     return float(

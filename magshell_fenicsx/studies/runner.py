@@ -3,6 +3,12 @@
 A study says which runs there are. The runner opens its folder, keeps every outcome in a file as
 soon as it is there, deals the missing runs to the ranks, and says how far it is. What these sources
 have kept is not computed again.
+
+A study is any command that runs a case many times, such as a sweep. A case is what the front end
+makes of a source (a case file with settings). An outcome is what a run leaves; it is found along
+its path, or as a fold that is followed from another run. A knockdown k_d is the pressure of the
+first fold over the classical one. A scalar is a named number of a run. A task is a run, or several
+that belong together. `say` prints a line.
 """
 
 import json
@@ -109,7 +115,8 @@ class Folder:
 def keep(file: Path, content: Mapping[str, Any]) -> None:
     """Write an outcome as a JSON file.
 
-    A killed study leaves the complete file or none. Two processes may write the same file.
+    A killed study leaves the complete file or none: it is written under another name, and renamed.
+    Two processes may write the same file.
 
     Raises
     ------
@@ -211,7 +218,7 @@ def compute(
     with _wait_for_all(comm), heard(comm, say, remaining_text) as progress:
         for i in deal(len(tasks), comm):
             for line in do(tasks[i]):
-                done_count = i + 1
+                done_count = i + 1  # on all ranks together, since tasks are dealt in order
                 progress(line + remaining_text())
 
 
@@ -239,6 +246,7 @@ class Heard:
 
     def remind(self) -> None:
         """Say a reminder after each long silence, until `end` is called."""
+        # wait until the silence would be long, unless a line is said meanwhile
         while not self._ended.wait(
             max(0.01, self._last + SECONDS_BETWEEN_LINES - time.perf_counter())
         ):
@@ -288,6 +296,7 @@ def remaining_time_text(seconds: float, prefix: str = "about ") -> str:
     """
     if seconds < LEAST_LEFT:
         return ""
+    # the largest unit of which there are 1.5 or more
     size, unit = next(
         (size, unit) for size, unit in ((3600, "h"), (60, "min"), (1, "s")) if seconds >= 1.5 * size
     )
@@ -315,7 +324,8 @@ def _remaining_by_count(seconds: float, done_count: int, count: int) -> str:
 def deal(count: int, comm: MPI.Intracomm) -> Iterator[int]:
     """Yield numbers from 0 to count - 1, each on one rank: the next free rank gets the next number.
 
-    Collective. All ranks increase a counter in the memory of rank 0, which works like the others.
+    Collective. All ranks increase a counter in the memory of rank 0 (one-sided MPI), so that rank 0
+    can work like the others.
     """
     if comm.size == 1:
         yield from range(count)
@@ -327,6 +337,7 @@ def deal(count: int, comm: MPI.Intracomm) -> Iterator[int]:
     comm.Barrier()
     increment, number = np.ones(1, dtype=np.int64), np.zeros(1, dtype=np.int64)
     while True:
+        # add one to the counter, and get its value before
         window.Lock(0)
         window.Fetch_and_op(increment, number, 0)
         window.Unlock(0)
@@ -347,6 +358,7 @@ def _wait_for_all(comm: MPI.Intracomm) -> Iterator[None]:
     except BaseException as e:
         if comm.size == 1:
             raise
+        # exit codes: 2 input, 3 disk, 1 anything else, which is told with its traceback
         code = 2 if isinstance(e, CaseError) else 3 if isinstance(e, DiskError) else 1
         print(
             f"rank {comm.rank}: {e if code > 1 else traceback.format_exc()}",
@@ -412,8 +424,9 @@ class Outcome:
 
     def value(self, scalar: Scalar) -> float | None:
         """Return a named number of the run; None if the run does not have it."""
-        if not self.curve:
+        if not self.curve:  # a failed run
             return None
+        # as far as a scalar reads it
         limits = [self.limit] if self.limit else []
         summary = {
             "knockdown": self.knockdown,
@@ -430,7 +443,7 @@ class Outcome:
 
         A fold alone has the knockdown only. A path must have the columns of the number.
         """
-        needed = {scalar.column, scalar.at} & set(COLUMNS)
+        needed = {scalar.column, scalar.at} & set(COLUMNS)  # those that an outcome may leave out
         has_path = self.found == "path" and (not self.curve or needed <= self.curve[0].keys())
         return has_path or scalar.name == "knockdown"
 
@@ -454,6 +467,7 @@ def outcome_of(
     columns
         Columns of path.csv that the curve keeps, beside those that the scene adds.
     """
+    # the limit point of k_d first; the others stay in order
     limit_points = sorted(
         result.limit_points,
         key=lambda p: p["amplitude"] != "pressure" or p["value"] != result.knockdown,
@@ -477,7 +491,7 @@ def outcome_of(
         factorisations=factorisations,
         barrier=result.barrier,
         in_units=in_units(result),
-        snaps=snaps(result.rows) if origin == "path" else [],
+        snaps=snaps(result.rows) if origin == "path" else [],  # a fold alone has no path
     )
 
 
@@ -487,6 +501,7 @@ def _event(result: Result) -> dict[str, Any] | None:
     None if the run ended otherwise.
     """
     last_row, steps = result.rows[-1], result.scene.problem.programme
+    # what ends the last step; only a motion in time has the amplitude "time"
     until = getattr(steps[-1].load, "until", "") if steps else ""
     if result.stopped or last_row["amplitude"] != "time" or until not in ("event", "instability"):
         return None

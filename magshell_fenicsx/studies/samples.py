@@ -1,4 +1,9 @@
-"""The samples of an ensemble: cases with drawn values."""
+"""The samples of an ensemble: cases with drawn values.
+
+A value is drawn for each random key of the case, and for all keys of random defects, which replace
+the shell's imperfections. Plain data are those of the case file; a section is their validated form.
+The weakest defect has the least amplitude.
+"""
 
 import copy
 import json
@@ -77,6 +82,7 @@ def make_samples(
             drawn_texts = section.settings(seed, number, shells)
             samples.append(_sample(source, number, drawn_texts, make_case, deleted))
         except (CaseError, NoRoom) as e:
+            # messages about random keys tell where the case file has their distributions
             message = in_the_file(
                 str(e),
                 source,
@@ -115,12 +121,13 @@ def _sample(
         for path, value in _flat(key, value_at(drawn_source.data, key.split(".")))
     }
     case = make_case(drawn_source)
-    ranked = _defects(drawn_source.data, case)
+    ranked = _defects(drawn_source.data, case)  # the weakest first
     if deleted:
         if len(ranked) <= deleted:
             raise CaseError(
                 f"--delete-weakest {deleted}: the sample has only {len(ranked)} defects"
             )
+        # by identity, as two defects may be equal
         deleted_ids = {id(defect) for defect in ranked[:deleted]}
         for shell, _ in _shells(drawn_source.data, case):
             if "imperfections" in shell:
@@ -128,10 +135,9 @@ def _sample(
                     item for item in shell["imperfections"] if id(item) not in deleted_ids
                 ]
         case = make_case(drawn_source)
-    case.problem()
-    return Sample(
-        number, values, dict(_flat("", ranked[-1])) if ranked else {}, case, identity(case)
-    )
+    case.problem()  # raises errors of the case
+    severest = dict(_flat("", ranked[-1])) if ranked else {}
+    return Sample(number, values, severest, case, identity(case))
 
 
 def _flat(path: str, part: Any) -> Iterator[tuple[str, Any]]:
@@ -155,10 +161,12 @@ def _flat(path: str, part: Any) -> Iterator[tuple[str, Any]]:
 def _defects(data: Any, case: Case) -> list[dict[str, Any]]:
     """Return the defects with an amplitude as plain data of the case, the weakest first.
 
-    They are ordered by their amplitudes over h, so amplitudes with units can be compared.
+    They are ordered by their amplitudes over h, which the sections have, so amplitudes with units
+    can be compared.
     """
     sizes_and_defects = list[tuple[float, dict[str, Any]]]()
     for shell, section in _shells(data, case):
+        # `defect` is short for one imperfection, in data and section alike
         defects = shell.get("imperfections") or ([shell["defect"]] if shell.get("defect") else [])
         single_defect = getattr(section, "defect", None)
         sections = section.imperfections or ([single_defect] if single_defect else [])

@@ -1,6 +1,8 @@
 """The sections of studies in a case: `design` and `ensemble`.
 
-They say what a design varies and wants, and what is random in an ensemble.
+They say what a design varies and wants, and what is random in an ensemble. A key is a path of words
+with dots into the case. A result is a number of a run, by name. A sample of an ensemble is a case
+with drawn values.
 """
 
 import json
@@ -231,6 +233,7 @@ class DesignSection(Section):
         """
         lower, upper = map(str, self.numbers[key])
         unit = number_and_unit(lower)[1] or number_and_unit(upper)[1]
+        # zero needs no unit
         for bound_text in (lower, upper) if unit else ():
             if not number_and_unit(bound_text)[1] and bound_text not in ("0", "0.0"):
                 raise ValueError(
@@ -319,6 +322,7 @@ class EnsembleSection(Section):
         """Check that something is random, and that no key is one that random defects replace."""
         if not self.keys and self.defects is None:
             raise ValueError("needs keys or defects: otherwise nothing is random")
+        # where random defects are put; None among the shells means all of them
         reserved_keys = tuple(
             f"shells.{shell_name}.{IMPERFECTIONS}" if shell_name else IMPERFECTIONS
             for shell_name in self._shells_with_defects
@@ -386,6 +390,7 @@ class EnsembleSection(Section):
             for key, distribution in self.keys.items()
         }
         defects = dict[str, list[Any]]()
+        # every section with the name of its shell; "" is the only shell of a case
         defects_by_shell = [
             (defect_section, name)
             for defect_section in self._listed
@@ -394,6 +399,7 @@ class EnsembleSection(Section):
         for i, (defect_section, name) in enumerate(defects_by_shell):
             key = f"shells.{name}.{IMPERFECTIONS}" if name else IMPERFECTIONS
             earlier_count = sum(other_name == name for _, other_name in defects_by_shell[:i])
+            # the first one has the generator of a single shell; a second one on a shell its own
             generator_key = (
                 (f"{key}.{earlier_count}" if earlier_count else key) if i else IMPERFECTIONS
             )

@@ -2,20 +2,21 @@
 
 Its prior is as strong as the data make most likely.
 
-The numbers B (n, c) of a field at n places are normal about their mean, c components alike and
-apart, with
+By the prior the numbers B (n, c) of a field at n places are normal about their mean. Its c
+components have the same distribution and are independent of each other, with
 
     cov(B(x), B(y)) = s^2 k(|x - y|/l),    k(r) = (1 + sqrt(3) r) exp(-sqrt(3) r)
 
 (C. E. Rasmussen and C. K. I. Williams, Gaussian Processes for Machine Learning, MIT Press 2006, eq.
 4.17). The deviation s, the length l and the noise of columns are those under which the data d are
-most likely (there, eq. 5.8): with the model linear about x, rows r of residuals over their
-deviations and their slopes A, those of priors too,
+most likely (there, eq. 5.8). With the model linear about x, r the residuals of data and priors
+over their standard deviations, and A their slopes,
 
     -2 ln p(d) = sum ln noise^2 - ln det Q + ln det A^T A + min |r - A dx|^2 + constant,
 
 Q being the inverse covariance of the field. A parameter without prior is integrated over too (D. A.
-Harville, J. Am. Stat. Assoc. 72, 320, 1977). Knows no shell.
+Harville, J. Am. Stat. Assoc. 72, 320, 1977). s and l are the strengths of the prior. Knows no
+shell.
 """
 
 from dataclasses import dataclass, replace
@@ -71,6 +72,7 @@ class Smooth:
 
         The least l is the median distance of neighbours.
         """
+        # without the distance of each place to itself
         distances = self.distances + np.where(np.eye(len(self.distances)), np.inf, 0.0)
         return (WEAKEST, STRONGEST), (
             float(np.median(distances.min(axis=1))),
@@ -79,7 +81,10 @@ class Smooth:
 
     @cached_property
     def _factor(self) -> tuple[Array, float]:
-        """W (n, n) with W^T W = Q, and ln det Q, of one component."""
+        """W (n, n) with W^T W = Q, and ln det Q, of one component.
+
+        With the covariance L L^T, W is the inverse of L.
+        """
         r = np.sqrt(3) * self.distances / self.length
         K = (1 + r) * np.exp(-r) + JITTER * np.eye(len(r))
         L = self.deviation * np.linalg.cholesky(K)
@@ -90,12 +95,14 @@ class Smooth:
     @property
     def rows(self) -> Array:
         """W (size, size) of the whole field, with W^T W = Q; components vary fastest."""
-        return np.asarray(np.kron(self._factor[0], np.eye(self.components)))
+        W, _ = self._factor
+        return np.asarray(np.kron(W, np.eye(self.components)))
 
     @property
     def determinant(self) -> float:
         """ln det Q."""
-        return self.components * self._factor[1]
+        _, determinant = self._factor
+        return self.components * determinant
 
     def at_bounds(self) -> list[str]:
         """Return the names of deviation s and length l, where they have reached a bound."""
@@ -114,8 +121,8 @@ class Smooth:
     def starts(self, prior: "Smooth") -> list[tuple[float, float]]:
         """Return pairs (s, l) from which a search begins.
 
-        A known prior starts from its own values. Else values are spread between the bounds, and
-        given ones are kept.
+        If this prior has values, of an earlier search, they are the only start. Else the starts are
+        spread between the bounds, and given values are kept.
 
         Parameters
         ----------
@@ -124,7 +131,8 @@ class Smooth:
         """
         if np.isfinite(self.deviation):
             return [(self.deviation, self.length)]
-        (_, _), (shortest, longest) = self.bounds
+        _, (shortest, longest) = self.bounds
+        # deviations over the field's unit
         deviations = (
             np.geomspace(0.03, 3.0, START_VALUES)
             if np.isnan(prior.deviation)

@@ -5,6 +5,11 @@ exp(-((x - location)/scale)^shape) for x > location, fitted by maximum likelihoo
 location the shape is the root of one equation and the scale follows from it, so that the likelihood
 is maximised over the location alone (profile likelihood). It has no maximum where the shape is
 below one: such shapes are left out.
+
+A sample of an ensemble is a random case. Its outcome is what its run gave, its result one number of
+that (a scalar), and its status a key of `STATUS`. Rows and columns are those of samples.csv: the
+result, the drawn values by keys of the case (a unit as ending), and the most severe defect
+(`severest.`). The weakest defects may be deleted in a second run of a sample (`WITHOUT`).
 """
 
 from collections.abc import Mapping, Sequence
@@ -59,6 +64,7 @@ def make_row(sample: Sample, outcome: Outcome | None, scalar: Scalar) -> Row:
         The number that is the result.
     """
     result = outcome.value(scalar) if outcome else None
+    # the reason is that of a run that stopped, or of no result
     status, reason = _status(outcome, result)
     computed = ("found", "factorisations", "dofs", "cpu_s", "wall_s")
     return {
@@ -80,9 +86,9 @@ def _status(outcome: Outcome | None, result: float | None) -> tuple[str, str | N
     reason = outcome.stopped
     if result is not None:
         return "found", reason
-    return "none" if reason is None else "failed" if reason.startswith(
-        FAILED
-    ) else "stopped", reason
+    if reason is None:  # the run reached its end
+        return "none", reason
+    return "failed" if reason.startswith(FAILED) else "stopped", reason
 
 
 def _columns(values: Mapping[str, Any]) -> Row:
@@ -195,7 +201,8 @@ def _weibull(values: Array) -> dict[str, Any] | None:
 def correlations(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     """Return Pearson's and Spearman's correlations of the result with drawn numbers.
 
-    The numbers are those of the most severe defect and all random keys but those of defects.
+    The numbers are those of the most severe defect, and of all other random keys. Single defects do
+    not count, since their numbering means nothing.
 
     Returns
     -------
@@ -205,7 +212,7 @@ def correlations(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
 
     correlated = {}
     polar_key, keys = "at.polar", drawn_keys(rows)
-    # keys that each defect has for itself
+    # begins of keys of single defects: of imperfections of one shell, and of all that have a place
     defect_prefixes = (
         "shell.imperfections.",
         *(key.removesuffix(polar_key) for key in keys if key.endswith(f".{polar_key}")),
@@ -220,7 +227,7 @@ def correlations(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
             ]
         )
         if len(pairs) < MIN_SAMPLES_FOR_CORRELATION or not np.ptp(pairs, axis=0).all():
-            continue
+            continue  # too few, or equal values
         x, y = pairs.T
         correlated[key] = {
             "pearson": float(pearsonr(x, y)[0]),
@@ -301,6 +308,7 @@ def fit(values: Sequence[float] | Array) -> Weibull | None:
     if len(np.unique(x)) < LEAST_DIFFERENT:
         return None
     deviation = float(x.std())
+    # logarithms of the distance, over the standard deviation
     low, high = np.log(SPANS)
     ends, best = (low, high), 0.0
     for _ in range(ROUNDS):
@@ -309,10 +317,13 @@ def fit(values: Sequence[float] | Array) -> Weibull | None:
             log_distances[np.argmax(_likelihoods(x, x[0] - deviation * np.exp(log_distances)))]
         )
         step = log_distances[1] - log_distances[0]
+        # the next grid is between the neighbours of the best point
         low, high = max(best - step, ends[0]), min(best + step, ends[1])
     location = x[0] - deviation * float(np.exp(best))
     shape, scale = (float(v[0]) for v in _best_shape_and_scale(x, np.array([location])))
-    return Weibull(shape, float(location), scale, best in ends or shape <= SHAPES[0])
+    smallest_shape, _ = SHAPES
+    is_at_bound = best in ends or shape <= smallest_shape
+    return Weibull(shape, float(location), scale, bounded=is_at_bound)
 
 
 def distance(values: Array, weibull: Weibull) -> float:
@@ -320,6 +331,7 @@ def distance(values: Array, weibull: Weibull) -> float:
 
     It is the largest difference between the empirical and the fitted distribution function.
     """
+    # the empirical function jumps at each value: from i/n to (i + 1)/n
     probabilities, n = weibull.probability_below(np.sort(values)), len(values)
     return float(
         np.max([np.arange(1, n + 1) / n - probabilities, probabilities - np.arange(n) / n])
@@ -332,6 +344,8 @@ def _likelihoods(x: Array, locations: Array) -> Array:
     Shape and scale are the best ones for each location.
     """
     shapes, scales = _best_shape_and_scale(x, locations)
+    # with z = ln((x - location)/scale), the logarithm of the density is
+    # ln(shape/scale) + (shape - 1) z - exp(shape z)
     logs = np.log((x - locations[:, None]) / scales[:, None])
     powers = np.exp(shapes[:, None] * logs)
     return np.asarray(
@@ -342,22 +356,24 @@ def _likelihoods(x: Array, locations: Array) -> Array:
 def _best_shape_and_scale(x: Array, locations: Array) -> tuple[Array, Array]:
     """Return the best shape (m,) and scale (m,) of a sample x (n,) for locations (m,).
 
-    The shape k solves 1/k = sum(y^k log y)/sum(y^k) - mean(log y) with y = x - location, by
-    Newton's method for log k.
+    With t = x - location, the shape k solves 1/k = sum(t^k log t)/sum(t^k) - mean(log t), by
+    Newton's method for log k, and the scale is mean(t^k)^(1/k). In the code y = log t.
     """
     y = np.log(x - locations[:, None])
-    y, mean_log = y - y.mean(axis=1, keepdims=True), y.mean(axis=1)  # mean(log y) = 0 then
-    # log y of a Weibull distribution has the deviation 1.28/k
+    y, mean_log = y - y.mean(axis=1, keepdims=True), y.mean(axis=1)  # the mean of y is 0 then
+    # log t of a Weibull distribution has the deviation 1.28/k: a start a little below
     k = 1.2 / np.maximum(y.std(axis=1), 1e-12)
     for _ in range(STEPS):
         largest_exponent = np.max(k[:, None] * y, axis=1, keepdims=True)
-        # y^k, scaled against overflow
+        # t^k, scaled against overflow
         w = np.exp(k[:, None] * y - largest_exponent)
         s0, s1, s2 = w.sum(axis=1), (w * y).sum(axis=1), (w * y**2).sum(axis=1)
         value, slope = s1 / s0 - 1 / k, s2 / s0 - (s1 / s0) ** 2 + 1 / k**2
+        # the step of log k, at most by 1
         k = k * np.exp(np.clip(-value / (slope * k), -1.0, 1.0))
     k = np.clip(k, *SHAPES)
     largest_exponent = np.max(k[:, None] * y, axis=1, keepdims=True)
+    # log of the mean of t^k
     mean = (
         np.log(np.mean(np.exp(k[:, None] * y - largest_exponent), axis=1)) + largest_exponent[:, 0]
     )
@@ -383,7 +399,7 @@ def intervals(
     for _ in range(count):
         resample = rng.choice(x, len(x))
         numbers = {"mean": float(resample.mean()), "deviation": float(resample.std(ddof=1))}
-        if weibull := fit(resample):
+        if weibull := fit(resample):  # a resample may have too few different values
             numbers |= {
                 "shape": weibull.shape,
                 "location": weibull.location,

@@ -1,6 +1,8 @@
 """Error against run time of a case over meshes, degrees, models and ranks.
 
-Every run is a separate process.
+Every run is a separate process. A point is a case with a value for each axis of `over`; a scalar is
+the number of a run whose error is studied; timings are the measurements of a point on a number of
+ranks. An origin says which sources and mesh file a run is of.
 """
 
 from collections.abc import Iterator, Sequence
@@ -46,7 +48,7 @@ class Study:
     Attributes
     ----------
     rows
-        As in study.csv, the points in product order, the ranks fastest.
+        Rows of study.csv: the points in the order of the product of axes, numbers of ranks fastest.
     reference
         The value that errors are relative to; None if no run gave the result.
     """
@@ -81,7 +83,7 @@ def study(  # noqa: PLR0913 - what a user gives
     Parameters
     ----------
     over
-        `key.path=start:stop:count` or `key.path=value,value`; keys tied with `+`.
+        One axis each: `key.path=start:stop:count` or `key.path=value,value`; keys tied with `+`.
     result
         `knockdown`, `critical_field`, `COLUMN@COLUMN=VALUE` or `COLUMN@end`; see `Scalar`.
     make_case
@@ -112,6 +114,7 @@ def study(  # noqa: PLR0913 - what a user gives
     with FOLDER.locked(folder, MPI.COMM_WORLD, Path(file).name):
         counts = sorted(set(ranks))
         origins = [{"sources": code_version(), **point.case.outside} for point in points]
+        # (index of a point, number of ranks) -> file of its measurements
         files = {
             (i, rank_count): folder / "points" / f"{points[i].key}-{rank_count}.json"
             for i in range(len(points))

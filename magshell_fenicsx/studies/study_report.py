@@ -1,4 +1,10 @@
-"""The rows of a study with their errors, its table and its picture."""
+"""The rows of a study with their errors, its table and its picture.
+
+A study runs a case over meshes, degrees, models and ranks. Errors are relative to a reference, a
+given value or the finest run. The cost column is the time that compares runs. A run is on the
+Pareto front if no other one is both faster and more accurate. A phase is a part of a run, such as
+assembly. A scalar is the number of a run whose error is studied.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -150,6 +156,7 @@ def make_rows(
         The reference; None takes the finest run, with an estimate of its error.
     """
     rows = [_row(run, scalar) for run in runs]
+    # finest: only if it is the reference itself
     reference, finest = None, None
     if reference_value is not None:
         reference = Reference(reference_value, None, None, "given")
@@ -161,6 +168,7 @@ def make_rows(
         reference = _estimated(finest, runs, rows)
     for row in rows:
         if reference and row["result"] is not None:
+            # the finest run has the estimated error, not zero
             row["error"] = reference.error if row is finest else reference.error_of(row["result"])
     cost_column = clock(rows)
     comparable = [row for row in rows if row["error"] is not None and row[cost_column] is not None]
@@ -189,6 +197,7 @@ def _row(run: Run, scalar: Scalar) -> Row:
         **summary["mesh"],
         "result": scalar.value_in(summary, measured.rows),
         **{key: measured.typical(key) for key in TIMES},
+        # of the first run, which may have compiled kernels
         "jit_first_s": measured.first["jit_s"] if measured.first else None,
         "factorisations": summary["factorisations"],
         "iterations": summary["iterations"],
@@ -199,7 +208,7 @@ def _row(run: Run, scalar: Scalar) -> Row:
 def _estimated(finest: Row, runs: Sequence[Run], rows: Sequence[Row]) -> Reference:
     """Return the finest run as reference, with an estimate of its error.
 
-    The error is extrapolated from runs that differ from it in the refinement alone.
+    The error is extrapolated (Richardson) from runs that differ from it in the refinement alone.
     """
     fixed_keys = [key for key in runs[0].point.values if key != REFINEMENT] + ["ranks"]
     results_by_refinement = {
@@ -211,7 +220,9 @@ def _estimated(finest: Row, runs: Sequence[Run], rows: Sequence[Row]) -> Referen
     }
     refinements = sorted(results_by_refinement)
     error, order = estimated_error(
-        [1 / r for r in refinements], [results_by_refinement[r] for r in refinements]
+        # mesh sizes are proportional to 1/refinement
+        [1 / r for r in refinements],
+        [results_by_refinement[r] for r in refinements],
     )
     value = finest["result"]
     relative_error = None if error is None else error / (abs(value) or 1.0)
@@ -398,8 +409,10 @@ def draw_study(
     import matplotlib.pyplot as plt
 
     cost_column = clock(rows)
+    # logarithms need positive errors
     series = _series([row for row in rows if row["error"] and row[cost_column]], keys)
     figure, panels = plt.subplots(2, 2, figsize=(9.6, 7.2), layout="constrained")
+    # three panels of errors; the fourth has the shares of the phases
     for axes, (quantity, label) in zip(
         panels.flat, {cost_column: CLOCKS[cost_column], **AXIS_LABELS}.items(), strict=False
     ):
@@ -473,6 +486,7 @@ def _errors(
         )
     axes.set(xscale="log", yscale="log")
     if values := [row[quantity] for rows in series.values() for row in rows]:
+        # geometric mean
         middle = (min(values) * max(values)) ** 0.5
         half_range = max(LEAST_SPREAD, 1.1 * (max(values) / min(values)) ** 0.5)
         axes.set_xlim(middle / half_range, middle * half_range)
@@ -495,6 +509,7 @@ def _draw_phase_shares(axes: Any, series: dict[str, list[Row]]) -> None:
         heights = [(row[key] or 0.0) / row["wall_s"] for row in rows]
         axes.bar(places, heights, bottom=bottom, color=f"C{i}", label=label)
         bottom = [b + h for b, h in zip(bottom, heights, strict=True)]
+    # two more parts on top: up to the end of the run, and of the process
     for end, colour, label in (
         ("total_s", "0.6", "the rest of the run"),
         ("wall_s", "0.85", "start and end of the process"),

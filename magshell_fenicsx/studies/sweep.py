@@ -1,8 +1,11 @@
 """A case over ranges of its keys; the ranks share the points, and existing points are kept.
 
-The points along one axis are a chain. If the result is a knockdown, the fold of one point of a
-chain is followed to the next; the first point, and every point where this fails, computes the full
-path.
+An axis is one direction of a sweep: keys of the case that take the same values (tied with `+`). A
+point is a case with a value for each axis; its outcome is what its run leaves. The points along one
+axis are a chain, whose members are links. If the result is a knockdown, the pressure of the first
+fold over the classical one, the fold of one point of a chain is followed to the next; the first
+point, and every point where this fails, computes the full path. A scalar is a further number of a
+run. A part is what one of several jobs computes. A scene is the model of a case with its solver.
 """
 
 import copy
@@ -56,8 +59,9 @@ from magshell_fenicsx.studies.sweep_picture import draw_sweep
 
 NAME, TABLE, CURVES, PICTURE = "sweep.json", "sweep.csv", "curves.csv", "sweep.png"
 FOLDER = Folder("a sweep", (NAME, TABLE, CURVES, PICTURE), ("keys", "base", "points"), first=TABLE)
-# a model with an earlier symmetry covers the later ones
+# a model with an earlier one of these symmetries can show what a model with a later one does
 SYMMETRIES = "none", "half", "axisymmetric"
+# columns of sweep.csv that are of the limit point, and of curves.csv
 OF_LIMIT = ("p_over_pc", "w_pole_over_h", "kind", "mode", "amplitude", "value")
 CURVE = (
     *(
@@ -113,12 +117,12 @@ def sweep(  # noqa: PLR0913 - what a user gives
     """Run a case at all points of a product of axes; collective, and every rank works.
 
     If the result is a knockdown (`loading: {kind: pressure, until: limit}`), one path is computed
-    up to its fold. The fold is then followed along the last axis with numbers; see `Continuation`.
+    up to its fold. The fold is then followed along the last axis with numbers (`Continuation`).
 
     Parameters
     ----------
     over
-        `key.path=start:stop:count` or `key.path=value,value`; keys tied with `+`.
+        One axis each: `key.path=start:stop:count` or `key.path=value,value`; keys tied with `+`.
     out
         Folder of sweep.csv, sweep.png and points/; existing points are kept if these sources
         computed them. Tables and picture have the points of earlier sweeps over the same keys too.
@@ -127,7 +131,7 @@ def sweep(  # noqa: PLR0913 - what a user gives
     make_case
         Makes a case of its source.
     result
-        A further number of each point, as of `magshell study`; see `parse_scalar`.
+        A further number of each point: knockdown, COLUMN@COLUMN=VALUE, ...; see `parse_scalar`.
     full_paths
         Compute the full path at every point.
     part
@@ -147,15 +151,16 @@ def sweep(  # noqa: PLR0913 - what a user gives
         If the tables cannot be written.
     """
     axes, scalar = parse_axes(over), parse_scalar(result) if result else None
+    # other numbers than a knockdown need the path
     full_paths = full_paths or not (scalar is None or scalar.name == "knockdown")
     source = on_first_rank(comm, lambda: swept_source(Path(file), axes, settings))
     requested = on_first_rank(comm, lambda: make_points(source, axes, make_case))
     share = share_of(part, len(requested))
     folder = FOLDER.prepare(user_folder(out), comm)
     points = access_disk(comm, lambda: with_earlier(folder, source, axes, requested, make_case))
-    earlier_count = len(points) - len(requested)
+    earlier_count = len(points) - len(requested)  # points of earlier sweeps come first
     files = [folder / "points" / f"{point.key}.json" for point in points]
-    # equal points are one
+    # equal points are one: in reversed order the first number of a key is written last
     first = {point.key: number for number, point in reversed(list(enumerate(points)))}
     missing = access_disk(
         comm, lambda: sorted(n for n in first.values() if not _is_known(files[n], scalar))
@@ -189,7 +194,7 @@ def sweep(  # noqa: PLR0913 - what a user gives
         for point, file in zip(points, files, strict=True)
         if (outcome := stored_outcome_of_case(file))
     ]
-    assert part or len(outcomes_of_points) == len(points)
+    assert part or len(outcomes_of_points) == len(points)  # other parts may not be finished
     if comm.rank == 0 and len(outcomes_of_points) < len(points):
         say(
             f"{len(points) - len(outcomes_of_points)} of {len(points)} points are left to other "
@@ -287,13 +292,13 @@ def make_chains(
     """
     axis = last_numeric_axis(axes)
     if full_paths or axis is None:
-        return [[Link(number, 0.0, points[number].case)] for number in missing]
+        # each point alone, so its value on an axis does not matter
+        return [[Link(number, at=0.0, case=points[number].case)] for number in missing]
     # values of the other axes -> points along the axis
     lines: dict[tuple[str, ...], list[int]] = {}
     for number, point in enumerate(points):
-        lines.setdefault(
-            tuple(v for key, v in point.values.items() if key not in axis.keys), []
-        ).append(number)
+        other_values = tuple(v for key, v in point.values.items() if key not in axis.keys)
+        lines.setdefault(other_values, []).append(number)
     return [
         chain for line in lines.values() for chain in _chains_of(line, axis, points, set(missing))
     ]
@@ -304,7 +309,8 @@ def _chains_of(
 ) -> list[Chain]:
     """Return the missing points of a line along the axis, as one chain if folds can be followed.
 
-    All cases of a chain get the lowest symmetry among the points of the line.
+    All cases of a chain get the lowest symmetry among the points of the line, as a fold can only be
+    followed in one kind of model.
 
     Parameters
     ----------
@@ -313,7 +319,7 @@ def _chains_of(
     missing
         Indices of the points to compute.
     """
-    key = axis.keys[0]
+    key = axis.keys[0]  # tied keys have the same values
     links = [
         Link(n, axis.number(points[n].values[key]), points[n].case) for n in line if n in missing
     ]
@@ -362,11 +368,12 @@ def run_chain(chain: Chain, folds: SweepCache) -> Iterator[tuple[int, Outcome]]:
     The fold of a point is followed from the point before. Where this fails, the full path is
     computed.
     """
-    continuation = folds.first if len(chain) > 1 else None
+    continuation = folds.first if len(chain) > 1 else None  # None: compute the path
     for link in chain:
         is_first = link is chain[0]
         start_time, factorisations, outcome = time.perf_counter(), 0, None
         if continuation:
+            # another chain's fold serves only on the same mesh
             outcome, factorisations = _by_fold(
                 continuation, link, folds, start_time, same_mesh=is_first
             )
@@ -401,7 +408,7 @@ def _by_fold(
     """
     try:
         scene = folds.scenes.scene_of(link.case)
-    except MeshError:
+    except MeshError:  # `_by_path` will report it
         return None, 0
     if same_mesh and not continuation.has_mesh_of(scene):
         return None, 0
@@ -449,9 +456,14 @@ def _by_path(
 
 
 def _continuation_from(parameter: float, result: Result) -> Continuation | None:
-    """Return a continuation from the fold at which a run ended, for the parameter's value there.
+    """Return a continuation from the fold at which a run ended.
 
     None if the run has not ended at the fold of its knockdown, or the fold is not found again.
+
+    Parameters
+    ----------
+    parameter
+        Value of the chain's axis for this run.
     """
     last_row = result.rows[result.end]
     if (
@@ -489,6 +501,7 @@ def with_earlier(
     """
     keys, base = [list(axis.keys) for axis in axes], _base(source, axes)
     earlier = _earlier(folder, keys, base)
+    # tied keys have the same value: the first one stands for the axis
     new_values = [[point.values[axis.keys[0]] for axis in axes] for point in points]
     # with all values, so that equal numbers in different units are found
     all_axes = [
@@ -548,6 +561,7 @@ def _earlier(folder: Path, keys: list[list[str]], base: str) -> list[list[str]]:
     """
     file = folder / NAME
     if not file.exists():
+        # an empty table was only created to try the folder
         if (folder / TABLE).exists() and (folder / TABLE).stat().st_size:
             raise CaseError(
                 f"--out {folder}: has a sweep.csv of an earlier version; give another folder"
@@ -584,7 +598,7 @@ def _base(source: Source, axes: Sequence[Axis]) -> str:
         if isinstance(section, dict):
             section.pop(last_word, None)
         elif isinstance(section, list) and last_word.isdecimal() and int(last_word) < len(section):
-            section[int(last_word)] = None
+            section[int(last_word)] = None  # keeps the numbers of the other items
     return hashlib.sha256(json.dumps(data, sort_keys=True, default=str).encode()).hexdigest()[:16]
 
 
@@ -625,6 +639,7 @@ def _write(
         if results
         else rows
     )
+    # order of the first columns; others follow as rows have them
     first = (
         *swept,
         "k_d",
@@ -644,7 +659,7 @@ def _write(
         {**point.values, **row} for point, outcome in outcomes_of_points for row in outcome.curve
     ]
     curves = [key for key in CURVE if any(key in line for line in lines)]
-    axis_columns = [key for line in lines for key in line if key not in COLUMNS]
+    axis_columns = [key for line in lines for key in line if key not in COLUMNS]  # of scenes, too
     write_csv(lines, tuple(dict.fromkeys((*swept, *curves, *axis_columns))), folder / CURVES)
     draw_sweep(
         axes,

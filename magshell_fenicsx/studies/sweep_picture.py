@@ -1,4 +1,10 @@
-"""The picture of a sweep: a result over one swept number or as a map over two, or all curves."""
+"""The picture of a sweep: a result over one swept number or as a map over two, or all curves.
+
+An axis of a sweep is one key of the case, or several tied ones, with its values; axes of a picture
+are `plot`. A point is a case with a value for each axis; its outcome has the curve of its run, rows
+of path.csv. An amplitude is a load parameter, by name, that varies along a part of the curve. A
+knockdown factor is the first buckling pressure over the classical one.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -72,6 +78,7 @@ def draw_sweep(
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
+    # values of all points, also of earlier sweeps
     axes = [
         Axis(axis.keys, tuple(dict.fromkeys(p.values[axis.keys[0]] for p in points)))
         for axis in axes
@@ -87,7 +94,7 @@ def draw_sweep(
     plot.set_title(_fixed(axes, points), fontsize=9)
     labels = plot.get_legend_handles_labels()[1]
     if labels and any(labels):
-        columns = -(-len(labels) // LEGEND_ROWS)
+        columns = -(-len(labels) // LEGEND_ROWS)  # rounded up
         figure.legend(loc="outside right upper", fontsize=8, frameon=False, ncols=columns)
     figure.savefig(file, dpi=200)
     plt.close(figure)
@@ -119,6 +126,7 @@ def _results(
     """
     if requested and requested[0] not in ("knockdown", "barrier"):
         return Results(requested[1], requested[0])
+    # second scales: the units of energy and pressure in millijoule and pascal
     barriers, knockdowns = [o.barrier for o in outcomes], [o.knockdown for o in outcomes]
     if any(value is not None for value in barriers):
         return Results(
@@ -141,6 +149,7 @@ def _ends(outcomes: Sequence[Outcome]) -> Results:
     last_rows = [outcome.curve[-1] if outcome.curve else {} for outcome in outcomes]
     last_row = next((row for row in last_rows if row), {})
     x, y = axes_of(str(last_row.get("amplitude", "")) or "force", last_row)
+    # x and y: displacement and load of the last amplitude
     drawn_quantity = y if np.ptp([y.on_axis(row) for row in last_rows if y.name in row]) > 0 else x
     return Results(
         [drawn_quantity.on_axis(row) if drawn_quantity.name in row else None for row in last_rows],
@@ -155,7 +164,7 @@ def _map(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results:
     """
     from matplotlib.ticker import MaxNLocator
 
-    rows, columns = axes
+    rows, columns = axes  # the first axis goes up
     x, y = (sorted(set(axis.numbers or ())) for axis in (columns, rows))
     grid = np.full((len(y), len(x)), np.nan)
     for point, value in zip(points, results.values, strict=True):
@@ -171,10 +180,11 @@ def _map(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results:
     else:
         levels = MaxNLocator(24, steps=[1, 2, 5, 10]).tick_values(np.nanmin(grid), np.nanmax(grid))
         filled = plot.contourf(x, y, grid, levels, cmap="viridis")
-        # at steps of the colours
+        # contours at every second step of the colours
         lines = plot.contour(x, y, grid, levels[::2], colors="white", linewidths=0.8)
         plot.clabel(lines, fontsize=8)
     places = np.stack(np.meshgrid(x, y), axis=-1)
+    # dots where there is a result, crosses where it is missing
     for is_hidden, style in (
         (False, {"marker": ".", "color": "0.15"}),
         (True, {"marker": "x", "color": "0.5"}),
@@ -206,6 +216,7 @@ def _write_values(plot: Any, x: Sequence[float], y: Sequence[float], grid: Any) 
         (y, x) values; nan where there is none.
     """
     low, high = np.nanmin(grid), np.nanmax(grid)
+    # three significant digits of the largest value
     digits = max(0, 2 - int(np.floor(np.log10(max(abs(low), abs(high)) or 1.0))))
     if len(x) > WRITTEN or digits > LONGEST:
         return
@@ -237,9 +248,8 @@ def _values(
             line.append((axis.number(x) if axis.numbers else x, value))
     for (name, line), style in zip(lines.items(), cycle(STYLES), strict=False):
         sorted_line = sorted(line) if axis.numbers else line
-        plot.plot(
-            *zip(*sorted_line, strict=True), style, marker=".", label=name
-        ) if sorted_line else None
+        if sorted_line:
+            plot.plot(*zip(*sorted_line, strict=True), style, marker=".", label=name)
     if axis.numbers:
         plot.locator_params(axis="x", nbins=5)  # long numbers would overlap
     plot.set_xlabel(_axis_label(axis))
@@ -268,7 +278,7 @@ def _curves(plot: "Axes", points: Sequence[SweepPoint], outcomes: Sequence[Outco
     for point, outcome, style in zip(points, outcomes, cycle(STYLES), strict=False):
         rows = loaded(outcome.curve, amplitude)
         places = ([quantity.on_axis(row) for row in rows] for quantity in (x, y))
-        plot.plot(*places, style, marker=".", label=_label(point, None))
+        plot.plot(*places, style, marker=".", label=_label(point, without=None))
     plot.axhline(0, color="0.8", linewidth=0.8, zorder=0)
     plot.set(xlabel=x.label, ylabel=y.label)
 

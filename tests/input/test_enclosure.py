@@ -43,3 +43,10 @@ def test_ranges_shrink_with_the_square_of_the_box():
             np.array([[0.5 - h, 0, 0]]), np.array([[0.5 + h, 0, 0]])
         )
         assert most[0] - least[0] < 5 * h**2
+
+
+def test_an_infinite_exponent_has_a_range():
+    least, most, _ = formula("x**(1e308*10)").bounds(
+        np.array([[0.2, 0, 0]]), np.array([[0.5, 0, 0]])
+    )
+    assert least[0] <= 0 <= most[0]

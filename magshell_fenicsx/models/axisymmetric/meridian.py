@@ -1,4 +1,14 @@
-"""The meridian of a surface of revolution: an interval mesh and, separately, the placement r0."""
+"""The meridian of a surface of revolution: an interval mesh and, separately, the placement r0.
+
+- The parameter s runs along the meridian; it is the mesh's coordinate. A chart (n, 2) has s and 0.
+- The embedding maps charts to places in space, over R; rho and z are those of the meridian.
+- Facets are vertices of the interval mesh, by local number.
+- The axis is e3; a pole is a place of the surface on it. Several shells may share the axis: each
+  has an interval of s.
+- A joint ties the edges of two shells by two parameters, which are equal where the edges meet; at a
+  T-junction they differ, as an edge ends within another shell.
+- h is the thickness over R.
+"""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -31,7 +41,7 @@ class Meridian:
     mesh
         Interval mesh over the parameter s, the distance from the origin of the chart.
     axis
-        Facets (local numbers) of the points on the axis, none where the surface has holes there.
+        Facets of the points on the axis, none where the surface has holes there.
     ends
         Name -> facets of the ends that are edges of the surface.
     embedding
@@ -39,11 +49,12 @@ class Meridian:
     points
         Name -> parameter s and azimuth (rad) of a place whose displacement is observed.
     curvature
-        See `shape.meridian_chart.MeridianChart`.
+        Largest curvature of the meridian times R, at least 1. Of several shells, that of the one
+        with the most waves around the axis.
     patches
         Name of each of several shells -> flags (cells,) of the cells in it; empty for one shell.
     tied
-        Pairs of parameters that joints tie, see `shape.meridian_chart.MeridianChart`.
+        Pairs of parameters, one for each joint.
     """
 
     mesh: mesh.Mesh
@@ -95,9 +106,13 @@ class Meridian:
 
     @property
     def bodies(self) -> list[NDArray[np.bool_]]:
-        """Flags (cells,) of each connected body: a shell, or several that joints connect."""
+        """Flags (cells,) of each connected body: a shell, or several that joints connect.
+
+        Bodies that a joint touches are merged, one joint after the other.
+        """
         bodies = [*self.patches.values()] or [np.ones(len(self._cell_ends), dtype=bool)]
         for tied_parameters in self.tied:
+            # cells that contain one of the two parameters
             begin = self._cell_ends[:, :1] - PARAMETER_TOLERANCE
             end = self._cell_ends[:, 1:] + PARAMETER_TOLERANCE
             touched_cells = ((begin < tied_parameters) & (tied_parameters < end)).any(axis=1)
@@ -108,7 +123,7 @@ class Meridian:
 
     @property
     def joints(self) -> list[Array | None]:
-        """For each joint, marks (cells,); None for a T-junction.
+        """Marks (cells,) for each joint of two edges; None for a T-junction.
 
         A mark is 1 in the cell that ends at the joint, -1 in the cell that begins there, else 0.
         """
@@ -155,6 +170,7 @@ class Meridian:
         nodes, normals, angles = r0.function_space.dofmap.list, positions_and_normals(r0)[1], [0.0]
         for marks in self.joints:
             if marks is not None:
+                # the cell that ends at the joint (mark 1), and the one that begins there (-1)
                 cells = [int(marks.argmax()), int(marks.argmin())]
                 # the node that both cells at the joint share, by its number in each
                 (i,), (j,) = np.nonzero(np.equal.outer(*nodes[cells]))
@@ -163,11 +179,14 @@ class Meridian:
         return max(angles)
 
     def growth(self, V: fem.FunctionSpace, deviations: Sequence[Deviation]) -> fem.Function:
-        """Return the change of the placement by further deviations, in the same space."""
+        """Return the change (rho, z) of the placement by further deviations, a function in V.
+
+        A deviation is a distance along the normal, as of an imperfection that grows.
+        """
         s, growth = V.tabulate_dof_coordinates()[:, 0], fem.Function(V, name="growth")
         assert isinstance(self.embedding, DeviatedEmbedding)
         growth.x.array[:] = self.embedding.along_normal(np.column_stack([s, 0 * s]), deviations)[
-            :, [0, 2]
+            :, [0, 2]  # the meridian is in the plane of e1 and e3
         ].ravel()
         return growth
 
@@ -182,7 +201,7 @@ def make_meridian(
     supported_ends: Collection[str] = (),
     tied: Sequence[tuple[float, float]] = (),
 ) -> Meridian:
-    """Mesh a meridian.
+    """Mesh a meridian, on each rank the whole of it.
 
     Parameters
     ----------
@@ -196,13 +215,13 @@ def make_meridian(
         See `Meridian`. By default there is "pole", at the parameter 0. Of several shells it is the
         highest place or, where this is supported, the highest free one on the axis.
     curvature
-        See `Meridian`.
+        Largest curvature of the meridian times R, at least 1.
     shell_intervals
         Name and ends of each of several shells, between which there are no cells.
     supported_ends
         Names of the ends that supports hold.
     tied
-        See `Meridian`.
+        Pairs of parameters that joints tie.
     """
     numbers = np.arange(len(vertices), dtype=np.int64)
     intervals = [ends for _, ends in shell_intervals] or [(float(vertices[0]), float(vertices[-1]))]
@@ -246,10 +265,10 @@ def make_meridian(
 
 
 def _highest_parameter(embedding: Embedding, vertices: Array, supported: Sequence[float]) -> float:
-    """Return the parameter of the highest vertex.
+    """Return the parameter of the vertex whose displacement is reported by default.
 
-    If it is one of the `supported` parameters, return that of the highest free vertex, on the axis
-    if one is free there.
+    It is the highest vertex along e3. If this is at one of the `supported` parameters, it is the
+    highest vertex without support, among those on the axis if there are any.
     """
     positions = embedding(np.column_stack([vertices, 0 * vertices]))
     distances = np.abs(np.subtract.outer(vertices, supported)).min(axis=1, initial=inf)
@@ -273,10 +292,10 @@ def graded_vertices(
     contact_size: tuple[float, float] | None = None,
     everywhere: float | None = None,
 ) -> Array:
-    """Return the vertices (n,) of a meridian, with cells of a fraction of sqrt(h).
+    """Return the parameters (n,) of a meridian's vertices, with cells of a fraction of sqrt(h).
 
-    They are finer on the axis, if the surface has a point there. At degree 4 such cells give k_d to
-    1e-7.
+    sqrt(h) is the length of a bending boundary layer over R. Cells are finer on the axis, if the
+    surface has a point there. At degree 4 they give the knockdown factor k_d to 1e-7.
 
     Parameters
     ----------
@@ -308,17 +327,22 @@ def graded_vertices(
     A point force bends the shell like s^2 log s. On the axis the cells shrink to a thickness
     whatever the refinement: the logarithmic stretch under an ideal point has no limit.
     """
+    # tuned for that accuracy: size of a cell on the axis, its growth along s, and the largest size
     smallest, growth = h, 0.3 / refinement
     largest = min(0.2 * sqrt(h), largest) / refinement
 
     def size(s: Array) -> Array:
-        """Return the wanted size of cells at parameters s (n,)."""
+        """Return the wanted size of cells at parameters s (n,): the least that any feature asks.
+
+        It grows linearly with the distance from the axis and from the place of contact.
+        """
         if everywhere is not None:
             return np.full_like(s, everywhere / refinement)
         sizes = np.minimum(smallest + growth * s, largest) if axis else np.full_like(s, largest)
         if contact_size:
+            contact_reach, size_in_contact = contact_size
             sizes = np.minimum(
-                sizes, contact_size[1] / refinement + growth * np.maximum(0.0, s - contact_size[0])
+                sizes, size_in_contact / refinement + growth * np.maximum(0.0, s - contact_reach)
             )
         return sizes
 
@@ -328,9 +352,10 @@ def graded_vertices(
 
 
 def _equidistributed(corners: Sequence[float], size: Callable[[Array], Array]) -> Array:
-    """Return vertices (n,) at the corners and between them, with cells in proportion to a size.
+    """Return vertices (n,) at the corners and between them, with cells in proportion to `size`.
 
-    `size` maps parameters (n,) to the wanted sizes of cells there.
+    `size` maps parameters (n,) to the wanted sizes of cells there. Between two corners all cells
+    are smaller by the same factor, so that a whole number of them fits.
 
     Raises
     ------
@@ -339,7 +364,7 @@ def _equidistributed(corners: Sequence[float], size: Callable[[Array], Array]) -
     """
     segments = []
     for a, b in pairwise(corners):
-        s = np.linspace(a, b, 20001)
+        s = np.linspace(a, b, 20001)  # fine enough for the integral of 1/size
         with np.errstate(over="ignore", divide="ignore"):
             # the number of cells up to s is the integral of 1/size
             cells_before = np.concatenate(
@@ -353,6 +378,6 @@ def _equidistributed(corners: Sequence[float], size: Callable[[Array], Array]) -
             )
         cells = int(np.ceil(cells_before[-1]))
         segment = np.interp(np.linspace(0, cells_before[-1], cells + 1), cells_before, s)
-        segment[[0, -1]] = a, b
+        segment[[0, -1]] = a, b  # without rounding
         segments.append(segment[:-1])
     return np.concatenate([*segments, corners[-1:]])

@@ -1,6 +1,16 @@
-"""The second variation of an axisymmetric shell along waves.
+"""The second variation of an axisymmetric shell's energy along waves around its axis.
 
-It is computed from the densities' Hessians at points of the meridian.
+In: the energies of a meridian with their densities. Out: for each wave number m, the entries of the
+symmetric matrix Q_m of the second variation, from Hessians of the densities at quadrature points.
+
+- A wave is v = U cos(m theta) e_rho + V sin(m theta) e_theta + W cos(m theta) e_z; its coefficients
+  along the meridian are (P, V, W) with P = U + V.
+- A jet is a vector field with its first and second derivatives by the coordinates of the surface.
+- r0 is the placement, u the axisymmetric displacement, both with components along e_rho and e_z.
+- Entities are what densities are integrated over: cells (one side), vertices between two cells (two
+  sides) or ends. A batch has entities with the same quadrature rule.
+- A block is the matrix of one entity; a pair is a row and a column node of an entry.
+- An amplitude is a load parameter, by name, that multiplies an energy.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -62,7 +72,9 @@ class WaveHessians:
         energies: Sequence[Energy],
         log: KernelLog,
     ) -> None:
+        """Sort energies into batches of points, and find the pairs of nodes that they couple."""
         self._nodes = u.function_space.dofmap.list.astype(np.int64)
+        # energies on the same points, which share one batch
         energies_by_support = dict[tuple[int, int, tuple[int, ...]], list[Energy]]()
         for e in energies:
             energies_by_support.setdefault(_support_of(e), []).append(e)
@@ -75,6 +87,7 @@ class WaveHessians:
         count = int(self._nodes.max()) + 1
         # a pair of nodes as one number, rows * count + columns
         pairs_of_batches = [rows * count + columns for rows, columns in nodes]
+        # the matrices are symmetric: only rows <= columns are assembled
         upper_numbers = [
             pair_numbers[rows <= columns]
             for pair_numbers, (rows, columns) in zip(pairs_of_batches, nodes, strict=True)
@@ -96,7 +109,8 @@ class WaveHessians:
         Parameters
         ----------
         factors
-            Amplitude of energies, or None for energies without one -> its value.
+            Amplitude -> its value, which multiplies energies; the key None is that of energies
+            without an amplitude.
         waves
             Numbers m of circumferential waves.
         """
@@ -135,6 +149,7 @@ class _WaveBatch:
         energies: Sequence[Energy],
         log: KernelLog,
     ) -> None:
+        """Declare the inputs of the kernels: point fields of u, r0, wave and geometry."""
         self._batch, self._energies, self._log, self._u = batch, energies, log, u
         self._domain, self._sides = domain, range(len(batch.cells))
         self._points = points = PointStorage(batch.size)
@@ -170,10 +185,12 @@ class _WaveBatch:
         return rows, columns
 
     def blocks(self, factors: Mapping[str | None, float], waves: Sequence[float]) -> Array | None:
-        """Return the matrices of the entities for each wave; None if no energy acts.
+        """Return the matrices of the entities for each wave; None if all factors are zero.
 
-        They are (waves, entities, pairs of components, pairs of functions), with the pairs of
-        components in `_UPPER`. `factors` and `waves` are as in `WaveHessians.entries`.
+        The array is (waves, entities, pairs of components, pairs of functions). The pairs of
+        components are those in `_UPPER`; functions are the shape functions of all cells at an
+        entity. `factors` are the values of amplitudes (key None: of no amplitude), `waves` the
+        numbers m.
         """
         active_energies = [
             number for number, e in enumerate(self._energies) if factors[e.amplitude]
@@ -185,7 +202,8 @@ class _WaveBatch:
         for number in active_energies:
             for target, values in self._varying[number]:
                 fill(target, values.renew()[0])
-        # upper triangles of the Hessians by the wave's jets; pi is the integral of cos² around e3
+        # upper triangles of the Hessians by the wave's jets; pi is the integral of cos² around e3,
+        # as of sin²
         upper = np.zeros((len(waves), *self._scales.shape))
         for wave_index, m in enumerate(waves):
             self._m.value = m
@@ -199,6 +217,7 @@ class _WaveBatch:
             axis=(0, 2)
         )  # a body touches few cells: the matrices of others are zero
         blocks = np.zeros((*upper.shape[:2], len(_UPPER), self._products.shape[1]))
+        # rows of Hessians (waves, entities) times products of shape functions at the points
         ordered = upper[:, has_stiffness][..., self._order].reshape(-1, len(self._products))
         blocks[:, has_stiffness] = (ordered @ self._products).reshape(
             len(waves), -1, *blocks.shape[2:]
@@ -213,10 +232,11 @@ class _WaveBatch:
 
     @cached_property
     def _kernels(self) -> list[PointKernel]:
-        """A kernel for each energy: the Hessian by the jets of a wave's coefficients, at no wave.
+        """A kernel for each energy: the Hessian at zero wave, by the wave's coefficients.
 
-        The wave's cosine and sine parts of the jets are two displacements that add up. Each adds
-        its second variation.
+        It is the Hessian by (P, V, W) and their first and second derivatives at a point. The jets
+        of a wave have a cosine and a sine part. Integrated around e3 the product of both vanishes,
+        so the second variation is the sum of those along each part.
         """
         waves = [self._of_sides(self._wave, WAVE, side) for side in self._sides]
         jets_of_waves = [wave_jets_of(side_jets, self._m) for side_jets in waves]
@@ -227,6 +247,7 @@ class _WaveBatch:
         kernels = []
         for energy, (parameters, _) in zip(self._energies, self._given, strict=True):
             assert energy.density
+            # `start` is the placement from which the energy counts, `shift` leads from there to r0
             if self._counts_from_initial(energy):
                 start, shift = (
                     initial_jets,
@@ -245,14 +266,17 @@ class _WaveBatch:
         return kernels
 
     def _counts_from_initial(self, e: Energy) -> bool:
+        """Return whether an energy counts from an initial placement other than r0."""
         return e.from_initial and self._domain.initial_placement is not None
 
     def _edge(self, r0: Sequence[Jet]) -> tuple[list[Expr], Expr] | None:
         """Return the covector on every side and the width of an edge; None in cells.
 
-        They are those of an `IntegrationDomain`; `r0` has the placement's jet on every side.
+        Here an edge is a circle, at a vertex of the meridian. The width is half the mean length of
+        the cells beside it, as triangles have half their height there. `r0` has the placement's jet
+        on every side.
         """
-        density = self._energies[0].density
+        density = self._energies[0].density  # all energies of a batch are on edges, or none
         if density is None or not density.on_edges:
             return None
         covectors = [ufl.as_vector([self._geometry[2 * side], 0]) for side in self._sides]
@@ -263,7 +287,11 @@ class _WaveBatch:
         return covectors, sum(widths, ufl.zero()) / len(widths)
 
     def _of_sides(self, field: fem.Function, components: int, side: int) -> list[list[Expr]]:
-        """Return value and two derivatives of a field's components on one side of an entity."""
+        """Return value and two derivatives of a field's components on one side of an entity.
+
+        The point field has for each side first the values of all components, then their first
+        and their second derivatives.
+        """
         first = components * DERIVATIVES * side
         return [
             [field[first + components * d + c] for c in range(components)]
@@ -271,9 +299,10 @@ class _WaveBatch:
         ]
 
     def _derivatives(self, field: fem.Function) -> Array:
-        """Return values and derivatives of an axisymmetric field at the points.
+        """Return an axisymmetric field at the points: its value, first and second derivative.
 
-        They are (points, sides, derivatives, components), by the coordinate of the meridian.
+        The array is (points, sides, derivatives, components); derivatives are by the coordinate of
+        the meridian.
         """
         nodal = field.x.array.reshape(-1, PLANE)[self._u.function_space.dofmap.list]
         sides = [
@@ -298,10 +327,9 @@ class _WaveBatch:
 
     @cached_property
     def _by_length(self) -> list[Array]:
-        """Factors (entities, derivatives) of derivatives by the coordinate, on each side.
+        """Factors (entities, derivatives), on each side, of value, first and second derivative.
 
-        They multiply the derivatives in the reference cell and give those by the meridian's
-        coordinate.
+        They turn derivatives by the reference coordinate into derivatives by the meridian's.
         """
         lengths = _lengths(self._u.function_space)
         return [
@@ -310,13 +338,15 @@ class _WaveBatch:
 
     @cached_property
     def _products(self) -> Array:
-        """Products of two shape functions' derivatives, with the functions of all sides.
+        """Products of derivatives of two shape functions, for the functions of all sides.
 
-        They are (points of an entity and pairs of derivatives, pairs of functions). A row of
-        Hessians times them gives a matrix of an entity.
+        The rows are (point of an entity, derivative i, derivative j), the columns (function n,
+        function m). The Hessians at the points of an entity, as one row, times this matrix give the
+        entity's matrix.
         """
         points_per_entity, derivatives, functions = self._reference[0].shape
         count = len(self._sides)
+        # a function of one side has no derivatives on the other: blocks on the diagonal
         tables = np.zeros((points_per_entity, count, derivatives, count, functions))
         for side, table in enumerate(self._reference):
             tables[:, side, :, side] = table
@@ -331,9 +361,11 @@ class _WaveBatch:
 
     @cached_property
     def _order(self) -> Ints:
-        """Positions in a row of an entity's Hessians that go with the rows of `_products`.
+        """Positions of Hessian entries, in the order of the rows of `_products`.
 
-        They are (pairs of components in `_UPPER`, points of an entity and pairs of derivatives).
+        The array is (pairs of components in `_UPPER`, points of an entity and pairs of
+        derivatives). A position counts the upper triangles of all points of an entity, one after
+        the other.
         """
         derivatives = DERIVATIVES * len(self._sides)
         triangle = _triangle(WAVE * derivatives).reshape(derivatives, WAVE, derivatives, WAVE)
@@ -342,9 +374,10 @@ class _WaveBatch:
 
     @cached_property
     def _scales(self) -> Array:
-        """Weights (points, entries of the Hessians) of the integral, times factors of derivatives.
+        """Factors (points, entries of the Hessians) by which Hessians are integrated.
 
-        The quadrature's weight is one at a vertex.
+        They are the weights of the quadrature times the cell's size, times the factors that turn
+        derivatives in the reference cell into those by the coordinate. A vertex has the weight one.
         """
         cells = self._batch.cells[0]
         weights = self._batch.rule.weights
@@ -367,8 +400,10 @@ def _perturbed_density(
 ) -> Expr:
     """Return a density whose Hessian in v, at v = 0, is that of the energy at u + v.
 
-    Of a virtual work it is the symmetric part, as in `Energy.perturbed_form`. All jets are given on
-    every side; `edge` has the covectors and the width, or is None in cells.
+    A virtual work w(u, v) may have no potential; its derivative by u then is not symmetric. The
+    quarter of w(u + v, v) - w(u - v, v) is quadratic in v and has the symmetric part as its
+    Hessian. All jets are given on every side; `edge` has the covectors and the width, or is None in
+    cells.
     """
     u_plus_v = [a + b for a, b in zip(u, v, strict=True)]
     if density.work is None:
@@ -383,7 +418,8 @@ def _perturbed_density(
 def _sum_of_blocks(numbers: Ints, in_triangle: NDArray[np.bool_], count: int) -> csr_array:
     """Return the sparse matrix that adds up a batch's blocks into entries of pairs of nodes.
 
-    Its rows are the entries of all pairs, its columns those of the blocks.
+    It acts on the entries of all blocks, as one vector, and gives the nine entries of each pair of
+    nodes. All its values are one.
 
     Parameters
     ----------
@@ -412,7 +448,8 @@ def _sum_of_blocks(numbers: Ints, in_triangle: NDArray[np.bool_], count: int) ->
 def _support_of(e: Energy) -> tuple[int, int, tuple[int, ...]]:
     """Return a key of where an energy is integrated: sides, quadrature and facets.
 
-    Energies with the same key share their points.
+    Energies with the same key share their points. A degree of quadrature 0 stands for that of the
+    domain.
     """
     assert e.density
     facets = () if e.density.facets is None else tuple(int(facet) for facet in e.density.facets)
@@ -420,10 +457,11 @@ def _support_of(e: Energy) -> tuple[int, int, tuple[int, ...]]:
 
 
 def _batches(domain: IntegrationDomain, density: Density | None) -> Iterable[EntityBatch]:
-    """Yield the batches of points of a density: cells, inner vertices, or ends.
+    """Yield the batches of entities of a density: all cells, or vertices with the same rule.
 
-    The geometry (points, 2 for each side) is the covector and the length of the cell. Vertices are
-    grouped by their local numbers in the cells beside them.
+    The geometry of a batch (points, 2 for each side) has on each side the outward covector, 1 or
+    -1 by the meridian's coordinate, and the length of the cell; it is zero for cells. Vertices are
+    grouped by their local numbers in the cells beside them, as these decide on the reference point.
     """
     V = domain.r0.function_space
     topology, lengths = V.mesh.topology, _lengths(V)
@@ -442,6 +480,7 @@ def _batches(domain: IntegrationDomain, density: Density | None) -> Iterable[Ent
         topology.connectivity(0, 1),
         topology.connectivity(1, 0).array.reshape(-1, 2),
     )
+    # vertices between two cells, unless the density is on given ends
     vertices: NDArray[np.integer] = np.flatnonzero(np.diff(cells_of_vertices.offsets) == 2)
     if density.facets is not None:
         vertices = density.facets
@@ -466,7 +505,10 @@ def _batches(domain: IntegrationDomain, density: Density | None) -> Iterable[Ent
 
 
 def _lengths(V: fem.FunctionSpace) -> Array:
-    """Return the change (cells,) of the coordinate from the first to the second vertex."""
+    """Return the change (cells,) of the coordinate from a cell's first to its second vertex.
+
+    It is negative in a cell whose reference coordinate runs against the meridian's.
+    """
     ends = V.mesh.geometry.x[compat.geometry_dofs(V.mesh), 0]
     return np.asarray(ends[:, 1] - ends[:, 0])
 

@@ -4,6 +4,14 @@ The ranges of a formula and of its derivatives in a box (`input/enclosure.py`) a
 values at a few places. A part is divided while the difference of both may change the integral of
 the formula's variation. So a step or a Gaussian of any width is found, at a cost that grows like
 the logarithm of one over the width.
+
+- A part is a piece of a cell: the image X = corner + sides X' of the reference cell in itself. Its
+  children are the pieces that it is divided into; d is the dimension of cells.
+- The range of a formula is an interval that surely contains its values in a box in space.
+- The variation of f is the integral of |f - mean of f|.
+- `hidden` is how far f may leave the range of its samples; times the area it is a hidden integral.
+- `open` is the share of the variation that stays hidden where the search gives up.
+- Own cells are those of this rank; they come first, ghosts follow and do not count in sums.
 """
 
 from collections.abc import Callable, Sequence
@@ -80,7 +88,7 @@ class SubCells:
         return [self[i : i + BATCH_SIZE] for i in range(0, len(self.cell), BATCH_SIZE)]
 
     def divided(self) -> "SubCells":
-        """Return the children of all parts: first those of the first part, and so on."""
+        """Return the children of all parts: first all of the first part, and so on."""
         children = CHILDREN[self.corner.shape[1]]
         corners, scales = (np.array(v, dtype=float) for v in zip(*children, strict=True))
         d = self.corner.shape[1]
@@ -92,9 +100,10 @@ class SubCells:
         )
 
     def rule(self, points: Array, weights: Array) -> tuple[Array, Array]:
-        """Return points (parts, q, d) and weights (parts, q) of a rule on each part.
+        """Return points (parts, q, d) and weights (parts, q) of a quadrature rule on each part.
 
-        `points` (q, d) and `weights` (q,) are the rule on the reference cell.
+        `points` (q, d) and `weights` (q,) are the rule on the reference cell. Sides may be negative
+        where a child is turned over.
         """
         X = self.corner[:, None] + self.sides[:, None] * points
         return X, np.abs(self.sides.prod(axis=1))[:, None] * weights
@@ -127,10 +136,11 @@ class Lattice:
 
     @classmethod
     def make(cls, kind: basix.CellType, count: int) -> "Lattice":
-        """Return the lattice that divides each side into `count` parts."""
+        """Return the lattice that divides each side of the reference cell into `count` parts."""
         corners = basix.geometry(kind)
         interior = basix.create_lattice(kind, count, basix.LatticeType.equispaced, exterior=True)
         X = np.concatenate([corners, interior])
+        # neighbours are places of the lattice proper, after the corners, one step apart
         differences = X[None, len(corners) :] - X[len(corners) :, None]
         steps = np.eye(X.shape[1]) / count
         pairs = [
@@ -140,10 +150,10 @@ class Lattice:
         return cls(X, len(corners), pairs, count)
 
     def bent(self, f: Array) -> Array:
-        """Return the variation (parts, formulas) of derivatives times sides, from values.
+        """Return how much the slopes of f differ within each part: (parts, formulas).
 
-        `f` (parts, n, formulas) are values at the places. The variation is the range of
-        differences, summed over the axes.
+        `f` (parts, n, formulas) are values at the places. Slopes are differences of neighbours over
+        their distance in the part; the ranges of slopes along each axis are added up.
         """
         slopes = (self.count * (f[:, pairs[:, 1]] - f[:, pairs[:, 0]]) for pairs in self.pairs)
         return np.asarray(sum(np.ptp(slope, axis=1) for slope in slopes))
@@ -155,8 +165,10 @@ class RefinedParts:
 
     Attributes
     ----------
+    parts
+        The n parts.
     area, centre, size
-        (n,), (n, 3) and the largest side of their boxes (n,).
+        (n,) areas, (n, 3) middles and (n,) largest sides of their boxes.
     variance
         (n,) mean of |f - mean of f|^2 in each part.
     variation
@@ -182,7 +194,7 @@ def refine_where_hidden(
     owned: int,
     comm: MPI.Comm = MPI.COMM_SELF,
 ) -> RefinedParts:
-    """Return the first parts, divided where samples may miss values; collective.
+    """Return the first parts, divided as far as samples may miss values of formulas; collective.
 
     Parameters
     ----------
@@ -201,8 +213,8 @@ def refine_where_hidden(
 
     Notes
     -----
-    In each pass only the parts with the largest hidden integrals are divided. The search ends where
-    the sum of these is negligible, or at `MAX_PARTS`.
+    In each pass only the parts with the largest hidden integrals are divided. The search ends if
+    the sum of hidden integrals is negligible, or at `MAX_PARTS`.
     """
     parts, samples = first_parts, _sample(formulas, first_parts, places_of, lattice)
     part_count = 0
@@ -285,16 +297,19 @@ class _Samples:
 def _sample(
     formulas: FormulaGroup, parts: SubCells, places_of: PlacesOfParts, lattice: Lattice
 ) -> _Samples:
-    """Sample formulas in each part, and estimate what the samples hide.
+    """Sample formulas in each part, and estimate how far they may leave the range of the samples.
 
-    Ranges are those in the box of a part's places, enlarged by the bulge of a curved part.
-    `places_of` and `lattice` are as in `refine_where_hidden`.
+    Ranges of the formulas, and of their slopes, are taken in the box around a part's places. The
+    box is enlarged for a curved part, which bulges out of it. `places_of` and `lattice` are as in
+    `refine_where_hidden`.
     """
     x, area = places_of(parts)
     low, high = x.min(axis=1), x.max(axis=1)
     off_centre = np.abs(x.mean(axis=1) - x[:, : lattice.corners].mean(axis=1))
+    # in a flat part the means of all places and of the corners agree
     bulge = off_centre.max(axis=1, initial=0.0)[:, None]
     bulge = np.where(bulge > VALUE_TOLERANCE, bulge, 0.0)
+    # ranges of values, and the range of slopes times the box's sides
     lower, upper, bent = formulas.bounds(low - bulge, high + bulge)
     values = formulas.values(x.reshape(-1, 3))
     f = values.reshape(*x.shape[:2], values.shape[1])  # a rank may have no parts

@@ -4,6 +4,12 @@ At a symmetric state u the whole shell's energy for an antisymmetric addition v 
 with u + v and of the other, mirrored, with u - v. Its Hessian at v = 0 on one half is the half's
 own, but v moves freely along the mirror normal m and not in the plane, and the edges on the plane
 see the two halves tilt against each other.
+
+- A jet is a field's value with its first and second derivatives; r0 is the placement.
+- A mode is unstable if the Hessian is negative along it; the number of negative pivots of the
+  factored tangent counts such directions.
+- A state is a point of a path of equilibria: the displacement u and the amplitudes (load
+  parameters) mu.
 """
 
 from collections.abc import Sequence
@@ -37,8 +43,9 @@ def antisymmetric_edge(  # noqa: PLR0913 - the arguments of a density with an ad
 ) -> Expr:
     """Half the energy of an edge on a mirror plane, for an antisymmetric addition v.
 
-    One half has the displacement u + v, the other is the mirror image of u - v. Parameters besides
-    v are those of `edges.symmetric`.
+    One half of the shell has the displacement u + v, the other is the mirror image of a half with u
+    - v. `m` is the edge's covector, `width` that of the cells there, `sigma` the penalty and
+    `mirror` the unit normal of the plane, as in `edges.symmetric`.
     """
     nu1, nu2, stretch = kin.conormal(r0, m)
 
@@ -47,7 +54,10 @@ def antisymmetric_edge(  # noqa: PLR0913 - the arguments of a density with an ad
         return a - 2 * ufl.dot(a, mirror) * mirror
 
     def jump(inner: Jet, outer: Jet) -> Expr:
-        """Return -[n] . {r_nu} between a surface and the mirror image of another one."""
+        """Return the jump -[n] . {r_nu} between a surface and the mirror image of another one.
+
+        `inner` is the jet of the surface, `outer` that of the other before it is mirrored.
+        """
         outward, inward = (j.r1 * nu1 + j.r2 * nu2 for j in (inner, outer))
         r_nu = (outward - mirrored(inward)) / 2
         return -ufl.dot(mirrored(kin.normal(outer)) - kin.normal(inner), r_nu)
@@ -56,11 +66,12 @@ def antisymmetric_edge(  # noqa: PLR0913 - the arguments of a density with an ad
     J = jump(r0 + sides[0], r0 + sides[1]) - (natural.kink(nu1, nu2) if natural else 1) * jump(
         r0, r0
     )
-    moments = [densities.normal_moment(r0, side, nu1, nu2, law, natural) for side in sides]
+    # moments across the edge and penalty stiffnesses on both sides
+    (first_moment, stiffness), (second_moment, _) = (
+        densities.normal_moment(r0, side, nu1, nu2, law, natural) for side in sides
+    )
     return (
-        edge_density((moments[0][0] + moments[1][0]) / 2, moments[0][1], J, width, sigma)
-        * stretch
-        / 2
+        edge_density((first_moment + second_moment) / 2, stiffness, J, width, sigma) * stretch / 2
     )
 
 
@@ -76,7 +87,7 @@ class AntisymmetricModes:
     """
 
     label = "antisymmetric"
-    tangents = None  # they are one family
+    tangents = None  # all modes are one family, with one tangent
 
     def __init__(self, system: FiniteElementSystem) -> None:
         self.system = system
@@ -86,7 +97,8 @@ class AntisymmetricModes:
     def factor_at(self, state: State) -> Factorisation:
         """Factor the tangent of the antisymmetric modes at a symmetric state; collective.
 
-        The factorisation of the last state is kept.
+        The factorisation of the last state is kept. `factor_with_lag` tries a tangent whose dense
+        terms are those of an earlier state; else the present tangent is factored.
         """
         if self._factored is not state:
             if not factor_with_lag(self.system, self._factorisation, state):

@@ -1,6 +1,11 @@
 """Control points: a field as a weighted mean of values at points, without a mesh.
 
 Designs vary these values, and measured points give them.
+
+- B is the field, a vector at each place; places are over R.
+- A pattern is a function of undeformed places r0 and normals n0 that gives vectors.
+- An axisymmetric field turns about e3: its points have rho and z, its values are along e_rho and
+  e_z.
 """
 
 from dataclasses import dataclass
@@ -40,9 +45,10 @@ class ControlPoints:
         return self.places.shape[1] == 2
 
     def weights(self, x: Array) -> "scipy.sparse.csr_matrix":
-        """Return the weights w (m, n) of the points at places x (m, 3) over R, as a sparse matrix.
+        """Return the weights w (m, n) of the n points at places x (m, 3), as a sparse matrix.
 
-        Far from all points the nearest one counts alone.
+        The neighbours of each place are searched until all further weights are negligible. Far from
+        all points the nearest one counts alone.
         """
         if self.is_axisymmetric:
             places = np.column_stack([np.hypot(x[:, 0], x[:, 1]), x[:, 2]])
@@ -87,20 +93,22 @@ class ControlledPattern:
 
     def __call__(self, r0: Array, n0: Array) -> Array:
         """Return the vectors at undeformed places r0 (..., 3); normals n0 are not used."""
+        # in the frame of the points
         x = np.asarray(r0.reshape(-1, 3))
         x = x if self.frame is None else x @ self.frame
         vectors: Array = np.asarray(self.controls.weights(x) @ self.values)
         if self.controls.is_axisymmetric:
-            rho = np.maximum(np.hypot(x[:, 0], x[:, 1]), 1e-300)[:, None]
+            rho = np.maximum(np.hypot(x[:, 0], x[:, 1]), 1e-300)[:, None]  # not zero on the axis
             vectors = np.column_stack([vectors[:, :1] * x[:, :2] / rho, vectors[:, 1]])
         return np.asarray(vectors if self.frame is None else vectors @ self.frame.T).reshape(
             r0.shape
         )
 
     def transposed(self, r0: Array, forces: Array) -> Array:
-        """Return derivatives of sum(forces . B) over places by each value, like `values`.
+        """Return the derivatives of a number by the values at the points, in the shape of `values`.
 
-        `r0` and `forces` are (cells, nodes, 3). It is the transpose of the map from values to B.
+        `forces` (cells, nodes, 3) are the number's derivatives by B at places `r0` (cells, nodes,
+        3). So the transpose of the map from values to B is applied, for gradients of designs.
         """
         x, f = np.asarray(r0.reshape(-1, 3)), np.asarray(forces.reshape(-1, 3))
         if self.frame is not None:

@@ -3,6 +3,15 @@
 All are in units of E h per undeformed area (lengths in R), so that the membrane energy is of order
 one. An energy is the integral of density times area_ratio(r0). The arguments r0 and u are the jets
 of placement and displacement, `natural` the natural forms, None for those of r0.
+
+- A jet is a vector field's value with its first and second derivatives by two coordinates.
+- E is the membrane strain, K the change of curvature, `up` an inverse metric (index up).
+- The natural forms (`kinematics.Forms`) are metric, curvature, area and thickness of the shape that
+  the shell would have without stress; area and thickness are over the undeformed ones.
+- `law` is the material's law, whose energies, moments and stresses are functions of E and K.
+- Br and Ba are the remanence and the applied flux density over their magnitudes. F = a_i (x) a0^i +
+  n (x) n0 is the deformation gradient at the mid-surface, F0 its value at u = 0.
+- q_i = n0 . u,_i are the components of the normal's linearised rotation.
 """
 
 from collections.abc import Callable
@@ -38,10 +47,11 @@ def membrane(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr
 
 
 def prestress(r0: Jet, u: Jet, v: Jet, E: Expr, *, law: Law, natural: Forms | None = None) -> Expr:
-    """Energy of v under the stress that a change of strain adds: S : (v_i . v_j)/2.
+    """Second variation along v of an additional membrane stress S: S : (v_i . v_j)/2.
 
-    S is the stress of the strain of u plus the change E = (E_11, E_12, E_22), less that of u. `v`
-    is the jet of a further displacement.
+    S is the change of the stress when the strain of u is increased by E = (E_11, E_12, E_22). `v`
+    is the jet of the displacement of the variation. It gives a tangent another membrane stress than
+    the one at u.
     """
     strain = ufl.as_matrix([[E[0], E[1]], [E[1], E[2]]])
     present, law = kin.membrane_strain(r0, u), law_at(law, r0)
@@ -71,13 +81,14 @@ def bending(r0: Jet, u: Jet, *, law: Law, natural: Forms | None = None) -> Expr:
 def normal_moment(
     r0: Jet, u: Jet, nu1: Expr, nu2: Expr, law: Law, natural: Forms | None = None
 ) -> tuple[Expr, Expr]:
-    """Return M_nunu, which works on b_nunu, and the stiffness of a penalty on edges.
+    """Return the moment M_nunu across an edge, and the stiffness for the penalty there.
 
-    nu1 and nu2 are the contravariant components of the undeformed unit conormal nu.
+    The moment works on b_nunu, the curvature across the edge. nu1 and nu2 are the contravariant
+    components of the undeformed unit conormal nu.
     """
     E, K, law = kin.membrane_strain(r0, u), kin.curvature_change(r0, u), law_at(law, r0)
     if natural is None:
-        edge = kin.inverse_metric(r0), (nu1, nu2), 1
+        edge = kin.inverse_metric(r0), (nu1, nu2), 1  # nu has the length 1
         return law.edge_moment(E, K, *edge), law.edge_stiffness(E, *edge)
     # nu with index down by the undeformed metric, then up by the natural one
     covector = ufl.dot(kin.metric(r0), ufl.as_vector([nu1, nu2]))
@@ -109,7 +120,9 @@ def magnetic_thinned(
 ) -> Expr:
     """Magnetic density where the thickness follows from the area (`thins` is 1).
 
-    In F the part n (x) n0 is stretched so that the volume stays, the `natural` one if given.
+    Where the area grows the thickness shrinks, so that the volume stays: in F the part n (x) n0 has
+    this stretch. With `natural`, the volume is that of the natural shape. Where `thins` is 0, the
+    density is that of `magnetic`.
     """
     r, n0 = r0 + u, kin.normal(r0)
     thinned = kin.area_ratio(r0) / kin.area_ratio(r)
@@ -121,27 +134,30 @@ def magnetic_thinned(
 
 
 def in_gradient(law: MagneticDensity) -> MagneticDensity:
-    """Return the density of the part Ba = G r of the field, of (r0, u, Br, G).
+    """Return the density of the part Ba = G r of the field, a function of (r0, u, Br, G).
 
     It is -(G r) . F Br at the deformed position r, without its value at u = 0. `law` is `magnetic`,
-    or has the rotation R in place of F.
+    or a density like it with the rotation R in place of F.
     """
 
     def magnetic_gradient(r0: Jet, u: Jet, Br: Expr, G: Expr, **options: Any) -> Expr:
         """Return the density at the displacement's jet u in the field G r."""
+        # -(G r) . F Br + (G r0) . F0 Br, where `law` has -(G r) . (F - F0) Br, and F0 = 1
         return law(r0, u, Br, ufl.dot(G, r0.r + u.r), **options) - ufl.dot(ufl.dot(G, u.r), Br)
 
     return magnetic_gradient
 
 
 def in_space(law: MagneticDensity) -> MagneticDensity:
-    """Return the density in a field known by values, of (r0, u, Br, P).
+    """Return the density in a field that is known by values, a function of (r0, u, Br, P).
 
-    P is the field's polynomial as in `field_at_displacement`; `law` is as in `in_gradient`.
+    P is the field's Taylor polynomial as in `field_at_displacement`. `law` is `magnetic`, or a
+    density like it with the rotation R in place of F.
     """
 
     def magnetic_in_space(r0: Jet, u: Jet, Br: Expr, P: Expr, **options: Any) -> Expr:
         """Return the density at the displacement's jet u in the field with the polynomial P."""
+        # `change` adds the work of the field's difference from its value at u = 0 on Br itself
         B, change = field_at_displacement(P, u.r)
         return law(r0, u, Br, B, **options) - ufl.dot(change, Br)
 
@@ -166,7 +182,8 @@ def magnetic_torque(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
 def magnetic_tau(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     """Utau: torques from the surface gradient of u; paper Eq. (eq:terms).
 
-    It is q^c U_ac, with a the index of the derivative.
+    It is -(n0 . Br) Ba^a q . u,_a, with the rotation vector q and the components Ba^a of the field
+    in the surface.
     """
     up1, up2 = kin.dual_basis(r0)
     q = rotation(r0, u)
@@ -205,9 +222,12 @@ def volume(r0: Jet, u: Jet, origin: Expr | None = None) -> Expr:
 def swept_volume(r0: Jet, u: Jet, unit: Expr | float = 1.0) -> Expr:
     """Volume that the surface sweeps when its points move straight to r0 + u.
 
-    It is per area of the coordinates, times `unit`. It is the work of p = 1 in that unit, and its
-    potential wherever there is one: it needs no origin, and no faces that close the volume.
+    It is per area of the coordinates, times `unit`, a unit of pressure. So it is the work of the
+    pressure 1 on this way. It is the potential of a live pressure wherever there is one, and needs
+    no origin and no faces that close the volume.
     """
+    # the area vector is quadratic along the way: its mean is the value halfway plus a twelfth of
+    # u,_1 x u,_2
     halfway = ufl.cross(r0.r1 + u.r1 / 2, r0.r2 + u.r2 / 2)
     return unit * ufl.dot(u.r, halfway + kin.area_vector(u) / 12)
 
@@ -218,11 +238,11 @@ def follower_pressure_work(r0: Jet, u: Jet, v: Jet, unit: Expr | float = 1.0) ->
 
 
 def field_at_displacement(P: Expr, u: Expr) -> tuple[Expr, Expr]:
-    """Return B at the displacement u, and its difference from B at u = 0.
+    """Return the field B at the displacement u, and its difference from B at u = 0.
 
-    B is the second-order polynomial P (`FIELD_POLYNOMIAL_SIZE`,) about the displacement in P[0:3].
-    P[3:6] is B at u = 0, P[6:9] the value at the centre, P[9:18] the gradient, P[18:36] halved
-    second derivatives by pairs j <= k.
+    P (`FIELD_POLYNOMIAL_SIZE`,) is a Taylor polynomial of second order about the displacement u* in
+    P[0:3]. P[3:6] is B at u = 0. At u*, P[6:9] is B, P[9:18] its gradient by rows, and P[18:36]
+    its second derivatives by pairs j <= k, of which those with j = k are halved.
     """
     d = u - ufl.as_vector([P[i] for i in range(3)])
 

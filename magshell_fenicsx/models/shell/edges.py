@@ -7,6 +7,15 @@ undeformed value, an edge contributes
 
 It is one energy: derived twice it gives a symmetric tangent. Every expression is invariant under
 exchange of '+' and '-'.
+
+- '+' and '-' are the cells on both sides of an edge; [n] is the jump of the normal, {} a mean.
+- nu is the outward conormal of a cell at the edge, r_nu the derivative of the place along it, and
+  b_nunu the curvature across the edge. M_nunu is the moment that works on it.
+- m is the covector (2,) of an edge (`kinematics.conormal`); an edge's parameter is its length in
+  the coordinates, or a number from 0 to 1.
+- h_e is the `width` of the cells at the edge, sigma the penalty, D a bending stiffness.
+- A natural shape (`Forms`) is the one that the shell would have without stress.
+- A jet is a field's value with its first and second derivatives.
 """
 
 from typing import Any
@@ -38,7 +47,8 @@ def fold_jump(
 ) -> Expr:
     """-[n] . {r_nu} with [n] = n- - n+: the jump of the normal across an edge.
 
-    nu_plus and nu_minus are the components of the outward conormals; the mean {r_nu} is out of '+'.
+    nu_plus and nu_minus are the components of each side's outward conormal. The mean {r_nu} points
+    out of '+', so that '-' enters with the opposite sign.
     """
     r_nu = (
         plus.r1 * nu_plus[0]
@@ -50,9 +60,10 @@ def fold_jump(
 
 
 def fold_angle(plus: Jet, minus: Jet, m_plus: Expr) -> tuple[Expr, Expr]:
-    """Return sine and cosine of the angle between the normals about the edge.
+    """Return sine and cosine of the angle about the edge from one normal to the other.
 
-    The angle has the sign of `fold_jump`. `m_plus` is the edge's covector on the side '+'.
+    The angle has the sign of `fold_jump`. `m_plus` is the edge's covector on the side '+', which
+    gives the edge its direction.
     """
     edge_tangent = kin.unit(plus.r2 * m_plus[0] - plus.r1 * m_plus[1])
     n_plus, n_minus = kin.normal(plus), kin.normal(minus)
@@ -70,12 +81,14 @@ def two_sided(
     law: tuple[Law, Law],
     natural: Shapes | None = None,
 ) -> Expr:
-    """Energy of an interior edge with a jump J, per length of its parameter.
+    """Energy of an interior edge with a jump J, per unit of its parameter.
+
+    It is {M_nunu} J + sigma D/(2 h_e) J^2 per undeformed length.
 
     Parameters
     ----------
     J
-        Jump of b_nunu over its undeformed value.
+        Strength of the curvature b_nunu that the edge concentrates, less its undeformed strength.
     r0, u
         Jets on both sides, '+' first.
     m
@@ -90,6 +103,7 @@ def two_sided(
         The natural forms on both sides; None if they are those of r0.
     """
     conormals = [kin.conormal(j, covector) for j, covector in zip(r0, m, strict=True)]
+    # a conormal has two components and the stretch of the edge
     stretch = (conormals[0][2] + conormals[1][2]) / 2
     moments = [
         densities.normal_moment(r0[i], u[i], *conormals[i][:2], law[i], natural and natural[i])
@@ -109,11 +123,12 @@ def interior(
 ) -> Expr:
     """Energy of an interior edge between cells that meet smoothly, or nearly so.
 
-    It is per length of the edge's parameter; `rest` are the width and sigma of `two_sided`.
+    It is per unit of the edge's parameter. The jump of the normal stands for the angle, whose sine
+    it is. `rest` are the width and sigma of `two_sided`.
     """
     nus = [kin.conormal(j, covector)[:2] for j, covector in zip(r0, m, strict=True)]
     J0 = fold_jump(*r0, *nus)
-    if natural:
+    if natural:  # a natural shape has another kink at the edge: the mean ratio of both sides
         J0 *= sum(shape.kink(*nu) for shape, nu in zip(natural, nus, strict=True)) / 2
     J = fold_jump(r0[0] + u[0], r0[1] + u[1], *nus) - J0
     return two_sided(J, r0, u, m, *rest, law=law, natural=natural)
@@ -129,9 +144,9 @@ def fold(
 ) -> Expr:
     """Energy of an interior edge across a fold of the undeformed surface.
 
-    The jump is the change of the angle, whatever its size. b_nunu is the angle times the natural
-    stretch across the fold: a natural kink is the limit of a narrow bend. `rest` are the width and
-    sigma of `two_sided`.
+    J is the change of the angle, whatever its size. A natural kink is the limit of a narrow bend:
+    its strength of b_nunu is the angle times the natural stretch across the fold. `rest` are the
+    width and sigma of `two_sided`.
     """
     sine0, cosine0 = fold_angle(*r0, m[0])
     sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
@@ -146,17 +161,18 @@ def fold(
         )
         angle = angle_ratio * ufl.atan2(sine0, cosine0)
         sine0, cosine0 = ufl.sin(angle), ufl.cos(angle)
+    # the difference of both angles, from their sines and cosines
     J = stretch_across * ufl.atan2(sine * cosine0 - cosine * sine0, cosine * cosine0 + sine * sine0)
     return two_sided(J, r0, u, m, *rest, law=law, natural=natural)
 
 
 def turning(r0: Jet, u: Jet, m: Expr, width: Expr, intensity: Expr, reference_turn: Expr) -> Expr:
-    """-Pi of a moment per length about the edge's first tangent.
+    """Potential of a moment per length about an edge, per unit of the edge's parameter.
 
-    It is `intensity` times the angle of the normal. The tangent runs with the surface on its left,
-    so that a positive angle turns the normal outward. The angle is that of the normal's part normal
-    to the tangent. `reference_turn` (2,) holds cosine and sine of the turn from which the angle is
-    counted, so that it may grow beyond pi.
+    It is -`intensity` times the angle of the normal about the undeformed tangent. The tangent runs
+    with the surface on its left, so that a positive angle turns the normal outward. Only the
+    normal's part across the tangent counts. `reference_turn` (2,) holds cosine and sine of the turn
+    from which the angle is counted, so that it may grow beyond pi. `width` is not used.
     """
     edge_tangent = r0.r2 * m[0] - r0.r1 * m[1]
     length = ufl.sqrt(ufl.dot(edge_tangent, edge_tangent))
@@ -176,10 +192,10 @@ def clamped(
     law: Law,
     natural: Forms | None = None,
 ) -> Expr:
-    """Energy of a clamped edge per length of its parameter.
+    """Energy of a clamped edge, per unit of its parameter.
 
-    The outer normal is held at n0, or at `turn` n0 with a rotation (3, 3). Other parameters are
-    those of `two_sided`, on one side.
+    The side '-' is rigid: its normal stays n0, or is `turn` n0 with a rotation (3, 3). Other
+    parameters are those of `two_sided`, on one side.
     """
     nu1, nu2, stretch = kin.conormal(r0, m)
     r, n0 = r0 + u, kin.normal(r0)
@@ -201,14 +217,15 @@ def symmetric(
     law: Law,
     natural: Forms | None = None,
 ) -> Expr:
-    """Energy of an edge on a mirror plane per length of its parameter: half of an interior edge's.
+    """Energy of an edge on a mirror plane, per unit of its parameter.
 
-    `mirror` is the unit normal of the plane; other parameters are those of `two_sided`, on one
-    side.
+    It is half of the energy of an interior edge whose side '-' is the mirror image of '+'. `mirror`
+    is the unit normal of the plane; other parameters are those of `two_sided`, on one side.
     """
     nu1, nu2, stretch = kin.conormal(r0, m)
 
     def mirror_jump(j: Jet) -> Expr:
+        """Return the jump `fold_jump` between a surface and its mirror image."""
         return 2 * ufl.dot(kin.normal(j), mirror) * ufl.dot(mirror, j.r1 * nu1 + j.r2 * nu2)
 
     J = mirror_jump(r0 + u) - (natural.kink(nu1, nu2) if natural else 1) * mirror_jump(r0)
@@ -219,7 +236,7 @@ def symmetric(
 def largest_fold(r0: fem.Function, degree: int) -> float:
     """Return the largest angle (rad) between the undeformed normals of two cells at their edge.
 
-    It is compared at the points of a rule of the given degree. Collective.
+    Angles are taken at the points of a quadrature rule of the given degree. Collective.
     """
     V = r0.function_space
     nodes, largest = r0.x.array.reshape(-1, 3), 0.0

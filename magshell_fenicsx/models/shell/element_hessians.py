@@ -2,6 +2,17 @@
 
 The densities are covariant, so the jets are taken in reference coordinates: the tables of the
 shape functions are then the same for all cells.
+
+- A jet is a vector field's value with its first and second derivatives by two coordinates: six
+  vectors (`JET_SIZE`), in the order of `JET_NAMES`.
+- r0 is the placement, u the displacement, v an addition to u; W is a density.
+- Entities are cells, interior or boundary edges. A batch has entities with the same quadrature
+  rule; "points" of a batch are the quadrature points of all its entities.
+- A side is one of the cells beside a point: two on an interior edge, else one.
+- A point field is a fem.Function whose values at the points of a batch are a kernel's input.
+- A Hessian's block (3, 3) is the derivative by two parts of jets. To contract it is to multiply it
+  with shape functions and sum over points.
+- A `Memo` holds a value that is computed again (`renew`) when its inputs have changed.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -57,7 +68,8 @@ class HessianIntegral:
     log
         Log of compiled kernels.
     prestress
-        Density of `densities.prestress`, for `replace_strain`; None without.
+        `densities.prestress` as a density: the second variation under an additional membrane
+        stress, for `replace_strain`. None if the strain is never replaced.
 
     Attributes
     ----------
@@ -74,10 +86,12 @@ class HessianIntegral:
         log: KernelLog,
         prestress: Density | None = None,
     ) -> None:
+        """Declare a kernel for each term, and a contraction for each quadrature rule."""
         V = r0.function_space
         self.batches, self._dofs, self._sides = batches, V.dofmap.list, sides
         self._points = PointStorage(max([1, *(batch.size for batch in batches)]))
         self._u, self._r0 = (self._points.field(3 * JET_SIZE * sides) for _ in range(2))
+        # a covector (2,) for each side, and the width of an edge
         self._geometry = self._points.field(2 * sides + 1)
         self._placements = Memo(
             lambda: [self._jets(batch, r0.x.array) for batch in batches], lambda: (r0.x.array,)
@@ -99,6 +113,7 @@ class HessianIntegral:
         for kernel in [*self._kernels.values(), *([self._prestress] if self._prestress else [])]:
             kernel.begin(self._u, self._r0, self._geometry, sides, log)
         self.coupling = batches if sides == 2 else []
+        # pairs of jet parts that any term couples: one contraction serves all terms
         pairs = reduce(or_, (kernel.pairs for kernel in self._kernels.values()))
         pairs = BlockPairs(tuple(sorted(pairs.within_side, key=_neighbours)), pairs.cross)
         self._coupled = pairs
@@ -115,6 +130,8 @@ class HessianIntegral:
     ) -> None:
         """Add the terms' element matrices at the displacement u.
 
+        After `replace_strain`, the additional membrane stress is included; it serves one call.
+
         Parameters
         ----------
         u
@@ -122,7 +139,8 @@ class HessianIntegral:
         factors
             Factors of terms by name; terms without a factor are left out.
         element_matrices
-            (local cells, 9, pairs of functions), see `BlockMatrix.add_cells`.
+            (local cells, 9, pairs a <= b of functions), to which the matrices are added: six
+            symmetric and three skew parts of each block (3, 3), see `BlockMatrix.add_cells`.
         couple
             Is called for each batch of interior edges, with its number and the matrices that couple
             the two cells at its edges.
@@ -155,9 +173,11 @@ class HessianIntegral:
         weighted_displacements: Sequence[tuple[float, Array]],
         excepted_cells: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Replace the membrane strain of u in the membrane stress, for the next call of `add`.
+        """Take the membrane stress of the next call of `add` from other displacements than u.
 
-        It is replaced by a weighted sum of the strains of other displacements.
+        The stress is then that of a weighted sum of their membrane strains. Only the difference
+        from the strain of u enters, by the density `prestress`. Nothing happens without this
+        density.
 
         Parameters
         ----------
@@ -174,6 +194,7 @@ class HessianIntegral:
         for number, (batch, r0) in enumerate(
             zip(self.batches, self._placements.renew(), strict=True)
         ):
+            # the weighted sum, less the strain of u
             strains = [
                 w * _strain(r0, self._jets(batch, v))
                 for w, v in (*weighted_displacements, (-1.0, u))
@@ -209,7 +230,8 @@ class Kernel:
     batches
         Batches of entities.
     of_v
-        Whether the Hessian is that in v at v = 0, of a density of u and v; else that in u.
+        True for a density of u and v, whose Hessian by v at v = 0 is taken; False for a density of
+        u, whose Hessian by u is taken.
     """
 
     def __init__(
@@ -221,6 +243,7 @@ class Kernel:
         *,
         of_v: bool,
     ) -> None:
+        """Declare inputs for the density's parameters; fields are sampled at points in `renew`."""
         self._name, self._density, self._of_v = name, density, of_v
         self._points, self._batches = points, batches
         self._parameters, varying = parameters_at(points, density.parameters, density.sides)
@@ -238,7 +261,7 @@ class Kernel:
         u, r0
             Point fields with the jets of displacement and placement.
         geometry
-            Point field with the covectors on all sides and the width of an edge.
+            Point field with the covectors (2,) on all sides, then the width of an edge.
         sides
             Number of cells beside a point.
         """
@@ -254,15 +277,16 @@ class Kernel:
         W = density.value_at(
             jets, (m, geometry[2 * sides]) if density.on_edges else None, self._parameters
         )
-        if (
-            density.work
-        ):  # the Hessian of dW(v)/2 along v is the symmetric part of the derivative of the work
+        # W is then a virtual work w(u, v), linear in v. Half of its derivative by u along v is
+        # quadratic in v, and has the symmetric part of that derivative as its Hessian.
+        if density.work:
             W = ufl.dot(ufl.diff(W, u), z) / 2
         self._hessian = point_hessian(name, W, z, JET_SIZE, self.pairs, log, at_zero=of_v)
 
     def vary(self, number: int, values: Array) -> None:
         """Set the values of the first varying parameter at the points of batch `number`."""
-        self._varying[0][1].renew()[number] = values
+        _, values_of_batches = self._varying[0]
+        values_of_batches.renew()[number] = values
 
     def renew(self) -> None:
         """Renew the values of fields at the points of all batches."""
@@ -270,27 +294,37 @@ class Kernel:
             values.renew()
 
     def evaluate(self, number: int) -> Array:
-        """Return the Hessian's blocks at the points of batch `number`, as in `point_hessian`."""
+        """Return the Hessian's blocks, for the pairs of jet parts, at the points of a batch.
+
+        `number` is the batch's position; the order of blocks is that of `point_hessian`. The point
+        fields of r0, u and the geometry must hold the batch's values.
+        """
         for target, values in self._varying:
             fill(target, values.latest[number])
         return self._points.evaluate(self._hessian, self._batches[number].size)
 
 
 def _strain(r0: Array, u: Array) -> Array:
-    """Return E_11, E_12, E_22 (points, 3) of a displacement, from jets (..., 6, 3) of r0 and u."""
+    """Return the membrane strain E_11, E_12, E_22 (points, 3) in reference coordinates.
+
+    `r0` and `u` are jets (..., 6, 3) of placement and displacement.
+    """
+    # rows 1 and 2 of a jet are the first derivatives
     first0, first = (np.moveaxis(jets.reshape(-1, JET_SIZE, 3)[:, 1:3], 1, 0) for jets in (r0, u))
     return np.stack(strain_components(first0, first, partial(np.einsum, "pc,pc->p")), axis=1)
 
 
 def _pairs(density: Density) -> BlockPairs:
-    """Return the pairs of jet parts of which the density's Hessian has a block.
+    """Return the pairs of jet parts for which the density's Hessian has a block that is not zero.
 
-    There is none for two parts in which the density is linear. Parts are counted as in `JET_NAMES`.
+    Two parts in which the density is linear have none. Parts are numbered as in `JET_NAMES`. Pairs
+    on one side are listed once, pairs across an edge in both orders.
     """
     parts = [JET_NAMES.index(name) for name in density.parts]
     linear = [JET_NAMES.index(name) for name in density.linear]
 
     def coupled(pairs: Iterable[IndexPair]) -> tuple[IndexPair, ...]:
+        """Return the pairs that are not both among the linear parts."""
         return tuple(p for p in pairs if not (p[0] in linear and p[1] in linear))
 
     within_side = coupled((min(p), max(p)) for p in combinations_with_replacement(parts, 2))
@@ -303,7 +337,10 @@ def _neighbours(pair: IndexPair) -> tuple[int, IndexPair]:
 
 
 def _jet(field: fem.Function, side: int) -> Jet:
-    """Return the jet on one side as UFL vectors, from a point field of jets on all sides."""
+    """Return the jet on one side (0 or 1) as UFL vectors, from a point field of jets on all sides.
+
+    The field holds the six parts of the first side, three components each, then the second side's.
+    """
     parts = range(side * JET_SIZE, (side + 1) * JET_SIZE)
     return Jet(*(ufl.as_vector([field[3 * part + c] for c in range(3)]) for part in parts))
 
@@ -333,7 +370,8 @@ def at_points(field: fem.Function, X: Array, cells: NDArray[np.int32]) -> Array:
     """Return the values (cells * points, components) of a field on cells, at reference points.
 
     X (points, 2) are the same points in each of the cells. A `PointField` is known at its own
-    points alone, in consecutive cells; what is returned then follows its values.
+    points alone, and X is not used. The array that it returns for consecutive cells is a view,
+    which follows later values.
     """
     if isinstance(field, PointField):
         return field.at_cells(cells)

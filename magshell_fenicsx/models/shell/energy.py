@@ -1,4 +1,15 @@
-"""A term of the shell: the density as a function of point quantities, its parameters, its form."""
+"""A term of the shell: the density as a function of point quantities, its parameters, its form.
+
+- A density is an energy per area of the coordinates, or per unit of an edge's parameter, as a
+  function of jets: a field's value with its first and second derivatives by two coordinates.
+- r0 is the placement, u the displacement, v a virtual displacement or an addition to u.
+- m is the covector (2,) of an edge: zero along it and positive outward. The width is that of the
+  cells at the edge.
+- A side is one of the cells beside a point: two on an interior edge, else one.
+- A load without potential, as a live pressure, has a virtual work in place of an energy.
+- A term is an energy in a sum, multiplied by its amplitude: a load parameter, by name.
+- A free parameter is a number in densities that can be varied as a load parameter can.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -88,14 +99,15 @@ class Density:
         Parameters
         ----------
         jets
-            For each argument (r0, u, ...) its jets on every side. With a third one, the jet of v,
-            the value of a load without potential is its virtual work.
+            For each argument (r0, u, ...) its jets on every side. If there is a third one, v, a
+            load without potential returns its virtual work along v; else the density is returned.
         edge
             The covector on every side and the width; None on cells.
         parameters
             Values of the parameters. With two sides, a field that varies holds the values of both,
             one after the other.
         """
+        # the order of `function`: jets, covectors, width, parameters; of one side without a tuple
         arguments = [*jets, *(edge[:1] if edge else ())]
         sided = [
             tuple(side_values) if self.sides == 2 else side_values[0] for side_values in arguments
@@ -108,7 +120,7 @@ class Density:
 
 
 def _halves(field: fem.Function) -> tuple[Expr, Expr]:
-    """Return a field with the values of both sides of an edge as two vectors."""
+    """Return the vectors of both sides from a point field that holds one after the other."""
     size = field.ufl_shape[0] // 2
     first, second = (
         ufl.as_vector([field[side * size + c] for c in range(size)]) for side in range(2)
@@ -133,7 +145,8 @@ def cell_quadrature(degree: int) -> int:
 def edge_quadrature(degree: int) -> int:
     """Return the degree of the rule on edges, for elements of a degree.
 
-    It is two below that of the cells: F at w/h = 20 moves by 2e-5, and the edges cost a fifth less.
+    It is two below that of the cells: the force at a deflection of 20 h changes by 2e-5, and the
+    edges cost a fifth less.
     """
     return 2 * degree - 2
 
@@ -163,6 +176,8 @@ class MomentTerm(AngleTerm, ShellTerm):
 
 class HessianTerm:
     """A term that contributes only a tangent: the Hessian in v, at v = 0, of an energy of u and v.
+
+    It serves antisymmetric modes v of a half model, whose displacement u is symmetric.
 
     Parameters
     ----------
@@ -218,7 +233,8 @@ def constants_of(
 ) -> tuple[fem.Constant | fem.Function, ...]:
     """Return the parameters of a term as constants or functions on a mesh.
 
-    A free parameter has the same constant in all terms; it is kept in `constants` by its name.
+    A free parameter has the same constant in all terms: it is taken from `constants` by its name,
+    or added there. Formulas must have been replaced by functions before.
 
     Raises
     ------
@@ -232,7 +248,7 @@ def constants_of(
     def constant_or_field(
         p: float | NDArray[np.float64] | Free | UserField | FormulaParameter | Coefficient,
     ) -> fem.Constant | fem.Function:
-        """Return a parameter as a constant, or as the function on the mesh that it is."""
+        """Return a parameter as a constant, or unchanged if it is a function on this mesh."""
         if isinstance(p, Free):
             return constants.setdefault(p.name, constant(p.value))
         if (

@@ -1,4 +1,16 @@
-"""The tangent without compiled tangent forms, from the point Hessians of the terms' densities."""
+"""The tangent without compiled tangent forms, from the point Hessians of the terms' densities.
+
+In: terms with densities. Out: the assembled matrix, the derivative of the residual by u.
+
+- An integral (`HessianIntegral`, `ElementIntegral`) adds element matrices of some terms on cells,
+  interior edges or boundary edges. Matrices at interior edges couple two cells.
+- An element matrix is (9, pairs of functions): nine parts of a block (3, 3) for each pair of shape
+  functions of a cell.
+- Factors are the numbers that multiply the terms, by name.
+- A batch has entities (cells or edges) with the same quadrature rule.
+- Moving nodes are those of supports whose motion is prescribed.
+- An oblique support acts along directions that are no coordinates; the system applies it.
+"""
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
@@ -56,7 +68,11 @@ class ElementIntegral(Protocol):
         element_matrices: Array,
         couple: Callable[[int, Array], None],
     ) -> None:
-        """Add element matrices, see `HessianIntegral.add`."""
+        """Add the element matrices at the displacement u (dofs,), with factors of terms by name.
+
+        `couple` is called for each batch in `coupling`, with its number and the matrices between
+        two cells.
+        """
 
 
 class FastTangent:
@@ -69,10 +85,10 @@ class FastTangent:
     integrals
         Integrals of the terms; they may have other terms too.
     constraints
-        Constraints of components of u; those along other directions are the system's.
+        Constraints of u. Only those of components are applied here, not oblique ones.
     moving
-        Flags (local cells,) of cells with nodes that move, and integrals of the terms on these
-        cells and their edges alone; None without.
+        A pair: flags (local cells,) of cells with moving nodes, and integrals of the terms on these
+        cells and their edges alone. None without moving nodes.
     """
 
     def __init__(
@@ -82,6 +98,7 @@ class FastTangent:
         constraints: Sequence[Constraint],
         moving: tuple[NDArray[np.bool_], Sequence[ElementIntegral]] | None = None,
     ) -> None:
+        """Make the matrix with the sparsity of all integrals."""
         V, clamped = u.function_space, [c for c in constraints if isinstance(c, fem.DirichletBC)]
         self._u, self._integrals, self._nodes = u, integrals, V.dofmap.list
         self._moving = moving[0] if moving else None
@@ -90,6 +107,7 @@ class FastTangent:
             V, [batch.cells for integral in integrals for batch in integral.coupling], clamped
         )
         cells, functions = V.dofmap.list.shape
+        # of a symmetric element matrix the pairs a <= b of functions are stored
         self._element_matrices = np.empty((cells, 9, functions * (functions + 1) // 2))
 
     def tangent(self, factors: Mapping[str, float], stress: Sequence[Weighted] = ()) -> PETSc.Mat:
@@ -100,12 +118,13 @@ class FastTangent:
         factors
             Factors of terms by name.
         stress
-            Weights and displacements with ghosts. The weighted sum of their membrane strains gives
-            the membrane stress in place of the present strain; empty for the present strain.
+            Pairs of a weight and a displacement with ghosts. The weighted sum of their membrane
+            strains gives the membrane stress, in place of the present strain. Cells with moving
+            nodes keep their present strain. Empty for the present strain everywhere.
         """
         self._element_matrices[:] = 0
         self._matrix.clear()
-        first = 0
+        first = 0  # number of an integral's first batch among those of all integrals
         for integral in self._integrals:
             if stress and isinstance(integral, HessianIntegral):
                 integral.replace_strain(self._u.x.array, stress, self._moving)
@@ -119,14 +138,15 @@ class FastTangent:
     def times(self, v: Array, factors: Mapping[str, float]) -> Array:
         """Return this rank's part of the matrix without supports times a vector v.
 
-        It has contributions of moving cells alone, so it is exact at nodes that move. `v` and the
-        product (dofs,) include ghosts.
+        Only cells with moving nodes contribute, so that it is exact at moving nodes and no others.
+        `v` and the product (dofs,) include ghosts.
         """
         product, x = np.zeros((len(v) // 3, 3)), v.reshape(-1, 3)
         element_matrices = np.zeros(self._element_matrices.shape)
         for integral in self._moving_integrals:
 
             def couple(batch: int, K: Array, integral: ElementIntegral = integral) -> None:
+                """Add the products of matrices K that couple the two cells at each edge."""
                 first, second = (self._nodes[cells] for cells in integral.coupling[batch].cells)
                 add_coupling_products(product, K, first, second, x)
 
@@ -155,8 +175,8 @@ def hessian_integrals(
 ) -> list[HessianIntegral]:
     """Return the integrals of terms' Hessians; collective.
 
-    There is one for the cells of each quadrature, one for all interior edges, and one for each
-    term's boundary edges. Terms that are linear in the displacement have none.
+    There is one for each quadrature on cells, one for all interior edges, and one for the boundary
+    edges of each term. Terms that are linear in the displacement have no Hessian.
 
     Parameters
     ----------
@@ -169,7 +189,8 @@ def hessian_integrals(
     log
         Log of compiled kernels.
     prestress
-        See `HessianIntegral`.
+        Density with which the membrane stress can be exchanged, see `HessianIntegral`. Terms with a
+        quadrature of their own do not have it.
     cell_mask
         Flags (local cells,) of the cells that count, with their edges; None for all.
     """

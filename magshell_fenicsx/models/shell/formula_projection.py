@@ -8,6 +8,15 @@ load on a disc between the nodes would vanish. The polynomial p of the displacem
 does the same work on every displacement, up to the curvature of the cell. Its integrals come from
 parts of the cell that are divided until each agrees with its own parts. Where f is a polynomial of
 the degree k, p is f.
+
+- In: f as a function of places and normals, and the cells. Out: nodal values of the polynomials.
+- Cells are those of a surface, a meridian, an edge or a body; d is their dimension.
+- A part is a piece of a cell of the same kind, by its image in the reference cell. Its own parts,
+  or children, are the pieces that it is divided into.
+- Samples are the values of f at the quadrature points of all cells' first parts; detail that they
+  miss is hidden. `refine_where_hidden` finds it by ranges of the formulas in boxes.
+- `scale` is the size of a cell over the size of the reference cell.
+- The variation of f is the integral of |f - its mean|.
 """
 
 from collections.abc import Callable
@@ -80,8 +89,9 @@ class CellGeometry:
     ) -> tuple[Array, Array, Array]:
         """Return places and normals (cells, n, 3), and the ratio of sizes (cells, n).
 
-        The ratio is the length or area over that of the reference cell; on a meridian it is rho
-        times the length, so that integrals are per radian.
+        The ratio is the length or area over that of the reference cell. On a meridian it is rho
+        times the length, so that integrals are per radian around the axis. Normals on an edge are
+        zero.
 
         Parameters
         ----------
@@ -95,12 +105,13 @@ class CellGeometry:
         table = table.reshape(1 + d, *X.shape[:-1], nodal.shape[1])
         x, *slopes = (np.matmul(derivative_table, nodal) for derivative_table in table)
         if d == 1:
-            if x.shape[-1] == 3:
+            if x.shape[-1] == 3:  # an edge
                 return x, np.zeros_like(x), np.linalg.norm(slopes[0], axis=-1)
             (rho, z), (rho_s, z_s) = np.moveaxis(x, -1, 0), np.moveaxis(slopes[0], -1, 0)
             length = np.hypot(rho_s, z_s)
             normals = np.stack([-z_s, 0 * z_s, rho_s], axis=-1) / length[..., None]
             return np.stack([rho, 0 * rho, z], axis=-1), normals, rho * length
+        # a surface, or the surfaces across the third axis of a body's cells
         m = np.cross(slopes[0], slopes[1])
         size = np.linalg.norm(m, axis=-1)
         return x, m / size[..., None], size
@@ -117,7 +128,7 @@ class ProjectedFormula:
     Attributes
     ----------
     nodal
-        (cells, nodes, components) values; the interpolated ones where the formula is smooth.
+        (cells, nodes, components) values; in cells where the formula is smooth, the interpolant's.
     smooth
         Whether the formula is smooth everywhere, on all ranks.
     size
@@ -125,7 +136,7 @@ class ProjectedFormula:
     missed
         Error that integrals of f may still have, over that of |f|.
     rest
-        Root of the integral of |f - p|^2 over that of |f|^2, of all cells.
+        The error of the polynomials p: root of the integral of |f - p|^2 over that of |f|^2.
     widest
         Largest side of the cells that contribute a visible part to `rest`.
     open
@@ -297,15 +308,16 @@ class _HiddenDetail:
         return cls(np.zeros(cells), variation, no_parts, np.zeros(cells, bool), open_)
 
     def parts_of(self, cells: Numbers, uniform_parts: SubCells) -> SubCells:
-        """Return the parts of some cells: uniform ones, or those of the search in divided cells.
+        """Return the parts of some cells with which the integration of moments begins.
 
-        No part is larger than a uniform one.
+        Cells that the search has divided have its parts, divided further until no part is larger
+        than a uniform one. Other cells have the uniform parts, given for one cell.
         """
         is_divided = self.is_divided[cells]
         if not is_divided.any():
             return uniform_parts.in_each_cell(cells)
         parts = self.parts[np.isin(self.parts.cell, cells)]
-        largest = 1.001 * np.abs(uniform_parts.sides[0, 0])
+        largest = 1.001 * np.abs(uniform_parts.sides[0, 0])  # with a margin for rounding
         small_parts, too_wide = list[SubCells](), np.abs(parts.sides[:, 0]) > largest
         while too_wide.any():
             small_parts.append(parts[~too_wide])
@@ -318,10 +330,11 @@ class _HiddenDetail:
 def _find_hidden_detail(
     values: Values, formulas: FormulaGroup, cells: CellGeometry, sampled_integrals: Array
 ) -> _HiddenDetail:
-    """Return what samples of whole cells miss, by an adaptive search for hidden parts; collective.
+    """Return what samples of whole cells miss, by an adaptive search for hidden detail; collective.
 
-    `sampled_integrals` (cells, components), over the reference cell, are compared with integrals
-    over the parts from `adaptive_sampling.refine_where_hidden`.
+    `refine_where_hidden` divides cells into parts until samples in these miss nothing. Integrals of
+    f over the parts are compared with `sampled_integrals` (cells, components) over the reference
+    cell.
     """
     d, kind = cells.dimension, cells.element.cell_type
     lattice = Lattice.make(kind, LATTICE_DIVISIONS[d])
@@ -329,6 +342,7 @@ def _find_hidden_detail(
 
     def places_of(parts: SubCells) -> tuple[Array, Array]:
         """Return the lattice's places (parts, n, 3) in each part, and the areas (parts,)."""
+        # the lattice has no weights of its own: equal ones give a part's area
         place_count = len(lattice.places)
         X, w = parts.rule(lattice.places, np.full(place_count, weights.sum() / place_count))
         x, _, area = cells.evaluate(X, parts.cell)
@@ -340,7 +354,7 @@ def _find_hidden_detail(
         formulas, whole_cells, places_of, lattice, cells.owned, cells.comm
     )
     is_divided = np.zeros(len(cells.nodal), bool)
-    is_smaller = np.abs(refined.parts.sides[:, 0]) < 1
+    is_smaller = np.abs(refined.parts.sides[:, 0]) < 1  # a part that is not the whole cell
     is_divided[refined.parts.cell[is_smaller]] = True
     integrals = np.where(is_divided[:, None], 0.0, sampled_integrals)
     parts = refined.parts[is_smaller]
@@ -365,9 +379,10 @@ def _moments(
     space: Element,
     components: int,
 ) -> tuple[Array, Array, Array, float]:
-    """Integrate f over parts of cells that are divided until each agrees with its own parts.
+    """Integrate f times polynomials over cells, by parts that are divided as far as needed.
 
-    Collective.
+    A part is divided until its integral agrees with the sum over its own parts, whose integrals are
+    then added up. Collective.
 
     Parameters
     ----------
@@ -397,16 +412,21 @@ def _moments(
         Estimated error of the integrals over the surface, of all ranks.
     """
     points, weights = basix.make_quadrature(space.cell_type, RULE_DEGREE[cells.dimension])
+    # row of each projected cell in the results
     number = np.zeros(len(cells.nodal), np.int64)
     number[projected_cells] = np.arange(len(projected_cells))
 
     def evaluated(batch: SubCells) -> tuple[Array, Array, Array, Array]:
-        """Return points, weights, weights times area ratios, and values in each part."""
+        """Return points X, weights w, weights times area ratios, and values f in each part.
+
+        Sums with w are integrals over the reference cell, sums with the third over the surface.
+        """
         X, w = batch.rule(points, weights)
         x, normals, area = cells.evaluate(X, batch.cell)
         return X, w, area * w, values(x, normals)
 
     def integrals(w: Array, f: Array) -> Array:
+        """Return the integrals (parts, components) of f over the parts, in the reference cell."""
         return np.asarray(np.einsum("pq,pqi->pi", w, f))
 
     moments = np.zeros((len(projected_cells), space.dim, components))
@@ -458,6 +478,9 @@ def _moments(
 
 def _bounded(at_nodes: Array, mean: Array, inner_values: Array, f: Array) -> Array:
     """Contract polynomials towards their means until all values are within the range of f.
+
+    A factor of the deviation from the mean is found for each cell and component. It keeps the mean,
+    which is the first moment.
 
     Parameters
     ----------

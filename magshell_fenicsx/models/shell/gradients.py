@@ -3,6 +3,15 @@
 The derivatives of u are those by the coordinates of the reference cell, so that one table of shape
 functions serves all cells. The kernels take them to the flat cell's own orthonormal coordinates
 first: the metric of a sliver is then as well conditioned as in a form.
+
+- A jet is a vector field's value with its first and second derivatives: parts r, r1, r2, r11, r12
+  and r22, of which only those that a density needs are known at points.
+- r0 is the placement, u the displacement, v a virtual displacement; W is a density.
+- A side is one of the cells beside a point: two on an interior edge, else one.
+- A point field is a fem.Function whose values at points are a kernel's input. A chunk is a slice of
+  all points that is evaluated at a time, in the same point fields.
+- A `Memo` holds a value that is computed again (`renew`) when its inputs have changed.
+- p, q, s and a determinant are a cell's frame: d/dx = p d/dX and d/dy = q d/dX + s d/dY.
 """
 
 from collections.abc import Callable, Sequence
@@ -84,6 +93,7 @@ class PointGradient:
         values: Callable[[fem.Function], Array],
         log: KernelLog,
     ) -> None:
+        """Write the densities as expressions of point fields; kernels are made of them later."""
         self._size = terms[0].density.sides * len(parts) * 3
         chunk = max(CHUNK_POINTS // points_per_entity, 1) * points_per_entity
         self._chunks = [slice(first, min(first + chunk, count)) for first in range(0, count, chunk)]
@@ -96,6 +106,7 @@ class PointGradient:
             _KernelInput(point_geometry, Memo(lambda: geometry, tuple)),
         ]
         self._names, self._log = [term.name for term in terms], log
+        # the energy of each term, and virtual works of loads without potential
         self._W, self._work, self._v = list[Expr](), list[Expr](), points.field(self._size)
         for term in terms:
             parameters, varying = parameters_at(points, term.density.parameters, term.density.sides)
@@ -122,7 +133,8 @@ class PointGradient:
 
     @cached_property
     def gradient(self) -> PointKernel | None:
-        """Kernel of the gradient for `evaluate`; None if nothing depends on u."""
+        """Kernel of the gradient of the terms' sum, for `evaluate`; None if none depends on u."""
+        # energies are differentiated by u, virtual works by v
         sums = [
             (sum(self._conservative, ufl.zero()), self._u),
             (sum(self._work, ufl.zero()), self._v),
@@ -133,7 +145,10 @@ class PointGradient:
         return None
 
     def energy(self, name: str) -> PointKernel | None:
-        """Return the kernel of the energy of the named term; None if the energy is zero."""
+        """Return the kernel of the named term's density, for `evaluate`; None if it is zero.
+
+        Kernels are kept by name.
+        """
         if name not in self._energies:
             W = self._W[self._names.index(name)]
             is_zero = isinstance(W, Zero)
@@ -147,9 +162,10 @@ class PointGradient:
         return self._chunks
 
     def input_array(self, chunk: slice) -> Array:
-        """Return an array (points of the chunk, sides * parts * 3) for the derivatives of u.
+        """Return the input array (points of the chunk, sides * parts * 3) for the jets of u.
 
-        The caller fills in derivatives by reference coordinates before `evaluate`.
+        It is a view of the kernels' input: the caller writes derivatives by reference coordinates
+        into it, before `evaluate`.
         """
         count = chunk.stop - chunk.start
         return np.asarray(self._u.x.array[: count * self._size].reshape(count, self._size))
@@ -218,16 +234,19 @@ def _energy(
     parts: Sequence[str],
     parameters: Sequence[fem.Constant | fem.Function],
 ) -> Expr:
-    """Return a density per area of the reference cell, or per parameter (from 0 to 1) of the edge.
+    """Return a density, or its virtual work, per area of the reference cell.
+
+    On edges it is per parameter of the edge, which runs from 0 to 1.
 
     Parameters
     ----------
     density
         The density.
     fields
-        Point fields of r0, u and perhaps v; those of u and v are by reference coordinates.
+        Point fields of r0 (in the cells' own coordinates), of u and perhaps of v (both in reference
+        coordinates).
     point_geometry
-        The geometry as in `PointGradient`.
+        Point field of the frames; on edges, then the covectors of all sides and the width.
     parts
         Names of the jet parts in the fields.
     parameters
@@ -242,7 +261,8 @@ def _energy(
     ]
     # the determinant in the frame turns an area of the flat cell into one of the reference cell
     if not density.on_edges:
-        return frames[0][-1] * density.value_at([r0_jets, *displacement_jets], None, parameters)
+        *_, determinant = frames[0]
+        return determinant * density.value_at([r0_jets, *displacement_jets], None, parameters)
     first = FRAME_SIZE * density.sides
     m = [
         ufl.as_vector([point_geometry[first + 2 * side], point_geometry[first + 2 * side + 1]])

@@ -3,6 +3,14 @@
 A placement enters by its value and its first and second derivatives, its *jet*. Every
 expression is covariant under linear changes of the coordinates: finite-element forms take
 an orthonormal frame t_1, t_2 of the flat cell, the fast tangent those of the reference cell.
+
+- r0 and r = r0 + u are placements of the undeformed and the deformed mid-surface, u is the
+  displacement. a_i = r,_i are the tangents, n the unit normal; a 0 marks the undeformed surface.
+- a_ij and b_ij are the first and second fundamental forms, E and K half and whole of their changes.
+- nu is the conormal of an edge: in the surface, normal to the edge, outward.
+- An edge has a parameter: its length in the coordinates, or a number from 0 to 1. `stretch` is the
+  true length over it.
+- A natural shape is the one that the shell would have without stress; the index n marks it.
 """
 
 from __future__ import annotations
@@ -53,7 +61,10 @@ class Jet:
 
 
 def cell_frame(mesh: ufl.Mesh) -> tuple[Expr, Expr]:
-    """Return orthonormal vectors t_1, t_2 of the flat cell, t_1 x t_2 along its normal."""
+    """Return orthonormal vectors t_1, t_2 of the flat cell, t_1 x t_2 along its normal.
+
+    t_1 is along the first edge of the reference cell.
+    """
     J = ufl.Jacobian(mesh)
     first, second = J[:, 0], J[:, 1]
     t1 = first / ufl.sqrt(ufl.dot(first, first))
@@ -117,10 +128,11 @@ def dual_basis(j: Jet) -> tuple[Expr, Expr]:
 def strain_components(
     r0: Vectors, u: Vectors, dot: Callable[[Any, Any], Any]
 ) -> tuple[Any, Any, Any]:
-    """Return E_11, E_12 and E_22 from the first derivatives of r0 and u.
+    """Return the membrane strain E_11, E_12 and E_22 from the first derivatives of r0 and u.
 
-    No two metrics of order one are subtracted. `dot` is the scalar product of expressions or of
-    arrays.
+    E_ij = (a0_i . u,_j + u,_i . a0_j + u,_i . u,_j)/2. So no two metrics of order one are
+    subtracted, and small strains keep their digits. `dot` is the scalar product of expressions or
+    of arrays.
     """
     (r1, r2), (u1, u2) = r0, u
     E12 = (dot(r1, u2) + dot(u1, r2) + dot(u1, u2)) / 2
@@ -130,7 +142,7 @@ def strain_components(
 def curvature_components(
     n: Any, normal_change: Any, r0: Vectors, u: Vectors, dot: Callable[[Any, Any], Any]
 ) -> list[Any]:
-    """Return K_11, K_12 and K_22, the changes of n . r,_ij.
+    """Return K_11, K_12 and K_22, the changes of the curvature n . r,_ij.
 
     Parameters
     ----------
@@ -180,13 +192,15 @@ def conormal(r0: Jet, m: Expr) -> tuple[Expr, Expr, Expr]:
     r0
         Jet of the placement.
     m
-        (2,) covector that is zero along the edge, whatever the placement, and positive outward. The
-        edge's parameter is the length of (-m_2, m_1), which is along the edge.
+        (2,) covector in the coordinates of jets: zero along the edge and positive outward. It does
+        not depend on the placement. The vector (-m_2, m_1) is along the edge, the step of one unit
+        of the edge's parameter.
 
     Returns
     -------
     nu_1, nu_2, stretch
-        nu^i (contravariant, so that r_nu = r,_i nu^i) and ds0 over the edge's parameter.
+        Contravariant components nu^i, so that the derivative along nu is r,_i nu^i; and the
+        undeformed length of the edge over its parameter.
     """
     up = inverse_metric(r0)
     nu = ufl.dot(up, m) / ufl.sqrt(ufl.dot(m, ufl.dot(up, m)))
@@ -205,9 +219,9 @@ class Edge:
     along
         Unit tangent (3,), n0 x outward.
     normal_part, tangent_part
-        Components of both in the coordinates of jets.
+        Contravariant components of `outward` and of `along` in the coordinates of jets.
     stretch
-        Its length over that of its parameter.
+        Length of the edge over that of its parameter.
     """
 
     outward: Expr
@@ -237,7 +251,8 @@ class Edge:
 def angle_from(sine: Expr, cosine: Expr, reference_turn: Expr) -> Expr:
     """Return the angle (rad) with a sine and a cosine, counted from a reference turn.
 
-    `reference_turn` (2,) has cosine and sine of that turn. Sine and cosine need not be normalised.
+    `reference_turn` (2,) has cosine and sine of that turn. So an angle can grow beyond pi without a
+    jump, if the reference follows. `sine` and `cosine` may have a common positive factor.
     """
     return ufl.atan2(
         sine * reference_turn[0] - cosine * reference_turn[1],
@@ -247,20 +262,20 @@ def angle_from(sine: Expr, cosine: Expr, reference_turn: Expr) -> Expr:
 
 @dataclass(frozen=True)
 class Forms:
-    """The natural shape at a point as surface tensors in coordinates, (2, 2) each.
+    """The natural shape at a point: surface tensors in coordinates, (2, 2) each, and two ratios.
 
     Attributes
     ----------
     strain
-        (a_n - a0)/2.
+        (a_n - a0)/2, the membrane strain of the natural shape.
     bend
-        b_n - b0.
+        b_n - b0, its change of curvature.
     metric, up
         a_n and its inverse.
     area
         Natural over undeformed area.
     thickness
-        h_n over h.
+        Natural over undeformed thickness.
     """
 
     strain: Expr
@@ -271,9 +286,10 @@ class Forms:
     thickness: Expr
 
     def kink(self, nu1: Expr, nu2: Expr) -> Expr:
-        """Return natural over undeformed b_nunu, where the curvature is across an edge.
+        """Return natural over undeformed curvature b_nunu where all curvature is across an edge.
 
-        nu1 and nu2 are the components of the edge's undeformed unit conormal.
+        It is the square of the natural stretch across the edge, over the ratio of thicknesses. nu1
+        and nu2 are the components of the edge's undeformed unit conormal.
         """
         return self.along(nu1, nu2) / self.thickness
 

@@ -4,6 +4,15 @@ With z along the normal the layer at z has the strain E - z K, so that the energ
 : E - 2 E : B : K + K : D : K)/2. A, B and D are the integrals of 1, z and z^2 times the stiffness
 of the plies (R. M. Jones, *Mechanics of Composite Materials*, 1999, chapter 4). E h, E h^2 and E
 h^3 are taken out.
+
+- E is the membrane strain, K the change of curvature, S the stress and M the moment; `up` is the
+  inverse metric of the shape without stress.
+- The components 11, 12, 22, 16, 26, 66 of a stiffness are those of its matrix by (11, 22, 12), in
+  Voigt's notation: 6 stands for the shear.
+- The angle 0 is the direction from which the angles of plies are counted. It is given by a vector,
+  or runs along the meridians about an axis.
+- "Index up" and "index down" are contravariant and covariant components.
+- A covector c (2,) at an edge is its unit conormal.
 """
 
 from dataclasses import dataclass, field, replace
@@ -71,9 +80,10 @@ class Laminate:
             )
 
     def mirrored(self, plane: Mirror) -> bool:
-        """Return whether a plane, in the model's frame, mirrors plies that do not twist.
+        """Return whether a plane of the model maps the directions of the plies to themselves.
 
-        It must be along or across their directions everywhere.
+        The angle 0 must be along or across the plane everywhere. Plies that couple stretching and
+        twist are not looked at here.
         """
         plane_in_shell_frame = replace(
             plane,
@@ -112,7 +122,11 @@ class Laminated(Law):
 
     @classmethod
     def from_laminate(cls, laminate: Laminate, h: float, nu: float) -> Self:
-        """Return the law of plies, for the thickness h over R and the Poisson's ratio of units."""
+        """Return the law of plies with the thickness h over R.
+
+        `nu` is the Poisson's ratio with which the stiffness of the units is defined, no property of
+        the plies.
+        """
         A, B, D = (tuple(float(v) for v in S) for S in laminate.matrices)
         direction, meridian = laminate.direction, laminate.direction is None
         axis_in_model = laminate.axes @ (np.eye(3)[2] if direction is None else direction)
@@ -134,13 +148,20 @@ class Laminated(Law):
         return self.meridian
 
     def at_point(self, r: Any, a1: Any, a2: Any, n: Any) -> Self:
-        """Return the law with the direction of the angle 0 at a point, see `Law.at_point`."""
+        """Return the law with the direction of the angle 0 at a point of the undeformed surface.
+
+        r (..., 3) is the place, a1 and a2 are the tangents, n is a normal of any length. The
+        direction has the covariant components t . a1 and t . a2 of a vector t along it.
+        """
 
         def dot(v: Any, a: Any) -> Scalar:
+            """Return the scalar product of a vector (3,) with vectors (..., 3)."""
             return v[0] * a[..., 0] + v[1] * a[..., 1] + v[2] * a[..., 2]
 
         component_1, component_2 = (dot(self.axis, a) for a in (a1, a2))
-        if self.meridian:  # (e_theta x n) . a, times lengths
+        # t = (axis x x) x n is along the meridian, with the place x from a point on the axis: then
+        # t . a = (axis . n) (x . a) - (x . n) (axis . a)
+        if self.meridian:
             x = [r[..., i] - self.origin[i] for i in range(3)]
             component_1, component_2 = (
                 dot(self.axis, n) * dot(x, a) - dot(x, n) * component
@@ -155,7 +176,7 @@ class Laminated(Law):
         ).bending_stiffness
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
-        """Return E : A : E/2, over E h per undeformed area."""
+        """Return E : A : E/2, the energy of stretching over E h per undeformed area."""
         strain = _Frame(self.direction, up).strain_components(E)
         return (
             self.modulus_factor * self.thickness_factor / 2 * _work(_stress(self.A, strain), strain)
@@ -169,7 +190,10 @@ class Laminated(Law):
         )
 
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
-        """Return K : D : K/2 - E : B : K, over E h per undeformed area."""
+        """Return K : D : K/2 - E : B : K, the energy of bending over E h per undeformed area.
+
+        It has the coupling of unsymmetric plies too, by the layer strain E - z K.
+        """
         frame = _Frame(self.direction, up)
         stretched, bent = frame.strain_components(E), frame.strain_components(K)
         bending_work = _work(_stress(self.D, bent), bent)
@@ -188,14 +212,17 @@ class Laminated(Law):
         covector_up: tuple[Scalar, Scalar],
         covector_square: Scalar,
     ) -> Scalar:
-        """Return the moment contracted twice with a covector, in the frame of the plies."""
+        """Return the moment M^ij c_i c_j for a covector c, computed in the frame of the plies.
+
+        `covector_square` is not used: plies have no trace term.
+        """
         frame = _Frame(self.direction, up)
         return _work(self._moment(frame, E, K), frame.product(covector_up))
 
     def edge_stiffness(
         self, E: Tensor, up: Tensor, covector_up: tuple[Scalar, Scalar], covector_square: Scalar
     ) -> Scalar:
-        """Return D contracted with the covector four times."""
+        """Return D contracted with the covector c four times; `covector_square` is not used."""
         bent = _Frame(self.direction, up).product(covector_up)
         return self._bending_factor * _work(_stress(self.D, bent), bent)
 
@@ -208,7 +235,7 @@ class Laminated(Law):
         return self.modulus_factor * self.h**2 * self.thickness_factor**3
 
     def _moment(self, frame: "_Frame", E: Tensor, K: Tensor) -> Triple:
-        """Return M_11, M_22, M_12 in the frame: D times K less B times E."""
+        """Return M_11, M_22, M_12 in the frame: D times K less B times E, with their factors."""
         bending_part = _stress(self.D, frame.strain_components(K))
         stretching_part = _stress(self.B, frame.strain_components(E))
         M1, M2, M6 = (
@@ -224,29 +251,35 @@ class _Frame:
     Parameters
     ----------
     direction
-        Components of the direction with index down, of any length.
+        Components (c_1, c_2) of the direction with index down, of any length.
     up
-        Inverse metric, in which the vectors are orthonormal.
+        Inverse metric; the vectors are orthonormal in its metric.
 
     Attributes
     ----------
     t1, t2
-        Components with index up.
+        Components of the two vectors with index up.
     """
 
     def __init__(self, direction: tuple[Scalar, Scalar], up: Tensor) -> None:
+        """Normalise the direction in the metric, and find the vector normal to it."""
         (c1, c2), (a11, a12, a22) = direction, (up[..., 0, 0], up[..., 0, 1], up[..., 1, 1])
         direction_up = a11 * c1 + a12 * c2, a12 * c1 + a22 * c2
         inverse_length = (c1 * direction_up[0] + c2 * direction_up[1]) ** -0.5
         det = a11 * a22 - a12**2
         self._up = up
         self.t1 = direction_up[0] * inverse_length, direction_up[1] * inverse_length
+        # the vector normal to the covector c is (-c_2, c_1), times the root of the determinant
         self.t2 = -(det**0.5) * c2 * inverse_length, det**0.5 * c1 * inverse_length
 
     def strain_components(self, S: Tensor) -> Triple:
-        """Return S_11, S_22 and 2 S_12 in the frame, of a tensor with indices down."""
+        """Return S_11, S_22 and 2 S_12 in the frame, of a strain S with indices down.
+
+        The shear is doubled, as in Voigt's notation.
+        """
 
         def component(a: tuple[Scalar, Scalar], b: tuple[Scalar, Scalar]) -> Scalar:
+            """Return S_ij a^i b^j."""
             mixed = a[0] * b[1] + a[1] * b[0]
             return S[..., 0, 0] * a[0] * b[0] + S[..., 0, 1] * mixed + S[..., 1, 1] * a[1] * b[1]
 
@@ -257,18 +290,18 @@ class _Frame:
         )
 
     def product(self, covector_up: tuple[Scalar, Scalar]) -> Triple:
-        """Return the components 11, 22 and 2 * 12 in the frame of c c, for a covector c.
+        """Return the components 11, 22 and 2 * 12, in the frame, of the tensor c (x) c.
 
-        `covector_up` are the components of c with index up.
+        `covector_up` are the components of the covector c with index up.
         """
         c = lower_index(covector_up, self._up)
         c_1, c_2 = (t[0] * c[0] + t[1] * c[1] for t in (self.t1, self.t2))
         return c_1**2, c_2**2, 2 * c_1 * c_2
 
     def components_up(self, factor: Scalar, S: Triple) -> Components:
-        """Return a factor times a stress as components with indices up.
+        """Return a factor times a stress, as components 11, 12, 22 with indices up.
 
-        The stress S_11, S_22, S_12 is in the frame.
+        The stress S is given by its components 11, 22, 12 in the frame.
         """
         (a1, a2), (b1, b2), (S1, S2, S6) = self.t1, self.t2, S
         S11 = S1 * a1**2 + S2 * b1**2 + 2 * S6 * a1 * b1

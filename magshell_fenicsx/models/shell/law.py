@@ -5,6 +5,12 @@ of curvature, (..., 2, 2) in coordinates of the surface; `up` is the inverse met
 without stress. Every formula is one of components, so that it holds for an expression of UFL at a
 point and for arrays of NumPy over many points.
 
+- S is the membrane stress and M the moment: the derivatives of the energy by E and K.
+- "Index up" and "index down" are contravariant and covariant components.
+- A covector c (2,) at an edge is its unit conormal; K_cc = K_ij c^i c^j is the curvature across it.
+- The numbers of a law, in a fixed order, become parameters of the densities.
+- A side is one of the cells beside a point: two on an interior edge, else one.
+
 A further law is a `Law`, and a line in `parameters.Material.law`.
 """
 
@@ -62,9 +68,9 @@ class Law(ABC):
 
     @property
     def numbers(self) -> tuple[Any, ...]:
-        """The law's numbers in order, without `thickness_factor` and `modulus_factor`.
+        """The law's numbers in a fixed order, without `thickness_factor` and `modulus_factor`.
 
-        Some laws have vectors among them.
+        They become parameters of the densities; some laws have vectors among them.
         """
         return self.h, self.parameter
 
@@ -94,7 +100,8 @@ class Law(ABC):
         """Return the law with another material.
 
         Young's modulus is multiplied by a factor; nu replaces Poisson's ratio where the law has
-        one. Of several laws `shell_number` selects one.
+        one, and is ignored here. `shell_number` selects a law of a `LawByShell`; a single law
+        ignores it.
         """
         return replace(self, modulus_factor=modulus_factor * self.modulus_factor)
 
@@ -121,8 +128,8 @@ class Law(ABC):
         """Return the derivative of `membrane` by E."""
 
     def stress_change(self, E: Tensor, change: Tensor, up: Tensor) -> Components:
-        """Return the stress of E + change less that of E."""
-        if self.linear is self:
+        """Return the difference of the stress at E + change and the stress at E."""
+        if self.linear is self:  # the stress is linear in E
             return self.stress(change, up)
         stress, changed_stress = self.stress(E, up), self.stress(E + change, up)
         S11, S12, S22 = (b - a for a, b in zip(stress, changed_stress, strict=True))
@@ -141,7 +148,9 @@ class Law(ABC):
         covector_up: tuple[Scalar, Scalar],
         covector_square: Scalar,
     ) -> Scalar:
-        """Return the moment contracted twice with a covector c.
+        """Return M^ij c_i c_j, the moment contracted twice with a covector c.
+
+        With the unit conormal of an edge as c it is the bending moment across the edge.
 
         Parameters
         ----------
@@ -150,17 +159,18 @@ class Law(ABC):
         up
             Inverse metric of the shape without stress.
         covector_up, covector_square
-            c with its index up, and c . c: the unit conormal of an edge and 1, but for a natural
-            stretch.
+            The components c^i, and the square c^i c_i. The square is 1 for a unit conormal; in the
+            metric of a naturally stretched shape it differs from 1.
         """
 
     @abstractmethod
     def edge_stiffness(
         self, E: Tensor, up: Tensor, covector_up: tuple[Scalar, Scalar], covector_square: Scalar
     ) -> Scalar:
-        """Return the derivative of `edge_moment` by K, contracted twice with c.
+        """Return the stiffness by which K_cc enters `edge_moment`, for the penalty of edges.
 
-        The penalty of edges is proportional to it. Parameters are those of `edge_moment`.
+        It is the derivative of the moment by K, contracted with c four times. Parameters are those
+        of `edge_moment`.
         """
 
 
@@ -210,7 +220,10 @@ class Koiter(Law):
         covector_up: tuple[Scalar, Scalar],
         covector_square: Scalar,
     ) -> Scalar:
-        """Return D ((1 - nu) K_cc + nu c² tr K), for the covector c; see `Law.edge_moment`."""
+        """Return D ((1 - nu) K_cc + nu c² tr K): the moment contracted twice with the covector c.
+
+        D is the bending stiffness, K_cc = K_ij c^i c^j and c² the square of c.
+        """
         curvature_across = (
             K[..., 0, 0] * covector_up[0] ** 2
             + 2 * K[..., 0, 1] * covector_up[0] * covector_up[1]
@@ -231,7 +244,7 @@ class Koiter(Law):
         return (1 - self.nu) * (T11**2 + 2 * T12 * T21 + T22**2) + self.nu * (T11 + T22) ** 2
 
     def _scaled(self, factor: Scalar, S: Tensor, up: Tensor) -> Components:
-        """Return a factor times (1 - nu) S + nu tr S with indices up."""
+        """Return components of factor ((1 - nu) S^ij + nu tr S a^ij), from S with indices down."""
         T11, T12, T21, T22 = _mixed(S, up)
         a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
         raised_components = (T11 * a11 + T12 * a12, T11 * a12 + T12 * a22, T21 * a12 + T22 * a22)
@@ -244,7 +257,9 @@ class Koiter(Law):
 
 @dataclass(frozen=True)
 class LawByShell(Law):
-    """The laws of several shells; the first one is that of the units.
+    """The laws of several shells in one model; `shell_number` says which holds at a place.
+
+    Energies of all shells are over E h of the first one.
 
     Attributes
     ----------
@@ -262,7 +277,7 @@ class LawByShell(Law):
         return tuple(number for law in self.laws for number in law.numbers)
 
     def with_numbers(self, *numbers: Any) -> Self:
-        """Return the laws with other numbers: first those of the first law, and so on."""
+        """Return the laws with other numbers: first all numbers of the first law, and so on."""
         remaining_numbers, laws = list(numbers), list[Law]()
         for law in self.laws:
             count = len(law.numbers)
@@ -330,7 +345,7 @@ class LawByShell(Law):
         covector_up: tuple[Scalar, Scalar],
         covector_square: Scalar,
     ) -> Scalar:
-        """Return the `edge_moment` of the law at the place."""
+        """Return M^ij c_i c_j by the law of the shell at the place."""
         return self._value_at_place(
             [law.edge_moment(E, K, up, covector_up, covector_square) for law in self.laws]
         )
@@ -338,7 +353,7 @@ class LawByShell(Law):
     def edge_stiffness(
         self, E: Tensor, up: Tensor, covector_up: tuple[Scalar, Scalar], covector_square: Scalar
     ) -> Scalar:
-        """Return the `edge_stiffness` of the law at the place."""
+        """Return the stiffness by which K_cc enters `edge_moment`, by the law at the place."""
         return self._value_at_place(
             [law.edge_stiffness(E, up, covector_up, covector_square) for law in self.laws]
         )
@@ -347,8 +362,12 @@ class LawByShell(Law):
         return replace(self, laws=tuple(change(law) for law in self.laws))
 
     def _value_at_place(self, values: Sequence[Scalar]) -> Scalar:
-        """Return the value of the law `shell_number`, from the values of all laws."""
+        """Return the value of the law with the number `shell_number`, from the values of all laws.
+
+        An expression of UFL selects by conditionals, a number or an array by NumPy.
+        """
         value_at_place = values[0]
+        # shell numbers are integers in floating point: above i + 1/2 counts as i + 1 or more
         for i, value in enumerate(values[1:]):
             if isinstance(self.shell_number, Expr):
                 value_at_place = ufl.conditional(
@@ -362,7 +381,10 @@ class LawByShell(Law):
 
 
 def _mixed(S: Tensor, up: Tensor) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-    """Return S^i_j = a^ik S_kj as 11, 12, 21, 22."""
+    """Return the mixed components S^i_j = a^ik S_kj, in the order 11, 12, 21, 22.
+
+    a^ij is the inverse metric `up`.
+    """
     S11, S12, S22 = S[..., 0, 0], S[..., 0, 1], S[..., 1, 1]
     a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
     return (
@@ -383,9 +405,9 @@ def trace(S: Tensor, up: Tensor) -> Scalar:
 
 
 def lower_index(covector_up: tuple[Scalar, Scalar], up: Tensor) -> tuple[Scalar, Scalar]:
-    """Return the components of a covector with index down, from those with index up.
+    """Return the components c_i of a covector with index down, from c^i with index up.
 
-    `up` is the inverse metric (2, 2).
+    `up` is the inverse metric a^ij (2, 2), which is inverted here: c_i = a_ij c^j.
     """
     a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
     det = a11 * a22 - a12**2
@@ -405,10 +427,10 @@ def elastic_density(
     thickness: Parameter | None = None,
     cell_materials: Parameter | None = None,
 ) -> Density:
-    """Return a density with parameters for a material, from one that takes a `law`.
+    """Return a density whose law is made of parameters, from one that takes a keyword `law`.
 
-    On interior edges the density takes a pair of laws. The numbers of the law become parameters,
-    then the fields.
+    The numbers of the law are appended to the density's parameters, then the fields. So other
+    numbers need no new kernel. On interior edges the given density takes a pair of laws.
 
     Parameters
     ----------
@@ -419,18 +441,21 @@ def elastic_density(
     thickness
         Field (1,) that multiplies the thickness; None for 1.
     cell_materials
-        Field (4,) of `ShellMaterial.numbers`; None for one material.
+        Field (4,) of `ShellMaterial.numbers` (modulus, nu, density, number of the law); None for
+        one material.
     """
 
     def by_side(value: Any) -> Sequence[Any]:
-        """Return the values of all sides in a sequence."""
+        """Return a field's values on all sides in a sequence; one side has its bare value."""
         return value if density.sides == 2 else [value]
 
     def with_law(*arguments: Expr, **keywords: Any) -> Expr:
-        """Return the density's value at its own arguments, numbers, thickness and materials.
+        """Return the density's value.
 
-        The arguments come in this order; the last two are absent without such fields.
+        The arguments are first the density's own, then the numbers of the law, then thickness and
+        materials if there are such fields.
         """
+        # taken off from the end
         arguments_left, factors, materials = list(arguments), [1] * density.sides, None
         if cell_materials is not None:
             materials = by_side(arguments_left.pop())
@@ -439,6 +464,7 @@ def elastic_density(
         count = len(arguments_left) - len(law.numbers)
         laws = [law.with_numbers(*arguments_left[count:]).thicker(factor) for factor in factors]
         if materials is not None:
+            # components 0, 1 and 3 are modulus, nu and number of the law; the density is not used
             laws = [
                 side_law.with_material(numbers[0], numbers[1], numbers[3])
                 for side_law, numbers in zip(laws, materials, strict=True)

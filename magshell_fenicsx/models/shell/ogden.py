@@ -11,7 +11,14 @@ squares of both stretches are sqrt(d) exp(+-u) with cosh u = 1 + w, so that
 where V is Chebyshev's function of the order a, less one: a power series in w that is cut off where
 w is small.
 
-Of the energy of bending see docs/theory.md, Rubber.
+The energy of bending is that of docs/theory.md, Rubber.
+
+- C = a0^-1 a is the Cauchy-Green tensor of the mid-surface, with the undeformed and the deformed
+  metric; l1, l2 and l3 = 1/(l1 l2) are the principal stretches.
+- T = tr C - 2 and D = det(C - 1), so that t = 2 + T and d = 1 + T + D: numbers of order one are not
+  subtracted.
+- K is the change of curvature, whose energy is a quadratic form in a^ij K_ij, tr K and det K.
+- Scalars are numbers, arrays or expressions of UFL.
 """
 
 from dataclasses import dataclass, field
@@ -58,24 +65,29 @@ class Ogden(Incompressible):
 
     @property
     def softening(self) -> float:
-        """Share of the stress that is taken into the stiffness of bending.
+        """Share of the stress in the stiffness of bending, which keeps it positive at any stretch.
 
-        It makes this stiffness positive at every stretch.
+        It is zero if all |alpha| are at least 2.
         """
         return max(0.0, 2 - min(abs(alpha) for alpha in self.alpha))
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
-        """Return the energy of stretching, without differences of numbers of order one."""
+        """Return the energy of stretching over E h, without differences of numbers of order one.
+
+        For each term it is mu/alpha (l1^alpha + l2^alpha + l3^alpha - 3), by z = d^(alpha/4).
+        """
         surface, total = Stretched(E, up), 0.0
         for mu, alpha in self.terms:
             z, (V, _, _) = surface.d ** (alpha / 4), _chebyshev(alpha / 2, _uneven(surface))
-            total = total + mu / alpha * (
-                (z - 1) ** 2 * (2 * z + 1) / z**2 + 2 * z * V
-            )  # of order one is nothing
+            # 2 z (1 + V) + 1/z² - 3, rearranged
+            total = total + mu / alpha * ((z - 1) ** 2 * (2 * z + 1) / z**2 + 2 * z * V)
         return self.modulus_factor * self.thickness_factor * total
 
     def _slopes(self, surface: Stretched) -> tuple[Scalar, Scalar]:
-        """Return the energy's derivatives by T and D, where t = 2 + T and d = 1 + T + D."""
+        """Return the derivatives of the energy of stretching by T and D.
+
+        As t = 2 + T and d = 1 + T + D, they are W_t + W_d and W_d.
+        """
         w, by_t, by_d = _uneven(surface), 0.0, 0.0
         for mu, alpha in self.terms:
             a = alpha / 2
@@ -87,10 +99,10 @@ class Ogden(Incompressible):
         return by_t + by_d, by_d
 
     def _stiffness(self, surface: Stretched) -> tuple[Scalar, Scalar, Scalar, Scalar]:
-        """Return factors of T², -T tr K, -det K and (tr K)², see `Incompressible._stiffness`.
+        """Return factors of T², -T tr K, -det K and (tr K)² in twice the energy of bending.
 
-        They follow from the second derivatives of the energy by t and d, see docs/theory.md,
-        Rubber.
+        Here T = a^ij K_ij with the deformed inverse metric a^ij. The factors follow from the second
+        derivatives of the energy of stretching by t and d, as derived in docs/theory.md, Rubber.
         """
         w, softening = _uneven(surface), self.softening
         y, square_factor, mixed_factor, trace_factor, equibiaxial = 1 + w, 0.0, 0.0, 0.0, 0.0
@@ -108,6 +120,7 @@ class Ogden(Incompressible):
             equibiaxial = equibiaxial + 4 * a * m * (
                 (a - 1 + softening / 2) * z + (a + 1 - softening / 2) / z**2
             )
+        # the factor of det K from the stiffness to bending in one direction and in all directions
         uniaxial = trace_factor + y * mixed_factor + square_factor
         det_factor = 2 * uniaxial**2 / (uniaxial + equibiaxial)
         factor = self.modulus_factor * self.thickness_factor**3 * self.h**2 / (12 * surface.d)
@@ -121,19 +134,20 @@ class Ogden(Incompressible):
 
 
 def _uneven(surface: Stretched) -> Scalar:
-    """Return w = t/(2 sqrt(d)) - 1, without a difference of numbers of order one.
+    """Return w = t/(2 sqrt(d)) - 1: zero if both principal stretches are equal.
 
-    It is (t^2/4 - d)/(sqrt(d) (t/2 + sqrt(d))).
+    It is computed as (t^2/4 - d)/(sqrt(d) (t/2 + sqrt(d))), without a difference of numbers of
+    order one.
     """
     s = root(surface.d)
     return (surface.T**2 / 4 - surface.D) / (s * (1 + surface.T / 2 + s))
 
 
 def _chebyshev(a: float, w: Scalar) -> tuple[Scalar, Scalar, Scalar]:
-    """Return V(w) of the order a and its first two derivatives.
+    """Return V(w) = cosh(a u) - 1, with cosh u = 1 + w, and its first two derivatives by w.
 
-    V is that of the module's docstring: a power series below `SERIES_LIMIT`, or a polynomial if a
-    is a small integer; else from p = exp(a u).
+    A power series is used for w below `SERIES_LIMIT`; if a is a small integer it ends, and holds
+    for all w. Otherwise V follows from p = exp(a u).
     """
     coefficients = [0.0, a**2]
     for k in range(1, SERIES_TERMS):
@@ -152,6 +166,7 @@ def _chebyshev(a: float, w: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     if a == int(a) and abs(a) <= SERIES_TERMS:  # a polynomial
         return series[0], series[1], series[2]
     in_series = ufl.lt(w, SERIES_LIMIT) if isinstance(w, Expr) else np.real(w) < SERIES_LIMIT
+    # in the series' range the other branch is evaluated too: it must not divide by zero
     bounded_w = _conditional(in_series, SERIES_LIMIT, w)
     y = 1 + bounded_w
     p = (y + root(bounded_w * (2 + bounded_w))) ** a

@@ -1,4 +1,18 @@
-"""An energy of the mid-surface or of an edge, of a part or of a user, from its density alone."""
+"""An energy of the mid-surface or of an edge that is given by its density alone.
+
+A part of the program or a user writes the density as a function of jets that returns a UFL scalar.
+`OwnTerm` finds out what the density depends on and which symmetries it has, and refuses a density
+that is no valid energy.
+
+- A jet is a vector field's value with its first and second derivatives by two coordinates of the
+  surface; its six parts are named r, r1, r2, r11, r12 and r22.
+- r0 is the placement (the undeformed mid-surface), u the displacement; lengths are over R.
+- m is the covector (2,) of an edge: it is zero along the edge and positive outward.
+- mu, the amplitude of a term, is the load parameter that multiplies its energy.
+- A sample holds random numbers for the jets of r0 and u and for m. Densities are evaluated at
+  samples to test their symmetries.
+- An outline is the shape of a shell as far as symmetries need it: places on it and its meridian.
+"""
 
 from __future__ import annotations
 
@@ -100,7 +114,10 @@ class FormulaParameter:
         )
 
     def turns(self, outline: Outline) -> bool:
-        """Return whether the formula is axisymmetric about e3."""
+        """Return whether the formula is axisymmetric about e3 on the shell's surface.
+
+        An outline without a meridian is not a surface of revolution.
+        """
         return outline.meridian is not None and scalar_is_axisymmetric(self.text, outline.meridian)
 
     def mirrored(self, mirror: Mirror, outline: Outline) -> bool:
@@ -210,6 +227,7 @@ class OwnTerm:
                 f"{self.name}: a density is that of a volume or that of an edge, not both"
             )
         self._refuse_coordinates()
+        # derivatives of the placement or the displacement, which a volume does not have
         bent = {*self.parts, *self._parts_in(self._symbolic.r0)} - {"r"}
         if self.of_volume and bent:
             raise ValueError(
@@ -261,6 +279,8 @@ class OwnTerm:
     ) -> OwnTerm:
         """Return the term with functions on a model's mesh in place of formulas and user fields.
 
+        Other parameters (numbers, vectors, `Free` ones) stay as they are.
+
         Parameters
         ----------
         formula_to_function
@@ -277,11 +297,13 @@ class OwnTerm:
         return replace(self, parameters=tuple(map(function_of, self.parameters)))
 
     def turned(self, angle: float) -> OwnTerm:
-        """Return the term in a frame that is turned by `angle` about e3 (rad).
+        """Return the term for a model whose frame is turned by `angle` (rad) about e3.
 
-        Jets are rotated into the density's own frame before it is evaluated; cosine and sine are a
-        further parameter.
+        The densities of the returned term take jets in the model's frame. They rotate these jets
+        into the frame in which the density was written, and then evaluate it. Cosine and sine of
+        the angle are appended to the parameters, so that another angle needs no new kernel.
         """
+        # an axisymmetric density is the same in both frames
         if not angle or (self.turns and not self.formula_parameters):
             return self
 
@@ -296,7 +318,7 @@ class OwnTerm:
 
             def density_in_frame(r0: Jet, u: Jet, *arguments: Any) -> Expr:
                 """Evaluate the density at rotated jets, with rotated vectors of an edge."""
-                *arguments_left, rotation = arguments
+                *arguments_left, rotation = arguments  # the appended parameter comes last
                 jets = (Jet(*(rotated(part, rotation) for part in jet.parts())) for jet in (r0, u))
                 if self.on is not None:
                     edge, *arguments_left = arguments_left
@@ -324,9 +346,11 @@ class OwnTerm:
         )
 
     def at_point(self, density: Callable[..., Expr]) -> Callable[..., Expr]:
-        """Return a density whose parameters of one number may be given as vectors (1,).
+        """Return a density that takes its scalar functions on a mesh as vectors (1,).
 
-        Functions on a mesh are such vectors at a point.
+        A function on a mesh is a vector at a point, also if it has one component. The given
+        `density` expects a number in its place, so the vector is unpacked. A density without such
+        parameters is returned as it is.
         """
         is_number = [
             isinstance(p, ufl.Coefficient) and p.ufl_shape == (1,) for p in self.parameters
@@ -336,6 +360,7 @@ class OwnTerm:
 
         def density_of_numbers(*arguments: Any) -> Expr:
             """Evaluate the density with vectors (1,) unpacked."""
+            # the parameters are the last arguments, after two jets and perhaps an edge
             jets_and_edge, parameters = arguments[: -len(is_number)], arguments[-len(is_number) :]
             return density(
                 *jets_and_edge,
@@ -362,14 +387,16 @@ class OwnTerm:
     def turns(self) -> bool:
         """Whether the densities stay the same if shell and displacement turn about e3.
 
-        It is tested at random jets.
+        It is tested at random jets, each turned by another angle. A term with functions on a mesh
+        counts as not turning.
         """
 
         def rotated(jet: Array, angle: float) -> Array:
+            """Return a jet (6, 3) rotated about e3 by an angle (rad)."""
             c, s = np.cos(angle), np.sin(angle)
             return np.asarray(jet @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]]))
 
-        samples = enumerate(_random_samples(), 1)
+        samples = enumerate(_random_samples(), 1)  # the number of a sample is its angle in rad
         return not self.varying and all(
             self._is_same((r0, u, m), (rotated(r0, a), rotated(u, a), m))
             for a, (r0, u, m) in samples
@@ -378,11 +405,12 @@ class OwnTerm:
     def mirrored(self, mirror: Mirror) -> bool:
         """Return whether the densities stay the same if shell and displacement are mirrored.
 
-        It is tested at random jets. A term with functions on a mesh counts as not mirrored.
+        It is tested at random jets. A term with functions on a mesh counts as not mirrored, and so
+        does a term on an edge that the plane maps to another edge.
         """
-        # the first coordinate changes places with the second, so that the normal stays outward
         if self.varying:
             return False
+        # the first coordinate changes places with the second, so that the normal stays outward
         order = [
             ("r", *ALL_DERIVATIVES).index(name) for name in ("r", "r2", "r1", "r22", "r12", "r11")
         ]
@@ -397,7 +425,11 @@ class OwnTerm:
         return all(self._is_same(sample, image(*sample)) for sample in _random_samples())
 
     def symmetry_constraint(self, outline: Outline) -> SymmetryConstraint:
-        """Return the symmetry that the term preserves of a shell with this outline."""
+        """Return which symmetries of a shell with this outline the term leaves to a model.
+
+        They are the axisymmetry about e3, and mirror planes. A term without axisymmetry has the
+        reason for the user in the constraint.
+        """
         turns = self.turns and all(p.turns(outline) for p in self.formula_parameters)
 
         def mirrors(mirror: Mirror) -> bool:
@@ -405,6 +437,7 @@ class OwnTerm:
                 p.mirrored(mirror, outline) for p in self.formula_parameters
             )
 
+        # an axisymmetric model also has every plane through e3 as a mirror
         is_shared = self.mirrored(Y0_PLANE) and turns
         name = self.name + (" or what it observes" if self.observed else "")
         return SymmetryConstraint(
@@ -413,7 +446,10 @@ class OwnTerm:
 
     @property
     def digest(self) -> str:
-        """A hash of the term: name, amplitude, parameters, and densities at random jets."""
+        """A hash (16 hex digits) by which two equal terms are recognised.
+
+        A function has no text to be hashed, so the densities enter by their values at random jets.
+        """
         values = [
             self._value(sample, density)
             for density in self.densities
@@ -430,7 +466,10 @@ class OwnTerm:
 
     @cached_property
     def _symbolic(self) -> Symbolic:
-        """The first density as an expression, with the variables that it is written with.
+        """The first of `densities` as a UFL expression, with the variables that it is made of.
+
+        These are UFL coefficients on a mesh of one triangle, without values. Dependence on a part
+        of a jet is found by looking for its coefficient in the expression.
 
         Raises
         ------
@@ -462,7 +501,10 @@ class OwnTerm:
             ) from e
 
     def _foreign_terminals(self) -> list[Expr]:
-        """Return fields, constants and coordinates in the density that are no arguments."""
+        """Return fields, constants and coordinates in the density that are not its arguments.
+
+        A density that holds such an object cannot be evaluated at points.
+        """
         W, r0, u, m = self._symbolic
         arguments = [m, *(part.ufl_operands[0] for jet in (r0, u) for part in jet.parts())]
         return [
@@ -473,15 +515,17 @@ class OwnTerm:
         ]
 
     def _refuse_coordinates(self) -> None:
-        """Refuse a density that depends on the coordinates of the surface.
+        """Refuse a density whose value depends on the coordinates of the surface.
 
-        Each cell has its own, so the value must be the same in others.
+        Each cell has its own two coordinates, by which jets are derived. So a density must have the
+        same value at a sample in two systems of coordinates.
 
         Raises
         ------
         ValueError
             With the density that differs.
         """
+        # the energy's density, if there is one, has no column of its own: ""
         for column, density in zip(
             ("", *self.observed)[-len(self.densities) :], self.densities, strict=True
         ):
@@ -500,7 +544,10 @@ class OwnTerm:
                     )
 
     def _parts_in(self, jet: Jet) -> tuple[str, ...]:
-        """Return the names of the parts of a jet of `_symbolic` that the density depends on."""
+        """Return the names of the parts of a jet that the first density depends on.
+
+        `jet` is that of r0 or of u in `_symbolic`.
+        """
         coefficients = ufl.algorithms.extract_coefficients(self._symbolic.W)
         return tuple(
             name
@@ -532,6 +579,7 @@ class OwnTerm:
         """Return a density's value at a sample; nan where it has none, as for a negative root."""
         r0, u, m = sample
         try:
+            # compound operators are expanded, then the expression of numbers is evaluated
             lowered = ufl.algorithms.apply_algebra_lowering.apply_algebra_lowering
             return float(
                 lowered(self._expression(_as_jet(r0), _as_jet(u), _as_expression(m), density))(())
@@ -541,7 +589,7 @@ class OwnTerm:
 
 
 class Symbolic(NamedTuple):
-    """A density, the jets of r0 and u, and the covector of an edge that it is written with."""
+    """A density W as an expression, with the jets of r0 and u and the covector m in it."""
 
     W: Expr
     r0: Jet
@@ -550,8 +598,8 @@ class Symbolic(NamedTuple):
 
 
 def _random_samples() -> list[Sample]:
-    """Return jets of r0 and u, and covectors of an edge, always the same."""
-    # within a box about as large as a shell
+    """Return `SYMMETRY_SAMPLES` samples (jets of r0 and u, a covector), the same at each call."""
+    # places within a box about as large as a shell, displacements a quarter of that
     rng = np.random.default_rng(2026)
     jets = rng.uniform(-1, 1, (SYMMETRY_SAMPLES, 2, 6, 3))
     covectors = rng.uniform(-1, 1, (SYMMETRY_SAMPLES, 2))
@@ -559,13 +607,16 @@ def _random_samples() -> list[Sample]:
 
 
 def _in_other_coordinates(sample: Sample) -> Sample:
-    """Return a sample (jets of r0 and u, a covector) in other coordinates of the surface."""
+    """Return a sample (jets of r0 and u, a covector) in other coordinates of the surface.
+
+    The value of a jet stays; derivatives and covector transform by the matrix `OTHER_COORDINATES`.
+    """
     A = OTHER_COORDINATES
     (r0, u), m = (np.array(jet) for jet in sample[:2]), sample[2]
     for jet in (r0, u):
         # second derivatives as a symmetric matrix of vectors
-        second = jet[[3, 4, 4, 5]].reshape(2, 2, 3)
-        jet[1:3] = A @ jet[1:3]
+        second = jet[[3, 4, 4, 5]].reshape(2, 2, 3)  # rows 3 to 5 of a jet are r11, r12, r22
+        jet[1:3] = A @ jet[1:3]  # rows 1 and 2 are r1 and r2
         jet[3:] = np.einsum("ai,bj,ijc->abc", A, A, second).reshape(4, 3)[[0, 1, 3]]
     return r0, u, A @ m
 
@@ -577,24 +628,23 @@ def _as_jet(parts: Array) -> Jet:
 def _as_expression(
     value: float | Array | Free | UserField | FormulaParameter | Coefficient,
 ) -> Expr:
-    """Return a parameter's value as an expression, for tests of a density.
+    """Return a parameter's value as an expression, for tests of a density at samples.
 
-    Formulas and functions get a value other than zero, so that no term vanishes.
+    Formulas and functions vary over the shell. A representative value other than zero stands for
+    them, so that no term of the density vanishes.
     """
-    if isinstance(value, FormulaParameter):  # of any value
+    if isinstance(value, FormulaParameter):  # any number does
         value = 1.0
     if isinstance(value, UserField):
         value = np.where(value.largest == 0, 1.0, value.largest)
         value = value if len(value) > 1 else float(value[0])
-    if isinstance(value, ufl.Coefficient):  # of any value
+    if isinstance(value, ufl.Coefficient):  # any number or vector does
         if value.ufl_shape not in ((), (1,)):
             value = np.arange(1.0, 1 + prod(value.ufl_shape))
         else:
             value = 1.0
     if isinstance(value, Free):
-        return ufl.as_ufl(
-            value.value or 1.0
-        )  # of no place in its range, such as zero, that hides terms
+        return ufl.as_ufl(value.value or 1.0)  # not zero, where terms of the density may vanish
     if np.ndim(value) == 0:
         return ufl.as_ufl(float(value))
     return ufl.as_tensor(np.asarray(value, dtype=float).tolist())

@@ -1,4 +1,9 @@
-"""Material, supports and loads of a shell, dimensionless."""
+"""Material, supports and loads of a shell, dimensionless.
+
+Energies are over E h R², lengths over R. E, h and R are Young's modulus, thickness and reference
+length of the shell, or of the first of several shells. A pattern is a function of undeformed places
+and normals that gives vectors. A dead load keeps its direction.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -82,7 +87,11 @@ class Material:
 
     @property
     def law(self) -> Law:
-        """The law of the material: energies, stresses and moments as functions of strains."""
+        """The law of the material: energies, stresses and moments as functions of strains.
+
+        Several shells have their laws in `laws`; else plies, rubber or Koiter's law hold, in this
+        order. Rubber has constants (mu, alpha) of Ogden's law, or one number of Mooney and Rivlin.
+        """
         if self.laws:
             if len(self.laws) > 1:
                 return LawByShell(self.h, self.nu, laws=self.laws)
@@ -91,7 +100,7 @@ class Material:
             return Laminated.from_laminate(self.laminate, self.h, self.nu)
         if isinstance(self.rubber, tuple):
             mu, alpha = self.rubber
-            return Ogden(self.h, 0.0, mu=mu, alpha=alpha)
+            return Ogden(self.h, 0.0, mu=mu, alpha=alpha)  # its own number is not used
         return Koiter(self.h, self.nu) if self.rubber is None else Rubber(self.h, self.rubber)
 
     @property
@@ -100,13 +109,14 @@ class Material:
         return {**({"": self.laminate} if self.laminate else {}), **self.laminates}
 
     def law_in(self, cells: NDArray[np.float64] | None) -> Law:
-        """Return the law in cells, for arrays (cells, n) of values at points.
+        """Return the law in cells, for arrays (cells, n) of values at n points of each cell.
 
-        `cells` (cells, 4) are the `ShellMaterial.numbers` of cells; None if all shells have one
-        material.
+        `cells` (cells, 4) are `ShellMaterial.numbers`: modulus, nu, density and number of the law.
+        None if all shells have one material.
         """
         if cells is None:
             return self.law
+        # with an axis (cells, 1), so that they multiply values at points; the density is not used
         modulus_factor, nu, _, law_number = np.moveaxis(cells[:, None], -1, 0)
         return self.law.with_material(modulus_factor, nu, law_number)
 

@@ -1,6 +1,17 @@
-"""Energies and residuals from densities and their gradients at points, without forms.
+"""Energies and residuals from densities and their gradients at points, without UFL forms.
 
-The derivatives of both by free parameters are computed in the same way.
+In: terms (`PointTerm`: a name, an amplitude and a density). Out: a term's energy, and its residual
+added to a vector. The derivatives of both by free parameters are computed in the same way.
+
+- A jet is a vector field's value with its first and second derivatives by two coordinates; its
+  parts have the names in `JET_NAMES`.
+- r0 is the placement, u the displacement; W is a density, an energy per area or length.
+- Nodal values are (cells, functions * 3): the displacements at the nodes of each cell.
+- Factors are the numbers that multiply the terms, by name.
+- An amplitude is a load parameter, by name, that multiplies a term; None stands for the factor 1.
+- The frame of a cell are four numbers (`cell_frames`) that turn derivatives by reference
+  coordinates into derivatives in orthonormal coordinates of the cell.
+- A `Memo` holds a value that is computed again when its inputs change.
 """
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -100,18 +111,24 @@ class FastResidual:
         *,
         one_by_one: bool = False,
     ) -> None:
+        """Group the terms: cells by quadrature and amplitude, then all edges."""
         cell_terms = [term for term in terms if not term.density.on_edges]
         edge_terms = [term for term in terms if term.density.on_edges]
 
         def kind(term: PointTerm) -> tuple[int | None, str | None, str]:
-            """Return a key of terms on cells that share a kernel."""
+            """Return a key: terms on cells with equal keys share a kernel.
+
+            It is the degree of the quadrature (None for the usual one), the amplitude and, if each
+            term is to have its own kernel, the name.
+            """
             return term.density.quadrature, term.amplitude, term.name if one_by_one else ""
 
         residual_parts: list[_ResidualPart] = []
         for kind_of_terms in dict.fromkeys(map(kind, cell_terms)):
             terms_of_kind = [term for term in cell_terms if kind(term) == kind_of_terms]
+            quadrature, _, _ = kind_of_terms
             residual_parts.append(
-                _CellTerms(r0, kind_of_terms[0] or cell_quadrature(degree), terms_of_kind, log)
+                _CellTerms(r0, quadrature or cell_quadrature(degree), terms_of_kind, log)
             )
         if edge_terms:
             residual_parts.append(_EdgeTerms(r0, edge_quadrature(degree), edge_terms, log))
@@ -135,7 +152,8 @@ class FastResidual:
     def add(self, b: Array, factors: Mapping[str, float]) -> None:
         """Add the residual at the present u to the local vector b (ghosts included).
 
-        `factors` are those of terms, by name. The first call is collective: kernels are compiled.
+        Terms without an entry in `factors` are left out. The first call is collective: kernels are
+        compiled.
         """
         nodal = self._nodal()
         elements = np.zeros_like(nodal)
@@ -144,13 +162,15 @@ class FastResidual:
         b += np.bincount(self._dofs, elements.ravel(), len(b))
 
     def _nodal(self) -> Array:
-        """Return u as (cells, functions * 3)."""
+        """Return the displacements (cells, functions * 3) at the nodes of each cell."""
         nodal = np.take(self._u.x.array.reshape(-1, 3), self._nodes, axis=0)
         return np.asarray(nodal.reshape(-1, 3 * self._nodes.shape[1]))
 
 
 class _CellTerms:
     """Terms with one amplitude and one quadrature on the owned cells.
+
+    The gradients of their densities are summed at each point before they are integrated.
 
     Parameters
     ----------
@@ -174,6 +194,7 @@ class _CellTerms:
             ShapeTable.tabulate(V.element.basix_element, reference_points),
             len(reference_points),
         )
+        # the first derivatives are always needed: the area of the surface is made of them
         jet_parts = [
             name
             for name in JET_NAMES
@@ -188,6 +209,7 @@ class _CellTerms:
         count = len(cells) * points_per_cell
 
         def placement() -> Array:
+            """Return the placement's jets (points, parts * 3) at the points of the owned cells."""
             return _placement(r0, table, frames, jet_parts)[cells].reshape(
                 count, 3 * len(jet_parts)
             )
@@ -206,6 +228,7 @@ class _CellTerms:
 
     def begin(self, *, energies: bool) -> None:
         """Begin to compile the gradient's kernel; with `energies`, those of energies too."""
+        # reading a kernel begins its compilation; the values are not used here
         _ = self._points.gradient, [self._points.energy(name) for name in self.names if energies]
 
     def energy(self, nodal: Array, name: str) -> float:
@@ -223,7 +246,10 @@ class _CellTerms:
         return total
 
     def add(self, nodal: Array, factors: Mapping[str, float], elements: Array) -> None:
-        """Add the element vectors of all terms; they share the factor of the first."""
+        """Add the element vectors of all terms to `elements` (cells, functions * 3).
+
+        The terms have one amplitude, so that the factor of the first one holds for all.
+        """
         factor = factors.get(self.names[0], 0.0)
         if not factor or (kernel := self._points.gradient) is None:
             return
@@ -233,7 +259,10 @@ class _CellTerms:
             )
 
     def _filled(self, nodal: Array) -> Iterator[tuple[slice, slice]]:
-        """Yield each chunk of points and its cells, with derivatives of u filled in as inputs."""
+        """Yield each chunk of points and its cells, as slices.
+
+        The derivatives of u at the chunk's points are in the kernels' input when it is yielded.
+        """
         points_per_cell = len(self._weights)
         for chunk in self._points.chunks():
             cells = slice(chunk.start // points_per_cell, chunk.stop // points_per_cell)
@@ -281,13 +310,17 @@ class _EdgeTerms:
             table, all_weights, [JET_NAMES.index(part) for part in jet_parts]
         )
         frames, cells = cell_frames(V.mesh), np.arange(len(V.dofmap.list), dtype=np.int32)
+        # at the points of all cells' edges: derivatives of u, and gradients of the energy by them
         self._displacement_jets, self._back = (
             np.empty((len(cells) * len(reference_points), self._width)) for _ in range(2)
         )
         self._points_of_terms = dict[str, tuple[NDArray[np.intp], PointGradient]]()
 
         def placements() -> dict[str, Array]:
-            """Return the placement's jets (points, sides * parts * 3) of each term, by name."""
+            """Return the placement's jets (points, sides * parts * 3) of each term, by name.
+
+            They are computed on all cells' edges at once, then picked for each term.
+            """
             all_cells = _placement(r0, table, frames, jet_parts).reshape(-1, self._width)
             return {
                 name: all_cells[rows].reshape(len(rows), rows.shape[1] * self._width)
@@ -300,6 +333,7 @@ class _EdgeTerms:
         all_placements = Memo(placements, lambda: (r0.x.array,))
 
         def placements_on(name: str) -> Array:
+            """Return the latest placement's jets at the points of the named term."""
             return all_placements.renew()[name]
 
         for term in terms:
@@ -318,21 +352,24 @@ class _EdgeTerms:
             self._points_of_terms[term.name] = rows, points
 
     def begin(self, *, energies: bool) -> None:
+        # reading a kernel begins its compilation; the values are not used here
         for name, (_, points) in self._points_of_terms.items():
             _ = points.gradient, points.energy(name) if energies else None
 
     def energy(self, nodal: Array, name: str) -> float:
         """Return the energy of the named term on its edges."""
         self._sampling.at_points(nodal, self._displacement_jets)
-        kernel, total = self._points_of_terms[name][1].energy(name), 0.0
+        _, points = self._points_of_terms[name]
+        kernel, total = points.energy(name), 0.0
         for _, values in self._evaluated(name, kernel):
             total += float(np.sum(values.reshape(-1, len(self._weights)) @ self._weights))
         return total
 
     def add(self, nodal: Array, factors: Mapping[str, float], elements: Array) -> None:
-        """Add the element vectors of the terms with factors.
+        """Add the element vectors of the terms that have a factor to `elements`.
 
-        Gradients at points of edges are collected by cell and then integrated back to nodes.
+        Gradients at points of edges are collected in `_back`, by cell. One product with the shape
+        functions then turns those of all terms into element vectors.
         """
         active = [name for name in self.names if factors.get(name)]
         if not active:
@@ -340,17 +377,18 @@ class _EdgeTerms:
         self._sampling.at_points(nodal, self._displacement_jets)
         self._back[:] = 0
         for name in active:
-            for numbers, values in self._evaluated(name, self._points_of_terms[name][1].gradient):
+            _, points = self._points_of_terms[name]
+            for numbers, values in self._evaluated(name, points.gradient):
                 self._back[numbers] += factors[name] * values.reshape(-1, self._width)
         elements += self._sampling.at_nodes(self._back)
 
     def _evaluated(
         self, name: str, kernel: PointKernel | None
     ) -> Iterator[tuple[NDArray[np.intp], Array]]:
-        """Yield a kernel's values at the points of a term's edges, chunk by chunk.
+        """Yield pairs (numbers, values) of a kernel at the points of a term's edges, by chunks.
 
-        Before the values come the numbers of their points, on all sides, among the points of all
-        cells' edges.
+        The numbers say where the points of the chunk, on all sides, are among the points of all
+        cells' edges. Nothing is yielded for the kernel None, of a density that is zero.
         """
         if kernel is None:
             return
@@ -368,9 +406,10 @@ class _EdgeTerms:
 
 
 def _placement(r0: fem.Function, table: ShapeTable, frames: Array, parts: Sequence[str]) -> Array:
-    """Return the parts (local cells, points, parts, 3) of the placement's jet.
+    """Return the named parts (local cells, points, parts, 3) of the placement's jet.
 
-    They are in the cells' own coordinates, given by `cell_frames`; `parts` are names.
+    Derivatives are by the cells' own orthonormal coordinates. `table` has the shape functions at
+    the points of the reference cell, `frames` (cells, 4) are `cell_frames`.
     """
     nodes = r0.x.array.reshape(-1, 3)[r0.function_space.dofmap.list]
     jet = in_own_coordinates(
@@ -384,7 +423,8 @@ def _points_on_edges(
 ) -> tuple[NDArray[np.intp], Array]:
     """Return where a density's points are among those of all cells' edges, and their geometry.
 
-    A rule on an edge is symmetric: run backwards, its points come in the opposite order.
+    The two cells at an interior edge number its points from opposite ends. A rule on an edge is
+    symmetric, so that the points of one side are those of the other in the opposite order.
 
     Parameters
     ----------
@@ -393,7 +433,7 @@ def _points_on_edges(
     density
         Density on interior edges, or on its boundary edges.
     frames
-        (cells, 4) `cell_frames`.
+        (cells, 4) of all local cells, from `cell_frames`.
     points_per_edge
         Number of points of the rule.
 
@@ -402,7 +442,8 @@ def _points_on_edges(
     rows
         (points, sides) numbers of the points, counted cell by cell and edge by edge.
     geometry
-        (points, 6 sides + 1) as in `PointGradient`.
+        (points, 6 sides + 1): the frame of each side, the covector of each side, then the width
+        of the cells at the edge.
     """
     if density.facets is None:
         cells, edges, backwards = interior_edges(V)
@@ -417,6 +458,7 @@ def _points_on_edges(
     )
     rows = (points_per_edge * (3 * cells + edges))[:, None] + order
     p, q, s, area = frames[cells].transpose(2, 0, 1)
+    # covectors of the reference triangle's edges, taken to the cells' own coordinates
     first, second = np.array([edge_covector(edge) for edge in range(3)])[edges].transpose(2, 0, 1)
     m = np.stack([area * p * first, area * (q * first + s * second)], axis=2)  # as long as the edge
     width = edge_width(V, tuple(cells.T), edges[:, 0])
@@ -435,7 +477,7 @@ Serve = Callable[[Sequence[PointTerm]], FastResidual]
 
 @dataclass
 class ParameterDerivative:
-    """A term's derivative by a parameter, or by two, with the amplitude of the term.
+    """A term's derivative by a free parameter, or by two, as a term of its own.
 
     Attributes
     ----------
@@ -466,6 +508,9 @@ def point_parameters(
 ) -> dict[str, FreeParameter]:
     """Return the free parameters of a shell, by name; collective.
 
+    A `FreeParameter` holds the constant p, the terms dPi/dp, and a function from another constant
+    q to the terms d2Pi/dp dq.
+
     Parameters
     ----------
     constants
@@ -478,6 +523,7 @@ def point_parameters(
     parameters = {}
     for name, p in constants.items():
         term_slopes = slopes(p, terms, f"by {name}", serve)
+        # the derivatives of several terms may share a residual: each is compiled once
         for residual in {id(slope.points): slope.points for slope in term_slopes}.values():
             residual.begin()
         parameters[name] = FreeParameter(
@@ -489,14 +535,15 @@ def point_parameters(
 def slopes(
     p: fem.Constant, terms: Sequence[PointTerm], words: str, serve: Serve
 ) -> list[ParameterDerivative]:
-    """Return the derivatives by a parameter of those terms whose densities depend on it.
+    """Return the derivatives by a parameter p of the terms whose densities depend on it.
 
-    `words` complete the names of the derivatives; `serve` is as in `point_parameters`.
+    A derivative is named after its term, followed by `words`. `serve` is a function from terms to a
+    `FastResidual` that can add each of them alone.
     """
-    entered = [term for term in terms if any(q is p for q in term.density.parameters)]
+    terms_with_p = [term for term in terms if any(q is p for q in term.density.parameters)]
     derivatives = [
         ParameterDerivative(f"{term.name} {words}", term.amplitude, derivative_by(term.density, p))
-        for term in entered
+        for term in terms_with_p
     ]
     points = serve(derivatives) if derivatives else None
     for slope in derivatives:
@@ -506,10 +553,17 @@ def slopes(
 
 
 def derivative_by(density: Density, p: fem.Constant) -> Density:
-    """Return the density's derivative by one of its parameters p, without virtual work."""
+    """Return the density's derivative by one of its parameters p.
+
+    The result has no virtual work, and no parts of jets in which it is known to be linear.
+    """
 
     def derivative(*arguments: Any) -> Expr:
-        """Return the derivative of the density at its arguments, by all places of the parameter."""
+        """Return the derivative at the density's arguments.
+
+        The parameter p may stand at several positions among these: one variable takes all of them.
+        """
+        # the parameters are the last arguments
         first = len(arguments) - len(density.parameters)
         positions = [first + i for i, q in enumerate(density.parameters) if q is p]
         variable = ufl.variable(arguments[positions[0]])

@@ -12,6 +12,14 @@ bending is
 
 Of W'' a part that multiplies det K is changed by a factor that is 1 without stretch; see
 docs/theory.md, Rubber.
+
+- E is the membrane strain, K the change of curvature, W the energy of stretching. `up` is the
+  inverse metric of the shape without stress, a0^-1; a is the deformed metric.
+- Numbers of order one are not subtracted: T = tr C - 2 and D = det(C - 1) stand for t and d, as t =
+  2 + T and d = 1 + T + D.
+- The energy of bending is a quadratic form in a^ij K_ij (deformed trace), tr K (undeformed trace)
+  and det K.
+- A covector c (2,) at an edge is its unit conormal.
 """
 
 from abc import abstractmethod
@@ -32,10 +40,10 @@ from magshell_fenicsx.models.shell.law import (
 
 
 class Incompressible(Law):
-    """A law of rubber, from its energy, its slopes and a stiffness of bending.
+    """A law of rubber: stress, moments and energy of bending, from three functions of a subclass.
 
-    A subclass gives the energy (`membrane`), the derivatives by the strain and the factors in the
-    energy of bending.
+    These are the energy of stretching (`membrane`), its slopes by T and D (`_slopes`) and the four
+    factors in the energy of bending (`_stiffness`).
     """
 
     @property
@@ -47,7 +55,10 @@ class Incompressible(Law):
         return Koiter(self.h, 0.5, self.thickness_factor, self.modulus_factor)
 
     def stress(self, E: Tensor, up: Tensor) -> Components:
-        """Return S with indices up, by the energy's slopes in T = tr C - 2 and D = det(C - 1)."""
+        """Return S with indices up, by the energy's slopes in T = tr C - 2 and D = det(C - 1).
+
+        T has the derivative 2 a0^ij by E_ij, D has 4 det(up) times the adjugate of E.
+        """
         surface = Stretched(E, up)
         by_T, by_D = (
             self.modulus_factor * self.thickness_factor * slope for slope in self._slopes(surface)
@@ -61,12 +72,12 @@ class Incompressible(Law):
         return S11, S12, S22
 
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
-        """Return the energy of bending, a quadratic form in T = a^ij K_ij, tr K and det K."""
+        """Return the energy of bending, a quadratic form in a^ij K_ij, tr K and det K."""
         square_factor, mixed_factor, det_factor, trace_factor = self._stiffness(
             surface := Stretched(E, up)
         )
         det = K[..., 0, 0] * K[..., 1, 1] - K[..., 0, 1] ** 2
-        T, tau = surface.deformed_trace(K), trace(K, up)
+        T, tau = surface.deformed_trace(K), trace(K, up)  # deformed and undeformed trace of K
         return (
             square_factor * T**2 - mixed_factor * T * tau - det_factor * det + trace_factor * tau**2
         ) / 2
@@ -99,20 +110,21 @@ class Incompressible(Law):
         covector_up: tuple[Scalar, Scalar],
         covector_square: Scalar,
     ) -> Scalar:
-        """Return the moment contracted twice with a covector, see `Law.edge_moment`."""
+        """Return M^ij c_i c_j, the moment contracted twice with a covector c.
+
+        `covector_up` are the components c^i; `covector_square` is not used.
+        """
         M, (c1, c2) = self.moment(E, K, up), lower_index(covector_up, up)
         return M[0] * c1**2 + 2 * M[1] * c1 * c2 + M[2] * c2**2
 
     def edge_stiffness(
         self, E: Tensor, up: Tensor, covector_up: tuple[Scalar, Scalar], covector_square: Scalar
     ) -> Scalar:
-        """Return the second derivative of `bending` along c c, see `Law.edge_stiffness`.
+        """Return the second derivative of `bending` along K = c (x) c, for a covector c.
 
-        The determinant of c c is zero, so that its factor does not matter.
+        The determinant of c (x) c is zero, so that its factor is not needed.
         """
-        square_factor, mixed_factor, _, trace_factor = self._stiffness(
-            surface := Stretched(E, up)
-        )  # c c has no determinant
+        square_factor, mixed_factor, _, trace_factor = self._stiffness(surface := Stretched(E, up))
         (c1, c2), (a11, a12, a22) = lower_index(covector_up, up), surface.inverse
         T = a11 * c1**2 + 2 * a12 * c1 * c2 + a22 * c2**2
         return (
@@ -123,13 +135,17 @@ class Incompressible(Law):
 
     @abstractmethod
     def _slopes(self, surface: "Stretched") -> tuple[Scalar, Scalar]:
-        """Return the derivatives by T and D of the energy of stretching, per volume over E."""
+        """Return the derivatives by T and D of the energy of stretching, per volume over E.
+
+        T = tr C - 2 and D = det(C - 1) are attributes of the surface.
+        """
 
     @abstractmethod
     def _stiffness(self, surface: "Stretched") -> tuple[Scalar, Scalar, Scalar, Scalar]:
-        """Return factors of T^2, -T tr K, -det K and (tr K)^2 in twice the energy of bending.
+        """Return the factors in twice the energy of bending, over E h per undeformed area.
 
-        Here T = a^ij K_ij with the deformed inverse metric a^ij.
+        They belong to T^2, -T tr K, -det K and (tr K)^2, in this order. Here T = a^ij K_ij with the
+        deformed inverse metric a^ij.
         """
 
 
@@ -138,7 +154,10 @@ class Rubber(Incompressible):
     """The law of Mooney and Rivlin; its parameter is C01/(C10 + C01), 0 for neo-Hooke."""
 
     def membrane(self, E: Tensor, up: Tensor) -> Scalar:
-        """Return ((1 - s)(I1 - 3) + s (I2 - 3))/6 times factors, with s = C01/(C10 + C01)."""
+        """Return ((1 - s)(I1 - 3) + s (I2 - 3))/6 with s = C01/(C10 + C01), the law's parameter.
+
+        It is multiplied by the factors of modulus and thickness.
+        """
         surface = Stretched(E, up)
         return (
             self.modulus_factor
@@ -148,7 +167,10 @@ class Rubber(Incompressible):
         )
 
     def _slopes(self, surface: "Stretched") -> tuple[Scalar, Scalar]:
-        """Return the derivatives by T and D of ((1 - s)(I1 - 3) + s (I2 - 3))/6."""
+        """Return the derivatives by T and D of ((1 - s)(I1 - 3) + s (I2 - 3))/6.
+
+        The slopes of I1 and I2 are found times d, which is divided out at the end.
+        """
         first_slopes = 2 * surface.T + surface.D - surface.first, surface.T - 1 - surface.first
         second_slopes = (
             2 * (surface.d - 1) - surface.second,
@@ -161,10 +183,12 @@ class Rubber(Incompressible):
         return by_T, by_D
 
     def _stiffness(self, surface: "Stretched") -> tuple[Scalar, Scalar, Scalar, Scalar]:
-        """Return factors of T², -T tr K, -det K and (tr K)², see `Incompressible._stiffness`."""
-        factor = (
-            self.modulus_factor * self.thickness_factor**3 * self.h**2 / 18 / surface.d**2
-        )  # h^2/(12 d) times 4/6 and 1/d
+        """Return factors of T², -T tr K, -det K and (tr K)² in twice the energy of bending.
+
+        Here T = a^ij K_ij with the deformed inverse metric a^ij.
+        """
+        # h^2/(12 d) times 4/6 and 1/d
+        factor = self.modulus_factor * self.thickness_factor**3 * self.h**2 / 18 / surface.d**2
         first_share, second_share, trace_of_C = 1 - self.parameter, self.parameter, 2 + surface.T
         det_factor = first_share + second_share * (
             trace_of_C - root(surface.d)
@@ -178,7 +202,7 @@ class Rubber(Incompressible):
 
 
 class Stretched:
-    """A surface with a membrane strain E, and the invariants of C = up a.
+    """The invariants of C = up a for a membrane strain E, with the deformed metric a.
 
     Attributes
     ----------
@@ -191,11 +215,12 @@ class Stretched:
     """
 
     def __init__(self, E: Tensor, up: Tensor) -> None:
+        """Compute the invariants from E, with indices down, and the undeformed inverse metric."""
         E11, E12, E22 = E[..., 0, 0], E[..., 0, 1], E[..., 1, 1]
         a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
         self.up = a11 * a22 - a12**2
         self.T, self.D = 2 * trace(E, up), 4 * self.up * (E11 * E22 - E12**2)
-        area = self.T + self.D
+        area = self.T + self.D  # d - 1
         self.d = 1 + area
         self.first = (self.T**2 + self.T * self.D - self.D) / self.d
         self.second = (area**2 - self.D) / self.d

@@ -1,4 +1,15 @@
-"""Fields that are functions of the undeformed position and normal."""
+"""Fields on a shell or a body that are functions of the undeformed place and normal.
+
+In: a pattern and a placement. Out: a discontinuous finite-element field on the cells.
+
+- A pattern is a function of undeformed places r0 and unit normals n0 that gives vectors: a
+  remanence, a load or, with one component, a factor. Places are over R.
+- The placement r0 maps the flat mesh, or the mesh of a meridian, to the undeformed surface.
+- A smooth pattern is interpolated. A formula that varies within a cell is projected: the field has
+  the formula's moments in the cell (`formula_projection`).
+- The nodes of a discontinuous field belong to one cell each: (cells, nodes, components).
+- A rim is the edge of a dimple; a patch is a named part of the mesh.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -41,7 +52,7 @@ InsideRim = Callable[[Array], NDArray[np.bool_]]  # places (n, 3) -> whether the
 class PlacementField(fem.Function):  # type: ignore[misc]  # dolfinx has no types
     """A field, perhaps discontinuous, that follows from the placement.
 
-    `rebuild` is a function from another placement to the field on it.
+    `rebuild` is a function from another placement to the field on it, for shells of another shape.
     """
 
     def __init__(
@@ -57,7 +68,11 @@ def radial(r0: Array, n0: Array) -> Array:
 
 
 def tangential(r0: Array, n0: Array) -> Array:
-    """Pattern along the meridians, away from e3; zero where the normal is along e3."""
+    """Pattern of unit vectors along the meridians, away from the pole of e3.
+
+    It is zero where the normal n0 is along e3, since a pole has no such direction.
+    """
+    # the part of -e3 in the surface
     down = n0[..., 2:3] * n0 - np.array([0.0, 0.0, 1.0])
     length = np.linalg.norm(down, axis=-1, keepdims=True)
     return np.where(length > 1e-9, down / np.maximum(length, 1e-300), 0.0)
@@ -75,7 +90,9 @@ class Uniform:
 
 @dataclass(frozen=True)
 class Components:
-    """Pattern of three functions of x, y, z.
+    """Pattern whose components are functions of x, y, z.
+
+    `by_formula` marks it as a formula, which `project_pattern` projects.
 
     Attributes
     ----------
@@ -103,7 +120,8 @@ class Components:
 class WithinRims:
     """Pattern of a vector within each rim, and another one elsewhere.
 
-    Rims separate cells; where two overlap, the first counts.
+    Rims run along edges of cells, so that the centre of a cell decides. Where two rims overlap, the
+    first one counts.
     """
 
     inner_vectors: tuple[tuple[InsideRim, Array], ...]
@@ -111,6 +129,7 @@ class WithinRims:
 
     def __call__(self, r0: Array, n0: Array) -> Array:
         centre = r0.mean(axis=1)
+        # in reversed order, so that the vector of the first rim is written last
         vectors = np.tile(self.outer_vector, (len(r0), 1))
         for is_inside, vector in reversed(self.inner_vectors):
             vectors[is_inside(centre)] = vector
@@ -119,7 +138,7 @@ class WithinRims:
 
 @dataclass(frozen=True)
 class ByPatch:
-    """A vector for each cell of this rank, ghosts included: (cells, size)."""
+    """Pattern of one vector for each cell of this rank: `vectors` (cells, size), with ghosts."""
 
     vectors: Array
 
@@ -130,7 +149,11 @@ class ByPatch:
 
 @dataclass(frozen=True)
 class PosedPattern:
-    """The pattern of one shell of several in its own frame, turned and times a factor."""
+    """The pattern of one of several shells, moved with this shell to its pose in the model.
+
+    `pattern` is a function in the shell's own frame; `place` is the pose: rotation Q, position and
+    scale.
+    """
 
     pattern: Pattern
     place: ShellPose
@@ -143,14 +166,14 @@ class PosedPattern:
 
 @dataclass(frozen=True, eq=False)
 class PatternsByPatch:
-    """Patterns on some cells of this rank, and vectors elsewhere.
+    """Patterns on some cells of this rank, and one vector in each other cell.
 
     Attributes
     ----------
     patterns
-        Flags (cells,) of cells, ghosts included, with the pattern there.
+        Pairs of flags (cells,), ghosts included, and the pattern in the flagged cells.
     others
-        The vectors.
+        A vector for each cell; in flagged cells it is not used.
     """
 
     patterns: tuple[tuple[NDArray[np.bool_], Pattern], ...]
@@ -167,9 +190,9 @@ class PatternsByPatch:
 
 @dataclass(frozen=True, eq=False)
 class CellPolynomials:
-    """A field that is a polynomial of its own in each cell.
+    """A pattern that is a polynomial of its own in each cell, as of a user's field on the mesh.
 
-    It can be evaluated at places that are the same in the reference cell for all cells.
+    It can be evaluated only at places that have the same reference coordinates in all cells.
 
     Attributes
     ----------
@@ -188,17 +211,19 @@ class CellPolynomials:
     def __call__(self, r0: Array, n0: Array | None = None) -> Array:
         """Return the values (cells, n, size) at places r0 (cells, n, 3) in the first cells.
 
-        Owned cells come first. The reference points are found from the places in the first cell.
+        `r0` may have the owned cells alone, which come first. The reference coordinates follow from
+        the places in the first cell; the normals n0 are not used.
         """
-        table = self.element.tabulate(
-            0, self._reference(r0[0]) if len(r0) else self.element.points
-        )[0, :, :, 0]
-        return np.asarray(np.matmul(table, self.values[: len(r0)]))  # owned cells come first
+        # a rank without cells has no place to start from: any points give an empty result
+        points = self._reference(r0[0]) if len(r0) else self.element.points
+        table = self.element.tabulate(0, points)[0, :, :, 0]
+        return np.asarray(np.matmul(table, self.values[: len(r0)]))
 
     def values_between_nodes(self) -> tuple[Array, Array]:
-        """Return values and places in owned cells, at the nodes and between them.
+        """Return values (cells, n, size) and places (cells, n, 3) in owned cells.
 
-        Both are (cells, n, size or 3), on a lattice of twice the degree.
+        They are taken on a lattice of twice the degree, so at the nodes and between them: a
+        polynomial may leave the range of its nodal values there.
         """
         X = basix.create_lattice(
             self.element.cell_type,
@@ -215,9 +240,9 @@ class CellPolynomials:
         )
 
     def _reference(self, places: Array) -> Array:
-        """Return the reference points (n, 2) of places (n, 3) of the first cell.
+        """Return the reference coordinates (n, 2) of places (n, 3) in the first cell.
 
-        Newton's method starts from the middle.
+        They solve x(X) = place by the Gauss-Newton method, from the middle of the triangle.
         """
         element, nodal = self.cells.element, self.cells.nodal[0]
         X = np.full((len(places), 2), 1 / 3)
@@ -237,6 +262,9 @@ def user_field_polynomials(
     user_field: UserField, midsurface: Midsurface, cells: CellGeometry
 ) -> CellPolynomials:
     """Return a user's field on the mesh as polynomials in the cells of this rank.
+
+    `cells` are the cells of the model with their geometry; `midsurface` finds the user's values in
+    them.
 
     Raises
     ------
@@ -260,13 +288,13 @@ def by_patch(
     cells: int,
     key: str = "magnetic.remanent.patches",
 ) -> ByPatch | PatternsByPatch:
-    """Return a pattern with a vector, or a pattern, on each named patch of a mesh.
+    """Return a pattern that is made of a vector, or a pattern, on each named patch of a mesh.
 
     Parameters
     ----------
     vectors
-        Name -> vector or pattern. The vector of "rest" is that of all other cells, zero by default.
-        All vectors have the same size; patches that come later take the place of others.
+        Name -> vector or pattern. "rest" names all cells that are in no patch; its vector is zero
+        by default. All vectors have the same size. Where patches overlap, the later one counts.
     patches
         Name -> flags (cells,) of this rank's cells in the patch.
     cells
@@ -279,6 +307,7 @@ def by_patch(
     MeshError
         If there is no such patch.
     """
+    # a patch with a pattern has zero vectors, which the pattern replaces later
     vector_by_patch = {
         name: np.zeros(3) if callable(vector) else vector for name, vector in vectors.items()
     }
@@ -288,6 +317,7 @@ def by_patch(
     for name, vector in vector_by_patch.items():
         if name in patches:
             by_cell[patches[name]] = vector
+            # earlier patterns lose the cells of this patch
             patterns = [(is_inside & ~patches[name], pattern) for is_inside, pattern in patterns]
             pattern = vectors[name]
             if callable(pattern):
@@ -307,7 +337,9 @@ def pattern_field(
     key: str = "magnetic.remanent",
     size: int = 3,
 ) -> tuple[PlacementField, float | None]:
-    """Return a pattern as a discontinuous field on all cells, see `project_pattern`; collective.
+    """Return a pattern as a discontinuous field on all cells, and its integral; collective.
+
+    A smooth pattern is interpolated, a formula is projected (`project_pattern`).
 
     Parameters
     ----------
@@ -316,9 +348,9 @@ def pattern_field(
     r0
         The placement.
     finer
-        Degree of the field less that of r0; positive for loads.
+        How much higher the degree of the field is than that of r0; positive for loads.
     name, size
-        Name of the field, and how many numbers it has.
+        Name of the field, and its number of components.
     key
         Key of the case, for the message.
 
@@ -327,7 +359,8 @@ def pattern_field(
     field
         The field; its `rebuild` makes it on another placement.
     size
-        Integral of its size; None if the field itself has that integral.
+        Integral of the pattern's length over the surface. None if the pattern was interpolated:
+        the field itself then has this integral.
 
     Raises
     ------
@@ -340,28 +373,33 @@ def pattern_field(
     field = PlacementField(
         Q, name, lambda r: pattern_field(pattern, r, finer, name=name, key=key, size=size)[0]
     )
+    # only loads have a finer field
     refuse_unbounded(pattern(nodes, n0), nodes, V.mesh.comm, "loading.loads" if finer else key)
     projection = project_pattern(
         pattern, cell_geometry(r0), pattern(inside_cells(nodes), n0), Q.element.basix_element
     )
     field.x.array.reshape(-1, size)[Q.dofmap.list] = projection.nodal
+    # on a meridian (two components) integrals are per radian around the axis
     angle = 2 * np.pi if V.dofmap.index_map_bs == 2 else 1.0
     return field, None if projection.smooth else angle * projection.size
 
 
 def formula_field(r0: fem.Function, parameter: FormulaParameter) -> fem.Function:
-    """Return a formula's field (1,) on all cells, see `pattern_field`; collective."""
-    return pattern_field(
+    """Return a formula as a discontinuous field (1,) on all cells; collective."""
+    field, _ = pattern_field(
         Components([parameter.of_place]), r0, name="factor", key=parameter.key, size=1
-    )[0]
+    )
+    return field
 
 
 def pattern_on_edge(
     pattern: Pattern, r0: fem.Function, facets: NDArray[np.int32], finer: int
 ) -> tuple[fem.Function, float | None]:
-    """Return a pattern as a field on some facets of the boundary; collective.
+    """Return a pattern as a field on some facets of the boundary, and its integral; collective.
 
-    Its values are valid on the facets alone: its moments are those along them.
+    The field is defined on all cells, but its values count on the facets alone. There a formula is
+    projected along the facet, as a cell of dimension one: the moments are integrals over its
+    length.
 
     Parameters
     ----------
@@ -372,14 +410,17 @@ def pattern_on_edge(
     facets
         Local numbers of the facets.
     finer
-        Degree of the field less that of r0.
+        How much higher the degree of the field is than that of r0.
 
     Returns
     -------
-    field, size
-        As those of `pattern_field`.
+    field
+        The field; its `rebuild` makes it on another placement.
+    size
+        Integral of the pattern's length along the facets; None if the pattern was interpolated.
     """
     V = r0.function_space
+    # inside the cells an interpolant will do; only the nodes on facets are projected below
     field, _ = pattern_field(InterpolatedPattern(pattern), r0, finer)
     field.rebuild = lambda r: pattern_on_edge(pattern, r, facets, finer)[0]
     Q, topology = field.function_space, V.mesh.topology
@@ -414,7 +455,7 @@ def pattern_on_edge(
 def _cells_at_facets(
     topology: mesh.Topology, facets: NDArray[np.int32]
 ) -> tuple[NDArray[np.int64], list[int]]:
-    """Return the cells (facets,) with boundary facets, and each facet's number in its cell."""
+    """Return the one cell (facets,) at each boundary facet, and the facet's local number in it."""
     topology.create_connectivity(1, 2)
     topology.create_connectivity(2, 1)
     to_cell, to_facet = topology.connectivity(1, 2), topology.connectivity(2, 1)
@@ -434,7 +475,7 @@ def _interval_element(degree: int) -> Element:
 
 
 def _points_on_side(cell_type: basix.CellType, side: int, points: Array) -> Array:
-    """Return the points (n, 2) of a triangle's side, from those (n, 1) of the interval."""
+    """Map points (n, 1) of the unit interval to a side of the reference triangle: (n, 2)."""
     a, b = basix.geometry(cell_type)[basix.topology(cell_type)[1][side]]
     return np.asarray(a + points * (b - a))
 
@@ -446,7 +487,7 @@ def _nearest_nodes(element: Element, points: Array) -> list[int]:
 
 @dataclass(frozen=True)
 class InterpolatedPattern:
-    """A pattern that is interpolated, even if it is a formula."""
+    """A pattern that is interpolated even if it is a formula: it has no flag `by_formula`."""
 
     pattern: Pattern
 
@@ -469,10 +510,11 @@ def cell_geometry(r0: fem.Function) -> CellGeometry:
 def project_pattern(
     pattern: Pattern, cells: CellGeometry, nodal: Array, element: Element
 ) -> ProjectedFormula:
-    """Return a pattern in every cell; collective.
+    """Return nodal values of a pattern in every cell; collective.
 
-    A formula has the same moments, see `project_formula`; other patterns are interpolated. `nodal`
-    are the values (cells, nodes, components) at the nodes of `element`.
+    A formula (with the flag `by_formula`) is projected by `project_formula`, so that its moments
+    are right where it varies within a cell. Other patterns are interpolated: they keep `nodal`, the
+    values (cells, nodes, components) at the nodes of `element`.
     """
     if not getattr(pattern, "by_formula", False):
         return ProjectedFormula(nodal, smooth=True, size=0.0)
@@ -491,9 +533,9 @@ def inside_cells(nodes: Array) -> Array:
 def positions_and_normals(r0: fem.Function, points: Array | None = None) -> tuple[Array, Array]:
     """Return the places and unit normals at the nodes of every cell: (cells, n, 3) each.
 
-    With `points` (n, 2), or (n, 1) on a meridian, they are those at these reference points. On a
-    meridian, whose placement has components along e_rho and e_z, results are along (e_rho, e_theta,
-    e_z).
+    With `points`, (n, 2) or (n, 1) on a meridian, they are taken at these reference points instead
+    of the nodes. The placement of a meridian has two components, along e_rho and e_z. The results
+    are then along (e_rho, e_theta, e_z).
     """
     V = r0.function_space
     element, size = V.element.basix_element, V.dofmap.index_map_bs
@@ -517,9 +559,10 @@ def body_cell_geometry(V: fem.FunctionSpace) -> CellGeometry:
 
 
 def body_positions_and_normals(V: fem.FunctionSpace) -> tuple[Array, Array]:
-    """Return the nodes of every cell of a body, and the normals of the surface at their height.
+    """Return the nodes of every cell of a body, and normals there: (cells, nodes, 3) each.
 
-    Both are (cells, nodes, 3). That surface is where the third reference coordinate is constant.
+    The third reference coordinate of a cell runs through the thickness. A normal is that of the
+    surface on which this coordinate is constant.
     """
     element = V.element.basix_element
     table = element.tabulate(1, element.points)[:, :, :, 0]
@@ -546,7 +589,7 @@ def field_in_body(
     V
         Lagrange space of the body.
     name, size
-        Name of the field, and how many numbers it has.
+        Name of the field, and its number of components.
     key
         Key of the case, for the message.
 

@@ -4,6 +4,14 @@ The tensors are those of the energy (`kinematics`, `law`), on the undeformed sur
 a0_ij)/2, K_ij = b_ij - b0_ij, and M_ij, the derivative of the energy by K. The normal is outward
 and b = n . r,_ij, so a sphere has b = -a/R, and a positive moment flattens it: it stretches the
 inner face.
+
+- A jet (6, ..., 3) is a value with its two first and three second derivatives by coordinates of the
+  surface; r0 is the placement, u the displacement, both over R.
+- A frame is two orthonormal vectors t_1, t_2 tangent to the undeformed surface, at each point.
+  Components 11, 12, 22 of a tensor in it are an array (..., 3).
+- a^i is the dual basis, F = a_i (x) a0^i + n (x) n0 the deformation gradient.
+- The natural shape is the one that the shell would have without stress; the index n marks it.
+- U is the stretch tensor of the natural shape in the surface, kappa its additional curvature.
 """
 
 from dataclasses import dataclass
@@ -31,10 +39,11 @@ class TangentFrame:
     n0
         (..., 3) unit normal a0_1 x a0_2.
     dual
-        (..., 2, 2) a0^a . t_i as [i, a].
-    in_frame, in_space
-        (..., 3, 3) and (..., 3, 3, 3): from S_11, S_12, S_22 in the coordinates to those in the
-        frame, and from these to a tensor in space.
+        (..., 2, 2) components a0^a . t_i, as [i, a].
+    in_frame
+        (..., 3, 3) matrix from S_11, S_12, S_22 in the coordinates to components in the frame.
+    in_space
+        (..., 3, 3, 3) map from components in the frame to the tensor in space.
     area
         (...) |a0_1 x a0_2|.
     """
@@ -49,7 +58,7 @@ class TangentFrame:
 
     @classmethod
     def from_jet(cls, jet: Array) -> "TangentFrame":
-        """Return the frame at points with a jet (6, ..., 3); its first vector is along r0,_1."""
+        """Return the frame at points of a placement with this jet; t_1 is along r0,_1."""
         m, area = _area_vector(jet)
         n0 = m / area[..., None]
         t1 = jet[1] / np.linalg.norm(jet[1], axis=-1, keepdims=True)
@@ -61,7 +70,7 @@ class TangentFrame:
             t,
             n0,
             dual,
-            _of_symmetric(dual)[..., [0, 0, 1], [0, 1, 1], :],
+            _of_symmetric(dual)[..., [0, 0, 1], [0, 1, 1], :],  # components 11, 12 and 22
             _of_symmetric(np.swapaxes(t, -1, -2)),
             area,
         )
@@ -88,8 +97,8 @@ class TangentFrame:
     def convected(self, v: Array, u: Array, *, thins: Array | float = 0) -> Array:
         """Return F v (..., 3) of vectors v, with F = a_i (x) a0^i + s n (x) n0.
 
-        So a remanence moves with the shell. Where `thins` is 1, the stretch s of the thickness
-        keeps the volume; else s = 1. `u` is the displacement's jet.
+        A remanence moves with the shell in this way. Where `thins` is 1, the stretch s of the
+        thickness keeps the volume; where it is 0, s = 1. `u` is the displacement's jet.
         """
         convected = self._moved_with(self._deformed(u), v, u)
         if not np.any(thins):
@@ -99,9 +108,13 @@ class TangentFrame:
         return np.asarray(convected + (thinned * _dot(self.n0, v) / area)[..., None] * m)
 
     def rotated(self, v: Array, u: Array) -> Array:
-        """Return R v (..., 3) of vectors v, with the rotation R of F; see `magnetism.laws`."""
+        """Return R v (..., 3) of vectors v, with the rotation R of the polar decomposition F = R U.
+
+        `u` is the displacement's jet. A remanence that does not stretch moves in this way.
+        """
         f, n = self._deformed(u), self.normal(u)
-        # J F C^-1 on t_1 and t_2; R = (F + J F C^-1)/T, T² = tr C + 2 J
+        # J F C^-1 on t_1 and t_2, with C = F^T F and J = sqrt(det C) in the surface;
+        # there R = (F + J F C^-1)/T, T² = tr C + 2 J
         cofactor = np.stack([np.cross(f[..., 1, :], n), np.cross(n, f[..., 0, :])], axis=-2)
         T = np.sqrt(np.sum(f * (f + cofactor), axis=(-2, -1)))
         return self._moved_with((f + cofactor) / T[..., None, None], v, u)
@@ -111,9 +124,9 @@ class TangentFrame:
         return np.asarray(np.einsum("...ia,a...j->...ij", self.dual, self.jet[1:3] + u[1:3]))
 
     def _moved_with(self, t: Array, v: Array, u: Array) -> Array:
-        """Return vectors (..., 3) whose components in t (..., 2, 3) are those of v in the frame.
+        """Return v with its frame exchanged: t and the deformed normal in place of t_1, t_2, n0.
 
-        Their components along the deformed normal are those of v along n0.
+        `t` (..., 2, 3) are two vectors tangent to the deformed surface; components stay the same.
         """
         in_surface = np.einsum("...ik,...k,...ij->...j", self.t, v, t)
         return np.asarray(in_surface + _dot(self.n0, v)[..., None] * self.normal(u))
@@ -153,17 +166,18 @@ class NaturalFrame:
         frame
             The points with their frames.
         T, kappa
-            (..., 3, 3) in space: natural stretch in the surface less one, and natural curvature
-            times R.
+            (..., 3, 3) tensors in space: natural stretch in the surface less one, U - 1, and
+            natural curvature times R.
         t
             (...) natural stretch of the thickness less one.
         bent, stretched
-            Amplitudes of kappa, and of T and t.
+            Factors of kappa, and of T and t.
         """
         t0 = frame.t
         tensors_in_frame = [
             np.einsum("...ai,...ij,...bj->...ab", t0, S, t0) for S in (stretched * T, bent * kappa)
         ]
+        # undeformed curvature b0 = n0 . r0,_ij
         b = np.einsum("d...i,...i->...d", frame.jet[3:], frame.n0)
         b0, s = _matrix(_times(frame.in_frame, b)), (1 + stretched * t)[..., None, None]
         U = np.eye(2) + tensors_in_frame[0]
@@ -174,11 +188,14 @@ class NaturalFrame:
         return cls(_components(strain), _components(bend), np.linalg.inv(U), s[..., 0, 0])
 
     def elastic(self, E: Array) -> Array:
-        """Return U^-1 (E - E_n) U^-1, (..., 3): the strain of the natural shell."""
+        """Return U^-1 (E - E_n) U^-1, (..., 3): the strain as measured in the natural shape."""
         return _components(self.inverse @ _matrix(E - self.strain) @ self.inverse)
 
     def moment(self, E: Array, K: Array, law: Law) -> Array:
-        """Return M (..., 3) over E h R, the derivative of the energy by K, at E and K."""
+        """Return M (..., 3) over E h R, the derivative of the energy by K.
+
+        E and K (..., 3) are strain and change of curvature in the frame, from the undeformed shape.
+        """
         up, area = self.inverse @ self.inverse, 1 / np.linalg.det(self.inverse)
         M = law.thicker(self.thickness).moment(_matrix(E - self.strain), _matrix(K - self.bend), up)
         return np.asarray(area[..., None] * np.stack(M, axis=-1))
@@ -212,7 +229,10 @@ def principal(S: Array) -> tuple[Array, Array]:
 
 
 def _of_symmetric(A: Array) -> Array:
-    """Return B (..., n, n, 3) with A S A^T = B (S_11, S_12, S_22), for A (..., n, 2)."""
+    """Return B (..., n, n, 3) with A S A^T = B (S_11, S_12, S_22), for A (..., n, 2).
+
+    It makes the change of basis of symmetric tensors S a product with their three components.
+    """
     first, second = A[..., 0], A[..., 1]
     mixed = first[..., :, None] * second[..., None, :]
     first_square, second_square = (v[..., :, None] * v[..., None, :] for v in (first, second))

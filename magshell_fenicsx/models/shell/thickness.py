@@ -1,4 +1,14 @@
-"""A thickness that varies over the surface: its factor of h, and densities weighted with it."""
+"""A thickness that varies over the surface: its factor of h, and densities weighted with it.
+
+- h is the thickness of the case, over R; the factor h(x)/h multiplies it at the place x.
+- Values in cells are (cells, nodes): at the nodes of a discontinuous element of the placement's
+  degree. Owned cells come first, then ghosts.
+- A formula that varies within a cell is projected (`project_formula`); its polynomials stay within
+  the range of the formula.
+- A patch is a named part of a mesh, perhaps one of several shells, which then has a pose: its
+  rotation, position and scale in the model.
+- A placement is the map r0 to the undeformed surface.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -35,7 +45,8 @@ class Thickness:
     of_position
         Function of arrays of x, y, z over R; None for 1.
     patches
-        Patch of a mesh -> a number, or the factor of a shell that has a place; the rest has 1.
+        Patch of a mesh -> a number, or the factor of the shell that the patch is. Outside the
+        patches the factor is that of the other attributes.
     formulas
         Formulas that vary in the function.
     user_field
@@ -62,9 +73,9 @@ class Thickness:
         return np.ones(x.shape[:-1])
 
     def values_in_cells(self, cells: CellGeometry, nodal: Array) -> Array:
-        """Return the factor (cells, nodes), for a formula by `project_formula`; collective.
+        """Return the factor (cells, nodes), a formula projected by `project_formula`; collective.
 
-        `nodal` are its values at the nodes.
+        `nodal` are its values at the nodes. They are returned unless the factor is a formula.
         """
         if self.of_position is None:
             return nodal
@@ -83,18 +94,19 @@ class Thickness:
 
 @dataclass(frozen=True)
 class PlacedFactor:
-    """The thickness factor of a shell that has a place, times a number."""
+    """The thickness factor of one of several shells, times a number, with the shell's pose."""
 
     thickness: Thickness
     place: ShellPose
     factor: float
 
     def in_cells(self, cells: CellGeometry) -> Array:
-        """Return the factor (cells, nodes); collective.
+        """Return the factor (cells, nodes) in cells of this shell; collective.
 
-        The cells are those of a surface in space, or of a meridian around its axis. Places are
-        moved into the shell's own frame.
+        The cells are those of a surface in space, or of a meridian with rho and z. The formula of
+        the factor is in the shell's own frame, so places are moved there.
         """
+        # nodal: the cells' nodes in the shell's frame, in the components of the mesh; x: in space
         if cells.nodal.shape[-1] == 3:
             nodal = x = self.place.to_shell_frame(cells.nodal)
         else:
@@ -128,6 +140,8 @@ def thickness_field(
 ) -> fem.Function:
     """Return h(x)/h as a discontinuous field (1,) of the placement's degree; collective.
 
+    Its `rebuild` makes it on another placement.
+
     Parameters
     ----------
     thickness
@@ -146,7 +160,7 @@ def thickness_field(
     nodes, _ = positions_and_normals(r0)
     values = thickness.values_at(nodes)
     refuse_unfit(values, nodes, V.mesh.comm)
-    if thickness.polynomials:
+    if thickness.polynomials:  # they may leave the range of their nodal values
         between_nodes, sampled = thickness.polynomials.values_between_nodes()
         refuse_unfit(between_nodes[..., 0], sampled, V.mesh.comm)
     values = thickness.values_in_cells(cell_geometry(r0), values)
@@ -166,8 +180,9 @@ def thickness_field(
 def material_field(
     shells: Mapping[str, ShellMaterial], domain: mesh.Mesh, patches: Mapping[str, NDArray[np.bool_]]
 ) -> fem.Function:
-    """Return `ShellMaterial.numbers` of each cell as a field (4,), constant in cells.
+    """Return the material of each cell as a field (4,), constant in cells.
 
+    The numbers are modulus, Poisson's ratio, density and number of the law (`ShellMaterial`).
     `patches` maps each shell's name to flags (cells,) of this rank's cells in it, ghosts included.
 
     Raises
@@ -179,6 +194,7 @@ def material_field(
     field = fem.Function(Q, name="material")
     values = field.x.array.reshape(-1, 4)
     for name, material in shells.items():
+        # a field that is constant in cells has one node, 0, in each
         values[Q.dofmap.list[patch_of(patches, name, "shells")][:, 0]] = material.numbers
     return field
 
@@ -205,12 +221,13 @@ def patch_of(
 
 
 def thickness_weighted(density: Density, t: fem.Function, component: int = 0) -> Density:
-    """Return a density times a component of the field t, which becomes a parameter.
+    """Return a density times a component of the field t, which becomes its last parameter.
 
     By default it is the first component, the thickness over h.
     """
 
     def weighted(*arguments: Expr) -> Expr:
+        """Return the density's value times the component; the field is the last argument."""
         *arguments_left, factor = arguments
         return factor[component] * density.function(*arguments_left)
 

@@ -4,6 +4,13 @@ Energies are over E, with lengths in R; divided by h/R they are in the shell's u
 the undeformed place, u the displacement and H its gradient by X; F = 1 + H. At an end, the face
 above an edge of the mid-surface, n is the undeformed outward normal of the mid-surface and t the
 edge's tangent, which has the surface on its left.
+
+- J = det F is the ratio of volumes; I1 and I2 are invariants of F^T F.
+- A growth G is the deformation of a part of the body without stress: only F G^(-1) is elastic. It
+  has the energy of the grown volume, so times det G.
+- Br and Ba are the remanence and the applied flux density over their magnitudes.
+- Pi is an energy, p a pressure. X1, X2 and u1, u2 are derivatives by the coordinates of a face.
+- `unit` is a factor that turns a volume over R³ into the unit of energies.
 """
 
 from dataclasses import dataclass
@@ -18,10 +25,11 @@ from magshell_fenicsx.models.shell.densities import field_at_displacement
 def distortion(X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr, growth: Expr | None = None) -> Expr:
     """mu/2 (J^(-2/3) F:F - 3)/h: the energy of distortion, without that of a change of volume.
 
-    After a `growth` G it is that of F G^(-1), times det G. `shear` is mu over E.
+    `shear` is mu over E. With a `growth` G, F G^(-1) takes the place of F, and the energy is times
+    det G.
     """
     F = ufl.Identity(3) + H
-    if growth is not None:
+    if growth is not None:  # the same density, for H + 1 = F G^(-1)
         return ufl.det(growth) * distortion(
             X, u, ufl.dot(F, ufl.inv(growth)) - ufl.Identity(3), shear, h
         )
@@ -31,7 +39,11 @@ def distortion(X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr, growth: Expr | N
 def areal_distortion(
     X: Expr, u: Expr, H: Expr, shear: Expr, h: Expr, growth: Expr | None = None
 ) -> Expr:
-    """mu/2 (J^(-4/3) I2 - 3)/h, I2 the second invariant of F^T F; arguments as in `distortion`."""
+    """mu/2 (J^(-4/3) I2 - 3)/h, with the second invariant I2 of F^T F: the term of Mooney-Rivlin.
+
+    Like `distortion` it has no energy of a change of volume. `shear` is mu over E. With a `growth`
+    G, F G^(-1) takes the place of F, and the energy is times det G.
+    """
     F = ufl.Identity(3) + H
     if growth is not None:
         return ufl.det(growth) * areal_distortion(
@@ -60,7 +72,7 @@ def magnetic(X: Expr, u: Expr, H: Expr, Br: Expr, Ba: Expr, h: Expr) -> Expr:
 def magnetic_gradient(X: Expr, u: Expr, H: Expr, Br: Expr, G: Expr, h: Expr) -> Expr:
     """Magnetic density in the part Ba = G x of the field, at the deformed place x = X + u.
 
-    It is -(G x) . F Br/h without its value at u = 0.
+    It is -(G x) . F Br/h without its value at u = 0, which is a constant.
     """
     F = ufl.Identity(3) + H
     return -(ufl.dot(ufl.dot(G, X + u), ufl.dot(F, Br)) - ufl.dot(ufl.dot(G, X), Br)) / h
@@ -88,8 +100,8 @@ def pressure(
 ) -> Expr:
     """Pi/p of a live pressure, times `unit`: the change of volume between a face and an origin.
 
-    X1, X2, u1, u2 are derivatives by the face's coordinates; it is per area of these. `origin` is
-    that of X by default.
+    It is per area of the face's coordinates, by which X1, X2, u1 and u2 are derivatives. `origin`
+    is a place, by default the origin of X.
     """
     X = X if origin is None else X - origin
     return unit * (enclosed(X + u, X1 + u1, X2 + u2) - enclosed(X, X1, X2))
@@ -100,8 +112,8 @@ def swept_volume(
 ) -> Expr:
     """Volume that a face sweeps, times `unit`, per area of its coordinates.
 
-    It is that of `models.shell.densities.swept_volume`: u times the mean of the area vector on the
-    way.
+    The points of the face move straight from X to X + u. The volume is u times the mean area vector
+    on this way.
     """
     mean = ufl.cross(X1, X2) + (ufl.cross(X1, u2) + ufl.cross(u1, X2)) / 2 + ufl.cross(u1, u2) / 3
     return unit * ufl.dot(u, mean)
@@ -136,10 +148,12 @@ def follower_pressure_work_on_end(
 def turning(
     X: Expr, u: Expr, H: Expr, n: Expr, t: Expr, weight: Expr, intensity: Expr, reference_turn: Expr
 ) -> Expr:
-    """-Pi of a moment per length about t: intensity times the mean angle of lines along n.
+    """Potential of a moment per length about t on an end: -intensity times a mean angle.
 
-    With the `weight` (1,) 3/2 (1 - 4 z^2/h^2)/h over the thickness, its forces are at first a
-    traction linear in z. `reference_turn` is that of `models.shell.edges.turning`.
+    It is the angle of material lines along n, averaged over the thickness with the `weight` (1,)
+    3/2 (1 - 4 z^2/h^2)/h. So its forces are at first a traction linear in z. `reference_turn` (2,)
+    has cosine and sine of the turn from which the angle is counted, so that it may grow beyond pi.
+    X and u are not used.
     """
     line = n + ufl.dot(H, n)
     sine, cosine = ufl.dot(ufl.cross(n, line), t), ufl.dot(n, line)
@@ -171,11 +185,11 @@ class MooneyRivlin:
     def from_poisson_ratio(
         cls, nu: float, bulk_to_shear: float, share: float = 0.0
     ) -> "MooneyRivlin":
-        """Return the law with Young's modulus 1 at small strains.
+        """Return the law with Young's modulus 1 and Poisson's ratio `nu` at small strains.
 
-        For nu = 0.5 the shear modulus is that of the incompressible solid, 1/3, and the bulk
-        modulus is `bulk_to_shear` times as large. Young's modulus is then less than 1 by about 1/(3
-        bulk_to_shear), and nu less than 1/2 by about 1/(2 bulk_to_shear).
+        For nu = 0.5 the bulk modulus would be infinite. In its place it is `bulk_to_shear` times
+        the shear modulus of the incompressible solid, 1/3. Young's modulus is then less than 1 by
+        about 1/(3 bulk_to_shear), and nu less than 1/2 by about 1/(2 bulk_to_shear).
         """
         shear = 1 / (2 * (1 + nu))
         return cls(shear, bulk_to_shear * shear if nu == 0.5 else 1 / (3 * (1 - 2 * nu)), share)

@@ -1,7 +1,14 @@
 """Gatherers: they collect the nodal fields of a model on rank 0, for pictures and for ParaView.
 
-Input: the displacement and the amplitudes of a state. Output: a `surface.Surface`. The gatherer of
-a meridian returns the surface of revolution that the meridian sweeps, in flat triangles.
+Input: the displacement u and the amplitudes mu of a state. Output: a `surface.Surface`. The
+gatherer of a meridian returns the surface of revolution that the meridian sweeps, in flat
+triangles.
+
+An amplitude is a load parameter, by name; mu maps names to values. An imperfection grows if an
+amplitude multiplies it. A jet is a map with its first and second derivatives at points. Samples are
+quadrature points inside cells; recovery fits smooth fields to strains and moments there. E and M
+are membrane strain and bending moment, with components 11, 12 and 22. w0 is the deviation of the
+drawn surface from the perfect one. h and R are thickness and reference length; lengths are over R.
 """
 
 from collections.abc import Mapping
@@ -48,16 +55,22 @@ class RevolvedGatherer:
     """Gather displacement and fields of a meridian on the surface of revolution that it sweeps.
 
     Every rank has the whole meridian; rank 0 of `comm` makes the surface. Strains and moments are
-    recovered from samples in the cells of the meridian.
+    recovered from samples in the cells of the meridian. Arrays have the cells in their order along
+    the meridian, `swept.order`; a circle of nodes is swept by one end of a cell.
     """
 
     def __init__(self, model: "MeridianModel", comm: MPI.Comm) -> None:
-        """Prepare the gathering for all states of a model of a meridian."""
+        """Prepare the gathering for all states of a model of a meridian.
+
+        `_inner` (q, 1) are the samples in the reference cell, `_swept` is the swept surface, and
+        `_recovered` takes samples to the ends of cells.
+        """
         self.comm, self._model = comm, model
+        # Gauss points: as many as a second derivative of the displacement has coefficients
         self._inner, rule = basix.make_quadrature(basix.CellType.interval, 2 * model.degree - 3)
         self._swept = Revolution(model)
-        self._set_placement({})
-        # fields may jump at kinks: circles of nodes there are double
+        self._set_placement({})  # without amplitudes: no imperfection has grown
+        # only now are kinks known: fields may jump there, so that circles of nodes become double
         if len(kinks := self._kinks()):
             self._swept = Revolution(model, kinks=kinks)
             self._set_placement({})
@@ -66,7 +79,10 @@ class RevolvedGatherer:
     def _set_placement(self, mu: Mapping[str, float]) -> None:
         """Set all that depends on the undeformed placement: fields, stresses, constant parts.
 
-        `mu` has the amplitudes of growing imperfections.
+        `mu` has the amplitudes of growing imperfections. "At ends" means at both ends of each cell,
+        where values are shown; "at samples" is where strains and moments are computed. `_fields`
+        and `_stresses` are functions of a displacement at ends and at samples; `_at_ends` has the
+        tangent frames at ends, `_constant` the fields that no displacement changes.
         """
         model, swept, loads = self._model, self._swept, self._model.loads
         r, r_at_samples = swept.jets(model.r0), swept.inner_jets(model.r0, self._inner)
@@ -75,7 +91,7 @@ class RevolvedGatherer:
             for points in (ENDS, self._inner)
         )
         cell_materials, made_of = model.cell_materials, None
-        if cell_materials is not None:
+        if cell_materials is not None:  # several shells: the four numbers of each cell's material
             cell_dofs = cell_materials.function_space.dofmap.list[swept.order, 0]
             made_of = cell_materials.x.array.reshape(-1, 4)[cell_dofs]
         self._law = model.material.law_in(made_of)
@@ -97,8 +113,10 @@ class RevolvedGatherer:
             s, embedding = model.meridian.cells.ravel(), model.meridian.embedding
             deviations = (*embedding.deviations, *deviations_at(loads.growing_imperfections, mu))
             imperfect = replace(embedding, deviations=deviations)
+            # the chart is (s, 0): all around the axis the deviation is the same
             w0 = imperfect.w0(np.column_stack([s, 0 * s])) / model.material.h
             self._fields.constant[W0] = np.asarray(w0.reshape(-1, 2))
+        # a mask of cells for each shell: argmax finds the one that has the cell
         if cells_in_shells := [*model.meridian.patches.values()]:
             shell_number = np.argmax(cells_in_shells, axis=0)[swept.order, None].astype(np.float64)
             self._fields.constant[SHELL] = np.asarray(np.repeat(shell_number, 2, axis=1))
@@ -113,9 +131,8 @@ class RevolvedGatherer:
             prescribed_fields += model.loads.natural.tensors_at(places, fields.n0)
         if model.thickness is not None:
             prescribed_fields.append(self._swept.scalars(model.thickness))
-        part_numbers = smooth_parts(
-            self._swept.ends, np.array([[0], [1]]), prescribed_fields, fields.n0
-        )
+        sides = np.array([[0], [1]])  # a side of an interval is one of its ends
+        part_numbers = smooth_parts(self._swept.ends, sides, prescribed_fields, fields.n0)
         return [int(i) + 1 for i in np.flatnonzero(np.diff(part_numbers))]
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
@@ -130,7 +147,7 @@ class RevolvedGatherer:
 
     def _surface_at(self, state: State) -> Surface:
         """Return the surface at the state that the model has been set to."""
-        if self._model.growing:
+        if self._model.growing:  # imperfections that amplitudes multiply move the placement
             self._set_placement(state.mu)
         swept = self._swept
         stresses = self._stresses.values_of(swept.inner_jets(self._model.u, self._inner), state.mu)
@@ -141,7 +158,7 @@ class RevolvedGatherer:
             | principal_fields(components)
             | self._fields.values_of(swept.jets(self._model.u), state.mu)
         )
-        if state.mu:
+        if state.mu:  # of a mode there are no amplitudes, and no contact
             add_contact(
                 values,
                 self._model,
@@ -152,11 +169,18 @@ class RevolvedGatherer:
         fields = resolved_pressure(swept.cells, self._constant | self._swept_fields(values))
         shape = swept.r0, swept.displacement(state.u), swept.n0, swept.cells
         return Surface(
-            *shape, fields, (), jumps["M"], jumps["E"], shells=self._model.meridian.shells
+            *shape,
+            fields,
+            jump=jumps["M"],
+            strain_jump=jumps["E"],
+            shells=self._model.meridian.shells,
         )
 
     def _swept_fields(self, fields: Mapping[str, Array]) -> dict[str, Array]:
-        """Return fields at the nodes of the swept surface, from cell ends (cells, 2, ...)."""
+        """Return fields at the nodes of the swept surface, from cell ends (cells, 2, ...).
+
+        Where two cells share a circle of nodes, the field is their mean, weighted by area.
+        """
         return {
             name: self._swept.on_parallels(values, self._fields.weight)
             for name, values in fields.items()
@@ -182,7 +206,10 @@ class RecoveredMeridian:
     def __init__(
         self, swept: Revolution, model: "MeridianModel", inner: Array, rule: Array
     ) -> None:
-        """Set the recovery, and the matrices from its coefficients to cell ends and to samples."""
+        """Set the recovery, and the matrices from its coefficients to cell ends and to samples.
+
+        Here s (cells, 2) is the parameter along the meridian at the ends of cells.
+        """
         s, ends, poles = model.meridian.cells, swept.ends, model.meridian.poles
         length, cells = np.diff(s), np.arange(len(s))
         samples = s[:, :1] + length * inner[:, 0]
@@ -207,7 +234,7 @@ class RecoveredMeridian:
         )
         self._weight = length * rule
         count = len(inner)
-        # barycentric coordinates of the samples
+        # barycentric coordinates of the samples, by which polynomials of both ends are blended
         hats = np.column_stack([1 - inner[:, 0], inner[:, 0]])
         self._to_samples = self._recovery.evaluation_matrix(
             np.repeat(cells, count), samples.reshape(-1, 1), np.tile(hats, (len(cells), 1))
@@ -226,7 +253,7 @@ class RecoveredMeridian:
         Parameters
         ----------
         stresses
-            Name -> (cells, q, 3) components at the samples.
+            Name, such as "E" or "M" -> (cells, q, 3) components 11, 12 and 22 at the samples.
 
         Returns
         -------
@@ -237,6 +264,7 @@ class RecoveredMeridian:
         """
         at_ends, jumps = {}, {}
         for name, S in stresses.items():
+            # the mirror image of a cell at a pole has the cell's own values: the field is even
             coefficients = self._recovery.coefficients(np.concatenate([S, S[self._pole_cells]]))
             at_ends[name] = (self._to_ends @ coefficients).reshape(-1, 2, 3)
             if name in ROUNDING:
@@ -252,9 +280,10 @@ class BodyGatherer:
         """Gather all that the displacement does not change: cells, nodes; collective."""
         self._model, self.comm = model, model.V.mesh.comm
         V = model.V
-        cells = V.dofmap.list[: V.mesh.topology.index_map(3).size_local]
+        cells = V.dofmap.list[: V.mesh.topology.index_map(3).size_local]  # without ghosts
         local_nodes = cells.ravel().astype(np.int32)
         numbers = V.dofmap.index_map.local_to_global(local_nodes).reshape(cells.shape)
+        # VTK numbers the nodes of a cell in another order than dolfinx
         to_vtk = np.argsort(perm_vtk(mesh.CellType.hexahedron, cells.shape[1]))
         self._cells = self._gather_nodes(numbers[:, to_vtk])
         self._fields: dict[str, Array] = {}
@@ -266,7 +295,8 @@ class BodyGatherer:
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
         """Return the displaced body with its imperfections; collective.
 
-        On rank 0; None on other ranks. `mu` changes nothing.
+        On rank 0; None on other ranks. `mu` is there for the protocol `Gatherer` alone: a solid has
+        no field that depends on amplitudes.
         """
         system = self._model.system
         displacement = self._gather_nodes(system.with_ghosts(u)[: system.size].reshape(-1, 3))
@@ -297,6 +327,7 @@ def _thickness_directions(r0: fem.Function) -> fem.Function:
     """
     V = r0.function_space
     element = V.element.basix_element
+    # derivatives of the shape functions: 0 is the value, 3 the derivative by the third coordinate
     slopes = element.tabulate(1, element.points)[3, :, :, 0]
     tangents = np.einsum("vk,cki->cvi", slopes, r0.x.array.reshape(-1, 3)[V.dofmap.list])
     n0 = fem.Function(V)

@@ -1,4 +1,9 @@
-"""Fields on grids outside the shell, as .vtu files for ParaView that pictures read back."""
+"""Fields on grids outside the shell, as .vtu files for ParaView that pictures read back.
+
+A `MapGrid` has a corner, two sides (a plane) or three sides (a box), the numbers of points along
+them, and the flux density B at these points, the first side's points fastest. R is the reference
+length, over which places are.
+"""
 
 from math import isnan, nan
 from pathlib import Path
@@ -28,6 +33,7 @@ def grid_content(grid: MapGrid, R: float) -> bytes:
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
 
     points, cells, vtk_grid = vtkPoints(), vtkCellArray(), vtkUnstructuredGrid()
+    # deep copies: VTK must not refer to memory that numpy frees
     points.SetData(numpy_to_vtk(np.ascontiguousarray(grid.places), deep=True))
     corners = _cells(grid.points)
     cell_starts = np.arange(0, corners.size + 1, corners.shape[1])
@@ -88,11 +94,13 @@ def _text(data: Any, name: str) -> str:
 def _cells(points: tuple[int, ...]) -> NDArray[np.int64]:
     """Return the corners (cells, 4 or 8) of a grid's cells, in VTK's order.
 
-    `points` are the numbers of points along two or three sides.
+    `points` are the numbers of points along two or three sides. The corners of all cells are slices
+    of one array of point numbers: `low` leaves out its last point along a side, `high` its first.
     """
+    # the last axis of the array is the first side, whose points are numbered first
     number = np.arange(np.prod(points)).reshape(points[::-1])
     low, high = slice(None, -1), slice(1, None)
-    # along the second and the first side
+    # around a square: slices along the second and the first side
     corners_of_square = [(low, low), (low, high), (high, high), (high, low)]
     if len(points) == 2:
         corners_of_cell = [number[corner] for corner in corners_of_square]

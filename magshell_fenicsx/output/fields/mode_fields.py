@@ -3,6 +3,11 @@
 A half shell is completed by the symmetric or antisymmetric mirror image of the mode. Waves are
 given by coefficients along the meridian, which are evaluated around the axis. Files of gradients
 and of frequencies are here too.
+
+The label of a mode is its symmetry: "m = 7" for waves around e3, "torsion", "antisymmetric" to a
+symmetry plane, or empty for the model's own symmetry. A gatherer collects the fields of a model on
+rank 0. omega2 is ω² ρ R²/E, with the angular frequency ω, the density ρ, the reference length R and
+Young's modulus E. A result's gradient is its derivative by a field of the shell.
 """
 
 from collections.abc import Mapping, Sequence
@@ -81,14 +86,15 @@ def mode_surface(
             return None
         m = 0 if label == TORSION else int(label.removeprefix(WAVES))
         return _with_mode(*_revolved_wave(model, u, m, vector))
-    base, mode = gatherer.gather(u, mu), gatherer.gather(vector)
+    base, mode = gatherer.gather(u, mu), gatherer.gather(vector)  # a mode is gathered like a u
     if base is None or mode is None:
         return None
     surface = _with_mode(base, mode.u)
-    if model.multiplicity > 1:
+    if model.multiplicity > 1:  # the model is a half or a sector
         assert not model.axisymmetric
         surface = completed_by_symmetry(surface, model.mirror)
         if label == "antisymmetric":
+            # nodes of the modelled half come first, those of its image after them
             for values in surface.fields.values():
                 values[len(base.r0) :] *= -1
     return rotated_surface(surface, azimuth)
@@ -187,17 +193,19 @@ def _revolved_wave(
     vector
         Coefficients (U + V, V, W) at the nodes of the meridian.
     """
-    sectors = max(96, 12 * m)
+    sectors = max(96, 12 * m)  # 96 even without waves, for a round picture
     swept = Revolution(model, sectors)
     vertices = swept.vertices(model.symmetry_breaking_modes.waves.V)
     U_and_V, V, W = vector.reshape(-1, 3)[vertices].T[:, :, None]
     theta = np.arange(sectors) * 2 * np.pi / sectors
+    # torsion, m = 0, is V alone, the same at all angles
     cosine, sine = (np.cos(m * theta), np.sin(m * theta)) if m else (0 * theta, 1 + 0 * theta)
     radial, azimuthal = (U_and_V - V) * cosine, V * sine
     x = radial * np.cos(theta) - azimuthal * np.sin(theta)
     y = radial * np.sin(theta) + azimuthal * np.cos(theta)
     v = np.stack([x, y, W * cosine], axis=-1)
-    return Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, {}), swept.at_nodes(v)
+    surface = Surface(swept.r0, swept.displacement(u), swept.n0, swept.cells, fields={})
+    return surface, swept.at_nodes(v)
 
 
 def wave_number(surface: Surface) -> int | None:
@@ -306,7 +314,8 @@ def frequency_table(
     time_unit
         R √(ρ/E) in s; None without a density.
     contact_changes
-        Number of a point -> value of the column `CONTACT_CHANGE`, which is there with bodies alone.
+        Number of a point -> for each of its modes the value of the column `CONTACT_CHANGE`. Empty
+        without bodies; the table then has no such column.
     """
     lines: list[Sequence[Any]] = [(*NUMBERS, CONTACT_CHANGE) if contact_changes else NUMBERS]
     for point, modes in by_point.items():
@@ -325,8 +334,8 @@ def read_frequencies(folder: Path) -> list[Frequency]:
     """Return the rows of frequencies.csv in a run's folder; empty without that file."""
 
     def frequency_of(line: Mapping[str, str]) -> Frequency:
-        return Frequency(
-            int(line["point"]), line["wave"], float(line["omega2"]), float(line["hertz"] or "nan")
-        )
+        # an empty cell: without a density, or of an unstable mode
+        hertz_or_nan = float(line["hertz"] or "nan")
+        return Frequency(int(line["point"]), line["wave"], float(line["omega2"]), hertz_or_nan)
 
     return read_csv(folder / NAME, frequency_of) if (folder / NAME).exists() else []

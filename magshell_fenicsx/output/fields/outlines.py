@@ -1,6 +1,9 @@
 """Bodies and field sources beside a shell, as .vtp files: their outlines and faces.
 
-They are drawn where the amplitudes have driven them.
+They are drawn where the amplitudes have driven them. An amplitude is a load parameter, by name; mu
+maps names to values. A `Solid` is a body or a magnet: corners, triangles between them, and at each
+corner of a magnet its pole strength, positive on the north half. h and R are thickness and
+reference length; places are over R.
 """
 
 import re
@@ -59,11 +62,12 @@ def _placed_objects(
     The motion begins at the place where all amplitudes are zero. Sources have no name. Arguments
     are as of `outlines`.
     """
-    for contact in loads.contacts:
+    for contact in loads.contacts:  # the amplitude of a body is its approach, over h
         translation = mu.get(contact.amplitude, 0.0) * h * contact.direction
         yield contact.distance, np.eye(3), translation, contact.body
     if loads.magnetic is None:
         return
+    # a uniform field has no parts, that is no sources
     for part_of_field in getattr(loads.magnetic.in_space, "parts", ()):
         yield part_of_field, np.eye(3), np.zeros(3), ""
     for moving_source in loads.magnetic.driven:
@@ -73,9 +77,10 @@ def _placed_objects(
 def vtp_content(lines: tuple[Array, ...], faces: Sequence[Solid] = ()) -> bytes:
     """Return outlines and faces as the content of a .vtp file.
 
-    VTK's own writer takes as long as a step of a path. The array `pole` is positive on the north
-    half of a magnet. The arrays `names` and `sizes` have the name, the number of corners and the
-    number of triangles of each body or magnet.
+    The XML is written here, because VTK's own writer takes as long as a step of a path. The points
+    of all lines come first, then the corners of the solids. The array `pole` is positive on the
+    north half of a magnet. The arrays `names` and `sizes` have the name, the number of corners and
+    the number of triangles of each body or magnet.
 
     Parameters
     ----------
@@ -87,16 +92,16 @@ def vtp_content(lines: tuple[Array, ...], faces: Sequence[Solid] = ()) -> bytes:
     line_sizes = [len(line) for line in lines]
     # number of each solid's first corner, after the points of lines
     starts = np.cumsum([sum(line_sizes), *(len(solid.points) for solid in faces)])
-    corners = [np.round(solid.points, DIGITS) for solid in faces]
+    corners = [np.round(solid.points, DIGITS) for solid in faces]  # short numbers, small files
     triangles = [solid.triangles + start for solid, start in zip(faces, starts, strict=False)]
     poles = [
-        np.zeros(sum(line_sizes)),
+        np.zeros(sum(line_sizes)),  # points of lines are no poles
         *(_poles_of(solid) for solid in faces),
     ]
     counts = [[len(solid.points), len(solid.triangles)] for solid in faces]
     numbers = np.array(counts).reshape(-1, 2)
     names = "".join(f"{solid.name}\0" for solid in faces).encode()
-    field_data = [
+    field_data = [  # texts are bytes with a zero after each name
         _array("sizes", "Int64", numbers, f'NumberOfTuples="{len(faces)}"'),
         _array("names", "String", np.frombuffer(names, np.uint8), f'NumberOfTuples="{len(faces)}"'),
     ]
@@ -173,13 +178,14 @@ def _read(text: str) -> tuple[tuple[Array, ...], tuple[Solid, ...]]:
 
     Raises KeyError, ValueError or IndexError for other texts.
     """
+    # lines and faces have arrays of the same names, so the text is divided first
     before_faces, _, polys = text.partition("<Polys>")
     arrays = {name: text_of_array.split() for name, text_of_array in ARRAY.findall(before_faces)}
     ends = np.array(arrays["offsets"], dtype=int)
     points = np.array(arrays["Points"], dtype=float).reshape(-1, 3)
     on_lines = int(ends[-1]) if len(ends) else 0
     lines = tuple(np.split(points[:on_lines], ends[:-1])) if len(ends) else ()
-    if "sizes" not in arrays:
+    if "sizes" not in arrays:  # without faces, or of an earlier version
         return lines, ()
     solid_counts = np.array(arrays["sizes"], dtype=int).reshape(-1, 2)
     names = bytes(int(code) for code in arrays["names"]).decode().split("\0")
@@ -189,6 +195,7 @@ def _read(text: str) -> tuple[tuple[Array, ...], tuple[Solid, ...]]:
     first_corner, first_triangle = on_lines, 0
     for name, (point_count, triangle_count) in zip(names, solid_counts, strict=False):
         pole_values = poles[first_corner : first_corner + point_count]
+        # numbers of corners begin at zero in each solid
         numbers = triangles[first_triangle : first_triangle + triangle_count] - first_corner
         if numbers.size and not 0 <= numbers.min() <= numbers.max() < point_count:
             raise IndexError(name)

@@ -2,6 +2,15 @@
 
 Input: jets of the placement and the displacement at points (cells, points per cell). Output: arrays
 by name, as `surface.Surface` has them. The theory is in docs/theory.md.
+
+A jet is a map with its first and second derivatives at points. h and R are thickness and reference
+length; lengths are over R. Br and Ba are remanence and applied flux density, mu the amplitudes
+(load parameters) of a state, lambda_m = |Br||Ba|/(mu_0 E). A field acts on a thin shell by a
+pressure p_mag, an in-plane force f_mag, rotational springs k and a torque tau. The remanence law is
+"deformation" (Br is convected) or "rotation" (Br turns and does not stretch). The arrays E and M
+are the components 11, 12, 22 of membrane strain and bending moment; in a unit such as h E lambda_m,
+E is Young's modulus, and D is the bending stiffness. A material thins if its thickness follows from
+its area, as that of rubber.
 """
 
 from collections.abc import Mapping, Sequence
@@ -53,12 +62,13 @@ def magnetic_loads(
     torque
         Function of the displacement's derivatives, see `Torque`.
     """
-    pattern = field.remanent
+    pattern = field.remanent  # a vector, or a function of places and normals
     Br = pattern(r0, g.n0) if callable(pattern) else np.broadcast_to(pattern, r0.shape)
     Ba = field.applied
     rotates = field.law == "rotation"
     loads = {"p_mag": magnetic_pressure(g, Br, Ba, h), "k": spring_stiffness(g, Br, Ba)}
     if rotates:
+        # to first order a rotation takes the antisymmetric part of B0 alone: b0:B0 is zero
         loads = {"p_mag": 0 * loads["p_mag"], "k": loads["k"] - (Br @ Ba + loads["k"]) / 2}
     if not callable(pattern) and isinstance(h, float):
         # the formula of f_mag assumes uniform vectors and thickness
@@ -109,11 +119,12 @@ def in_plane_force(g: SurfaceGeometry, Br: Array, Ba: Array, h: float) -> Array:
     equals h [b_ca (n . Ba)(a^a . Br) + tr b (n . Br)(a_c . Ba)].
     """
     dual = g.dual
+    # (a^a . Br) and (n . Ba)
     tangential_Br, normal_Ba = (
         np.einsum("...ai,...i->...a", dual, Br),
         np.einsum("...i,i->...", g.n0, Ba),
     )
-    trace = np.einsum("...ab,...ai,...bi->...", g.b0, dual, dual)
+    trace = np.einsum("...ab,...ai,...bi->...", g.b0, dual, dual)  # tr b
     covariant = np.einsum("...ca,...a->...c", g.b0, tangential_Br) * normal_Ba[..., None]
     covariant += (trace * np.einsum("...i,...i->...", g.n0, Br))[..., None] * np.einsum(
         "...ci,i->...c", g.a, Ba
@@ -138,8 +149,8 @@ class Torque:
         (..., 2): -(n0 . Br)(a0^a . Ba). For a remanence that does not stretch, that and half of
         (n0 . Ba)(a0^a . Br).
     dual, transposed
-        Dual basis (..., 2, 3) and half of (n0 . Ba) Br, (..., 3), for a remanence that does not
-        stretch.
+        Dual basis (..., 2, 3), and half of (n0 . Ba) times the tangential part of Br, (..., 3).
+        None for a convected remanence, which has no such term.
     """
 
     n0: Array
@@ -152,6 +163,7 @@ class Torque:
 
         `du` are the derivatives u,_1 and u,_2 (..., 2, 3).
         """
+        # the coefficients times du, without its part along n0
         rotation = np.matmul(self.coefficients[..., None, :], du)[..., 0, :]
         torque = rotation - np.sum(rotation * self.n0, axis=-1, keepdims=True) * self.n0
         if self.dual is not None and self.transposed is not None:
@@ -169,6 +181,7 @@ def torque(g: SurfaceGeometry, Br: Array, Ba: Array, *, rotates: bool = False) -
     )
     if not rotates:
         return Torque(g.n0, coefficients)
+    # further terms of a remanence that does not stretch, see `Torque`
     in_surface = Br - np.einsum("...i,...i->...", g.n0, Br)[..., None] * g.n0
     half_normal_Ba = (g.n0 @ Ba / 2)[..., None]
     coefficients = coefficients + half_normal_Ba * np.einsum("...ai,...i->...a", g.dual, Br)
@@ -190,7 +203,13 @@ class Stresses:
     natural
         The natural shape; None if the drawn shape is without stress.
     made_of
-        (cells, 4) `parameters.OwnMaterial` of each cell; None if all cells have `material`.
+        (cells, 4) `parameters.ShellMaterial.numbers` of each cell: modulus over that of the first
+        shell, Poisson's ratio, density ratio, number of the law. None if all have `material`.
+
+    Attributes
+    ----------
+    frame
+        Tangent bases and normals of the undeformed surface at the points.
     """
 
     def __init__(
@@ -208,7 +227,7 @@ class Stresses:
             r0[0], frame.t[..., 0, :], frame.t[..., 1, :], frame.n0
         )
         self._natural = natural and natural.tensors_at(r0[0], self.frame.n0)
-        self._unit = material.bending_stiffness
+        self._unit = material.bending_stiffness  # D of the thickness h, the unit of M
 
     def values_of(self, u: Array, mu: Mapping[str, float]) -> dict[str, Array]:
         """Return strains and moments of a displacement at the points.
@@ -231,7 +250,7 @@ class Stresses:
         frame, total = self.frame, {}
         E, K = frame.membrane_strain(u), frame.curvature_change(u)
         law = self._law if self._thickness is None else self._law.thicker(self._thickness)
-        if self._natural:
+        if self._natural:  # stresses come from the strain beyond the natural shape
             total["E_total"] = E
             shape = NaturalFrame.from_tensors(
                 frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0)
@@ -274,12 +293,13 @@ def rubber_fields(fields: Mapping[str, Array], law: Law) -> dict[str, Array]:
     """
     if not law.thins_somewhere:
         return {}
+    # in principal axes, where strains and stresses are diagonal
     E = np.stack([fields["E_1"], fields["E_2"]], axis=-1)
     squared_stretch = 1 + 2 * E
     S1, _, S2 = law.stress(E[..., None] * np.eye(2), np.eye(2))
     stretches = [
         *np.sqrt(np.moveaxis(squared_stretch, -1, 0)),
-        1 / np.sqrt(np.prod(squared_stretch, axis=-1)),
+        1 / np.sqrt(np.prod(squared_stretch, axis=-1)),  # the volume is constant
     ]
     stretch_fields = {f"stretch_{number}": values for number, values in enumerate(stretches, 1)}
     stretch_fields |= {
@@ -326,7 +346,8 @@ class PointFields:
     natural
         The natural shape. A material that thins has its thickness from the volume of this shape.
     made_of
-        (cells, 4) `parameters.OwnMaterial` of each cell; None if all cells have `material`.
+        (cells, 4) `parameters.ShellMaterial.numbers` of each cell; None if all cells have
+        `material`.
 
     Attributes
     ----------
@@ -355,7 +376,11 @@ class PointFields:
         natural: Natural | None = None,
         made_of: Array | None = None,
     ) -> None:
-        """Set the constant fields, and what fields of a displacement need."""
+        """Set the constant fields, and what fields of a displacement need.
+
+        Formulas are evaluated slightly inside cells, so that one that jumps has both its values.
+        `_field` has the applied field, `_magnetisation` the remanence with or without such a field.
+        """
         self._contacts, self._h, self._thins = contacts, material.h, material.law_in(made_of).thins
         self._frame, self._field, self._thickness = TangentFrame.from_jet(r0), field, thickness
         self._natural = (
@@ -372,7 +397,7 @@ class PointFields:
             self.susceptibility = field.soft.susceptibility_at(inside_cells(r0[0]), self.n0)[
                 ..., None
             ]
-        if field and field.soft and field.soft.alone:
+        if field and field.soft and field.soft.alone:  # soft material without any remanence
             self._magnetisation, field = None, None
         if self._magnetisation:
             pattern = self._magnetisation.remanent
@@ -381,7 +406,7 @@ class PointFields:
                 if callable(pattern)
                 else np.broadcast_to(pattern, r0[0].shape)
             )
-        if field and field.uniform:
+        if field and field.uniform:  # the loads are derived for a uniform field
             h = material.h if thickness is None else material.h * thickness
             self.constant, self._torque = magnetic_loads(
                 self._geometry(), field, inside_cells(r0[0]), h
@@ -445,11 +470,13 @@ class PointFields:
         It is 1 where the thickness is constant. `u` and `mu` are as in `values_of`.
         """
         area = np.linalg.norm(np.cross(*(self._frame.jet[1:3] + u[1:3])), axis=-1)
+        # of constant volume: the thickness grows as the area shrinks
         stretch = self._frame.area / area
         if self._natural is not None:
             shape = NaturalFrame.from_tensors(
                 self._frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0)
             )
+            # the volume is that of the natural shape, whose area and thickness are other ones
             stretch = stretch * shape.thickness / np.linalg.det(shape.inverse)
         return np.asarray(1 + self._thins * (stretch - 1))
 
@@ -462,6 +489,7 @@ class PointFields:
         thickness = 1.0 if self._thickness is None else self._thickness
         thickness = thickness * (self._thinned(u, mu) if np.any(self._thins) else 1.0)
         thickness = np.broadcast_to(thickness, r.shape[:-1]).ravel()
+        # the first of gap, gradient and Hessian; the amplitude is the body's approach over h
         gaps = [
             contact.gap(r.reshape(-1, 3), h * mu.get(contact.amplitude, 0.0), h / 2 * thickness)[0]
             for contact in self._contacts

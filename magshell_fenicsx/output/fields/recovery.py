@@ -3,6 +3,11 @@
 A polynomial is fitted to samples in the patch of cells around each vertex, as in the
 superconvergent patch recovery of Zienkiewicz and Zhu. A surface is split into smooth parts, within
 which prescribed fields and the normal are continuous. Each part is recovered on its own.
+
+Samples are quadrature points inside cells. A vertex is at an edge if a cell's side there has no
+neighbour; the first ring of cells around it are its own cells, the second ring those that share a
+vertex with them. Shapes: m cells, q samples in each, v vertices, d coordinates on a surface (1 on a
+meridian, 2 on a shell), k coordinates of a place. E and M are membrane strain and bending moment.
 """
 
 from collections.abc import Mapping
@@ -84,10 +89,13 @@ class Recovery:
         frames: Array,
         degree: int,
     ) -> None:
-        """Set the sparse matrix from samples to the coefficients of all polynomials."""
+        """Set the sparse matrix from samples to the coefficients of all polynomials.
+
+        It is filled directly in the form of `scipy.sparse.csr_matrix`: values, columns, starts.
+        """
         self._cells, self._vertices, self._frames, self._degree = cells, vertices, frames, degree
         self._coefficient_count = len(_powers(cells.shape[1] - 1, degree))
-        self._size = np.ones(len(vertices))
+        self._size = np.ones(len(vertices))  # of each patch, by which its coordinates are divided
         samples_per_cell = weight.shape[1]
         patches, cell_weights = _patches(cells, len(vertices))
         cells_per_vertex = np.diff(patches.indptr)
@@ -186,6 +194,7 @@ class Recovery:
         local_coordinates = offsets @ np.swapaxes(self._frames[vertex], 1, 2)
         self._size[vertex] = np.abs(local_coordinates).max(axis=(1, 2))
         degree = self._degree
+        # lower until the samples are more than the coefficients
         while (
             degree
             and MIN_SAMPLES_PER_COEFFICIENT * len(_powers(local_coordinates.shape[-1], degree))
@@ -198,7 +207,8 @@ class Recovery:
         ridge = np.broadcast_to(
             RIDGE * np.eye(monomials.shape[-1]), (n, monomials.shape[-1], monomials.shape[-1])
         )
-        # a factorisation by reflections keeps the condition small
+        # rows of the ridge, with values of zero, keep every fit regular; a factorisation by
+        # reflections keeps the condition small, where normal equations would square it
         Q, upper_triangle = np.linalg.qr(np.concatenate([weight_roots * monomials, ridge], axis=1))
         return np.asarray(
             np.linalg.solve(
@@ -235,8 +245,9 @@ def _patches(cells: Numbers, count: int) -> tuple["scipy.sparse.csr_matrix", Arr
     is_at_edge[sides[cells_per_side == 1]] = 1.0
     # cells that share a vertex with the first ring
     second_ring = scipy.sparse.diags(is_at_edge) @ (first_ring @ (first_ring.T @ first_ring))
-    second_ring.data[:] = SECOND_RING_WEIGHT
+    second_ring.data[:] = SECOND_RING_WEIGHT  # in place of numbers of shared vertices
     patches = (first_ring + second_ring).tocsr()
+    # entries of the first ring are at least one
     return patches, np.where(patches.data > SECOND_RING_WEIGHT, 1.0, SECOND_RING_WEIGHT)
 
 
@@ -293,7 +304,11 @@ class RecoveredShell:
         table: Array,
         degree: int,
     ) -> None:
-        """Set the recovery around the vertices, and its evaluation at all nodes."""
+        """Set the recovery around the vertices, and its evaluation at all nodes.
+
+        Vertices are the corners of cells, renumbered; the normal at a vertex is the sum of the
+        cells' normals there.
+        """
         vertices, corners = np.unique(numbers[:, :3], return_inverse=True)
         corners = corners.reshape(-1, 3)
         vertex_places, vertex_normals = np.zeros((2, len(vertices), 3))
@@ -313,6 +328,8 @@ class RecoveredShell:
         self, tensors: Mapping[str, Array], n0: Array
     ) -> tuple[dict[str, Array], dict[str, float]]:
         """Return recovered tensors with their principal values, and the jumps of the samples.
+
+        Tensors are projected onto the tangent planes of the nodes.
 
         Parameters
         ----------
@@ -361,7 +378,10 @@ def components_in_space(frame: TangentFrame) -> Array:
 
 
 def frames_across(normals: Array) -> Array:
-    """Return two orthogonal unit vectors (n, 2, 3) across each of n vectors (n, 3)."""
+    """Return two orthogonal unit vectors (n, 2, 3) across each of n vectors (n, 3).
+
+    The first is across e1 too, or across e2 where the vector is nearly along e1.
+    """
     n = normals / np.linalg.norm(normals, axis=-1, keepdims=True)
     t1 = np.cross(n, np.where(np.abs(n[:, :1]) < 0.8, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]]))
     t1 /= np.linalg.norm(t1, axis=-1, keepdims=True)
@@ -427,9 +447,8 @@ def smooth_parts(
     adjacency = scipy.sparse.coo_matrix(
         (np.ones(len(first_cells)), (first_cells, second_cells)), (count, count)
     )
-    return np.asarray(
-        scipy.sparse.csgraph.connected_components(adjacency, directed=False)[1], np.int64
-    )
+    _, part_numbers = scipy.sparse.csgraph.connected_components(adjacency, directed=False)
+    return np.asarray(part_numbers, np.int64)
 
 
 def split(numbers: Numbers, parts: Numbers) -> Numbers:
@@ -443,4 +462,5 @@ def split(numbers: Numbers, parts: Numbers) -> Numbers:
     if not parts.any():
         return numbers
     key = np.column_stack([np.repeat(parts, numbers.shape[1]), numbers.ravel()])
-    return np.unique(key, axis=0, return_inverse=True)[1].reshape(numbers.shape).astype(np.int64)
+    _, new_numbers = np.unique(key, axis=0, return_inverse=True)
+    return new_numbers.reshape(numbers.shape).astype(np.int64)

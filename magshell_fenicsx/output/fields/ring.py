@@ -1,6 +1,9 @@
 """Wave number of a mode around e3, counted on a ring: the surface at one height.
 
 The mode between nodes is that of its elements, so the count does not depend on where nodes lie.
+`mode_w` is the normal component of a mode at the nodes, w on the ring. theta is the azimuth around
+e3. A tessellation divides curved cells into flat triangles, which the plane of one height z cuts in
+straight lines. Places are over the reference length R.
 """
 
 from dataclasses import dataclass
@@ -70,11 +73,11 @@ class Ring:
         # weights by the length of arc: small elements have many points
         arc_weights = np.sqrt((angle_to_next + np.roll(angle_to_next, 1)) / 2)
         values = arc_weights * self.w
-        remainders = []
+        remainders = []  # for each m the part of the mode that cos(m theta), sin(m theta) leave
         for m in range(MAX_WAVES + 1):
             wave = np.column_stack([np.cos(m * self.theta), np.sin(m * self.theta)])
             basis = arc_weights[:, None] * wave
-            coefficients = np.linalg.lstsq(basis, values)[0]
+            coefficients, *_ = np.linalg.lstsq(basis, values)
             remainders.append(float(np.sum((values - basis @ coefficients) ** 2)))
         best = int(np.argmin(remainders))
         if best < 2 or remainders[best] >= MAX_REMAINDER * float(values @ values):
@@ -101,6 +104,7 @@ def waves_around(surface: Surface) -> WaveCount | None:
     if np.ptp(height) < MIN_HEIGHT:
         return None
     crest = surface.r0[np.argmax(np.abs(surface.fields["mode_w"]))]
+    # the crest may be on the rim, where the surface has no height beyond: go towards the middle
     sign_inwards = np.sign((height.max() + height.min()) / 2 - crest[2]) or 1.0
     tessellation = tessellate(surface, MAX_TRIANGLES)
     # just inside the crest, and farther from it where rims are uneven
@@ -125,6 +129,7 @@ def _ring(surface: Surface, tessellation: Tessellation, crest: Array, height: fl
         return None
     triangles = tessellation.triangles[cut_triangles]
     values = np.column_stack([r, mode_w])
+    # each cut triangle has one line of the ring, with two ends
     ends, w_at_ends = _cuts(triangles, is_above[cut_triangles], values, height)
     on_ring = _connected(ends, crest)
     theta = np.arctan2(ends[on_ring, :, 1], ends[on_ring, :, 0])
@@ -133,8 +138,9 @@ def _ring(surface: Surface, tessellation: Tessellation, crest: Array, height: fl
     if np.diff(ascending, append=ascending[0] + 2 * np.pi).max() > MAX_GAP:
         return None
     triangles_per_cell = len(tessellation.triangles) // len(tessellation.nodes)
-    cells_on_ring = cut_triangles[on_ring] // triangles_per_cell
+    cells_on_ring = cut_triangles[on_ring] // triangles_per_cell  # triangles are cell after cell
     nodes_of_cells = surface.r0[tessellation.nodes[cells_on_ring]]
+    # a cell of degree d has d intervals between nodes along its side
     spacing = _extent(nodes_of_cells, theta[:, 0]) / tessellation.degree
     return Ring(ascending, w_at_ends[on_ring].ravel()[order], spacing)
 
@@ -162,7 +168,7 @@ def _cuts(
     """
     # the corner that is alone on its side of the plane
     single_corner = np.argmax(is_above == (is_above.sum(axis=1) == 1)[:, None], axis=1)
-    order = (single_corner[:, None] + np.arange(3)) % 3
+    order = (single_corner[:, None] + np.arange(3)) % 3  # that corner first
     corners = values[np.take_along_axis(triangles, order, axis=1)]
     tip, base = corners[:, :1], corners[:, 1:]
     fraction = (height - tip[..., 2]) / (base[..., 2] - tip[..., 2])
@@ -182,9 +188,9 @@ def _connected(ends: Array, place: Array) -> Numbers:
     graph = scipy.sparse.coo_array(
         (np.ones(len(links)), tuple(links.T)), shape=(len(points), len(points))
     )
-    number = scipy.sparse.csgraph.connected_components(graph, directed=False)[1]
+    _, number = scipy.sparse.csgraph.connected_components(graph, directed=False)
     nearest = np.argmin(np.linalg.norm(points - place[:2], axis=1))
-    return np.flatnonzero(number[::2] == number[nearest])
+    return np.flatnonzero(number[::2] == number[nearest])  # one of the two ends of each line
 
 
 def _extent(nodes: Array, theta: Array) -> float:

@@ -2,6 +2,12 @@
 
 A `Surface` has the nodes of the whole shell or body, and fields at the nodes. A `SurfaceGatherer`
 makes it from a state of a shell model. Half shells and sectors are completed by symmetry.
+
+A state has the displacement u and the amplitudes mu: load parameters, by name. An imperfection
+grows if an amplitude multiplies it; its deviation w0 is the distance of the drawn surface from the
+perfect one. Samples are quadrature points in cells, to which smooth strains E and moments M are
+fitted: they are recovered. A smooth part of the surface ends where the normal or a prescribed field
+jumps. h and R are thickness and reference length; lengths are over R.
 """
 
 from collections.abc import Callable, Mapping
@@ -117,7 +123,11 @@ class SurfaceGatherer:
     """
 
     def __init__(self, model: "ShellModel") -> None:
-        """Prepare the gathering for all states of a model; collective."""
+        """Prepare the gathering for all states of a model; collective.
+
+        `_element` has the equidistant nodes at which fields are given; `_recovered` fits fields to
+        samples, on rank 0.
+        """
         self._model = model
         domain, degree = model.V.mesh, model.degree
         self.comm = domain.comm
@@ -149,6 +159,10 @@ class SurfaceGatherer:
     ) -> None:
         """Set all that depends on the undeformed placement: fields, recovery, averages; collective.
 
+        `_fields` and `_stresses` are functions of a displacement at nodes and at samples.
+        `_to_space` maps components in tangent frames to components in space. `_constant` has the
+        fields that no displacement changes.
+
         Parameters
         ----------
         mu
@@ -162,7 +176,7 @@ class SurfaceGatherer:
         r_at_samples = self._jet(model.r0, self._reference_samples)
         thickness_at_nodes = self._thickness(self._reference_nodes)
         thickness_at_samples = self._thickness(self._reference_samples)
-        made_of = self._cell_materials()
+        made_of = self._cell_materials()  # None if all cells have one material
         self._fields = PointFields(
             r,
             model.material,
@@ -217,7 +231,8 @@ class SurfaceGatherer:
             prescribed_fields.append(self._shell_numbers())
         materials = self._cell_materials()
         if isinstance(self._model.material.law, LawByShell) and materials is not None:
-            prescribed_fields.append(np.repeat(materials[:, None, 3], r.shape[1], axis=1))
+            law_numbers = materials[:, None, 3]
+            prescribed_fields.append(np.repeat(law_numbers, r.shape[1], axis=1))
         if thickness is not None:
             prescribed_fields.append(thickness)
         prescribed_fields = [self._gather_cells(field) for field in prescribed_fields if field.size]
@@ -228,6 +243,7 @@ class SurfaceGatherer:
         self._numbers = numbers
         if self.comm.rank:  # rank 0 alone recovers fields
             return
+        # nodes of the entities of dimension 1
         sides = np.array(self._element.entity_closure_dofs[1])
         self._numbers = split(numbers, smooth_parts(numbers, sides, prescribed_fields, n0))
         to_vtk = np.argsort(perm_vtk(mesh.CellType.triangle, numbers.shape[1]))
@@ -259,11 +275,11 @@ class SurfaceGatherer:
 
         On rank 0; None on other ranks.
         """
-        if self._model.growing:
+        if self._model.growing:  # imperfections that amplitudes multiply move the placement
             self._set_placement(state.mu)
-        jet = self._jet(self._model.u, self._reference_nodes, 1)
+        jet = self._jet(self._model.u, self._reference_nodes, order=1)
         values = self._fields.values_of(jet, state.mu)
-        if state.mu:
+        if state.mu:  # of a mode there are no amplitudes, and no contact
             nodes_of_cell = len(self._reference_nodes)
             add_contact(
                 values,
@@ -284,19 +300,27 @@ class SurfaceGatherer:
             name: self._gather_cells(np.einsum("...ia,...a->...i", self._to_space, S))
             for name, S in stresses.items()
         }
-        if not self._recovered:
+        if not self._recovered:  # on other ranks than 0
             return None
         recovered, jumps = self._recovered.fields(tensors, self._n0)
         fields = self._constant | recovered | rubber_fields(recovered, law) | averaged
         fields = resolved_pressure(self._cells, fields)
         names = self._model.midsurface.shells
         return Surface(
-            self._r0, nodes, self._n0, self._cells, fields, (), jumps["M"], jumps["E"], shells=names
+            self._r0,
+            nodes,
+            self._n0,
+            self._cells,
+            fields,
+            jump=jumps["M"],
+            strain_jump=jumps["E"],
+            shells=names,
         )
 
     def _shell_numbers(self) -> Array:
         """Return (cells, nodes) the number of the shell to which each owned cell belongs."""
         midsurface = self._model.midsurface
+        # a mask of cells for each shell: argmax finds the one that has the cell
         in_shells = [midsurface.patches[name][: self._owned_cells] for name in midsurface.shells]
         numbers = np.argmax(in_shells, axis=0)[:, None].astype(np.float64)
         return np.repeat(numbers, len(self._reference_nodes), axis=1)
@@ -329,7 +353,11 @@ class SurfaceGatherer:
         return np.asarray(factor.x.array[V.dofmap.list[: self._owned_cells]] @ values.T)
 
     def _cell_materials(self) -> Array | None:
-        """Return the material (cells, 4) of each owned cell; None if the shell has one material."""
+        """Return the material (cells, 4) of each owned cell; None if the shell has one material.
+
+        The four numbers are modulus over that of the first shell, Poisson's ratio, density ratio
+        and number of the law of elasticity.
+        """
         materials = self._model.cell_materials
         if materials is None:
             return None
@@ -479,7 +507,7 @@ def completed(surface: Surface, mirror: Array) -> Surface:
     """
     normal, offset = mirror[:3], float(mirror[3:].sum())
     image = _transformed(surface, np.eye(3) - 2 * np.outer(normal, normal))
-    image = replace(image, r0=image.r0 + 2 * offset * normal)
+    image = replace(image, r0=image.r0 + 2 * offset * normal)  # the plane need not pass the origin
 
     sign = _parity(surface, normal, offset)
     for name in FIELDS_OF_EITHER_PARITY & surface.fields.keys():
@@ -507,7 +535,8 @@ def completed_by_symmetry(surface: Surface, mirror: Mirror) -> Surface:
     surface_and_image = completed(surface, mirror.plane)
     if not isinstance(mirror, Sector):
         return surface_and_image
-    # images of positive sign are rotations about e3, the identity among them
+    # half and image are two sectors; images of positive sign are rotations about e3, the identity
+    # among them, which take these two around the axis
     turns = [image.Q.T for image in mirror.images if image.sign > 0]
     copies = [_transformed(surface_and_image, Q) for Q in turns]
     count = len(surface_and_image.r0)
@@ -542,6 +571,7 @@ def on_nodes_of(surface: Surface, target: Surface) -> Surface:
     distance, nearest_nodes = scipy.spatial.cKDTree(surface.r0).query(target.r0, NODES_OF_FIT)
     offsets = surface.r0[nearest_nodes] - target.r0[:, None]
     reach = np.maximum(distance.max(axis=1), SAME_PLACE_TOLERANCE)[:, None]
+    # from one at the target to exp(-4) at the farthest of these nodes
     weight = np.exp(-((2 * distance / reach) ** 2))[..., None]
     # row 0 of the pseudo-inverse is the fit's constant, its value at the target node
     basis = np.concatenate([np.ones((*nearest_nodes.shape, 1)), offsets / reach[..., None]], axis=2)
@@ -594,6 +624,7 @@ def _transformed(surface: Surface, Q: Array) -> Surface:
     """
 
     def transformed(f: Array) -> Array:
+        """Return scalars (n,) unchanged, vectors (n, 3) and tensors (n, 3, 3) transformed."""
         if f.ndim == 1:
             return f
         return f @ Q if f.ndim == 2 else Q.T @ f @ Q

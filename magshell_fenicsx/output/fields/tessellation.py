@@ -1,4 +1,9 @@
-"""Tessellation: flat triangles of a surface, as fine as its cells are curved."""
+"""Tessellation: flat triangles of a surface, as fine as its cells are curved.
+
+A reference cell (a triangle, or a square for the faces of a solid) is divided once; all cells are
+divided alike. Shapes: m cells with k nodes each, q points in a reference cell, t triangles in all.
+The shape functions interpolate between the nodes of a cell.
+"""
 
 from dataclasses import dataclass
 
@@ -58,7 +63,7 @@ class Tessellation:
         """
         tangents = np.matmul(self.slopes[:, None], r[self.nodes])
         vectors = np.cross(*tangents).reshape(-1, 3)
-        if self.flat:
+        if self.flat:  # the points of a flat triangle are its nodes: sums of normals at each node
             node_numbers, node_count = self.nodes.ravel(), len(r)
             sums = [np.bincount(node_numbers, vectors[:, i], node_count) for i in range(3)]
             vectors = np.column_stack(sums)[node_numbers]
@@ -73,11 +78,12 @@ def tessellate(surface: Surface, max_triangles: int = 40_000) -> Tessellation:
     """
     if surface.is_body:
         faces = _outer_faces(surface.cells)
-        division = _division(2 * len(faces), 4, max_triangles)
+        division = _division(2 * len(faces), finest=4, max_triangles=max_triangles)
         element = basix.create_element(
             basix.ElementFamily.P, basix.CellType.quadrilateral, 2, EQUISPACED
         )
-        return _divided(faces, element, np.arange(9), _squares(division))
+        in_order = np.arange(9)  # the faces have the element's own order
+        return _divided(faces, element, in_order, _squares(division))
     count = surface.cells.shape[1]
     # a triangle of degree d has (d + 1)(d + 2)/2 nodes
     degree = round((np.sqrt(8 * count + 1) - 3) / 2)
@@ -85,14 +91,16 @@ def tessellate(surface: Surface, max_triangles: int = 40_000) -> Tessellation:
         basix.ElementFamily.P, basix.CellType.triangle, degree, EQUISPACED
     )
     order = np.argsort(perm_vtk(CellType.triangle, count))
+    # two parts for each interval between nodes show the curvature; flat cells need no division
     division = 1 if degree == 1 else _division(len(surface.cells), 2 * degree, max_triangles)
     return _divided(surface.cells, element, order, _triangle(division))
 
 
 def _division(triangles: int, finest: int, max_triangles: int) -> int:
-    """Return the number of equal parts of each side of a triangle, from 1 to `finest`.
+    """Return the number n of equal parts of each side of a triangle, from 1 to `finest`.
 
-    `triangles` is the number of triangles that are to be divided.
+    A triangle becomes n² smaller ones, `max_triangles` in all at most. `triangles` is the number of
+    triangles that are to be divided.
     """
     return int(np.clip(np.sqrt(max_triangles / max(triangles, 1)), 1, finest))
 
@@ -118,16 +126,16 @@ def _divided(
     """
     points, triangles = triangulation
     table, *slopes = element.tabulate(1, points)[:, :, :, 0][:, :, order]
+    # the points of all cells are numbered cell after cell
     numbers = np.arange(len(nodes))[:, None, None] * len(points) + triangles
     corners = numbers.reshape(-1, 3).astype(np.int32)
-    return Tessellation(
-        nodes, table, np.array(slopes), corners, nodes.shape[1] == 3, element.degree
-    )
+    is_flat = nodes.shape[1] == 3  # a triangle of degree one
+    return Tessellation(nodes, table, np.array(slopes), corners, is_flat, element.degree)
 
 
 def _triangle(n: int) -> tuple[Array, Numbers]:
     """Return points (q, 2) in the reference triangle, and n² triangles (n², 3) between them."""
-    places = [(i, j) for j in range(n + 1) for i in range(n + 1 - j)]
+    places = [(i, j) for j in range(n + 1) for i in range(n + 1 - j)]  # in steps of 1/n
     number = {place: k for k, place in enumerate(places)}
     up = [(number[i, j], number[i + 1, j], number[i, j + 1]) for i, j in places if i + j < n]
     down = [
@@ -158,6 +166,7 @@ def _outer_faces(cells: Numbers) -> Numbers:
     square = basix.create_element(
         basix.ElementFamily.P, basix.CellType.quadrilateral, 2, EQUISPACED
     )
+    # argsort inverts a permutation: once gives Basix to VTK, twice VTK to Basix
     to_basix = np.argsort(np.argsort(perm_vtk(CellType.hexahedron, cells.shape[1])))
     cells_in_basix_order = cells[:, to_basix]
 

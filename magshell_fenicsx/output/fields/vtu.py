@@ -1,6 +1,10 @@
 """Fields for ParaView: a .vtu file with curved cells for each point, and a .pvd list of the points.
 
-Pictures read these files back.
+Pictures read these files back. A point is an equilibrium of a path, numbered along it; its row is
+the line of path.csv with its numbers. A .vtu file has data of the nodes (VTK's point data) and of
+the file as a whole (VTK's field data). A grid is a plane or a box outside the shell with the
+magnetic field, as its own file map_NAME_NNNN.vtu. h and R are thickness and reference length;
+lengths in the files are over R.
 """
 
 import os
@@ -97,6 +101,7 @@ def unstructured_grid(
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
 
     points, cells, grid = vtkPoints(), vtkCellArray(), vtkUnstructuredGrid()
+    # deep copies: VTK must not refer to memory that numpy frees
     points.SetData(numpy_to_vtk(surface.r0 + surface.u if deformed else surface.r0, deep=True))
     cell_count, nodes_per_cell = surface.cells.shape
     cell_starts, nodes = (
@@ -168,11 +173,12 @@ def read_grid(file: Path, convert: "Callable[[vtkUnstructuredGrid], Read]") -> "
     if not is_whole(file):
         reason = "it is cut off" if file.exists() else "it is missing"
         raise Damaged(f"{file}: is damaged: {reason}")
+    # VTK reports errors to an observer and goes on; its own messages are switched off meanwhile
     errors, reader = list[str](), vtkXMLUnstructuredGridReader()
     vtk_warnings = vtkObject.GetGlobalWarningDisplay()
     reader.AddObserver("ErrorEvent", lambda _, event: errors.append(event))
     reader.SetFileName(str(file))
-    vtkObject.GlobalWarningDisplayOff()  # the message follows
+    vtkObject.GlobalWarningDisplayOff()
     try:
         reader.Update()
         content = convert(reader.GetOutput())
@@ -189,6 +195,7 @@ def is_whole(file: Path) -> bool:
     """Whether a file is VTK's XML with its beginning and its end, and so not cut off."""
     if not file.is_file():
         return False
+    # 200 bytes have the opening element, the last 40 the closing one with white space
     with file.open("rb") as stream:
         head, size = stream.read(200), stream.seek(0, os.SEEK_END)
         stream.seek(max(size - 40, 0))
@@ -232,6 +239,7 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, ShellDat
         file_arrays.get("mirror"),
         R,
     )
+    # u is stored over h too, and is multiplied by h below
     r0, u, n0 = (point_arrays[name] for name in ("r0", "u_over_h", "n0"))
     if (
         {r0.shape, u.shape, n0.shape} != {(len(r0), 3)}
@@ -302,9 +310,10 @@ class FieldSeries:
         )
         folder.mkdir(exist_ok=True)
         self.complete_points = 0
+        # all files of points 0, 1, ... until one is missing or cut off
         while all(map(is_whole, self._files(self.complete_points))):
             self.complete_points += 1
-        self.complete_points = (
+        self.complete_points = (  # a point without a row will be written again
             min(self.complete_points, len(rows)) if rows else self.complete_points
         )
         self._rows: list[Mapping[str, Any]] = list(rows[: self.complete_points]) or [
@@ -321,6 +330,8 @@ class FieldSeries:
         grid_contents: Mapping[str, bytes] = MappingProxyType({}),
     ) -> None:
         """Write the files of a point and update the lists.
+
+        No file waits for the disk, because a resumed run writes lost ones again.
 
         Parameters
         ----------
@@ -415,7 +426,8 @@ def abscissae(rows: Sequence[Mapping[str, Any]]) -> list[float]:
     if rows and "time" in rows[0]:
         times = list[float]()
         for row in rows:
-            t = float(row[shown_quantity("time", row).name])
+            t = float(row[shown_quantity("time", row).name])  # the column in s, if there is one
+            # ParaView shows one point at a time, so that times must ascend
             times.append(max(t, times[-1] + TIME_INCREMENT) if times else t)
         return times
     if len(amplitudes) != 1:
@@ -464,7 +476,7 @@ def vtu_content(surface: Surface, shell_data: ShellData) -> bytes:
         SHELLS: surface.shells,
     }
     for name, lines in texts.items():
-        if lines or name != SHELLS:
+        if lines or name != SHELLS:  # of one shell there are no names
             add_texts(grid.GetFieldData(), name, lines)
     return content_of(grid)
 

@@ -1,4 +1,10 @@
-"""An animation of the path: the deformed shell, and a marker on the curve beside it."""
+"""An animation of the path: the deformed shell, and a marker on the curve beside it.
+
+A frame shows one row of path.csv, that is one point of the path. A panel is a drawn view of the
+shell with its scale of colours; a window the part of the projection that it shows. Displacements
+may be magnified; colours show w/h, the inward normal displacement over the thickness. The pole is
+the point whose displacement the column w_pole_over_h has. Lengths of the layout are in pixels.
+"""
 
 import io
 from collections.abc import Sequence
@@ -91,12 +97,14 @@ def animated(
         views = _views(surfaces, h, factor, camera)
         frames = _composed(views, factor, titles, rows, frame_rows, pole)
     dither = Pillow.Dither.FLOYDSTEINBERG  # without it 256 colours are contours that are not there
+    # the first, the middle and the last frame stand for the colours of all
     samples = [frames[i] for i in sorted({0, len(frames) // 2, len(frames) - 1})]
     palette = _palette(samples)  # the same for all frames
     first_image, *further_images = (
         _with_white(frame, Pillow.fromarray(frame).quantize(palette=palette, dither=dither))
         for frame in frames
     )
+    # ms, in multiples of ten, which GIF files count
     duration = round(max(1000 * DURATION / len(frames), MIN_FRAME_DURATION), -1)
     durations = [*[duration] * len(further_images), DURATION_OF_LAST]
     content = io.BytesIO()
@@ -126,7 +134,7 @@ def _with_white(frame: Image, reduced: "Pillow.Image") -> "Pillow.Image":
     """
     from PIL import Image as Pillow
 
-    numbers = np.asarray(reduced).copy()
+    numbers = np.asarray(reduced).copy()  # of each pixel in the palette
     numbers[(frame == WHITE[0]).all(axis=-1)] = 0
     white = Pillow.fromarray(numbers, "P")
     white.putpalette(reduced.getpalette() or [])
@@ -140,13 +148,14 @@ def _palette(frames: Sequence[Image]) -> "Pillow.Image":
     """
     from PIL import Image as Pillow
 
+    # each colour once, so that rare colours count as much as frequent ones
     colours = Pillow.fromarray(np.unique(np.concatenate(frames).reshape(-1, 3), axis=0)[None])
     palette = Pillow.new("P", (1, 1))
     methods = Pillow.Quantize.MAXCOVERAGE, Pillow.Quantize.MEDIANCUT
     levels = list[int]()
     for method in methods:
         levels += colours.quantize(COLOURS, method).getpalette() or []
-    palette.putpalette([*WHITE, *levels[3:]])
+    palette.putpalette([*WHITE, *levels[3:]])  # white in place of the first three levels
     return palette
 
 
@@ -164,7 +173,7 @@ def _views(surfaces: Sequence[Surface], h: float, factor: float, camera: Camera)
     highest = max(float(surface.w.max()) for surface in surfaces)
     limits = from_zero(lowest / h, highest / h)
     magnified = [replace(surface, u=factor * surface.u) for surface in surfaces]
-    places = [surfaces[0].r0]
+    places = [surfaces[0].r0]  # the window is around all that any frame draws
     for surface in magnified:
         places += [surface.r0 + surface.u, *near_places(surface)]
     window = Window.around(camera(np.concatenate(places)), WINDOW_WIDTH)
@@ -203,6 +212,7 @@ def _composed(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    # from the left: shell, bar of colours, curves; the title above takes 40 pixels
     shell_height, shell_width = views[0].image.shape[:2]
     width, height = shell_width + 600, max(shell_height + 40 + FOOT, 400)
     shell_low = FOOT + (height - 40 - FOOT - shell_height) // 2
@@ -225,7 +235,8 @@ def _composed(
     for i, step in enumerate(reversed(steps)):  # from below
         axes = box(shell_width + 230, 70 + i * height_of_curve, 350, height_of_curve - 70)
         plot_curve(axes, step, pole)
-        marker = axes.plot([], [], "o", color="k", markersize=8, animated=True)[0]
+        # without places yet: `animated` leaves it out of the fixed parts
+        (marker,) = axes.plot([], [], "o", color="k", markersize=8, animated=True)
         markers |= {int(row["point"]): (axes, step, marker) for row in step.rows}
     title = figure.text(15 / width, 1 - 12 / height, "", va="top", animated=True)
     canvas.draw()
@@ -240,6 +251,7 @@ def _composed(
             marker.set_data(*([x] for x in curve_coordinates(row, step.amplitude)))
             axes.draw_artist(marker)
         frame = np.array(canvas.buffer_rgba())[:, :, :3]
+        # rows of an image go downwards
         shell_rows = slice(height - shell_low - shell_height, height - shell_low)
         _overlay(view.image, frame[shell_rows, 10 : 10 + shell_width])
         frames.append(frame)
@@ -259,6 +271,7 @@ def edge_of(coverage: Array) -> Array:
 
     `coverage` (n, m, 1) is the drawn fraction of each pixel.
     """
+    # least coverage of a pixel and its four neighbours
     smallest = coverage.copy()
     for axis, shift in ((0, 1), (0, -1), (1, 1), (1, -1)):
         smallest = np.minimum(smallest, np.roll(coverage, shift, axis))

@@ -1,6 +1,9 @@
 """Bodies and magnets near a shell in a picture, and names of those that are too far.
 
-Bodies are drawn as glass, magnets with a red north and a blue south pole.
+Bodies are drawn as glass, magnets with a red north and a blue south pole. A `Solid` has corners and
+triangles, and of a magnet a pole strength at each corner, positive on its north half. A source of
+the field without faces, such as a coil, is drawn by its outlines. Depth grows towards the eye; it
+is -inf where nothing is drawn. A drawn pixel is finer than a pixel of the picture.
 """
 
 from collections.abc import Sequence
@@ -53,6 +56,7 @@ class SolidImage:
 
     def over(self, background: Image) -> Image:
         """Return the image `background` with the solid drawn in front of it."""
+        # the usual composition of two transparent images, in pixels that the solid covers
         composed, covered = background.copy(), self.opacity > 0
         opacity, behind = self.opacity[covered], background[covered]
         opacity_behind = behind[:, 3] / 255 * (1 - opacity)
@@ -94,6 +98,7 @@ class BodiesInView:
         depths = [view.depth for view in self._views]
         in_front = []
         for i, depth in enumerate(depths):
+            # depth grows towards the eye: the largest one is in front
             other_depths = [
                 self._shell.depth,
                 *(depth_of_other for k, depth_of_other in enumerate(depths) if k != i),
@@ -115,6 +120,7 @@ class BodiesInView:
             opacity = opacity_alone * in_pixels(visible & ~behind) + opacity_over_shell * in_pixels(
                 visible & behind
             )
+            # a magnet's colours change at pole strength zero, in the middle of the limits
             table = np.array([BODY] if solid.poles is None else [SOUTH, NORTH])
             values = np.zeros(len(solid.points)) if solid.poles is None else solid.poles
             largest = float(np.abs(values).max()) or 1.0
@@ -132,8 +138,10 @@ class BodiesInView:
         left, _, _, high = self._window.box
         lines = list[Array]()
         for solid, view, visible in zip(self._solids, self._views, self._visible, strict=True):
+            # a frame of equal values: no line where the solid goes on beyond the window
             padded = np.pad(in_pixels(visible), 1, mode="edge")
             contours: Any = contourpy.contour_generator(z=padded).lines(0.5)
+            # from pixels of the padded image, centred at whole numbers, to the projection
             lines += [
                 np.array([left, high]) + (line - 0.5) * np.array([1, -1]) / self._window.scale
                 for line in contours
@@ -163,6 +171,7 @@ class BodiesInView:
             if solid.poles is None:
                 continue
             centres = _centres(solid)
+            # faces that the magnet itself does not hide
             visible = view.shows(centres, 2 * DEPTH_TOLERANCE / self._window.scale)
             for sign, letter in ((1, "N"), (-1, "S")):
                 centres_of_pole = centres[(_poles(solid) * sign > 0) & visible]
@@ -176,7 +185,10 @@ class BodiesInView:
 
 
 def _face_tessellation(solid: Solid) -> Tessellation:
-    """Return the faces of a solid as flat triangles, with normals averaged at corners."""
+    """Return the faces of a solid as flat triangles, with normals averaged at corners.
+
+    The points of each triangle are its corners, where the three shape functions are 0 or 1.
+    """
     numbers = np.arange(3 * len(solid.triangles), dtype=np.int32).reshape(-1, 3)
     return Tessellation(solid.triangles, np.eye(3), SLOPES, numbers, flat=True)
 

@@ -1,4 +1,10 @@
-"""Numbers beside marks of curves, and captions under pictures."""
+"""Numbers beside marks of curves, and captions under pictures.
+
+A row is a line of path.csv, by column. An amplitude is a load parameter, by name; its value is in
+the column of the amplitude. Lengths on a picture are in points, 1/72 inch. In the code `half` is
+half the width and height of a text, as a box around its middle. lambda_m measures the magnetic
+field; h, R and nu are thickness, reference length and Poisson's ratio.
+"""
 
 from collections.abc import Iterable, Sequence
 from functools import partial
@@ -59,6 +65,7 @@ def write_numbers(
     points_of_curves = (
         np.concatenate([in_points(curve.T) for curve in curves]) if curves else np.zeros((0, 2))
     )
+    # boxes (middle, half of the size) that texts must not cover: marks, later texts too
     occupied = [(place, np.full(2, HALF_MARK)) for place in places_of_marks]
     for i, (_, text) in enumerate(marks):
         place: Array = places_of_marks[i]
@@ -90,6 +97,8 @@ def write_numbers(
 
 def _fault(place: Array, half: Array, marks: Array, line: Array, middle: Array) -> tuple[int, int]:
     """Return the faults of a place for a mark's number: (nearer marks, covered points of curves).
+
+    Fewer nearer marks, to which a reader would relate the number, count before points of curves.
 
     Parameters
     ----------
@@ -154,7 +163,7 @@ def caption(h: float, nu: float, row: Row, amplitudes: Iterable[str] = ()) -> st
     if row["field_angle"]:
         items.append(rf"turned by ${row['field_angle']:.4g}\degree$")
     if row["p_over_pc"]:
-        items.append(named_value("p_over_pc", row, 5))
+        items.append(named_value("p_over_pc", row, digits=5))
     if row.get("force"):
         displacement = f"{named_value('w_over_h', row)} {amplitude('force').place}"
         items.append(f"{named_value('force', row)}, {displacement}")
@@ -162,6 +171,7 @@ def caption(h: float, nu: float, row: Row, amplitudes: Iterable[str] = ()) -> st
         items.append(f"{named_value('load_factor', row)}, {named_value('w_over_h', row)}")
     if row["amplitude"] == "time":
         items.append(named_value("time", row))
+    # other amplitudes, such as those of user-defined energies
     further_columns = (amplitude(name).column for name in amplitudes)
     items += [
         named_value(column, row)
@@ -173,7 +183,7 @@ def caption(h: float, nu: float, row: Row, amplitudes: Iterable[str] = ()) -> st
 
 def named_value(name: str, row: Row, digits: int = 4) -> str:
     """Return "symbol = value" of a column of a row, in the case's units if the row has them."""
-    q = shown_quantity(name, row)
+    q = shown_quantity(name, row)  # of another name if it is in units
     unit = q.si.replace("%", r"\%") if q.name != name else ""
     return f"{q.latex} = {in_mathematics(float(row[q.name]), digits)}{f' {unit}' if unit else ''}"
 

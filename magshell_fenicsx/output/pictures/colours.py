@@ -1,6 +1,13 @@
 """Fields as colours: values, limits, captions with units.
 
 A field that is zero or unknown is named in a note and not drawn.
+
+Input: a `Surface`, the deformed shell with fields at its nodes. Output: for each panel of a picture
+a `ColouredField`, and a note for its foot. E_1, E_2, M_1, M_2 are principal values of membrane
+strain and bending moment. The jump of a field is the difference of the cells' own values from the
+smooth field that is drawn, relative; it measures the noise of the mesh. Br and Ba are remanence and
+applied magnetic field, h and R thickness and reference length, E is Young's modulus, D the bending
+stiffness.
 """
 
 from collections.abc import Iterable
@@ -146,10 +153,11 @@ def unresolved_strains_note(surface: Surface, h: float) -> str:
     jump = surface.strain_jump or 0.0
     if not {*STRAINS, *MOMENTS} <= surface.fields.keys() or jump < UNRESOLVED_JUMP:
         return ""
+    # M/(D/R) is about a change of curvature over 1/R: times half of h the strain at the faces
     membrane, bending = _largest(surface, STRAINS), h / 2 * _largest(surface, MOMENTS)
     if not 0 < membrane < SMALL_STRAIN * bending:
         return ""
-    ratio = "more than 10 000"
+    ratio = "more than 10 000"  # the inverse of UNKNOWN_RATIO
     if membrane > UNKNOWN_RATIO * bending:
         ratio = f"{float(f'{bending / membrane:.1g}'):.0f}"
     return (
@@ -168,6 +176,7 @@ def stretches(surface: Surface) -> list[ColouredField]:
         if (values := surface.fields.get(name)) is not None:
             low, high = float(np.nanmin(values)), float(np.nanmax(values))
             if name.startswith("sigma"):
+                # rounding of a stress that is zero stays pale
                 limits = from_zero(low, max(high, ZERO_STRESS["E_1"]))
                 fields.append(ColouredField(name, values, limits, SIGNED, caption))
             else:
@@ -228,12 +237,13 @@ def _principal(
         if magnitudes[name] < ZERO_FRACTION * max(magnitudes.values()):
             notes.append(f"The {caption.partition(' $')[0]} is zero everywhere.")
             continue
+        # `noise` is that many times the noise itself
         if float(np.sqrt((values**2).mean())) < noise / LIMIT_OVER_NOISE:
             notes.append(f"The {caption.partition(' $')[0]} is zero but for the mesh.")
             continue
         lowest, highest = from_zero(float(values.min()), float(values.max()), ZERO_FRACTION)
         limits = (-limit if lowest < 0 else 0.0, limit if highest > 0 else 0.0)
-        if max(magnitudes.values()) < ZERO_STRESS[first_name]:
+        if max(magnitudes.values()) < ZERO_STRESS[first_name]:  # both are zero: white
             limits = -limit, limit
         fields.append(ColouredField(name, values, limits, SIGNED, caption))
     return fields, notes
@@ -258,7 +268,7 @@ def _limit(surface: Surface, first: str, second: str) -> float:
     if (largest := float(magnitude.max())) < ZERO_STRESS[first]:
         return 1.0
     in_cells = magnitude[surface.cells].mean(axis=1)
-    a, b, c = np.moveaxis(surface.r0[surface.cells[:, :3]], 1, 0)
+    a, b, c = np.moveaxis(surface.r0[surface.cells[:, :3]], 1, 0)  # corners of all cells
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
     order = np.argsort(in_cells)
     # magnitude that all but a small part of the area does not exceed
@@ -293,7 +303,7 @@ def loads(surface: Surface, h: float) -> tuple[list[ColouredField], str]:
         if values is None:
             unknown_loads.append(words)
             continue
-        has_sign = values.ndim == 1
+        has_sign = values.ndim == 1  # a scalar; of a vector the length is drawn
         values = np.nan_to_num(values if has_sign else np.linalg.norm(values, axis=1))
         largest = float(np.abs(values).max())
         if largest < ZERO_LOAD:
@@ -332,6 +342,7 @@ def pressure_note(surface: Surface) -> str:
     it.
     """
     pressure = surface.fields["contact_pressure"]
+    # a pressure is nan where the contact is narrower than a cell
     is_unresolved, largest = np.isnan(pressure).any(), np.nan_to_num(pressure).max()
     if not largest:
         if not is_unresolved:

@@ -1,4 +1,12 @@
-"""Curves of a run as pictures: load over displacement, and natural frequencies along a path."""
+"""Curves of a run as pictures: load over displacement, and natural frequencies along a path.
+
+A row is a line of path.csv: one point of the path. A step (`CurveStep`) has the rows of one load
+step; a line (`Line`) those of one branch, drawn as a smooth curve with SEGMENTS_PER_INTERVAL
+segments between two rows. A located row is a fold or a bifurcation, with the label of that name; a
+crossing is one at which a mode that the model excludes becomes neutral. An amplitude is a load
+parameter, by name; it is one coordinate of a curve, a displacement the other. The pole is the point
+of the column w_pole_over_h.
+"""
 
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
@@ -69,13 +77,14 @@ def curve_figure(
     from matplotlib.figure import Figure
 
     steps = worth_drawing(curve_steps(rows, amplitude))
+    # the last step spans a whole row below the others if it is a motion, or of three or more
     last_number = len(steps) - 1
     last_is_wide = steps[-1].amplitude == "time" or len(steps) > 2
     width = (style.width or (ONE_COLUMN if len(steps) == 1 else TWO_COLUMNS)) / INCH
     if last_is_wide and last_number:
         columns = min(last_number, 3)
-        small_row_count = -(-last_number // columns)
-        last_height = 0.45 * width
+        small_row_count = -(-last_number // columns)  # rounded up
+        last_height = 0.45 * width  # wider than the others, so lower over its width
     else:
         columns, small_row_count = len(steps), 0
         last_height = width * (0.75 / columns)
@@ -101,7 +110,7 @@ def curve_figure(
             axes = figure.add_subplot(cell)
             plot_curve(axes, step, pole)
             axes.set_title(step.title)
-        legend(figure, 4 * min(len(steps), 2))
+        legend(figure, max_columns=4 * min(len(steps), 2))
         figure.draw_without_rendering()  # insets need the places of the axes
         for axes, step in zip(list(figure.axes), steps, strict=True):
             draw_hidden(axes, step)
@@ -110,7 +119,8 @@ def curve_figure(
 
 def worth_drawing(parts: Sequence[CurveStep]) -> list[CurveStep]:
     """Return the steps whose curve is not a single straight line, and always the last step."""
-    widths: dict[str, float] = defaultdict(float)  # of the curves over each quantity
+    # the widest curve over each quantity of an x axis says what is noise there
+    widths: dict[str, float] = defaultdict(float)
     names = [axes_for(step)[0].name for step in parts]
     for name, step in zip(names, parts, strict=True):
         widths[name] = max(widths[name], float(np.ptp(_points(step)[0])))
@@ -190,6 +200,7 @@ def plot_curve(axes: "Axes", step: CurveStep, pole: str = POLE) -> None:
         )
     axes.set(xlabel=x_label, ylabel=y_label)
     axes.margins(0.06, 0.09)  # room for the numbers
+    # numbers of instabilities along the path, and of the solutions of searches
     texts = [str(step.numbers[int(row["point"])]) for row in instabilities]
     texts += [str(row["branch"]) for row in solutions]
     places = [curve_coordinates(row, step.amplitude) for row in (*instabilities, *solutions)]
@@ -200,7 +211,7 @@ def plot_curve(axes: "Axes", step: CurveStep, pole: str = POLE) -> None:
         axis.set_major_formatter(number_format())
     axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
     has_unstable = any(is_unstable(row) for row in step.rows if row["label"] != SOLUTION)
-    if instabilities and has_unstable:
+    if instabilities and has_unstable:  # empty lines, for the legend
         axes.plot([], [], color="C0", lw=1.2, label=_once(axes, "stable"))
         axes.plot([], [], color="C0", lw=1.2, linestyle=DASHED, label=_once(axes, "unstable"))
 
@@ -215,7 +226,7 @@ def draw_lines(
     colour
         Colour of lines and points.
     place_of
-        Coordinates of a row; by default those of the curve of the amplitude.
+        Function from a row to its coordinates; by default those of the curve of the amplitude.
 
     Returns
     -------
@@ -223,6 +234,7 @@ def draw_lines(
     """
     curves = list[Array]()
     coordinates = place_of or (lambda row: curve_coordinates(row, step.amplitude))
+    # which coordinate is the amplitude and has its extreme at a fold; of other curves unknown
     load_coordinate = None if place_of else load_axis(step.amplitude)
     for line in line_coordinates(step):
         curve = line.smooth_curve(
@@ -231,6 +243,7 @@ def draw_lines(
         curves.append(curve)
         crossings = [row for row in step.rows if row["label"] in LOCATED and row not in line.rows]
         segments = _segments(line, curve, crossings, coordinates)
+        # consecutive segments that are all stable or all unstable are one drawn line
         for unstable, group in groupby(segments, key=lambda segment: segment[2]):
             ends = [(first, last) for first, last, _ in group]
             part_of_curve = curve[:, ends[0][0] : ends[-1][1] + 1]
@@ -283,6 +296,7 @@ def _segments(
         ]
         changes = row["label"] not in LOCATED and is_unstable(row) != unstable
         if crossings_between and changes:
+            # becoming unstable the path changes at the first crossing, becoming stable at the last
             crossing_place = np.array(place_of(crossings_between[0 if unstable else -1]))[:, None]
             offsets = (curve[:, low : high + 1] - crossing_place) / extent
             middle = low + int(np.argmin(np.linalg.norm(offsets, axis=0)))
@@ -308,6 +322,7 @@ def hidden_box(axes: "Axes", step: CurveStep) -> Array | None:
             part_of_curve = curve[
                 :, first * SEGMENTS_PER_INTERVAL : last * SEGMENTS_PER_INTERVAL + 1
             ]
+            # points are 1/72 inch
             size_in_points = (
                 np.ptp(axes.transData.transform(part_of_curve.T), axis=0) * 72 / axes.figure.dpi
             )
@@ -333,10 +348,10 @@ def draw_hidden(axes: "Axes", step: CurveStep) -> None:
     points = drawn_points(axes)
     # in units of the axes, from 0 to 1
     places = axes.transAxes.inverted().transform(axes.transData.transform(points))
-    far_side = 0.97 - INSET_SIZE
+    far_side = 0.97 - INSET_SIZE  # a margin of 0.03
     corners = [(x, y) for y in (INSET_GAP, far_side) for x in (far_side, INSET_GAP)]
     covered = list[float]()
-    for corner in np.array(corners) - INSET_GAP:
+    for corner in np.array(corners) - INSET_GAP:  # with room for numbers, left and below
         is_covered = (places > corner) & (places < corner + INSET_SIZE + INSET_GAP)
         covered.append(float(is_covered.all(axis=1).mean()))
     best = int(np.argmin(covered))
@@ -362,7 +377,8 @@ def _once(axes: "Axes", name: str) -> str:
 
     Matplotlib leaves out labels that begin with "_".
     """
-    return "_" if name in axes.get_legend_handles_labels()[1] else name
+    _, names = axes.get_legend_handles_labels()
+    return "_" if name in names else name
 
 
 MAX_NAMED_WAVES = 12  # waves in the legend
@@ -396,6 +412,7 @@ def frequencies_figure(
     over_waves = all(f.wave.isdigit() for f in shown if f.wave != TORSION)
     hertz_per_root = _hertz_per_root(frequencies)
 
+    # (wave, rank of the frequency among those of the wave at its point) -> places of the line
     lines = defaultdict[tuple[str, int], list[tuple[float, float]]](list)
     count = defaultdict[tuple[int, str], int](int)
     for number, frequency in enumerate(shown, 1):
@@ -415,6 +432,7 @@ def frequencies_figure(
     width = (style.width or ONE_COLUMN) / INCH
     figure = Figure(figsize=(width, 0.75 * width), dpi=style.dpi, layout="constrained")
     axes, waves = figure.subplots(), list(dict.fromkeys(wave for wave, _ in lines))
+    # over numbers of waves: all waves have one colour, torsion another
     if is_spectrum := is_one_point and over_waves:
         waves = ["waves", *({TORSION} & set(waves))]
     for (wave, rank), points in lines.items():
@@ -435,7 +453,7 @@ def frequencies_figure(
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     else:
         axes.set(xlabel=column.label if column else "")
-    if waves not in ([""], ["waves"]):
+    if waves not in ([""], ["waves"]):  # one wave alone needs no legend
         figure.legend(title="wave", frameon=False, loc="outside right upper", fontsize="small")
     return figure
 
@@ -445,6 +463,7 @@ def _hertz_per_root(frequencies: Sequence[Frequency]) -> float:
 
     A frequency in Hz is this factor times the root of its omega2 = ω² ρ R²/E.
     """
+    # every stable frequency gives the same factor; unstable ones have no frequency in Hz
     return max(
         (
             frequency.hertz / np.sqrt(frequency.omega2)

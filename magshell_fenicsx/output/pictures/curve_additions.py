@@ -1,4 +1,9 @@
-"""Additions to a curve: the curves of several runs in one picture, and the shell at some points."""
+"""Additions to a curve: the curves of several runs in one picture, and the shell at some points.
+
+A row is a line of path.csv: one point of the path. A step (`CurveStep`) has the rows of one load
+step, drawn as one curve. A window is the part of the projection that an image shows. "Over the
+axes" means in units of width and height of the axes, from 0 to 1.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -78,7 +83,7 @@ def runs_figure(runs: Mapping[Path, Sequence[Row]], style: OutputSection) -> "Fi
         figure = Figure(figsize=(width, 0.8 * width), dpi=style.dpi, layout="constrained")
         axes = figure.subplots()
         for i, (name, step) in enumerate(zip(labels(cases), steps.values(), strict=True)):
-            number = i % 10
+            number = i % 10  # matplotlib has ten colours
             colour = f"C{number if number < 3 else number + 1}"  # C3 is that of the marks
             draw_lines(axes, step, colour)
             axes.plot([], [], color=colour, lw=1.2, label=name)
@@ -91,7 +96,7 @@ def runs_figure(runs: Mapping[Path, Sequence[Row]], style: OutputSection) -> "Fi
         for axis in (axes.xaxis, axes.yaxis):
             axis.set_major_formatter(number_format())
         axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
-        legend(figure, 2)
+        legend(figure, max_columns=2)
     return figure
 
 
@@ -176,6 +181,7 @@ def add_shapes(
     shapes
         Row of path.csv of each point, and the deformed shell there.
     """
+    # for each shape the last step that has its row; None if no curve has it
     curve_numbers = [
         next((i for i in range(len(steps) - 1, -1, -1) if row in steps[i].rows), None)
         for row, _ in shapes
@@ -187,7 +193,7 @@ def add_shapes(
             axes = figure.axes[curve_number]
             title = f"{axes.get_title()}; " if axes.get_title() else ""
             axes.set_title(rf"{title}displacements of shapes $\times$ {factor:g}")
-    figure.draw_without_rendering()
+    figure.draw_without_rendering()  # sizes of the axes are known only then
     places = camera(np.concatenate([surface.r0 + surface.u for surface in magnified]))
     occupied = dict[int, list[Array]]()
     for number, (row, _), surface in zip(curve_numbers, shapes, magnified, strict=True):
@@ -195,6 +201,7 @@ def add_shapes(
             continue
         axes = figure.axes[number]
         box = axes.get_window_extent()
+        # of a window of 1000 pixels; all shells have one window, and so one scale
         height_over_width = Window.around(places, 1000).shape[0] / 1000
         room = min(MAX_WIDTH * box.width, MAX_HEIGHT * box.height / height_over_width)
         width = max(int(room), 8)
@@ -256,6 +263,7 @@ def _nearest(
 
     `corner` and `size` are those of the image, over the axes.
     """
+    # rows go downwards, places on the axes upwards
     down, right = np.nonzero(image[..., 3] > OPAQUE)
     pixels = corner + size * np.column_stack(
         [(right + 0.5) / image.shape[1], 1 - (down + 0.5) / image.shape[0]]
@@ -286,6 +294,7 @@ def _free_corner(axes: "Axes", point: Array, size: Array, occupied: Sequence[Arr
         """Return the cost of a box at `low`: what it covers, and its distance from its point."""
         high = low + size
         covered = ((points > low) & (points < high)).all(axis=1).mean()
+        # area that is common with each other box
         overlap = sum(
             float(np.prod(np.clip(np.minimum(high, b) - np.maximum(low, a), 0, None)))
             for a, b in occupied

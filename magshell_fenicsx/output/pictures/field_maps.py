@@ -1,4 +1,10 @@
-"""Maps of the magnetic field on planes: its lines and |B|, with the section of the shell."""
+"""Maps of the magnetic field on planes: its lines and |B|, with the section of the shell.
+
+A `MapGrid` has a corner, two sides (a plane) or three (a box), numbers of points along them, and
+the flux density B at the points, the first side's points fastest; places are over the reference
+length R, which is nan for a case without units. A section is the set of lines in which a plane
+meets a surface.
+"""
 
 from collections.abc import Mapping, Sequence
 from math import isnan
@@ -62,10 +68,11 @@ def field_maps_figure(
 
     shown_maps = maps[:MAX_MAPS]
     panels_per_row = columns(len(shown_maps))
-    row_count = -(-len(shown_maps) // panels_per_row)
+    row_count = -(-len(shown_maps) // panels_per_row)  # rounded up
     width = (style.width or (ONE_COLUMN if panels_per_row == 1 else TWO_COLUMNS)) / INCH
     with drawing(style):
         lengths = [np.linalg.norm(grid.sides, axis=1) for grid, _ in shown_maps]
+        # of the tallest map: all rows have one height
         ratio = max(float(second / first) for first, second, *_ in lengths)
         row_height = MARGIN + MAP_WIDTH * min(ratio, MAX_MAP_HEIGHT) * width / panels_per_row
         figure = Figure(
@@ -103,7 +110,7 @@ def section(surface: Surface, grid: MapGrid) -> Array:
     # places on the plane are on one side of it, in all cells
     height = np.where(np.abs(height) < PLANE_TOLERANCE, PLANE_TOLERANCE, height)
     corners, heights = places[tessellation.triangles], height[tessellation.triangles]
-    crossed = np.abs(np.sign(heights).sum(axis=1)) < 3
+    crossed = np.abs(np.sign(heights).sum(axis=1)) < 3  # not three corners on one side
     corners, heights = corners[crossed], heights[crossed]
     # the corner that is alone on its side of the plane
     single_corner = np.where(
@@ -141,7 +148,7 @@ def _draw(
     from matplotlib.patches import PathPatch
 
     size_of_unit, unit = unit_of(case)
-    length_of_R = 1.0 if isnan(R) else 1e3 * R
+    length_of_R = 1.0 if isnan(R) else 1e3 * R  # in mm, or in R itself
     directions = grid.sides / np.linalg.norm(grid.sides, axis=1)[:, None]
     nx, ny = grid.points
     x, y = (
@@ -199,7 +206,7 @@ def _colour_norm(size: Array) -> tuple["Normalize", float, bool]:
     high = float(np.nanmax(size, initial=0.0))
     if high <= 0:
         low, high = 0.0, 1.0
-    if low * MIN_RATIO_OF_LOGARITHMS < high:
+    if low * MIN_RATIO_OF_LOGARITHMS < high:  # a wide range, as near a magnet
         return LogNorm(max(low, high / 10**DECADES), high), high, True
     return Normalize(low, high), high, False
 
@@ -208,6 +215,7 @@ def _thickened(lines: Array, h: float) -> Array:
     """Return lines (n, 2, 2) as rectangles (n, 4, 2) of width h around them."""
     vectors = lines[:, 1] - lines[:, 0]
     offsets = np.stack([-vectors[:, 1], vectors[:, 0]], axis=-1)
+    # half of h across each line; of a line without length the rectangle is a point
     offsets *= h / 2 / np.maximum(np.linalg.norm(offsets, axis=1), TINY)[:, None]
     return np.stack(
         [
@@ -229,7 +237,9 @@ def outlines(lines: Array) -> list[Array]:
     if not len(lines):
         return []
     ends = lines.reshape(-1, 2)
-    nearest, numbers = cKDTree(ends).query(ends, k=2)[1], np.arange(len(ends))
+    # of each end the two nearest ends, itself among them
+    _, nearest = cKDTree(ends).query(ends, k=2)
+    numbers = np.arange(len(ends))
     # the same point as an end of another line; ends 2 i and 2 i + 1 belong to line i
     twin = np.where(nearest[:, 0] == numbers, nearest[:, 1], nearest[:, 0])
     remaining, polygons = set(range(len(lines))), list[Array]()
@@ -238,6 +248,7 @@ def outlines(lines: Array) -> list[Array]:
         end = 2 * line + 1
         while True:
             polygon.append(ends[end])
+            # go on along the line that begins where this one ends, until it is used already
             next_end = int(twin[end])
             if next_end // 2 not in remaining:
                 break
@@ -266,6 +277,7 @@ def with_holes(polygons: Sequence[Array]) -> "MatplotlibPath":
         )
         is_hole = enclosing_count % 2
         is_clockwise = np.sum(x * np.roll(y, -1) - y * np.roll(x, -1)) < 0
+        # matplotlib fills between outlines of opposite directions: holes are clockwise
         if is_clockwise != is_hole:
             path = MatplotlibPath(np.asarray(path.vertices)[::-1], path.codes)
         oriented.append(path)
@@ -296,6 +308,7 @@ def _place(grid: MapGrid, directions: Array, length: float, R: float) -> str:
     if normal[number] < PARALLEL:
         return ""
     unit = "$R$" if isnan(R) else "mm"
+    # adding zero turns a negative zero into zero
     return f", ${'xyz'[number]}$ = {length * grid.corner[number] + 0.0:.4g} {unit}"
 
 

@@ -1,6 +1,9 @@
 """Layout of figures: panels with images of shells, outlines, arrows and colour bars, in inches.
 
-The directions of e1, e2, e3 are drawn once in a figure.
+The directions of e1, e2, e3 are drawn once in a figure. A window is the part of the camera's
+projection that an image shows, over the reference length R. A pen is a grey and a style of dashes.
+Room for text is counted in lines, `line_height`, and in points, 1/72 inch; numbers that multiply it
+are chosen by eye.
 """
 
 import io
@@ -131,6 +134,7 @@ def drawing(style: OutputSection) -> AbstractContextManager[None]:
         "ytick.labelsize": 0.9 * font_size,
         "axes.linewidth": 0.6,
     }
+    # text stays text; a fixed salt makes equal pictures equal files
     settings |= {"svg.fonttype": "none", "pdf.fonttype": 42, "svg.hashsalt": "magshell"}
     return matplotlib.rc_context(settings)
 
@@ -157,11 +161,12 @@ def panels_figure(panels: Sequence[Panel], style: OutputSection, note: str = "")
     from matplotlib.figure import Figure
 
     per_row, line_height = columns(len(panels)), LINE_HEIGHT * style.font_size
-    row_count = -(-len(panels) // per_row)
+    row_count = -(-len(panels) // per_row)  # rounded up
     gap, dpi = GAP / INCH, style.dpi
     heights, widths = zip(*(panel.size for panel in panels), strict=True)
     image_height, cell_width = max(heights) / dpi, max(widths) / dpi + gap
     has_bar = any(panel.scale.colours for panel in panels)
+    # below an image: its bar with numbers and caption; above it: a line for each field of arrows
     height_below = (4.2 if has_bar else 0.4) * line_height
     legend_lines = max(
         (sum(bool(arrows.name) for arrows in panel.arrows) for panel in panels), default=0
@@ -290,7 +295,7 @@ def _draw_arrows(axes: "Axes", arrows: Arrow, extent: float, style: OutputSectio
     is_point = np.linalg.norm(in_picture, axis=1) < MAX_SLOPE_TO_EYE * lengths
     x, y = arrows.feet[:, :2].T
     longest = float(np.linalg.norm(in_picture, axis=1).max(initial=0.0))
-    thinness = min(1.0, longest / (FULL_ARROW_LENGTH * extent))
+    thinness = min(1.0, longest / (FULL_ARROW_LENGTH * extent))  # short arrows are thin too
     axes.quiver(
         *(x[~is_point], y[~is_point], *in_picture[~is_point].T),
         angles="xy",
@@ -314,6 +319,7 @@ def _draw_arrows(axes: "Axes", arrows: Arrow, extent: float, style: OutputSectio
         zorder=4,
         linewidths=0,
     )
+    # circles; the third component of a vector is towards the eye
     for is_selected, marker in ((arrows.vectors[:, 2] > 0, "."), (arrows.vectors[:, 2] <= 0, "x")):
         points = is_point & is_selected
         if points.any():
@@ -354,7 +360,7 @@ def directions(axes: "Axes", camera: Camera, style: OutputSection) -> None:
         length = float(np.hypot(x, y))
         if length < MIN_DIRECTION:  # it points to the eye, or away
             axes.plot(0, 0, "k.", ms=0.4 * style.font_size)
-            x, y, length = -0.35, -0.35, 0.5
+            x, y, length = -0.35, -0.35, 0.5  # the letter is beside the dot
         else:
             axes.annotate("", (x, y), (0, 0), arrowprops=arrow)
         letters.append(_letter_place(np.array([x, y]), length, letters))
@@ -376,7 +382,7 @@ def _letter_place(end: Array, size: float, others: Sequence[Array]) -> Array:
         Places of earlier letters; the letter is beside the arrow if one of them is ahead of it.
     """
     forward, sideways = 0.4 * end / size, LETTER_DISTANCE * np.array([-end[1], end[0]]) / size
-    places = [end + forward, end + sideways, end - sideways]
+    places = [end + forward, end + sideways, end - sideways]  # the preferred first
     for place in places:
         if all(np.linalg.norm(place - other_letter) > LETTER_DISTANCE for other_letter in others):
             return np.asarray(place)

@@ -1,4 +1,11 @@
-"""Curves of a run as data, for pictures and the report: steps, lines, smooth curves."""
+"""Curves of a run as data, for pictures and the report: steps, lines, smooth curves.
+
+A row is a line of path.csv: one point of the path, by column. Its label is "fold" or "bifurcation"
+at an instability (a located row), "solution" for what a search found, "field" in the step that
+applies the magnetic field; its branch is 0 on the main path. An amplitude is a load parameter, by
+name; it is one coordinate of a curve, a displacement the other. A pivot count is the number of
+unstable directions. A motion is a step in time.
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -60,6 +67,7 @@ def curve_steps(rows: Sequence[Row], amplitude: str) -> list[CurveStep]:
     amplitude
         The amplitude that varied last.
     """
+    # numbers of the steps; a case without a programme has no such column
     steps = sorted({int(row.get("step", 0)) for row in rows if row["label"] != "field"} - {0})
     numbers = instability_numbers(rows)
     if len(steps) < 2:
@@ -67,6 +75,7 @@ def curve_steps(rows: Sequence[Row], amplitude: str) -> list[CurveStep]:
     curves = []
     for step in steps:
         first_row = next(i for i, row in enumerate(rows) if row["step"] == step)
+        # a step begins at the last point of the main path, from which its curve starts
         row_before = max((i for i in range(first_row) if rows[i]["branch"] == 0), default=0)
         rows_of_step = [row for row in rows[first_row:] if row["step"] == step]
         name = str(rows_of_step[0]["amplitude"])
@@ -83,6 +92,7 @@ def last_varied_rows(rows: Sequence[Row], amplitude: str) -> Sequence[Row]:
     """
     if amplitude == "lambda_m":
         return rows
+    # the last row at which another amplitude varied, or else the first row
     first_row = max(
         i for i, row in enumerate(rows) if row["amplitude"] != amplitude or row is rows[0]
     )
@@ -94,7 +104,7 @@ def axes_for(step: CurveStep) -> tuple[Quantity, Quantity]:
     x, y = axes_of(step.amplitude, step.rows[0])
     if step.amplitude != "load":
         return x, y
-    # moments have no conjugate displacement
+    # moments have no conjugate displacement: w_over_h is then that of the pole
     if all(row["w_over_h"] == row["w_pole_over_h"] for row in step.rows):
         x = shown_quantity("w_pole_over_h", step.rows[0])
     return x, y
@@ -166,6 +176,7 @@ class Line:
         """
         are_unstable: list[bool] = []
         for first_row, last_row in pairwise(self.rows):
+            # at an instability one direction is neutral, so that the row says nothing by itself
             not_located = [row for row in (last_row, first_row) if row["label"] not in LOCATED]
             if not_located:
                 are_unstable.append(is_unstable(not_located[0]))
@@ -173,6 +184,7 @@ class Line:
             first_count, last_count = _unstable_count(first_row), _unstable_count(last_row)
             # between the two rows: as many as at each of them, or one more
             possible_counts = {first_count, first_count + 1} & {last_count, last_count + 1}
+            # where the count may be zero: stable after an unstable segment, unstable after others
             alternates = not (are_unstable and are_unstable[-1])
             are_unstable.append(min(possible_counts, default=0) > 0 or alternates)
         return are_unstable
@@ -229,6 +241,7 @@ def _line(rows: Sequence[Row], amplitude: str) -> list[Row]:
 
     They are the points of the model, and a symmetry-breaking instability after the last one.
     """
+    # the rest are instabilities by modes that the model excludes, found between its points
     rows_of_model = [row for row in rows if row["mode"] in OWN_MODES]
     last_place = curve_coordinates(rows_of_model[-1], amplitude)
     previous_place = curve_coordinates(rows_of_model[max(len(rows_of_model) - 2, 0)], amplitude)
@@ -272,7 +285,7 @@ def smooth(
         Which coordinate has its extreme at which end, 0 or -1.
     """
     xy = np.array([x, y], float)
-    scale = np.ptp(xy, axis=1)
+    scale = np.ptp(xy, axis=1)  # of a picture, in which both axes count equally
     if xy.shape[1] == 1:
         return xy
     steps = np.hypot(*(np.diff(xy, axis=1) / np.where(scale > 0, scale, 1)[:, None]))
@@ -281,6 +294,7 @@ def smooth(
     slopes = np.array([_slopes(chord, values, is_located) for values in xy])
     for coordinate, end in level:
         slopes[coordinate, end] = 0.0
+    # cubics by Horner's rule, with t from 0 to 1 in each interval
     t = np.arange(SEGMENTS_PER_INTERVAL) / SEGMENTS_PER_INTERVAL
     h, rise = np.diff(chord)[:, None], np.diff(xy, axis=1)[..., None]
     first_term, last_term = h * slopes[:, :-1, None], h * slopes[:, 1:, None]
@@ -294,7 +308,7 @@ def _slopes(t: Array, values: Array, located: NDArray[np.bool_]) -> Array:
 
     `located` tells which points are folds or bifurcations.
     """
-    h, chords = np.diff(t), np.diff(values) / np.diff(t)
+    h, chords = np.diff(t), np.diff(values) / np.diff(t)  # intervals, and slopes of the chords
     if len(chords) == 1:
         return np.full(2, chords[0])
     chords_before, chords_after, h1, h2 = chords[:-1], chords[1:], h[:-1], h[1:]
@@ -305,6 +319,7 @@ def _slopes(t: Array, values: Array, located: NDArray[np.bool_]) -> Array:
     inner_slopes = np.clip(
         (h2 * chords_before + h1 * chords_after) / (h1 + h2), -max_slopes, max_slopes
     )
+    # the coordinate turns exactly at a fold or bifurcation
     inner_slopes[located[1:-1] & (chords_before * chords_after < 0)] = 0.0
     ends = [
         _end_slope(h[0], h[1], chords[0], chords[1]),
@@ -340,13 +355,14 @@ def spline_curve(x: Sequence[float], y: Sequence[float], point_times: Sequence[f
     where points are too few, or where further times are equal.
     """
     xy, times = np.array([x, y], float), np.array(point_times, float)
-    is_later = np.concatenate([[True], np.diff(times) > 0])
+    is_later = np.concatenate([[True], np.diff(times) > 0])  # than the point before
+    # a spline needs four points; only the first two may have one time
     if is_later.sum() < 4 or not is_later[2:].all():
         return smooth(x, y)
     refined_times = _refined(times)
     spline = scipy.interpolate.CubicSpline(times[is_later], xy[:, is_later], axis=1)
     curve = np.asarray(spline(refined_times))
-    if not is_later[1]:
+    if not is_later[1]:  # the point before the motion and its first point
         count = SEGMENTS_PER_INTERVAL + 1
         curve[:, :count] = np.linspace(xy[:, 0], xy[:, 1], count).T
     return curve

@@ -1,6 +1,12 @@
 """Pictures of modes and further solutions as small panels, and pictures of gradients.
 
 gradients.png shows where a result would change most with more of a field.
+
+A row is a line of path.csv: one point of the path. A null vector is the mode that is neutral at an
+instability; a point there is singular. "mode" and "mode_w" are the fields of a mode: its
+displacement and the normal component of that, see `fields.mode_fields`. A layer is the field in
+whose colours a shell is drawn. h and R are thickness and reference length. Lengths of the layout
+are in inches.
 """
 
 from collections.abc import Iterator, Mapping, Sequence
@@ -108,7 +114,8 @@ def small_panels(
     text_place = boxes.place(gap / 2, 0.5 * line_height)
     figure.text(*text_place, note, va="center", fontsize=0.9 * style.font_size)
     for i, (surface, layer, caption) in enumerate(zip(surfaces, layers, captions, strict=True)):
-        panel = Background(surface, camera, 0, window).panel(layer, style)
+        # the window is given, so that the width of the picture does not count
+        panel = Background(surface, camera, width=0, window=window).panel(layer, style)
         left, lower = i % per_row * cell_width, height - (i // per_row + 1) * cell_height
         axes = boxes.axes(left + gap / 2, lower, cell_width - gap, image_height)
         draw_panel(axes, panel, style)
@@ -116,7 +123,7 @@ def small_panels(
             left + cell_width / 2, lower + image_height + caption_lines * line_height / 2
         )
         figure.text(*text_place, caption, ha="center", va="center")
-    bar_length = min(width - gap - 8 * line_height, 4.0)
+    bar_length = min(width - gap - 8 * line_height, 4.0)  # inches, with room for the directions
     bar_axes = boxes.axes(
         (width - bar_length) / 2, foot_height + 1.7 * line_height, bar_length, 0.65 * line_height
     )
@@ -138,6 +145,7 @@ def solution_rows(rows: Sequence[Row]) -> list[Row]:
     for number_of_row, row in enumerate(rows):
         if row["label"] == SOLUTION:
             previous = rows[number_of_row - 1]
+            # the first solution of its step
             if previous["label"] != SOLUTION or previous["step"] != row["step"]:
                 earlier_path = [
                     earlier_row
@@ -168,6 +176,7 @@ def solutions_figure(
         ColouredField("w_over_h", np.asarray(surface.w / h), limits, SIGNED, caption)
         for surface in surfaces
     ]
+    # "stable" or "unstable"
     captions = [f"{_name(row)}: {stability(row).split()[0]}" for row in rows]
     with drawing(style):
         return small_panels(surfaces, layers, captions, style, camera)
@@ -235,6 +244,7 @@ def mode_figures(
     """
     numbers = instability_numbers(rows)
     singular_rows = [row for row in rows if row["label"] in LOCATED]
+    # an instability that the path meets again is drawn once
     occurrences = _occurrences(singular_rows)
     distinct_rows = [row for row in singular_rows if int(row["point"]) in occurrences]
     null_vectors = [_null_vector(folder, row, rows, numbers, occurrences) for row in distinct_rows]
@@ -254,7 +264,8 @@ def mode_figures(
         for rank, mode in enumerate(modes, 1):
             file = mode_file(folder, point, str(rank), mode.label)
             if file.exists():
-                panels.append((read_vtu(file)[0], mode_caption(rank, mode)))
+                surface, _ = read_vtu(file)
+                panels.append((surface, mode_caption(rank, mode)))
         if panels:
             yield f"modes_{point:04d}", _figure(panels, style, camera)
 
@@ -268,7 +279,9 @@ def _figure(
 
 
 def _occurrences(singular: Sequence[Row]) -> dict[int, list[Row]]:
-    """Group the instabilities of a path: those that are the same one are met several times.
+    """Return the distinct instabilities of a path, each with all rows at which the path meets it.
+
+    A path that turns back, or several branches, meet the same instability again.
 
     Parameters
     ----------
@@ -324,6 +337,7 @@ def _null_vector(
     occurrences
         Number of a point -> the rows of the same instability.
     """
+    # modes with the model's own symmetry have no label in names of files
     label = "" if row["mode"] in OWN_MODES else str(row["mode"])
     file = mode_file(folder, int(row["point"]), str(row["label"]), label)
     if not file.exists():
@@ -341,9 +355,9 @@ def _null_vector(
         # the load at the end of a path is zero up to an error only
         is_zero = abs(float(row[column])) <= ZERO_LOAD * largest
         rounded = {**row, column: 0.0} if is_zero else row
-        if rounded is not row:
+        if rounded is not row:  # a copy: its column in units is zero too
             rounded[shown_quantity(column, row).name] = 0.0
-        load_words = f"\n{named_value(column, rounded, 5)}"
+        load_words = f"\n{named_value(column, rounded, digits=5)}"
     rows_of_same = occurrences[int(row["point"])]
     number_words = ", ".join(str(numbers[int(other_row["point"])]) for other_row in rows_of_same)
     return surface, f"{number_words}: {row['label']}{kind}{load_words}"
@@ -375,6 +389,7 @@ def _panels(
         caption, values = f"{result.replace('_', ' ')}: {WORDS[name]}", surface.fields[name]
         if values.ndim == 1:
             limit = _limit(np.abs(values))
+            # no wider than the field, and without its peaks
             limits = from_zero(max(float(values.min()), -limit), min(float(values.max()), limit))
             yield view.panel(ColouredField(name, values, limits, SIGNED, caption), style)
             continue
@@ -391,11 +406,17 @@ def _limit(sizes: Array) -> float:
 
 
 def _arrows(surface: Surface, vectors: Array, view: Background, camera: Camera) -> Arrow:
-    """Return arrows of vectors (n, 3) at nodes, at some visible nodes where vectors are long."""
+    """Return arrows of vectors (n, 3) at nodes, at some visible nodes where vectors are long.
+
+    The longest arrow is as long as the least distance of arrows.
+    """
     r, length = surface.r0 + surface.u, np.linalg.norm(vectors, axis=1)
     longest, extent = length.max() or 1.0, float(np.ptp(r, axis=0).max())
     visible = view.seen.shows(r, DEPTH_TOLERANCE * extent)
     nodes = np.flatnonzero((length >= MIN_ARROW_LENGTH * longest) & visible)
     distance = ARROW_DISTANCE * float(np.ptp(r[nodes], axis=0).max())
     feet = nodes[spread_points(r[nodes], distance)]
-    return Arrow(camera(r[feet]), camera(distance / longest * vectors[feet]), "0.15", "")
+    # dark grey, without a name: the caption says what the arrows are
+    return Arrow(
+        camera(r[feet]), camera(distance / longest * vectors[feet]), colour="0.15", name=""
+    )

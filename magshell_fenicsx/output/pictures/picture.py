@@ -1,4 +1,10 @@
-"""Pictures of the deformed shell: displacement, strains, moments, magnetic fields and loads."""
+"""Pictures of the deformed shell: displacement, strains, moments, magnetic fields and loads.
+
+A layer is the field in whose colours one panel of a picture is drawn. A window is the part of the
+camera's projection that a picture shows; places in the projection are over the reference length R,
+to the right, up and towards the eye. A place is visible if no part of the surface is nearer to the
+eye. Br, Ba and J are remanence, applied field and induced polarisation, h is the thickness over R.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -80,6 +86,7 @@ def _arrows_content(surface: Surface, h: float) -> Content:
     """
     layers = list[ColouredField]()
     if field_arrows(surface):
+        # no name and no colours: a grey shell, on which `Background.panel` draws arrows
         layers.append(ColouredField("", np.zeros(len(surface.r0)), (0, 1), "", ""))
     return Content(layers, far_bodies_note(surface))
 
@@ -147,6 +154,13 @@ class Background:
         Width of the picture in pixels.
     window
         Part of the projection to draw; None for all of the shell and what is near.
+
+    Attributes
+    ----------
+    window
+        The part that is drawn.
+    seen
+        The deformed shell rendered in it, which tells what is visible.
     """
 
     def __init__(
@@ -160,10 +174,11 @@ class Background:
         )
         self.seen = RenderedSurface(tessellation, r, camera, self.window)
         self._bodies = BodiesInView(surface, camera, self.window, self.seen)
-        # enough for a line that is wider than a pixel
+        # half of the resolution is enough for a line that is wider than a pixel
         coarse = replace(self.window, scale=self.window.scale / 2)
         undeformed_view = RenderedSurface(tessellation, surface.r0, camera, coarse)
         outline = silhouette(self.seen)
+        # it is drawn only where it differs visibly from the deformed outline
         undeformed = [
             self._not_behind(line, undeformed_view) for line in silhouette(undeformed_view)
         ]
@@ -212,7 +227,7 @@ class Background:
         low, high = style.ranges.get(layer.name, layer.limits)
         colours = colour_map(layer.colours, (low, high))
         image = self.seen.coloured(layer.values, (low, high), colours)
-        slack = END_TOLERANCE * (high - low)
+        slack = END_TOLERANCE * (high - low)  # rounding beyond an end is not told
         is_below = bool(np.nanmin(layer.values) < low - slack)
         is_above = bool(np.nanmax(layer.values) > high + slack)
         scale = Scale((low, high), layer.colours, layer.caption, (is_below, is_above))
@@ -282,9 +297,10 @@ def lines_away_from(
     places_of_others = cKDTree(np.concatenate(others))
     broken = []
     for line in lines:
-        is_far = places_of_others.query(np.nan_to_num(line))[0] > distance
+        distance_to_others, _ = places_of_others.query(np.nan_to_num(line))
+        is_far = distance_to_others > distance
         remaining = np.where(is_far[:, None], line, np.nan)
-        # each nan begins a part: places of one part have one number
+        # each nan begins a part: places of one part have one number, short parts are removed
         part_numbers = np.cumsum(np.isnan(remaining[:, 0]))
         steps = np.diff(remaining, axis=0, prepend=remaining[:1])
         lengths = np.nan_to_num(np.linalg.norm(steps, axis=1))
@@ -301,9 +317,9 @@ def edge_lines(surface: Surface) -> Array:
     """
     if surface.is_body:
         return np.zeros((0, 3))
-    # number of nodes within a side: a triangle of degree d has (d + 1)(d + 2)/2 nodes
+    # d - 1 nodes are within a side: a triangle of degree d has (d + 1)(d + 2)/2 nodes
     nodes_within_side = round((np.sqrt(8 * surface.cells.shape[1] + 1) - 3) / 2) - 1
-    # in VTK's order
+    # in VTK's order: three corners, then the nodes within each side
     nodes_of_sides = [
         [k, *range(3 + k * nodes_within_side, 3 + (k + 1) * nodes_within_side), (k + 1) % 3]
         for k in range(3)
@@ -337,6 +353,7 @@ def silhouette(view: RenderedSurface) -> list[Array]:
     import contourpy
 
     left, _, _, high = view.window.box
+    # a frame of equal values: no line at the border of the window
     padded = np.pad(view.coverage, 1, mode="edge")
     lines: Any = contourpy.contour_generator(z=padded).lines(0.5)
     return [
@@ -383,7 +400,7 @@ def field_arrows(
         for name in FIELDS.keys() & surface.fields
     }
     names = [name for name in FIELDS if name in lengths and lengths[name].max() > 0]
-    if camera is None or visible is None:
+    if camera is None or visible is None:  # only to ask which fields there are
         return tuple(Arrow(np.zeros((0, 3)), np.zeros((0, 3)), *FIELDS[name]) for name in names)
     r = surface.r0 + surface.u
     extent = float(np.ptp(r, axis=0).max())
@@ -397,6 +414,7 @@ def field_arrows(
     offsets = np.zeros(places.shape)
     if len(names) > 1:
         offsets = _foot_offsets(list(vectors.values())) * FOOT_OFFSET * extent
+    # feet of the first field go left, of the second right, a third one stays
     for name, sign in zip(names, (1, -1, 0), strict=False):
         is_long = lengths[name][feet] > MIN_ARROW * lengths[name].max()
         arrow_feet = (places + sign * offsets)[is_long]
@@ -419,6 +437,7 @@ def _foot_offsets(fields: Sequence[Array]) -> Array:
     # cross product of the projections: small where they are parallel
     covers = np.abs(x * last_y - y * last_x) <= COVERING_ANGLE * length * last_length
     to_the_left = np.column_stack([-y, x, 0 * x]) / np.maximum(length, TINY)[:, None]
+    # an arrow that is a point in the picture is moved along the picture's width
     offsets = np.where(length[:, None] > MIN_IN_PICTURE, to_the_left, np.array([-1.0, 0, 0]))
     return np.asarray(offsets * covers[:, None])
 

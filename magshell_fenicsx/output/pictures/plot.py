@@ -1,4 +1,10 @@
-"""The pictures of a run, drawn from the files of its folder: path.csv and fields/*.vtu."""
+"""The pictures of a run, drawn from the files of its folder: path.csv and fields/*.vtu.
+
+A row is a line of path.csv: one point of the path. The headline is the row that a run is about, at
+which its pictures show the shell. Options are keys of the section `output` (style, camera, formats)
+in place of those of the case. A map is a grid outside the shell with the magnetic field. A shape is
+a picture of the shell that is put on the curve. A motion is a step in time.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -67,6 +73,8 @@ class PicturedRun:
         The case of summary.json or of the checkpoint.
     headline
         The row at which pictures show the shell.
+    style
+        The section `output`, with the options.
 
     Raises
     ------
@@ -75,6 +83,7 @@ class PicturedRun:
     """
 
     def __init__(self, folder: Path, options: Mapping[str, Any] | None = None) -> None:
+        """Read the rows and the case; surfaces are read when they are needed."""
         self.folder = folder
         self.rows = _rows(folder)
         self.on_path = [row for row in self.rows if row["label"] != SOLUTION]
@@ -91,7 +100,8 @@ class PicturedRun:
     @cached_property
     def camera(self) -> Camera:
         """Camera of all pictures of the run."""
-        return run_camera(self.surface_at(self.headline)[0], self.style)
+        surface, _ = self.surface_at(self.headline)
+        return run_camera(surface, self.style)
 
     def surface_at(self, row: Row) -> tuple[Surface, ShellData]:
         """Return the whole deformed shell at a point, and the shell's data."""
@@ -131,7 +141,7 @@ def plot(
     -------
     The names of the files; whole.pvd lists the files `fields/whole_*`, which are left out.
     """
-    _rows(folder)  # there is a run
+    _rows(folder)  # raises if there is no run
     refuse_unwritten(folder)
     names = draw(folder, point, options, shapes)
     if animation:
@@ -166,6 +176,7 @@ def plot_folders(
     """
     if len(folders) == 1:
         return f"{', '.join(plot(folders[0], options=options, **options_of_one))} in {folders[0]}/"
+    # arguments that are not given are None, False or empty
     if any(
         value is not None and value is not False and value != []
         for value in options_of_one.values()
@@ -262,6 +273,7 @@ def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[
     `shapes` are the numbers of points whose shells are put on the curve.
     """
     style, last_row = run.style, run.on_path[-1]
+    # pictures for which the run has no data are left out
     surface, shell_data = run.surface_at(run.headline)
     if amplitude := str(last_row["amplitude"]):
         curve = curve_figure(run.rows, amplitude, style, run.pole_name)
@@ -304,6 +316,7 @@ def without_zero_fields(surface: Surface, row: Row, rows: Sequence[Row]) -> Surf
     """
     if row["lambda_m"]:
         return surface
+    # a remanence is of interest as soon as a field is applied on the path
     left_out = {"Ba"} if any(other_row["lambda_m"] for other_row in rows) else {"Ba", "Br"}
     fields = {name: values for name, values in surface.fields.items() if name not in left_out}
     return replace(surface, fields=fields)
@@ -337,6 +350,7 @@ def in_true_time(rows: Sequence[Row]) -> list[Row]:
     """Return the rows of a path's motions that are nearest to equal times, at most MAX_FRAMES."""
     motion = [row for row in rows if row["amplitude"] == "time"]
     times = np.array([float(row["time"]) for row in motion])
+    # frames at least as far apart as the two nearest rows; one frame if all rows have one time
     shortest = np.diff(np.unique(times)).min(initial=np.ptp(times) or 1.0)
     count = int(min(MAX_FRAMES, np.ptp(times) / shortest + 1.5))
     return [

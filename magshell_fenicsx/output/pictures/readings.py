@@ -1,4 +1,9 @@
-"""Readings of magnetic sensors along a path as a picture."""
+"""Readings of magnetic sensors along a path as a picture.
+
+A sensor is a point at which the flux density B is read; its components are the columns NAME_Bx,
+NAME_By and NAME_Bz of path.csv, whose rows are the points of the path. A step (`CurveStep`) has the
+rows of one load step. An amplitude is a load parameter, by name.
+"""
 
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
@@ -44,6 +49,7 @@ def readings_figure(
     readings = [f"{name}_B{axis}" for name in names for axis in "xyz"]
     largest = max(abs(float(row[column])) for column in readings for row in step.rows)
     columns_of_panels = columns(min(len(names), MAX_SENSORS))
+    # rounded up
     row_count = -(-min(len(names), MAX_SENSORS) // columns_of_panels)
     width = (style.width or (ONE_COLUMN if columns_of_panels == 1 else TWO_COLUMNS)) / INCH
     with drawing(style):
@@ -58,6 +64,7 @@ def readings_figure(
                 column = f"{name}_B{axis}"
                 if max(abs(float(row[column])) for row in step.rows) > ZERO_READING * largest:
                     draw_lines(axes, step, f"C{k}", over_load(column))
+                    # an empty line, for the legend
                     axes.plot([], [], color=f"C{k}", lw=1.2, label=f"$B_{axis}$")
             axes.set(xlabel=load.label, ylabel=f"field at {name.replace('_', ' ')}  {unit}")
             axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
@@ -65,7 +72,7 @@ def readings_figure(
                 axis_of_panel.set_major_formatter(number_format())
         for axes in grid[len(names) :]:
             axes.set_axis_off()
-        legend(figure, 5)
+        legend(figure, max_columns=5)
     return figure
 
 

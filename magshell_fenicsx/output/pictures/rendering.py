@@ -1,7 +1,10 @@
 """Rendering of a surface: parallel projection, hidden triangles, colours, shade.
 
 raster.c draws at `FINER` times the resolution of the picture. A "drawn pixel" is of that finer
-resolution.
+resolution. The projection has coordinates to the right, up and towards the eye (the depth), over
+the reference length R; a window is the part that a picture shows. Pixels are counted from the upper
+left corner, to the right and downwards. A tessellation divides the cells of a surface into flat
+triangles.
 """
 
 from dataclasses import dataclass
@@ -97,6 +100,7 @@ class Window:
         margin = WINDOW_MARGIN * max(high - low)
         low, high = low - margin, high + margin
         extent_x, extent_y = high - low
+        # what would be too tall gets room at both sides
         side_margin = max(extent_y / tallest - extent_x, 0.0) / 2
         box = low[0] - side_margin, high[0] + side_margin, low[1], high[1]
         return Window(box, width / (extent_x + 2 * side_margin))
@@ -134,7 +138,8 @@ class RenderedSurface:
         self._places, self._r = np.ascontiguousarray(places), r
         corners = _pointers(self._places, tessellation.triangles)
         pixels = _pointers(self._index, self._depth)
-        library()[1].rasterise(*corners, len(tessellation.triangles), width, height, *pixels)
+        _, lib = library()
+        lib.rasterise(*corners, len(tessellation.triangles), width, height, *pixels)
 
     @cached_property
     def _light(self) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
@@ -149,6 +154,7 @@ class RenderedSurface:
         eye, to_lamp = (
             np.ascontiguousarray(values, np.float32) for values in (normals[:, 2], normals @ lamp)
         )
+        # normals that point away from the eye are turned around: both sides are drawn alike
         best = float(np.where(eye < 0, -to_lamp, to_lamp).max(initial=-1.0))
         return eye, to_lamp, min(float(lamp[2]), best)
 
@@ -194,6 +200,7 @@ class RenderedSurface:
         image = self.painted(np.where(is_absent, limits[0], values_at_points), limits, table)
         if not is_absent.any():
             return image
+        # painted white where values are absent, and black elsewhere
         black_and_white = np.repeat([[0.0], [1.0]], 3, axis=1)
         absence = self.painted(is_absent * 1.0, (0.0, 1.0), black_and_white)
         is_grey = absence[..., :1] > MIN_WHITE
@@ -217,7 +224,8 @@ class RenderedSurface:
         image = np.empty((height, width, 4), np.uint8)
         numbers, colours = values.astype(np.float32), table.astype(np.float32)
         *cosines, full_light = self._light
-        library()[1].paint(
+        _, lib = library()
+        lib.paint(  # arguments as in FUNCTIONS: triangles, sizes, values, light, colours, image
             *_pointers(self._places, self._tessellation.triangles, self._index),
             *(
                 width,
@@ -267,7 +275,8 @@ def _pointers(*arrays: NDArray[Any]) -> list[Any]:
         "int32": "int32_t[]",
         "uint8": "uint8_t[]",
     }
-    return [library()[0].from_buffer(kinds[array.dtype.name], array) for array in arrays]
+    ffi, _ = library()
+    return [ffi.from_buffer(kinds[array.dtype.name], array) for array in arrays]
 
 
 def axes_on_screen(direction: Array) -> Array:
@@ -327,6 +336,7 @@ def viewing_direction(place: Array, turn: float = -0.5) -> Array:
     """
     has_azimuth = np.hypot(*place[:2]) > MIN_RADIUS
     heading = (np.arctan2(place[1], place[0]) if has_azimuth else DEFAULT_AZIMUTH) + turn
+    # some 33 degrees above the horizon; the length does not count
     return np.array([4.2 * np.cos(heading), 4.2 * np.sin(heading), 2.75])
 
 
@@ -391,6 +401,7 @@ def _object_numbers(lines: Sequence[Array], tolerance: float) -> list[int]:
     numbers = list(range(len(lines)))
     for i, line in enumerate(lines):
         for earlier, earlier_line in enumerate(lines[:i]):
+            # distances from the ends of both lines to all places of both
             ends = np.concatenate([line[[0, -1]], earlier_line[[0, -1]]])
             distances = np.linalg.norm(
                 ends[:, None] - np.concatenate([earlier_line, line])[None], axis=2
@@ -398,7 +409,7 @@ def _object_numbers(lines: Sequence[Array], tolerance: float) -> list[int]:
             distances[:2, len(earlier_line) :] = distances[2:, : len(earlier_line)] = (
                 np.inf
             )  # of a line from itself
-            if distances.min() < tolerance:
+            if distances.min() < tolerance:  # all lines of one number get the other number
                 numbers = [
                     numbers[earlier] if number == numbers[i] else number for number in numbers
                 ]

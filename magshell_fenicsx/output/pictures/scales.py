@@ -1,4 +1,8 @@
-"""Colours and numbers: colour maps, bars with the values at their ends, numbers of axes."""
+"""Colours and numbers: colour maps, bars with the values at their ends, numbers of axes.
+
+A field with a sign has a colour map that is white at zero, red above and blue below. Limits are the
+values at the ends of the colours.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -60,6 +64,7 @@ def colour_map(name: str, limits: tuple[float, float] = (-1.0, 1.0)) -> "Colorma
         return ListedColormap(colours, name).with_extremes(over=FAR_GREY)
     if name != SIGNED:
         return colormaps[name].resampled(COLOURS)
+    # zero is at 0.5, the limit that is larger in size at an end of matplotlib's map
     positions = 0.5 + np.linspace(*limits, COLOURS) / (2 * max(map(abs, limits)))
     colours = colormaps["RdBu_r"](positions)[:, :3]
     # the middle of matplotlib's map is a light grey, which is made white
@@ -79,7 +84,7 @@ def from_zero(low: float, high: float, min_fraction: float = 0.01) -> tuple[floa
     ((-1.0, 4.0), (0.0, 4.0), (0.0, 4.0), (-1.0, 1.0))
     """
     low, high = min(low, 0.0), max(high, 0.0)
-    if not high - low > 0:
+    if not high - low > 0:  # zero everywhere, or nan
         return -1.0, 1.0
     lower = 0.0 if -low < min_fraction * high else low
     upper = 0.0 if high < -min_fraction * low else high
@@ -147,7 +152,8 @@ def colour_bar(
     if np.isfinite(room):
         renderer = FigureCanvasAgg(figure).get_renderer()
         title_width = title.get_window_extent(renderer).width / figure.dpi
-        title.set_fontsize(float(title.get_fontsize()) * min(1.0, room / title_width))
+        reduction = min(1.0, room / title_width)  # a short caption keeps its size
+        title.set_fontsize(float(title.get_fontsize()) * reduction)
 
 
 def numbers(values: Sequence[float]) -> tuple[list[str], str]:
@@ -162,9 +168,9 @@ def numbers(values: Sequence[float]) -> tuple[list[str], str]:
     """
     largest = max(map(abs, values)) or 1.0
     order = int(np.floor(np.log10(largest)))
-    power = 0 if -2 <= order < 4 else order
+    power = 0 if -2 <= order < 4 else order  # numbers such as 0.01 and 9999 are written plainly
     texts = [f"{round(v / 10.0**power, 2 - order + power):.10g}" for v in values]
-    texts = [text if text.strip("-0.") else "0" for text in texts]
+    texts = [text if text.strip("-0.") else "0" for text in texts]  # also of a negative zero
     power_of_ten = rf"$\times 10^{{{power}}}$" if power else ""
     return [text.replace("-", "−") for text in texts], power_of_ten
 
@@ -182,7 +188,7 @@ def number_format(limits: tuple[int, int] = (-3, 4)) -> "ScalarFormatter":
         def get_offset(self) -> str:
             """Return the common power of ten and offset of all numbers; matplotlib calls it."""
             power, offset = self.orderOfMagnitude, self.offset
-            if not len(self.locs):
+            if not len(self.locs):  # no numbers on this axis
                 return ""
             power_of_ten = rf"$\times 10^{{{power}}}$" if power else ""
             return power_of_ten + (f"{offset:+.10g}" if offset else "")

@@ -1,6 +1,12 @@
 """The interactive part of a report: the deformed shell to turn, a slider along the path, the curve.
 
 All data are in the page: the rows of path.csv as JSON, the shells as small integers, compressed.
+
+A row is one point of the path, by column; its label is "fold" or "bifurcation" at an instability,
+"solution" for what a search found. The headline is the row that a run is about. A frame is a row
+whose shell the page can show. A tessellation divides curved cells into flat triangles; a part of
+its points is kept as the vertices of the page. h and R are thickness and reference length; places
+are over R. A quantity knows name, words, symbol and unit of a column.
 """
 
 import base64
@@ -84,6 +90,7 @@ def simplify(surface: Surface, max_vertices: int) -> SimplifiedSurface:
     """
     tessellation = tessellate(surface, MAX_TRIANGLES)
     r, edge = tessellation.at_points(surface.r0), SAME_PLACE_TOLERANCE
+    # first only points of one place, where cells meet, become one
     vertices, triangles = _merge_vertices(r, tessellation.triangles, edge)
     # edge of cubes over R: a first guess, which grows in the loop
     edge = 0.5 * float(np.ptp(r, axis=0).max()) / np.sqrt(max_vertices)
@@ -121,7 +128,8 @@ def _merge_vertices(
         (k, 3) positions in `vertices`, of the triangles whose corners remain distinct.
     """
     cubes = np.rint((r - r.min(axis=0)) / size).astype(np.int64)
-    # three cube numbers as one: exclusive or, fast, suffices for large cubes
+    # three cube numbers as one: those of large cubes have so few bits that shifts and exclusive or,
+    # which are fast, keep them apart
     if size > EXACT_SIZE:
         key = (cubes[:, 0] * (1 << 42)) ^ (cubes[:, 1] * (1 << 21)) ^ cubes[:, 2]
     else:
@@ -189,8 +197,10 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> InteractivePart | None
     last_row = next(row for row in reversed(rows) if row["label"] != SOLUTION)
     headline_row = headline(case, rows)
     surface, shell_data = read_point(fields, int(headline_row["point"]))
+    # vertices times frames are limited: at least MIN_FRAMES, more of a small mesh
     mesh = simplify(surface, MAX_VALUES // MIN_FRAMES)
     frames = chosen_frames(rows, min(MAX_FRAMES, MAX_VALUES // mesh.count))
+    # read_point gives a surface and the shell's data
     frame_surfaces = (read_point(fields, int(row["point"]))[0] for row in frames)
     surfaces_on_nodes = [on_nodes_of(deformed, surface) for deformed in frame_surfaces]
     number_type = np.uint16 if mesh.count < 2**16 else np.uint32
@@ -241,6 +251,7 @@ def chosen_frames(rows: Sequence[Row], max_rows: int) -> list[Row]:
     The first row, the last row, instabilities and solutions are among them. Between them the shape
     changes by about equal amounts: a snap has as many frames as the slow part before it.
     """
+    # at most half of the frames are instabilities and solutions
     marked_rows = [row for row in rows if row["label"] in (*LOCATED, SOLUTION)][: max_rows // 2]
     ordinary_rows = [row for row in rows if row not in marked_rows]
     ordinary_count = min(len(ordinary_rows), max(max_rows - len(marked_rows), 2))
@@ -273,6 +284,7 @@ def _change_of_shape(rows: Sequence[Row]) -> Array:
     )
     ranges = np.ptp(values, axis=0)
     steps = np.abs(np.diff(values[:, ranges > 0] / ranges[ranges > 0], axis=0)).sum(axis=1)
+    # where nothing changes, the sum counts as one, and rows are at equal distances
     share = 0.5 * (float(steps.sum()) or 1.0) / max(len(steps), 1)
     return np.concatenate([[0.0], np.cumsum(steps + share)])
 
@@ -295,8 +307,8 @@ def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
     )
     steps = _steps_of_curve(rows, amplitude_name) if amplitude_name else []
     quantities = _quantities(rows[0])
-    axes = list[str]()
-    for step in reversed(steps):  # its words say whose displacement it is
+    axes = list[str]()  # columns of the curves' axes, those of the last step first
+    for step in reversed(steps):  # a quantity of an axis says whose displacement it is
         quantities |= {q.name: q for q in axes_for(step)}
         axes += [q.name for q in axes_for(step)]
     numeric = [name for name in rows[0] if not isinstance(rows[0][name], str)]
@@ -345,6 +357,7 @@ def _step(part: CurveStep, rows: Sequence[Row]) -> dict[str, Any]:
     def numbers_of(rows_of_line: Sequence[Row]) -> list[int]:
         return [row_of_point[int(row["point"])] for row in rows_of_line]
 
+    # the page draws a line as the pictures do: stable and unstable pieces of smooth curves
     varied_quantity = quantity(amplitude(part.amplitude).column)
     lines = [
         {
@@ -423,12 +436,13 @@ def _fields(
         ]
         if len(nodal_values) < len(shells):
             continue
+        # one scale of colours for all frames
         low = min(float(values_of_shell.min()) for values_of_shell in nodal_values)
         high = max(float(values_of_shell.max()) for values_of_shell in nodal_values)
         if high - low < MIN_RANGE:
             low, high = low - 1.0, low + 1.0
         colours: list[tuple[float, str]] = []  # plotly's own map
-        if name == "gap_over_h":
+        if name == "gap_over_h":  # what is farther than one thickness is grey
             low, high, colours = 0.0, 1.0, _stops(DISTANCE)
         elif name in WITH_SIGN:
             low, high = from_zero(low, high)
@@ -441,6 +455,7 @@ def _fields(
         fractions = [np.clip((values - low) / (high - low), 0.0, 1.0) for values in at_vertices]
         levels = [np.rint(255 * fraction).astype(np.uint8) for fraction in fractions]
         is_constant = all((level == levels[0]).all() for level in levels)
+        # a field that does not change is stored once
         locations = [arrays.raw(level) for level in (levels[:1] if is_constant else levels)]
         fields.append(
             {
@@ -463,6 +478,7 @@ def _stops(name: str, limits: tuple[float, float] = (-1.0, 1.0)) -> list[tuple[f
     from matplotlib.colors import to_hex
 
     colours = colour_map(name, limits)
+    # the last colour begins just before the end: in a map of distances it is another one, grey
     fractions = [
         *(float(fraction) for fraction in np.linspace(0.0, 1.0, COLOUR_STOPS)[:-1]),
         1 - 1e-3,
@@ -504,7 +520,7 @@ class _Packed:
         """
         min_integer, max_integer = np.iinfo(kind).min, np.iinfo(kind).max
         low, high = float(values.min()), float(values.max())
-        if min_integer < 0:
+        if min_integer < 0:  # a signed type: zero stays exactly zero
             low, high = 0.0, max(abs(low), abs(high))
         step = (high - low) / max_integer or 1.0
         return {**self.raw(np.rint((values - low) / step).astype(kind)), "low": low, "step": step}
@@ -518,7 +534,7 @@ class _Packed:
         """
         content = np.ascontiguousarray(values).tobytes()
         location = {"at": self._length, "size": int(values.size), "kind": values.dtype.name}
-        self._parts.append(content + bytes(-len(content) % 4))
+        self._parts.append(content + bytes(-len(content) % 4))  # zeros up to a multiple of four
         self._length += len(self._parts[-1])
         return location
 
@@ -551,6 +567,7 @@ def plotly() -> str | None:
 def _packed_file(file: Path) -> str:
     """Return a file compressed and in base64; the disk cache keeps the result for all runs."""
     file_status = file.stat()
+    # another version of the file has another size or time, and so another name
     name = f"packed_{file.name}_{file_status.st_size}_{file_status.st_mtime_ns}_{COMPRESSION_LEVEL}"
     if cached := load_cached(name):
         return cached.decode()

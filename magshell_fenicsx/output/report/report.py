@@ -1,4 +1,10 @@
-"""report.html: a run in one file, made from the files of its folder."""
+"""report.html: a run in one file, made from the files of its folder.
+
+Input: summary.json, path.csv, pictures and fields. A line is a row of path.csv as text: one point
+of the path. Markup is text that is HTML already, so that the template does not escape it. The pole
+is the point whose displacement the column w_pole_over_h has. A quantity knows name, symbol and unit
+of a column; the shown one is in the case's units if path.csv has such a column.
+"""
 
 import base64
 import io
@@ -131,11 +137,12 @@ def _content(folder: Path, playable: bool) -> dict[str, Any]:
     pole = pole_of(case)
     first_line = lines[0] if lines else {}
     interactive_part = interactive(folder, case) if playable else None  # it replaces the animation
+    # p_c is the pressure of a sphere; on a flat shell it is only the unit of a pressure
     classical = not is_flat(case) or any(float(line["p_over_pc"]) for line in lines)
     length_unit = "m" if summary["dimensions"]["units"] == "SI" else ""
     path = path_table(lines, length_unit, pole)
     pictured_point = _pictured_point(case, read_rows(folder / "path.csv"))
-    parameter = ""
+    parameter = ""  # symbol of the load, whose value at the fold has the sensitivities
     if summary["sensitivities"]:
         parameter = symbol(amplitude(lines[-1]["amplitude"]).column)
     gradients = list[list[Markup | str]]()
@@ -184,7 +191,7 @@ def _groups(summary: Summary, classical: bool) -> list[tuple[Markup, Markup]]:
     `classical` is whether the classical pressure p_c means something for the run.
     """
     groups, magnetic = summary["dimensionless"], summary["case"].get("magnetic") or {}
-    chi = magnetic.get("susceptibility")
+    chi = magnetic.get("susceptibility")  # a number, or a formula
     field = "|B<sup>r</sup>||B<sup>a</sup>|/(μ<sub>0</sub>E)"
     if chi is not None and "remanent" not in magnetic:
         field = "|B<sup>a</sup>|/√(μ<sub>0</sub>E)"
@@ -245,10 +252,11 @@ def _pictures(folder: Path, pictured_point: str, animated: bool) -> Iterator[tup
     animated
         Whether the animation is shown.
     """
+    # two pictures are side by side if both are narrow
     small_files = [folder / name for name in SMALL_PICTURES if (folder / name).exists()]
     side_by_side = all(_is_narrow(file.read_bytes()) for file in small_files)
     for pattern, template in PICTURES.items():
-        caption = template.replace("the last point", pictured_point)
+        caption = template.replace("the last point", pictured_point)  # it may be an instability
         if pattern == "animation.gif" and not animated:
             continue
         is_small = side_by_side and pattern in SMALL_PICTURES
@@ -285,7 +293,7 @@ def _solution(solution: dict[str, Any]) -> list[Markup | str]:
         f"{solution['solution']}",
         stability(solution),
         *numbers,
-        number(solution["residual"], 2),
+        number(solution["residual"], digits=2),
     ]
 
 
@@ -316,7 +324,7 @@ def _gradients(result: str, gradient: dict[str, Any]) -> Iterator[list[Markup | 
 
 def _how_to_estimate(case: dict[str, Any]) -> str:
     """Return advice on how to get an error estimate, for a run that has none."""
-    if "tolerance" in case["mesh"]:
+    if "tolerance" in case["mesh"]:  # given, but without an estimate
         return (
             "mesh.tolerance was ignored because this run has no scalar result; "
             "the default mesh was used"
@@ -372,8 +380,9 @@ def _is_narrow(content: bytes) -> bool:
     from PIL import Image
 
     with Image.open(io.BytesIO(content)) as image:
+        # along the width; the second is the height's
         dpi = image.info.get("dpi", (DEFAULT_DPI,))[0]
-        return bool(image.width / dpi * 25.4 < MAX_COLUMN_WIDTH)
+        return bool(image.width / dpi * 25.4 < MAX_COLUMN_WIDTH)  # 25.4 mm are an inch
 
 
 def reduced_picture(content: bytes) -> bytes:
@@ -387,4 +396,4 @@ def reduced_picture(content: bytes) -> bytes:
         smaller = image.convert("RGB").resize(size, Image.Resampling.LANCZOS, reducing_gap=3.0)
     reduced_file = io.BytesIO()
     smaller.save(reduced_file, "PNG", compress_level=6)
-    return min(content, reduced_file.getvalue(), key=len)
+    return min(content, reduced_file.getvalue(), key=len)  # the smaller file of both

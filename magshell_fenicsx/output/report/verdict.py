@@ -1,6 +1,12 @@
 """The result of a run for its report: sentences, and the path as a table of the varying columns.
 
 Input: summary.json and the lines of path.csv. Output: HTML, or text for a terminal.
+
+A line is a row of path.csv as text: one point of the path. Its label is "fold" or "bifurcation" at
+an instability, its branch "0" on the main path, its amplitude the load parameter that varied. The
+pole is the point whose displacement the column w_pole_over_h has. A quantity knows name, symbol,
+words and unit of a column; the shown one is in the case's units if path.csv has such a column.
+Markup is text that is HTML already.
 """
 
 import math
@@ -89,11 +95,11 @@ def column(
     largest = max(
         (abs(value) for value in (*values, *other_columns) if math.isfinite(value)), default=0.0
     )
-    order = math.floor(math.log10(largest)) if largest else 0
+    order = math.floor(math.log10(largest)) if largest else 0  # power of ten of the first digit
     exponent = 0 if MIN_PLAIN <= largest < MAX_PLAIN or not largest else order
-    decimals = max(0, DIGITS - 1 - order + exponent)
+    decimals = max(0, DIGITS - 1 - order + exponent)  # the largest number has DIGITS digits
     texts = [f"{value / 10.0**exponent:.{decimals}f}" for value in values]
-    if largest and "." in texts[0]:
+    if largest and "." in texts[0]:  # zeros that end all cells are dropped
         trailing_zeros = min(
             len(text) - len(text.rstrip("0"))
             for text, value in zip(texts, values, strict=True)
@@ -194,6 +200,7 @@ def path_table(lines: Sequence[Line], length_unit: str, pole: str = POLE) -> lis
         Name of the point of w_pole_over_h in a case without named points.
     """
     first_line = lines[0] if lines else {}
+    # columns that are shown in place of another one, in units
     columns_in_units = {
         column_quantity.name
         for name in first_line
@@ -217,6 +224,7 @@ def path_table(lines: Sequence[Line], length_unit: str, pole: str = POLE) -> lis
         )
         if name in ("point", "label") or (len(set(values)) > 1 and not is_repeated):
             varying_columns[name] = values
+    # all energies have one power of ten, so that they can be compared
     energies = _energies(
         lines, [name for name in varying_columns if quantity(name).kind == "energy"]
     )
@@ -307,12 +315,14 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
     """
     loading = summary["case"].get("loading") or {}
     last_step = (loading[-1] or {}) if isinstance(loading, list) else loading
-    until = last_step.get("until", "target")
+    until = last_step.get("until", "target")  # the event at which the run was to end
     first_instability = next((line for line in located(lines) if line["branch"] == "0"), None)
+    # the end is of interest unless the run was to find the instability
     sentences = (
         [_end(summary, lines)] if not first_instability or until in ("target", "points") else []
     )
     if first_instability:
+        # one entry for each instability, in their order; a summary without them has one empty entry
         points = summary.get("limit_points") or [{}]
         point = points[min(located(lines).index(first_instability), len(points) - 1)]
         sentences.append(_instability(first_instability, summary, lines, point.get("mode_at")))
@@ -353,16 +363,16 @@ def _snaps(summary: Summary) -> list[Markup]:
     times = list[Markup]()
     for key in ("jump", "departure"):
         if in_ms:
-            times.append(Markup("{} ms").format(number(summary[f"snap_{key}_ms"], 4)))
+            times.append(Markup("{} ms").format(number(summary[f"snap_{key}_ms"], digits=4)))
         else:
-            times.append(number(snaps[0][key], 4))
+            times.append(number(snaps[0][key], digits=4))
     unit = Markup()
     if not in_ms:
         unit = Markup(" (times in R √(ρ/E); with a density of the shell they are in ms)")
     percent = 100 * float(snaps[0]["overshoot"])
     overshoot = Markup()
     if percent > MIN_OVERSHOOT:
-        overshoot = Markup(", and overshoots by {} % of its way").format(number(percent, 2))
+        overshoot = Markup(", and overshoots by {} % of its way").format(number(percent, digits=2))
     words = (
         "The snap takes {} from 10 to 90 % of its way, after a departure from the fold of {}{}{}."
     )
@@ -378,17 +388,18 @@ def _error(summary: Summary) -> list[Markup]:
     if (estimate := tolerance.get("error_estimate")) is None:
         return []
     best = tolerance.get("best")
+    # the mesh of the run need not have the smallest estimate of all rounds
     sentence = Markup("The estimated relative error of the result is {}").format(
-        number(estimate, 2)
+        number(estimate, digits=2)
     )
     if best and best["error_estimate"] < estimate:
         sentence += Markup("; another mesh gives {} with {}").format(
-            number(best["result"], 9), number(best["error_estimate"], 2)
+            number(best["result"], digits=9), number(best["error_estimate"], digits=2)
         )
     on_branch = (tolerance.get("branch") or {}).get("error_estimate")
     if on_branch is not None:
         sentence += Markup(", that of the bifurcation; at the end of the branch it is {}").format(
-            number(on_branch, 2)
+            number(on_branch, digits=2)
         )
     return [sentence + "."]
 
@@ -408,7 +419,7 @@ def value(line: Line, summary: Summary) -> Markup:
     """
     name = amplitude(line["amplitude"]).column
     degrees = "°" if line["amplitude"] == "angle" else ""
-    shown_column = shown_quantity(name, line)
+    shown_column = shown_quantity(name, line)  # in units, or the column itself
     has_unit = shown_column.name != name
     is_same_number = float(line[shown_column.name]) == float(line[name])
     # the column in units has the same symbol and the same numbers
@@ -475,7 +486,7 @@ def _instability(
         Place (3,) over R at which the mode is largest; None if unknown.
     """
     kind = line["label"]
-    if line["mode"]:
+    if line["mode"]:  # a number of waves, or a symmetry in words
         is_wave = line["mode"] not in (*OWN_MODES, "antisymmetric")
         kind += f" ({line['mode']}{' waves' if is_wave else ''})"
     load = value(line, summary)
@@ -499,6 +510,7 @@ def _place_of_mode(place: Sequence[float] | None, summary: Summary) -> Markup:
     dimensions = summary["dimensions"]
     in_metres = bool(dimensions["radius"]) and dimensions["units"] == "SI"
     geometry = shell_of(summary["case"])["geometry"]
+    # one pair of unit and numbers
     ((key, numbers),) = place_in_units(place, geometry, in_metres=in_metres).items()
     if key == "degrees" and numbers[0] < NEAR_POLE:
         return Markup("; its mode is largest near the pole")
@@ -539,6 +551,7 @@ def _end(summary: Summary, lines: Sequence[Line]) -> Markup:
         if summary["stopped"]:
             return Markup("")
         return Markup("Nothing loads the shell: this is its undeformed state.")
+    # labels of the point at which a step ends, and of the end of a field without a load
     arrived = last_line["label"] in ("target", "field") and not summary["stopped"]
     subject = "The run reached its target" if arrived else "The last point"
     pole = pole_name(last_line, pole_of(summary["case"]))
@@ -556,8 +569,8 @@ def _untouched(line: Line) -> Markup:
     if not line["amplitude"].startswith("approach"):
         return Markup("")
     name = f"penetration_over_h{line['amplitude'].removeprefix('approach')}"
-    gap = -float(line[name])
-    if above_rounding(gap, ()) <= 0:
+    gap = -float(line[name])  # the column has penetrations, negative where there is a gap
+    if above_rounding(gap) <= 0:
         return Markup("")
     gap_quantity = shown_quantity(name, line)
     unit = f" {gap_quantity.shown_unit}" if gap_quantity.shown_unit else " h"
@@ -587,6 +600,7 @@ def _displacement(line: Line, pole: str, lines: Sequence[Line]) -> Markup:
         for axis in axes_of(line["amplitude"], line)
         if axis.kind == "reaction" or axis.name.startswith("force")
     ]
+    # the load has been said already; if a displacement is prescribed, the force is of interest
     if force_axes and varied_amplitude.column != "force":
         return Markup("{}, {}").format(_amount(force_axes[0], line, lines), at_pole)
     if varied_amplitude.conjugate == "w_over_h" and line["w_over_h"] != line["w_pole_over_h"]:

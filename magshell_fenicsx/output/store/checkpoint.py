@@ -1,8 +1,11 @@
 """DIR/checkpoint: the case, then every result and finding of a run, each on disk before the next.
 
-A result is a point of a path, or the reason of a failure. A finding is an expensive value computed
-at a point, see `RecordedValues`. A resumed run reads results and findings in place of computing
-them again.
+A result is a point of a path, or the reason of a failed solve. A finding is an expensive value
+computed at a point, see `RecordedValues`. A resumed run replays results and findings: it reads them
+in place of computing them again. An element (a frame) of the file is a mark, a length, a checksum
+and the content: the head with the identity of the run, the places of a space's nodes, a result, or
+a finding. A document has what a run writes down about its case. A loading device adds unknowns to a
+state, which belong to no node. Vectors are u and du, the displacement and the tangent of the path.
 
 Rank 0 alone writes one file, so that a full disk stops all ranks together. With ADIOS2 (2.10,
 through adios4dolfinx 0.9.3) a full disk raises on one rank in `Close`, and the other ranks wait for
@@ -108,7 +111,7 @@ class Ordering:
         own_places = V.tabulate_dof_coordinates()[: V.dofmap.index_map.size_local]
         places_of_ranks = self._space_comm.allgather(own_places)
         places = comm.bcast(places)
-        if places is None:
+        if places is None:  # the run begins: the present order is stored
             self.places: Array = np.concatenate(places_of_ranks)
             # in the present order, nodes are numbered rank after rank
             first_number = sum(
@@ -126,6 +129,7 @@ class Ordering:
 
         Raises CaseError on every rank if nodes and places do not match one to one.
         """
+        # a node is the nearest of the places; all ranks together must have each place once
         distance, number = scipy.spatial.cKDTree(places).query(own_places)
         numbers_of_ranks = self._space_comm.allgather(number)
         one_to_one = np.array_equal(
@@ -147,12 +151,7 @@ class Ordering:
     def gather(self, u: Vector) -> Array:
         """Return a displacement as values (n, components) in the order in use; collective.
 
-        On rank 0 of the space; empty on other ranks.
-
-        Parameters
-        ----------
-        u
-            This rank's values.
+        On rank 0 of the space; empty on other ranks. `u` has this rank's values.
         """
         vectors_of_ranks = self._space_comm.gather(u)
         values = np.empty((len(self.places) if vectors_of_ranks else 0, self._values_per_node))
@@ -231,6 +230,7 @@ def refuse_other_case(saved: dict[str, Any], document: Document, folder: Path) -
     CaseError
         With the first difference; `OtherSources` if only the sources differ.
     """
+    # a key `version` is of checkpoints of earlier versions
     identity_now, saved = _without_appearance(identity(document)), _without_appearance(saved)
     saved_sources, sources = saved.get("sources", saved.get("version")), identity_now["sources"]
     saved_case = _without_program(saved)
@@ -310,6 +310,7 @@ class Checkpoint:
 
         The places of its nodes come first in the file. They are read there, or appended.
         """
+        # a run that is resumed uses the order of the nodes in the file, a new one writes its own
         places = (
             access_disk(self._comm, self._places_in_file, "cannot be read")
             if self._replaying
@@ -345,10 +346,10 @@ class Checkpoint:
         return content
 
     def recorded_values(self, find: Callable[[], RecordedValues]) -> RecordedValues:
-        """Return the next finding in the file; at its end call `find`, and append its finding.
+        """Return the next finding in the file; at its end call `find`, and append what it finds.
 
-        A finding is an expensive value at a point, with this rank's part of a vector or None.
-        Collective; `find` is called on every rank.
+        A finding is an expensive value at a point, and optionally a vector, of which each rank has
+        a part. Collective; `find` is called on every rank.
         """
         if content := self._next_content():
             return self._read(content)
@@ -367,9 +368,10 @@ class Checkpoint:
 
         The vector is None if the ranks do not have the nodes that they had when it was written.
         """
+        # a line of JSON, then the parts of the vector, rank after rank
         text, _, data = content.partition(b"\n")
         decoded = json.loads(text)
-        self._refuse_other_kind(is_other="values" not in decoded)
+        self._refuse_other_kind(is_other="values" not in decoded)  # only a finding has values
         sizes, rank = decoded["parts"], self._comm.rank
         if len(sizes) != self._comm.size or not self._ordering.is_present:
             return RecordedValues(decoded["values"])
@@ -435,10 +437,10 @@ class Checkpoint:
         """Return the result in an element of the file, with this rank's part of its vectors."""
         text, _, data = content.partition(b"\n")
         decoded = json.loads(text)
-        self._refuse_other_kind(is_other="values" in decoded)
+        self._refuse_other_kind(is_other="values" in decoded)  # as a finding has
         if "failure" in decoded:
             return str(decoded["failure"])
-        vectors = np.split(np.frombuffer(data), 2)
+        vectors = np.split(np.frombuffer(data), 2)  # u and du, at all nodes
         u, du = (self._ordering.scatter(vector) for vector in vectors)
         values_beyond_nodes = decoded.pop("beyond")
         if self._ordering.last:  # the numbers of a loading device
@@ -480,7 +482,7 @@ def _difference(saved: Any, present: Any, key: str = "") -> str:
     key
         Key path of these parts; empty for the whole case.
     """
-    if isinstance(saved, dict) and isinstance(present, dict):
+    if isinstance(saved, dict) and isinstance(present, dict):  # go on into the first other key
         name = next(name for name in {**saved, **present} if saved.get(name) != present.get(name))
         inner_key = f"{key}.{name}".removeprefix(".").removeprefix("case.")
         return _difference(saved.get(name), present.get(name), inner_key)

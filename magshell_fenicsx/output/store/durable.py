@@ -1,7 +1,8 @@
 """Files that stay readable after a kill, a crash or a full disk.
 
-Writing is atomic (`write_whole`) or by complete pieces (`AppendedFile`). Reading refuses anything
-that is no regular file.
+Writing is atomic (`write_whole`) or by complete pieces (`AppendedFile`). A sync waits until the
+disk has what the system keeps in memory; without it a power failure may lose what was written, a
+kill may not. Reading refuses anything that is no regular file.
 """
 
 import json
@@ -99,7 +100,7 @@ def write_whole(file: Path, content: bytes, *, waits: bool = True) -> None:
     unfinished = file.with_name(file.name + ".unfinished")
     try:
         unfinished.unlink(missing_ok=True)  # it may be a link to another file
-        stream = AppendedFile(unfinished, 0)
+        stream = AppendedFile(unfinished, length=0)
         try:
             stream.append(content, waits=waits)
         finally:
@@ -138,6 +139,7 @@ class AppendedFile:
     """
 
     def __init__(self, file: Path, length: int | None = None) -> None:
+        """Open the file, and cut it off after `length` bytes."""
         self._file = file
         self._stream = file.open("ab", buffering=0)
         self._length = self._stream.seek(0, os.SEEK_END) if length is None else length
@@ -161,7 +163,7 @@ class AppendedFile:
         """
         remaining = memoryview(content)
         try:
-            while remaining:
+            while remaining:  # a write may take a part only
                 remaining = remaining[self._stream.write(remaining) :]
             if waits and time.monotonic() - self._last_sync >= SYNC_INTERVAL:
                 self._sync(self._length + len(content))
@@ -191,6 +193,7 @@ class AppendedFile:
             With the file's name.
         """
         try:
+            # without any sync the caller has not asked to wait
             if self._last_sync > -math.inf and self._synced_length < self._length:
                 self._sync(self._length)
         except OSError as e:

@@ -1,4 +1,8 @@
-"""The output folder: making and locking it, and access to the disk through rank 0."""
+"""The output folder: making and locking it, and access to the disk through rank 0.
+
+A foreign file is one that no run of this program is known to have written; it is never replaced.
+A collective function is called on all ranks, and raises on all of them.
+"""
 
 import fcntl
 import json
@@ -67,6 +71,7 @@ def refuse_foreign(folder: Path, names: Iterable[str], new_files: str) -> None:
         With the names, if there are any.
     """
     if foreign := sorted(names):
+        # empty for a few names
         further = f" and {len(foreign) - MAX_NAMED_FILES} more" * (len(foreign) > MAX_NAMED_FILES)
         raise CaseError(
             f"{folder}: has files that {new_files} would replace and that none is known to have "
@@ -100,6 +105,8 @@ def refuse_other_tables(
         On the calling rank.
     """
     content = _object(folder / names[0])
+    # known tables are replaced; unknown ones only if they are empty, or the folder has the points
+    # of a study that was interrupted before it wrote its tables
     if content.keys() >= set(keys):
         name = content.get("case")
         is_of_other_case = isinstance(name, str) and Path(name).stem != Path(case).stem
@@ -110,7 +117,6 @@ def refuse_other_tables(
     elif not any(
         _object(file).keys() & KEYS_OF_POINTS for file in (folder / "points").glob("*.json")
     ):
-        # of an interrupted one there would be points
         refuse_foreign(folder, (name for name in names if _is_filled(folder / name)), new_files)
 
 
@@ -170,7 +176,7 @@ def locked_folder(out: Path, comm: "MPI.Comm", make: bool) -> Iterator[None]:
     CaseError
         On every rank, if the folder cannot be made, or another run is writing to it.
     """
-    descriptors: list[int] = []
+    descriptors: list[int] = []  # of the folder, on rank 0; closing it ends the lock
 
     def lock(folder: Path) -> None:
         """Make the folder if that is due, and lock it; on rank 0."""

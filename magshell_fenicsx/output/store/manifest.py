@@ -1,4 +1,8 @@
-"""Manifest of a folder: which files a run has written, so that another run replaces only these."""
+"""Manifest of a folder: which files a run has written, so that another run replaces only these.
+
+The manifest is written.txt, a list of names. A run's names are all names that a run may write,
+`RUN_NAMES`; a file with such a name is foreign if no run is known to have written it.
+"""
 
 import re
 import stat
@@ -46,7 +50,7 @@ def files_with_run_names(folder: Path) -> set[str]:
     """
     files = list(folder.iterdir())
     has_fields = _irregular_kind(folder / "fields") == "a folder"
-    if has_fields:
+    if has_fields:  # not if it is a link to another folder
         files += (folder / "fields").iterdir()
     relative = {file.relative_to(folder).as_posix() for file in files}
     names = {name for name in relative if RUN_NAMES.fullmatch(name)}
@@ -64,10 +68,10 @@ def _irregular_kind(file: Path) -> str:
 def files_of_runs(folder: Path) -> set[str]:
     """Return those names of `files_with_run_names` that a run is known to have written.
 
-    With a manifest they are the names listed there. Without one they are all names, as of earlier
-    versions, if summary.json is a run's. The files of a path count too if the checkpoint is a
-    run's, for instance after a kill; or if there is no manifest, but a path.csv. Only regular files
-    count.
+    With a manifest they are the names listed there. Without one, as earlier versions left folders,
+    they are all names if summary.json is a run's. The files of a path count too if the checkpoint
+    is a run's, for instance after a kill; or if there is no manifest, but a path.csv. Only regular
+    files count.
     """
     regular_names = {
         name for name in files_with_run_names(folder) if not _irregular_kind(folder / name)
@@ -78,7 +82,7 @@ def files_of_runs(folder: Path) -> set[str]:
         names.add(NEW_CHECKPOINT)
     if text.startswith(HEADER):
         names |= regular_names & {NAME, *text.splitlines()}
-    elif _is_of_run(lambda: read_object(folder / "summary.json")):
+    elif _is_of_run(lambda: read_object(folder / "summary.json")):  # of an earlier version
         return regular_names
     has_checkpoint = _is_of_run(lambda: checkpoint.identity_in(folder / checkpoint.NAME))
     if has_checkpoint or (NAME not in names and is_path(folder / "path.csv")):

@@ -1,6 +1,9 @@
 """Stored results of a run: its case and summary.json, checked, and the row that pictures show.
 
-Runs may be finished or interrupted.
+Runs may be finished or interrupted. A resolved case is the plain data of a case after validation. A
+row is a line of path.csv: one point of the path, by column. Its label is "fold" or "bifurcation" at
+an instability, "solution" for what a search found; its branch is 0 on the main path. The pole is
+the point whose displacement the column w_pole_over_h has.
 """
 
 import json
@@ -112,8 +115,9 @@ def _first_error(value: Any, kind: Any, key: str = "") -> str:
         entries = [(entry, kind[0], f"{key}.{i}") for i, entry in enumerate(value)]
     elif isinstance(kind, dict) and isinstance(value, dict):
         types_of_keys = dict.fromkeys(value, kind["*"]) if "*" in kind else kind
+        # a name that ends with ? may be absent
         missing = [name for name in types_of_keys if not name.endswith("?") and name not in value]
-        for name in missing:
+        for name in missing:  # the first one is enough
             return f"it has no {key}.{name}".replace(" .", " ")
         names = {name: name.removesuffix("?") for name in types_of_keys}
         entries = [
@@ -143,7 +147,7 @@ def style_of(case: Mapping[str, Any], options: Mapping[str, Any] | None = None) 
     """
     output_data, options = case.get("output") or {}, options or {}
     source = Source("options", {"output": {**output_data, **options}})
-    for key in options:
+    for key in options:  # messages name the option of the command line in place of a line of a file
         source.places["output", key] = f"--{key.replace('_', '-')}"
     try:
         return _Options.model_validate(source.data).output
@@ -160,6 +164,7 @@ def headline(case: Mapping[str, Any], rows: Sequence[Row]) -> Row:
     path = [row for row in rows if row["label"] != SOLUTION]
     loading = case.get("loading") or {}
     last_load = loading[-1] if isinstance(loading, list) else loading
+    # such a run goes on beyond the instability, so that it is about its end
     goes_on = last_load.get("then") or last_load.get("branches")
     ends_at_limit = last_load.get("until") == "limit" and not goes_on
     instabilities = (row for row in path if row["label"] in LOCATED and not row["branch"])
@@ -189,6 +194,7 @@ def pole_of(case: Mapping[str, Any]) -> str:
     """
     shell = shell_of(case) or {"geometry": "hemisphere"}
     geometry = shell.get("geometry")
+    # a cap without a hole, and a profile that ends on the axis, have a pole
     if geometry == "cap" and shell.get("hole") is None:
         return POLE
     points = (shell.get("profile") or {}).get("points") or []

@@ -1,4 +1,9 @@
-"""Tables of results: writing and reading CSV files, and path.csv, on disk row by row."""
+"""Tables of results: writing and reading CSV files, and path.csv, on disk row by row.
+
+A row of path.csv is one point of a path: the values of its columns. The column `amplitude` has the
+name of the load parameter that varied. A pivot count is the number of unstable directions: of the
+model, and of modes that the reduced model excludes by its symmetry.
+"""
 
 import csv
 import io
@@ -51,6 +56,7 @@ def stability(row: Mapping[str, object]) -> str:
         if model_pivots
         else "unstable in"
     )
+    # " and" only where the model is unstable too
     return beginning + (
         f"{' and' * bool(model_pivots)} {excluded_pivots} that the model excludes"
         if excluded_pivots
@@ -84,7 +90,7 @@ class PathTable:
         self._columns = (*COLUMNS, *extra)
         header = table_text([self._columns])
         content = read_result(file) if file.exists() else b""
-        length = content.rfind(b"\n") + 1
+        length = content.rfind(b"\n") + 1  # of the complete rows, with the header
         if length and not content.startswith(header.encode()):
             raise Damaged(f"{file}: is damaged: its columns are not those of this run")
         self.complete_rows = read_lines(file) if length else []
@@ -220,6 +226,7 @@ def _wrong_column(number: int, row: Mapping[str, str], counts: Collection[str]) 
         try:
             value = 0.0 if key in TEXTS else float(text)
             may_be_nan = isnan(value) and (key.startswith(NAN_COLUMNS) or key not in COLUMNS)
+            # infinity is too large, and nan fails the comparison
             if not (abs(value) <= MAX_NUMBER or may_be_nan):
                 return key
             if key in counts and not value.is_integer():
@@ -228,6 +235,7 @@ def _wrong_column(number: int, row: Mapping[str, str], counts: Collection[str]) 
             return key
     if row["point"] != str(number):
         return "point"
+    # the amplitude that varied must have its column
     if row["amplitude"] and amplitude(row["amplitude"]).column not in row:
         return "amplitude"
     return ""

@@ -1,4 +1,11 @@
-"""The base of rigid bodies: their sections, where they are, and their signed distance."""
+"""The base of rigid bodies: their sections, where they are, and their signed distance.
+
+The approach is the displacement of a body along its direction, a load parameter; distances are
+those at approach zero. The front is the point of the body that goes ahead. The case's frame has the
+axes of the case, the model's frame those of the part that is modelled, turned about e3. A mirror
+plane of a body is one about which it is symmetric. Lengths are over R, in sections in the case's
+unit. g, n and H or N are a signed distance, its gradient and its Hessian.
+"""
 
 import re
 from abc import ABC, abstractmethod
@@ -205,11 +212,11 @@ def place_body(
     R
         The length by which lengths are divided.
     """
-    outward = normal if section.side == "outside" else -normal
+    outward = normal if section.side == "outside" else -normal  # from the shell to the body
     direction = unit(-outward if section.direction is None else np.array(section.direction))
     direction, front_offset = Q @ direction, section.front_offset / R
-    front = Q @ (place + half * outward)
-    if section.position is not None:
+    front = Q @ (place + half * outward)  # on the shell's face
+    if section.position is not None:  # which is that of the reference point, behind the front
         front = Q @ (np.array(section.position) / R) + front_offset * direction
     return PlacedBody(key, front, front - front_offset * direction, direction, Q, R)
 
@@ -228,12 +235,13 @@ class RigidBodies(KeyAbility[Mapping[str, BodySection]]):
             With the key of the body and what is allowed.
         """
         for name, body in self.sections.items():
+            # a named point is on the shell anyway; the polar angle of a direction may not be
             context.on_shell(f"bodies.{name}", 0.0 if body.at.point else body.at.polar)
             if not re.fullmatch(r"[A-Za-z][A-Za-z0-9_]{0,39}", name):
                 raise ValueError(
                     f"bodies.{name}: a name is a letter, then letters, digits and _; at most 40"
                 )
-            if name in endings():
+            if name in endings():  # columns end with a body's name, as others with a unit
                 raise ValueError(
                     f"bodies.{name}: is taken, by columns in this unit; choose another name"
                 )
@@ -244,7 +252,8 @@ class RigidBodies(KeyAbility[Mapping[str, BodySection]]):
 def rounded(q: Array, edge: float) -> tuple[Array, Array, Array]:
     """Return the signed distance from a convex corner with a rounded edge, and its derivatives.
 
-    The corner is that of a core, moved outwards by the radius of the rounding.
+    The corner is where m faces meet at right angles. The body is all that is nearer than the radius
+    of the rounding to a core, which has the same corner, sharp.
 
     Parameters
     ----------
@@ -264,7 +273,9 @@ def rounded(q: Array, edge: float) -> tuple[Array, Array, Array]:
     is_outside = distance > 0
     # inside the core the nearest face is that of the largest coordinate
     nearest = np.eye(q.shape[1])[q.argmax(axis=1)]
+    # 1e-300 only keeps the division finite where the other branch is taken
     n = np.where(is_outside[:, None], outside_part / np.maximum(distance, 1e-300)[:, None], nearest)
+    # curved only in the directions of positive coordinates, as a circle, a sphere or a plane
     active = (outside_part > 0)[:, :, None] * np.eye(q.shape[1])
     H = (active - n[:, :, None] * n[:, None, :]) / np.maximum(distance, 1e-300)[:, None, None]
     return (

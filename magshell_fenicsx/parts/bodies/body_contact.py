@@ -8,6 +8,13 @@ thickness. The penalty psi(-gap) is zero where the gap is open. As of an applied
 derivatives of the penalty itself, by the displacement and by the approach, for every shape of a
 body. Where the thickness varies, or is that of a shell that gets thinner as it stretches, t is one
 more variable of the polynomial. docs/theory.md, Contact.
+
+The approach is a load parameter: how far the body has moved from where it is at first. psi is the
+penalty energy per undeformed area, a function of the penetration (minus the gap). The expansion
+point is the y for which a polynomial was computed; P are a polynomial's coefficients, F those by
+the thickness. A jet is a map with its first and second derivatives at quadrature points, a density
+an energy per undeformed area as a function of jets. A memo is a value that is computed again where
+its inputs have changed. Lengths are over R, the approach is over h, psi over E h.
 """
 
 from collections.abc import Callable
@@ -100,6 +107,7 @@ class ContactBody:
         half
             Half the thickness of the shell, one number or (n,).
         """
+        # moving the body forward is the same as moving the place back
         g, n, N = self.distance(x - approach * self.direction)
         return g - half, n, N
 
@@ -126,6 +134,7 @@ def contact_energy(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face
         Only where the thickness varies: derivatives by the thickness (`FACE_SIZE`,), and the
         thickness over h, (1,).
     """
+    # r0 is an argument of all densities, and not needed here
     s = _off_expansion_point(u, P, motion, approach)
     psi = _polynomial(P, s)
     return psi + _face_term(face[0], face[1][0], s) if face else psi
@@ -165,7 +174,7 @@ def thinned_energy(
 
 def _polynomial(P: Expr, s: Expr) -> Expr:
     """Return psi at an offset s (3,) from the expansion point of the polynomial P."""
-    pairs = enumerate(zip(*INDEX_PAIRS, strict=True))
+    pairs = enumerate(zip(*INDEX_PAIRS, strict=True))  # of the Hessian, at P[7] and after it
     return (
         P[3]
         + ufl.dot(_gradient(P), s)
@@ -176,8 +185,8 @@ def _polynomial(P: Expr, s: Expr) -> Expr:
 def _face_term(F: Expr, t: Expr, s: Expr) -> Expr:
     """Return the change of psi with the thickness factor t, at an offset s from the expansion.
 
-    F (`FACE_SIZE`,) has the factor at the expansion, the first derivative of psi by the factor, the
-    mixed derivatives (3,) by place, and the second derivative.
+    F (`FACE_SIZE`,) has the factor at the expansion point, the first derivative of psi by the
+    factor, the mixed derivatives (3,) by factor and place, and the second derivative by the factor.
     """
     change = t - F[0]
     return change * (
@@ -279,6 +288,7 @@ class _ActivePenalty:
         is_pressed, coefficients
             (points,) the flags, and (m, 10) the coefficients of `_flattened` at pressed points.
         """
+        # derivatives by the place, of which the penetration has the gradient -n
         H = (
             self.second[..., None] * self.n[:, :, None] * self.n[:, None, :]
             - self.first[..., None] * self.N
@@ -344,12 +354,16 @@ class BodyContact:
         thickness: fem.Function | None = None,
         ratio_at_points: ThicknessRatio | None = None,
     ) -> None:
-        """Create the polynomials as functions of the state, with memos of what they depend on."""
+        """Create the polynomials as functions of the state, with memos of what they depend on.
+
+        A memo takes a function of its value, and one of the arrays whose change makes it outdated.
+        """
         V = u.function_space
         self.contact, self._h, self._u, self._approach = contact, h, u, approach
         self.polynomial = PointField(V.mesh, degree, POLYNOMIAL_SIZE)
         self._points, self._degree = self.polynomial.points, degree
         self._placement_memo = Memo(lambda: at_quadrature(r0, self._points), lambda: (r0.x.array,))
+        # the deformed over the undeformed thickness at the points; None where it is 1
         ratio_memo = ratio_at_points and ratio_at_points(self._points)
 
         def factor() -> float | Array:
@@ -376,7 +390,8 @@ class BodyContact:
             self.parameters = *self.parameters, thickness
         self._owned = V.mesh.topology.index_map(V.mesh.topology.dim).size_local
         self.stiffness = fem.Constant(V.mesh, contact.stiffness)
-        # derivatives of a step by place and thickness, in place of the present ones
+        # of a step in time, in place of the present ones: gradient (points, 3) and Hessian (points,
+        # 3, 3) of psi by the place, and its derivatives by the thickness factor (points, 5)
         self._step_derivatives: tuple[Array, ...] = ()
         self._expansion_gap: tuple[Array, ...] = ()  # about which the penalty is expanded
 
@@ -419,12 +434,14 @@ class BodyContact:
             Thickness over h, one number or (cells * points,).
         """
         relative_places = (self._placement_memo.renew() + y).reshape(-1, 3)
-        return self.contact.gap(relative_places, 0.0, self._h / 2 * factor)
+        # the displacements are relative to the body, which is then at approach zero
+        return self.contact.gap(relative_places, approach=0.0, half=self._h / 2 * factor)
 
     def _active_penalty(self) -> "_ActivePenalty":
         """Return the penalty at the points whose gap is closed, which are few of all.
 
-        The gap is that of `expand_about`, where this was called.
+        After `expand_about` the closed points are those of its gap, about which the penalty is
+        expanded. Else a penalty about the present gap is exact.
         """
         gap, n, N = self._gap_memo.renew()
         expansion_gap = self._expansion_gap[0] if self._expansion_gap else gap
@@ -443,7 +460,7 @@ class BodyContact:
         """
         y = self.place
         polynomials = np.zeros((*y.shape[:2], POLYNOMIAL_SIZE))
-        polynomials[..., :3] = y
+        polynomials[..., :3] = y  # the expansion point; other coefficients are zero at open points
         is_pressed, psi = (
             self._step_mean() if self._step_derivatives else self._penalty_memo.renew().penalty()
         )
@@ -456,6 +473,7 @@ class BodyContact:
         They are in the form of `_ActivePenalty.penalty`, with zero for the value of psi.
         """
         gradient, H, _ = self._step_derivatives
+        # psi itself does not enter the forces
         return np.ones(len(gradient), dtype=bool), _flattened(
             np.zeros((len(gradient), 1)), gradient, H
         )
@@ -471,6 +489,7 @@ class BodyContact:
         if self._step_derivatives:
             by_t[:, 1:] = self._step_derivatives[2]
         else:
+            # the penetration grows by h/2 with t, and by -n with the place
             by_t[active.is_pressed, 1:] = half * np.concatenate(
                 [active.first, -active.second * active.n, half * active.second], axis=1
             )
@@ -513,8 +532,10 @@ class BodyContact:
         """Use the mean forces of a step in time, until `use_present_forces` is called.
 
         The product of the mean force with the change of y is the change of psi, plus the energy
-        that the step dissipates. The mean gradient is the mean of that of psi over the penetration,
-        not over time. So contact that sets in or ceases within the step counts in full. See
+        that the step dissipates. The mean gradient is the mean of psi's gradient over the
+        penetrations of the step, not over its time: so contact that sets in or ceases within the
+        step counts in full. A dissipative force is added as in generalised alpha, the scheme of
+        time integration: the change of the force over the step, times `part` - 1/2. See
         docs/theory.md, Motion.
 
         Parameters
@@ -529,10 +550,12 @@ class BodyContact:
             SOFT_PENETRATION * self._h,
             self._h / 2,
         )
-        # normals by Simpson's rule; the middle depends on the end of the step by half
-        middle = (begin[0] + end[0]) / 2, (begin[1] + end[1]) / 2
+        # normals by Simpson's rule; the middle depends on the end of the step by half, so that the
+        # derivative of the mean normal has the weights 4/6/2 and 1/6
+        (y_begin, factor_begin), (y_end, factor_end) = begin, end
+        middle = (y_begin + y_end) / 2, (factor_begin + factor_end) / 2
         gaps, n, N = zip(*(self._gap_at(*state) for state in (begin, middle, end)), strict=True)
-        s0, _, s1 = (-gap for gap in gaps)
+        s0, _, s1 = (-gap for gap in gaps)  # penetrations at the begin and the end
         mean_slope, mean_curvature = mean_pressure(s0, s1, k, soft_penetration)
         normal, mean_hessian = (n[0] + 4 * n[1] + n[2]) / 6, (2 * N[1] + N[2]) / 6
         (_, p0, _), (_, p1, k1) = (
@@ -546,7 +569,7 @@ class BodyContact:
         def times(c: Array, a: Array) -> Array:
             return c.reshape(-1, *[1] * (a.ndim - 1)) * a
 
-        # the terms with off_middle are what generalised alpha dissipates
+        # the terms with off_middle are the dissipative force; only the end of the step is varied
         off_middle = part - 0.5
         gradient = -times(mean_slope, normal) - off_middle * (times(p1, n[2]) - times(p0, n[0]))
         H = (
@@ -584,6 +607,7 @@ class BodyContact:
         `LARGEST_OVER_MEAN_PRESSURE` times the mean.
         """
         pressures = self._pressures()
+        # true of a cell without pressure too, which the other condition excludes
         is_even = pressures.max(axis=1) <= LARGEST_OVER_MEAN_PRESSURE * self.cell_pressures()
         return np.asarray((pressures > 0).all(axis=1) & is_even)
 
@@ -600,8 +624,9 @@ class BodyContact:
         comm
             Communicator of the mesh.
         radius
-            Mean radius of the contact over R, which the caller integrates.
+            Mean radius of the contact over R, which the caller integrates by `radius_density`.
         """
+        # points of owned cells alone: ghosts belong to other ranks
         owned = slice(0, self._owned * len(self._points))
         gap, from_front = (
             self.gap[owned],
@@ -618,4 +643,5 @@ class BodyContact:
         penetration = comm.allreduce(float(-gap.min(initial=np.inf)), MPI.MAX)
         inner = comm.allreduce(float(from_axis.min(initial=np.inf)), MPI.MIN)
         outer = comm.allreduce(float(from_axis.max(initial=0.0)), MPI.MAX)
+        # without contact the least distance is that of no points, infinite
         return Region(penetration, radius, inner if largest else 0.0, outer)

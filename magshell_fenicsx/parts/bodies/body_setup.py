@@ -1,5 +1,11 @@
 """The rigid bodies of a case in the model's terms: where they are, how stiff the penalty is, and
 the symmetry that they preserve.
+
+The approach is the displacement of a body along its direction, a load parameter; a driven amplitude
+is a load parameter that a step changes. The chart has the coordinates of the shell's mid-surface;
+the reference is the undeformed shell, perfect or with its imperfections. Q turns the case's frame
+into the model's. Under a plane the contact is a ring, the rim of a flat disc. Lengths are over R,
+approaches over h, stiffnesses over E h/R^2; D is the bending stiffness.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping
@@ -62,6 +68,7 @@ def contact_bodies(
     contacts = [_contact(name, body, approaches[name], reference) for name, body in bodies.items()]
     for i, body in enumerate(contacts):
         for other in contacts[i + 1 :]:
+            # bodies that stay may overlap
             if not {body.amplitude, other.amplitude} & {*driven_amplitudes}:
                 continue
             if (depth := overlap(body, other)) > 0:
@@ -77,9 +84,10 @@ def _contact(
 ) -> ContactBody:
     """Return one rigid body of a case at its place, with the stiffness of its penalty.
 
-    The body is placed so that it touches the shell at the section's `at`. If the section gives a
-    `position` instead, the shell's place nearest to it counts. The default stiffness is that of a
-    plane for a plane, and larger for a body of finite radius.
+    The body is placed so that it touches the shell at the section's `at`. With a `position` alone
+    the nearest place of the shell counts if the direction is given too, or on a mesh; else the
+    default of `at` gives the direction. The default stiffness is that of a plane for a plane, and
+    larger for a body of finite radius.
 
     Parameters
     ----------
@@ -95,6 +103,7 @@ def _contact(
     """
     key, h, Q = f"bodies.{name}", reference.h, reference.Q
     has_own_place = section.position is not None and "at" not in section.model_fields_set
+    # the nearest sample, unless the normal at the default `at` is to give the direction
     if has_own_place and (reference.geometry == "mesh" or section.direction is not None):
         places = reference.perfect.sample()
         place = places[
@@ -103,12 +112,14 @@ def _contact(
     else:
         place, _ = locate(section.at, reference, key)
     chart = reference.perfect.inverse(place)
+    # the chart of a mesh file is the place itself (3,): there is no map from a chart to the surface
     normal = reference.perfect.normal_near(chart)
     start = place if len(chart) == 3 else reference.imperfect.embedding(chart[None])[0]
     half_thickness = float(reference.half_thickness(start[None])[0])
     placed_body = place_body(
         section, key, start, normal / np.linalg.norm(normal), half_thickness, Q, reference.R
     )
+    # D over E h R^2, from which the default is a number times D/(R h)^2; a radius over R
     D, body_radius = h**2 / (12 * (1 - reference.nu**2)), section.blunt_radius / placed_body.R
     stiffness = section.stiffness or DEFAULT_STIFFNESS * D / h**2 * (
         1.0 if body_radius == inf else POINTED_STIFFNESS_FACTOR * (1 + 1 / body_radius)
@@ -122,7 +133,8 @@ def _contact(
         stiffness,
         section.penetration,
         body_radius,
-        section.stiffness is not None,
+        section.stiffness is not None,  # has_given_stiffness
+        # start and lift, of a body without a position of its own
         *((Q @ start, placed_body.front - Q @ start) if section.position is None else ()),
     )
     depth = -least_gap(contact, reference)
@@ -161,8 +173,9 @@ class ContactZone:
     ) -> "ContactZone":
         """Return the zone in which a body presses, up to the largest approach of the steps.
 
-        For a plane its radius is about that of a ring, sqrt(2 R a) at an approach a. For other
-        bodies it is at most their radius and a margin.
+        For a plane its radius is about that of a ring, sqrt(2 R a) at an approach a, with margins.
+        For other bodies it is at most their radius and a margin. Without a target of the approach,
+        ten thicknesses are assumed.
         """
         h, size = reference.h, contact.size
         ring_radius = 1.1 * sqrt(2 * (largest_approach(loads) or 10.0) * h)
@@ -179,13 +192,26 @@ class ContactZone:
         """
         x, y = map(float, self.place)
         ring_width, size = sqrt(sizing.h), self.size
+        # three elements per radius, but no finer than h/10; the numbers are rules of thumb
         small_body = (
-            [DiscFeature((x, y), 1.5 * size, max(size / 3, 0.1 * sizing.h), 0.4)]
+            [
+                DiscFeature(
+                    (x, y),
+                    radius=1.5 * size,
+                    size=max(size / 3, 0.1 * sizing.h),
+                    growth=0.4,
+                )
+            ]
             if size < ring_width
             else []
         )
         return [
-            DiscFeature((x, y), self.reach, RING_SIZE * ring_width / sizing.refinement, growth),
+            DiscFeature(
+                (x, y),
+                radius=self.reach,
+                size=RING_SIZE * ring_width / sizing.refinement,
+                growth=growth,
+            ),
             *small_body,
         ]
 
@@ -218,9 +244,11 @@ def body_symmetry(contact: ContactBody) -> SymmetryConstraint:
             < SYMMETRY_TOLERANCE * (1 + np.abs(distances).max())
         )
 
-    # two turns by angles that no symmetry of finite order has
+    # two turns by angles (rad) that no symmetry of finite order has
     is_turned = all(is_image(Q, random_places @ Q.T) for Q in (rotation(1.0), rotation(2.5)))
+    # which a mirror plane must contain
     held_vectors = [contact.front, direction, *contact.distance.mirror_vectors]
+    # of planes through e3 and a vector; one along e3 gives no plane
     azimuths = tuple(
         atan2(v[1], v[0])
         for v in contact.distance.possible_mirror_vectors
@@ -246,11 +274,14 @@ def least_gap(contact: ContactBody, reference: ReferenceShell) -> float:
     outline = reference.imperfect
 
     def gap(x: Array) -> Array:
-        return contact.gap(x @ reference.Q.T, 0.0, reference.half_thickness(x))[0]
+        half = reference.half_thickness(x)
+        gaps, *_ = contact.gap(x @ reference.Q.T, approach=0.0, half=half)
+        return gaps
 
     chart = outline.chart_samples()
-    if chart is None:
+    if chart is None:  # of a mesh file, where samples alone are compared
         return float(gap(outline.sample()).min())
+    # half the box around the best sample in which the search goes on: a tenth of the chart
     reach = np.full(2, 0.1 * float(np.ptp(chart, axis=0).max()))
 
     def on_chart(x: Array) -> Array:
@@ -263,12 +294,14 @@ def least_gap(contact: ContactBody, reference: ReferenceShell) -> float:
 def overlap(body: ContactBody, other: ContactBody) -> float:
     """Return the depth over R by which two bodies overlap near the shell, at approach zero.
 
-    It is negative if they are apart. The depth is minus the least value of the larger distance.
+    It is negative if they are apart. At each place the larger of both signed distances is taken;
+    the depth is minus its least value, since a place where both are negative is in both bodies.
     """
 
     def larger_distance(x: Array) -> Array:
         return np.maximum(body.distance(x)[0], other.distance(x)[0])
 
+    # random places near the shell, and the points where bodies are most likely to meet
     x = np.concatenate(
         [
             np.random.default_rng(3).uniform(-HALF_SEARCH_EXTENT, HALF_SEARCH_EXTENT, (4000, 3)),
@@ -297,7 +330,7 @@ def _refined_minimum(
     reach
         (dim,) half the sides of the first box.
     """
-    rng = np.random.default_rng(5)
+    rng = np.random.default_rng(5)  # a fixed seed: results are the same in each run
     for _ in range(SEARCH_ROUNDS):
         trial_places = best + reach * rng.uniform(-1, 1, (200, len(best)))
         values = f(trial_places)

@@ -1,4 +1,8 @@
-"""A box with rounded edges."""
+"""A box with rounded edges, a rigid body: its section of a case and its signed distance.
+
+The approach is the body's displacement along its direction; distances are those at approach zero.
+Lengths are over R, in sections in the case's unit.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -77,9 +81,10 @@ class Box(Distance):
 
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
         """Return signed distance (n,), gradient (n, 3), Hessian (n, 3, 3) at places x (n, 3)."""
-        # in the octant of positive coordinates, from which signs lead back to the place's own
+        # by symmetry in the octant of positive coordinates, where the core's corner is half - edge
         y = (x - self.centre) @ self.axes.T
         g, n, N = rounded(np.abs(y) - self.half + self.edge, self.edge)
+        # the axes with the signs of the place's own octant
         basis = np.where(y < 0, -1.0, 1.0)[:, :, None] * self.axes
         return g, np.einsum("na,nai->ni", n, basis), np.einsum("nai,nab,nbj->nij", basis, N, basis)
 

@@ -1,4 +1,10 @@
-"""The step `kind: contact`: a rigid body that presses on the shell, and its observables."""
+"""The step `kind: contact`: a rigid body that presses on the shell, and its observables.
+
+A step of a case drives one amplitude, a load parameter by name: here the approach, the displacement
+of a body along its direction over h. Its conjugate -dPi/da, with the energy Pi, is minus the force
+on the body. mu holds the amplitudes of a state. An observable is a column of results that is read
+from a state; a view is a model with the units in which it is reported.
+"""
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
@@ -72,6 +78,7 @@ class ContactSection(PathStep):
     def name_in(self, context: Context, loads: Sequence[Step]) -> str:
         """Return the name of the load parameter that this step drives."""
         names = approaches(context.sections["bodies"], loads)
+        # a step without `body` is for the only one; `refuse_unfit` reports other cases
         body = str(self.body or next(iter(names), ""))
         return names.get(body, self.amplitude)
 
@@ -84,6 +91,7 @@ class ContactSection(PathStep):
             With the key and the names that are allowed.
         """
         bodies: Mapping[str, object] = context.sections["bodies"]
+        # only a single body need not be named
         if (self.body is None and len(bodies) != 1) or (
             self.body is not None and self.body not in bodies
         ):
@@ -110,7 +118,8 @@ class ContactSection(PathStep):
 def contact_step_options(options: "StepOptions") -> "StepOptions":
     """Return step control for a path along which contact sets in, grows and ceases.
 
-    It allows smaller steps and more Newton iterations than the given options.
+    It allows smaller steps, and more Newton iterations before a step counts as hard, than the given
+    options: the active set of a contact changes within a step.
     """
     return replace(
         options,
@@ -124,7 +133,8 @@ def contact_step_options(options: "StepOptions") -> "StepOptions":
 def approaches(bodies: Collection[str], loads: Sequence[Step]) -> dict[str, str]:
     """Return a mapping: name of each body -> name of its approach, the load parameter.
 
-    A single body has plain "approach", unless a step is a force; otherwise the name is appended.
+    A single body has plain "approach", otherwise the body's name is appended. Beside a step with a
+    force it is appended too, since the column `force` is then that of the step.
     """
     is_single = len(bodies) == 1 and not any(load.amplitude == "force" for load in loads)
     return {name: "approach" if is_single else f"approach_{name}" for name in bodies}
@@ -193,7 +203,7 @@ class BodiesObservables(Observables):
     )
 
     def amplitudes(self, loads: "Loads") -> tuple[str, ...]:
-        """Return the load parameters of all bodies: approach, and stored stiffness."""
+        """Return the numbers of all bodies in a state: approach, and stiffness of the penalty."""
         return tuple(
             name for contact in loads.contacts for name in (contact.amplitude, contact.setting)
         )
@@ -218,6 +228,7 @@ class BodiesObservables(Observables):
         """
         model, h, values = view.model, view.h, dict[str, float]()
         for name in model.contacts:
+            # dPi/da, the force on the body over the unit below
             region, force = model.region(state, name), view.potential(state, name)
             approach_force_penetration = (
                 state.mu[name],
@@ -225,7 +236,8 @@ class BodiesObservables(Observables):
                 region.penetration / h,
             )
             radii = (view.length * radius for radius in (region.radius, region.inner, region.outer))
-            stiffness = float(model.contacts[name][0].stiffness.value)
+            body_contact, _ = model.contacts[name]
+            stiffness = float(body_contact.stiffness.value)
             values |= dict(
                 zip(
                     contact_columns(name),

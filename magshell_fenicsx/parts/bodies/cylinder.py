@@ -1,4 +1,8 @@
-"""A cylinder that touches with its round side."""
+"""A cylinder that touches with its round side: its section of a case and its signed distance.
+
+The approach is the body's displacement along its direction; distances are those at approach zero.
+Lengths are over R, in sections in the case's unit.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,4 +1,8 @@
-"""An ellipsoid."""
+"""An ellipsoid, a rigid body: its section of a case and its signed distance.
+
+The approach is the body's displacement along its direction; distances are those at approach zero.
+Lengths are over R, in sections in the case's unit.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -76,10 +80,10 @@ class Ellipsoid(Distance):
         The Hessian has the curvatures k/(1 + g k) of the parallel surface at distance g, where k
         are those of the ellipsoid at the nearest place.
         """
-        y = (x - self.centre) @ self.axes.T
+        y = (x - self.centre) @ self.axes.T  # coordinates along the ellipsoid's axes
         foot = self.nearest(y)
         normal = foot / self.semi**2
-        normal_length = np.linalg.norm(normal, axis=1)
+        normal_length = np.linalg.norm(normal, axis=1)  # of half the gradient of sum (y_i/a_i)²
         n = normal / normal_length[:, None]
         g = np.einsum("ni,ni->n", y - foot, n)
         # projection onto the tangent plane, and the curvatures of the surface as a tensor
@@ -100,8 +104,8 @@ class Ellipsoid(Distance):
         Both are coordinates along the ellipsoid's axes, from its centre.
         """
         a = self.semi
-        size = np.maximum(np.abs(y), PLANE_OFFSET * a)
-        # the largest term of F + 1 is then 1, so that 0 <= F <= 2
+        size = np.maximum(np.abs(y), PLANE_OFFSET * a)  # in the octant of positive coordinates
+        # the start: the largest of the three terms of F + 1 is then 1, so that 0 <= F <= 2
         t = (a * size - a**2).max(axis=1)
         for _ in range(MAX_NEWTON_ITERATIONS):
             ratio = a * size / (t[:, None] + a**2)

@@ -1,4 +1,4 @@
-"""A plane."""
+"""A plane: its section of a case and its signed distance, at approach zero and over R."""
 
 from dataclasses import dataclass
 from typing import Literal

@@ -1,4 +1,9 @@
-"""A cylinder that touches with its flat end, whose edge is rounded."""
+"""A cylinder that touches with its flat end, whose edge is rounded: its section of a case and its
+signed distance.
+
+The approach is the body's displacement along its direction; distances are those at approach zero.
+Lengths are over R, in sections in the case's unit.
+"""
 
 from dataclasses import dataclass
 from typing import Literal, Self
@@ -64,13 +69,14 @@ class Rod(Distance):
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
         """Return signed distance (n,), gradient (n, 3), Hessian (n, 3, 3) at places x (n, 3).
 
-        In cylinder coordinates (rho, z) the rod is a rounded corner; the Hessian also has n_rho/rho
+        In cylinder coordinates (rho, z) the rod is a corner with a rounded edge. Its core has the
+        radius less `edge`, and its end is as much behind. In space the Hessian also has n_rho/rho
         around the axis.
         """
         r, d = x - self.end, self.along
         radial = r - (r @ d)[:, None] * d
         from_axis = np.linalg.norm(radial, axis=1)
-        e_rho = radial / np.maximum(from_axis, 1e-300)[:, None]
+        e_rho = radial / np.maximum(from_axis, 1e-300)[:, None]  # zero on the axis
         q = np.column_stack([from_axis - self.radius + self.edge, r @ d + self.edge])
         g, n, N = rounded(q, self.edge)
         basis = np.stack([e_rho, np.broadcast_to(d, e_rho.shape)], axis=1)  # d(rho, z)/dx

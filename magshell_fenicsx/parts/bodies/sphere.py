@@ -1,4 +1,4 @@
-"""A sphere."""
+"""A sphere: its section of a case and its signed distance, at approach zero and over R."""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -39,7 +39,7 @@ class Sphere(Distance):
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
         """Return signed distance (n,), gradient (n, 3), Hessian (n, 3, 3) at places x (n, 3)."""
         r = x - self.centre
-        from_centre = np.maximum(np.linalg.norm(r, axis=1), 1e-300)
+        from_centre = np.maximum(np.linalg.norm(r, axis=1), 1e-300)  # a divisor, also in the centre
         n = r / from_centre[:, None]
         return (
             from_centre - self.radius,

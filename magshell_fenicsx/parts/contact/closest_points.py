@@ -3,6 +3,14 @@
 A tree gives the pairs of cells that are near, which stay while nodes move little; Newton's method
 the closest point in each cell (`projection`). Of these the places count from which the surface goes
 on to no nearer one. docs/theory.md, Contact.
+
+A point is a quadrature point of a cell. A place is its projection: a cell with coordinates X in it
+(`Projections`). Cells are near within the surface if the way between them along the undeformed
+surface is short: such cells are the material around a point, and touch it only if folded. The side
+of a cell is one of its three; the number `side` of a place is that of the direction in which the
+point faces it. Free directions are those in which a place can move: two inside a cell, one on its
+side, none in its corner. Cuts divide cells along the cells that they face (`segments`). The reach
+is the largest distance that is looked for. Lengths are over R.
 """
 
 from collections.abc import Callable
@@ -90,19 +98,22 @@ class ClosestPointSearch:
         if offsets:
             self.half_thickness = offsets.undeformed_half_thickness
         self._largest_thickness = 2 * self._bound(self.half_thickness)
+        # a number of thicknesses, as a field at nodes
         distance = 2 * SELF_CONTACT_DISTANCE * self.half_thickness
+        # numbers i * cells + j of the pairs of cells i and j that are near within the surface
         self._near_keys = cells.near_within_surface(r0, distance)
         self._undeformed_nodes = np.column_stack([r0, self.half_thickness])
         undeformed_points = self.places_of_points(rule, self._undeformed_nodes)
         self._undeformed_points: tuple[ContactPoints, Array] = rule, undeformed_points
         self._own_cells = np.unique(rule.cell)  # of this rank, that are modelled
+        # reach -> displacement, margin and near pairs of the last search, see `_near_pairs`
         self._tracked = dict[float, tuple[Array, float, tuple[Longs, Longs]]]()
 
     def places_of_nodes(self, u: Array, *, to_faces: bool = True) -> Array:
         """Return the places (nodes, 3) of all nodes at a displacement u (nodes, 3), over R.
 
         Where the thickness varies and `to_faces` is set, they are (nodes, 4). The fourth component
-        is half the thickness less h/2, see `projection`.
+        is half the thickness less h/2, so that distances are those of faces, see `projection`.
         """
         r = self._r0 + u
         if not (to_faces and self._offsets):
@@ -114,7 +125,9 @@ class ClosestPointSearch:
         return polynomial_bound(nodal[self._cells.nodes], self._cells.lebesgue_constant)
 
     def places_of_points(self, points: ContactPoints, r: Array, which: Any = slice(None)) -> Array:
-        """Return the places (n, 3 or 4) of some contact points, over R; see `points_in_cells`.
+        """Return the places (n, 3 or 4) of some contact points, over R.
+
+        A fourth component is minus half the thickness, plus h/2: of points it has the other sign.
 
         Parameters
         ----------
@@ -137,6 +150,7 @@ class ClosestPointSearch:
             (nodes, 3) displacements over R.
         """
         spheres = [self._bounding_spheres(self._r0 + displacement) for displacement in (u, v)]
+        # one sphere around each cell's way: at the middle, larger by half of the motion
         centres = (spheres[0][0] + spheres[1][0]) / 2
         half_motion = np.linalg.norm(spheres[1][0] - spheres[0][0], axis=1) / 2
         radii = np.maximum(spheres[0][1], spheres[1][1]) + half_motion
@@ -169,7 +183,7 @@ class ClosestPointSearch:
         allowed = self._may_touch(i, j)
         i, j = i[allowed], j[allowed]
         is_selected = ~self._are_near_in_surface(i * len(self._cells.nodes) + j)
-        neighbours = np.flatnonzero(~is_selected)
+        neighbours = np.flatnonzero(~is_selected)  # near within the surface
         for r in surfaces:
             is_selected[neighbours] |= self._are_folded(i[neighbours], j[neighbours], r, reach)
         return i[is_selected], j[is_selected]
@@ -179,6 +193,7 @@ class ClosestPointSearch:
 
         The keys (n,) are i * cells + j.
         """
+        # beyond the last key the last one is compared, which differs
         position = np.minimum(np.searchsorted(self._near_keys, keys), len(self._near_keys) - 1)
         return np.asarray(self._near_keys[position] == keys)
 
@@ -198,10 +213,11 @@ class ClosestPointSearch:
             Distance over R.
         """
         is_folded, nodes = np.zeros(len(i), dtype=bool), self._cells.nodes
+        # no place of a cell is farther from all nodes than `spacing` times the cell's radius
         _, radii = self._bounding_spheres(r)
         _, undeformed_radii = self._bounding_spheres(self._r0)
         spacing = LATTICE_RADIUS_FACTOR / self._cells.element.degree
-        chunks = 1 + len(i) * nodes.shape[1] ** 2 // MAX_DISTANCES_AT_ONCE
+        chunks = 1 + len(i) * nodes.shape[1] ** 2 // MAX_DISTANCES_AT_ONCE  # which limits memory
         for chunk in np.array_split(np.arange(len(i)), chunks):
             corners = nodes[i[chunk], :3, None], nodes[j[chunk], None, :3]
             # a fold brings corners nearer to each other: most pairs end here
@@ -224,7 +240,8 @@ class ClosestPointSearch:
     def _near_pairs(self, u: Array, reach: float) -> tuple[Longs, Longs]:
         """Return pairs (i, j) of cells that are near each other; i are modelled cells of this rank.
 
-        The pairs are searched with a margin and cached until nodes have moved that far.
+        The pairs are searched with a margin and cached, for each reach, until nodes have moved
+        that far: the result may have pairs that are a little farther.
 
         Parameters
         ----------
@@ -235,6 +252,7 @@ class ClosestPointSearch:
         """
         if reach in self._tracked:
             tracked_u, margin, pairs = self._tracked[reach]
+            # twice, since two cells may move towards each other
             motion = 2 * float(np.linalg.norm(u - tracked_u, axis=1).max(initial=0.0))
             if motion + reach <= margin:
                 return pairs
@@ -246,10 +264,11 @@ class ClosestPointSearch:
         return pairs
 
     def gap_at_supports(self, supported_nodes: Longs, u: Array) -> float:
-        """Return the least gap over R between the faces at supported nodes, at a displacement.
+        """Return the least gap over R between the faces at supported nodes, where faces overlap.
 
         Only nodes count that may touch and are not near within the undeformed surface. The gap is
-        infinite if there are none, and if the thickness depends on the displacement.
+        negative. It is infinite if no faces overlap there, and if the thickness depends on the
+        displacement, which is then not looked at.
 
         Parameters
         ----------
@@ -260,7 +279,7 @@ class ClosestPointSearch:
         """
         if self._offsets and not self._offsets.is_constant:
             return np.inf
-        count = len(self._cells.nodes)
+        count = len(self._cells.nodes)  # of cells, for the keys of pairs
 
         def may_touch(i: Longs, j: Longs) -> Flags:
             return np.asarray(self._may_touch(i, j) & ~self._are_near_in_surface(i * count + j))
@@ -294,6 +313,7 @@ class ClosestPointSearch:
         """
         points = points or self._rule
         r = self.places_of_nodes(u, to_faces=to_faces)
+        # the nearest place in each cell, of which those stay from which none is nearer
         places = self.projections_in_cells(points, u, r, reach, least_only=least_only)
         return self._select_nearest(points, places)
 
@@ -340,6 +360,7 @@ class ClosestPointSearch:
             np.bincount(surface_of_cell),
             np.unique(surface_of_cell, return_index=True),
         )
+        # one cell stands for its surface; `faces_all.T` below looks from the other surface
         # numbers of cells of one surface that another faces
         faced = np.zeros((count, count), dtype=np.int64)
         for surface, cell in enumerate(first_cells):
@@ -365,6 +386,7 @@ class ClosestPointSearch:
         """Return bounds of the distance from points to their nearest places on separate surfaces.
 
         The nearest node of such a surface bounds the distance, since it is a place of the surface.
+        A surface is separate from a point's own if the nearest place on it is the one that counts.
 
         Parameters
         ----------
@@ -378,7 +400,7 @@ class ClosestPointSearch:
             Distance over R beyond which nodes are not looked for.
         """
         surface_of_cell, are_separate = self._separate_surfaces
-        variation = 0.0
+        variation = 0.0  # of half the thickness, by which distances of faces differ from nodes'
         if r.shape[1] > 3:
             variation = self._bound(r[:, 3]) + self._bound(-r[:, 3])
         reach, surface_of_point = np.full(len(x), np.inf), surface_of_cell[cell]
@@ -389,6 +411,7 @@ class ClosestPointSearch:
             nodes = np.unique(self._cells.nodes[near_separate_cells])
             if len(nodes):
                 own_points = searched[surface_of_point == number_of_surface]
+                # infinite distances, beyond the largest one, leave the points without a bound
                 tree = scipy.spatial.cKDTree(r[nodes, :3])
                 distance, _ = tree.query(x[own_points, :3], distance_upper_bound=max_distance)
                 reach[own_points] = distance + variation + 2 * DISTANCE_TOLERANCE * self._h
@@ -408,13 +431,14 @@ class ClosestPointSearch:
         points
             Contact points.
         u, r
-            (nodes, 3) displacement, and nodes at it as of `places_of_nodes`.
+            (nodes, 3) displacement, and the result of `places_of_nodes` at it.
         reach
             Largest distance over R, see `projections`.
         least_only
             See `projections`.
         """
         largest_offset = self._bound(r[:, 3]) if r.shape[1] > 3 else 0.0
+        # mid-surfaces may be farther apart than faces, by both offsets
         face_reach, reach = reach, reach + 2 * largest_offset
         i, j = self._near_pairs(u, reach)
         # points of cell i are order[first_position : first_position + count]
@@ -424,7 +448,7 @@ class ClosestPointSearch:
         searched = order[np.isin(cell_in_order, i)]
         x = np.zeros((len(order), r.shape[1]))
         x[searched] = self.places_of_points(points, r, searched)
-        if self._undeformed_points[0] is not points:
+        if self._undeformed_points[0] is not points:  # undeformed places are kept for one set
             self._undeformed_points = points, self.places_of_points(points, self._undeformed_nodes)
         is_near = self._are_near_in_surface(i * len(self._cells.nodes) + j)
         undeformed = UndeformedPairs(
@@ -434,7 +458,8 @@ class ClosestPointSearch:
         if least_only:
             limits = self._limits(searched, x, r, (i, j), points.cell[searched], reach)
         pairs = j, first_position, count, order
-        return nearest_places(self._cells, r, x, pairs, reach, face_reach, undeformed, limits)[1]
+        _, places = nearest_places(self._cells, r, x, pairs, reach, face_reach, undeformed, limits)
+        return places
 
     def select_distant_cells(self, points: ContactPoints, places: Projections) -> Projections:
         """Return the places whose cells are not near the point's own cell within the surface.
@@ -448,7 +473,8 @@ class ClosestPointSearch:
         """Return the mean (n,) of the undeformed thicknesses at points and places, over R."""
         half = self.half_thickness[self._cells.nodes]
         nodal = half[places.cell][..., None]
-        (_, half_at_places), *_ = jets(self._cells.element, places.X, nodal, 0)
+        # values alone: no derivatives
+        (_, half_at_places), *_ = jets(self._cells.element, places.X, nodal, order=0)
         shape, own_cell = points.shape[places.point], points.cell[places.point]
         half_at_points = np.sum(shape * half[own_cell], axis=1)
         return np.asarray(half_at_points + half_at_places[:, 0])
@@ -457,13 +483,14 @@ class ClosestPointSearch:
         """Return the places from which the surface goes on to no nearer place.
 
         A point has at most one such place in each direction: on both sides of its own surface, and
-        before its edge. Places at the same distance in neighbouring cells all stay, see
-        `JoinedPlaces`.
+        before its edge. Places at the same distance in neighbouring cells all stay, to be joined as
+        one by `JoinedPlaces`. The result is in the order of points, directions and distances.
         """
         cells, cell_count = self._cells, len(self._cells.nodes)
         keys = places.point * cell_count + places.cell
         order = np.argsort(keys, kind="stable")
         places, keys = places.select(order), keys[order]
+        # a barycentric coordinate is zero on the side opposite to its corner
         on_sides = np.column_stack([1 - places.X.sum(axis=1), places.X]) == 0.0
         key_of_point_cell = points.cell[places.point] * cell_count
         is_nearest = np.ones(len(keys), dtype=bool)
@@ -477,8 +504,9 @@ class ClosestPointSearch:
             is_nearer = (
                 places.distance[neighbour_row] < places.distance - DISTANCE_TOLERANCE * self._h
             )
-            # the surface that goes on there is not searched
+            # at a fold: beyond the side is material around the point, which is not searched
             is_folded = places.is_above & self._are_near_in_surface(key_of_point_cell + neighbour)
+            # elsewhere the neighbour's place must be known, and no nearer
             is_nearest &= ~is_on_side | (is_listed & ~is_nearer) | is_folded
         places = places.select(is_nearest)
         if not len(places.point):
@@ -494,9 +522,9 @@ class ClosestPointSearch:
         """Return flags (n,): which places do not count, because points of an edge press there.
 
         They are places on an edge of another surface that a point inside a surface faces steeply.
-        Such points see a line, which is narrower than their distance. The line would be held back
-        where it slides over one of them. All places of one point and direction have the flag of the
-        nearest.
+        Points inside a surface see the edge as a line that is narrower than the distance of the
+        points. The edge would catch at each of them as it slides. So only the edge's own points
+        press. All places of one point and direction have the flag of the nearest.
 
         Parameters
         ----------
@@ -514,7 +542,8 @@ class ClosestPointSearch:
     def are_edges_alone(self, points: ContactPoints, nearest: Projections, normals: Array) -> Flags:
         """Return flags (n,): which points belong to an edge that presses on a face alone.
 
-        The face's own points are left to the edge, see `are_left_to_edges`.
+        Such a point faces the inside of a surface that is steep to its own. The own points of the
+        face do not count there, see `are_left_to_edges`.
 
         Parameters
         ----------
@@ -531,7 +560,8 @@ class ClosestPointSearch:
     ) -> tuple[Flags, Flags]:
         """Return two flags (n,): whether places are on an edge, and steep to their point's cell.
 
-        Cells are steep to each other if their normals have a cosine below `STEEP_COSINE`.
+        A place is on an edge if it moves along an open side, or is in a corner of one. Cells are
+        steep to each other if their normals have a cosine below `STEEP_COSINE`.
 
         Parameters
         ----------
@@ -541,6 +571,7 @@ class ClosestPointSearch:
             (cells, 3) unit normals.
         """
         on_side = np.column_stack([1 - nearest.X.sum(axis=1), nearest.X]) == 0.0
+        # one free direction: the second column of each matrix is zero
         moves_along_side = nearest.free_directions.any(axis=(1, 2)) & (
             nearest.free_directions[:, :, 1] == 0
         ).all(axis=1)
@@ -561,8 +592,8 @@ def _distances_of_nodes(r: Array, nodes: Longs, others: Longs) -> Array:
 def _number_directions(places: Projections) -> Projections:
     """Return the places with a number `side` for each direction from their point, in that order.
 
-    The number is 0 for the direction of the nearest place, then 1, and at last `MAX_DIRECTIONS` -
-    1.
+    Places whose directions differ by less than an angle have one number. It is 0 for the direction
+    of the nearest place, then 1, and `MAX_DIRECTIONS` - 1 for all others.
 
     Parameters
     ----------
@@ -591,9 +622,10 @@ def gap_between_supports(
     half_thickness: Array,
     may_touch: Callable[[Longs, Longs], Flags],
 ) -> float:
-    """Return the least negative gap over R between faces at supported nodes; infinite if none.
+    """Return the least gap over R between faces at supported nodes, where it is negative.
 
-    See `ClosestPointSearch.gap_at_supports`.
+    It is infinite if no faces overlap. Only nodes count that are a thickness apart undeformed: the
+    others are the same material.
 
     Parameters
     ----------
@@ -609,7 +641,7 @@ def gap_between_supports(
         Of cell numbers i and j, (n,) each, returns flags (n,): whether they may touch and are not
         near within the surface.
     """
-    cell_of = np.zeros(len(r0), dtype=np.int64)
+    cell_of = np.zeros(len(r0), dtype=np.int64)  # one of the cells of each node
     cell_of[nodes.ravel()] = np.repeat(np.arange(len(nodes)), nodes.shape[1])
     cells, undeformed = cell_of[supported_nodes], r0[supported_nodes]
     deformed, half = (r0 + u)[supported_nodes], half_thickness[supported_nodes]
@@ -626,6 +658,7 @@ def no_projections() -> Projections:
     """Return an empty set of places."""
     no_numbers = np.zeros(0, dtype=np.int64)
     X, free_directions, distance, direction = (np.zeros((0, *shape)) for shape in PLACE_SHAPES)
+    no_flags = no_numbers > 0
     return Projections(
-        no_numbers, no_numbers, X, free_directions, distance, no_numbers, direction, no_numbers > 0
+        no_numbers, no_numbers, X, free_directions, distance, no_numbers, direction, no_flags
     )

@@ -1,4 +1,10 @@
-"""Observables of shells that touch: the force, the least gap and the penalty's stiffness."""
+"""Observables of shells that touch: the force, the least gap and the penalty's stiffness.
+
+An observable is a column that is read from a state. A pair has two members that may touch: shells,
+patches, or a shell and itself. A penalty of the penetration keeps them apart. A state stores the
+penalty's stiffness among its amplitudes, under the name `Pair.setting`. A view is a model with the
+units in which it is reported.
+"""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
@@ -64,6 +70,7 @@ class ContactObservables(Observables):
         MeshError
             With the name of the missing patch, or the two pairs.
         """
+        # flags of cells by name; the whole shell counts as a patch
         patches = {**surface.patches, WHOLE_SHELL: np.ones(len(surface.cells), dtype=bool)}
         for number, pair in enumerate(loads.pairs):
             for name in pair.names:
@@ -91,6 +98,7 @@ class ContactObservables(Observables):
         model, values = view.model, dict[str, float]()
         for contact in model.shell_contacts:
             evaluation = model.system.at_state(state)
+            # the model evaluates both with this state as its present one
             force, gap = evaluation.evaluate(contact.force), evaluation.evaluate(contact.least_gap)
             numbers_of_pair = force / model.force_unit, gap / view.h, contact.stiffness.value
             values |= dict(zip(_columns(contact.pair), numbers_of_pair, strict=True))
@@ -107,11 +115,12 @@ def _share_cells(pair: "Pair", other: "Pair", patches: Mapping[str, NDArray[np.b
     """
     other_first, other_second = (patches[name] for name in other.names)
     own_first, own_second = (patches[name] for name in pair.names)
+    # the first member shares cells with the first or with the second of the other pair
     straight = (own_first & other_first).any() and (own_second & other_second).any()
     crossed = (own_second & other_first).any() and (own_first & other_second).any()
     return bool(straight or crossed)
 
 
 def _columns(pair: "Pair") -> Iterator[str]:
-    """Return the names of the columns of a pair."""
+    """Return the names of the columns of a pair: those of the quantities, and the pair's suffix."""
     return (q.name + pair.suffix for q in ContactObservables.quantities)

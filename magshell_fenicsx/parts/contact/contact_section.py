@@ -1,4 +1,10 @@
-"""The section `contact` of a case: which shells may touch, and what a case with contact can be."""
+"""The section `contact` of a case: which shells may touch, and what a case with contact can be.
+
+A pair has two members that may touch: shells, patches of one, or a shell and itself; the name
+`shell` stands for all of a case's shell. A penalty keeps them apart. E, h, R and D are modulus,
+thickness, reference length and bending stiffness of the shell. A step of a case drives one load.
+In goes the section, out come the pairs of a model (`Pair`).
+"""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -108,10 +114,12 @@ class ShellContact(KeyAbility[Sequence[GivenPair]]):
     ) -> list[SymmetryConstraint]:
         """Return the symmetry that contact preserves: all, but no meridian if a patch may touch."""
         names = {name for pair in self.sections for name in names_of(pair)} - {WHOLE_SHELL}
+        # patches need not be the same all around an axis
         return [patch_constraint("contact", names, context.shell)]
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
         """Return `pairs` of the model's `Loads`: the pairs that may touch, dimensionless."""
+        # several shells, each with a modulus of its own; only a mesh can have them
         assembly = context.shell.assembly if isinstance(context.shell, MeshSurface) else None
         return {
             "pairs": model_pairs(
@@ -136,12 +144,15 @@ def model_pairs(
     moduli
         Name of each of several shells -> Young's modulus over E; empty for one shell.
     """
+    # over E h/R^2: D/(R h)^2 is E h/R^2 over 12 (1 - nu^2)
     default_stiffness, pairs = RELATIVE_STIFFNESS / (12 * (1 - nu**2)), list[Pair]()
     for pair in sections:
         first, second = names_of(pair)
         moduli_of_pair = [_values_of_shells(name, moduli) for name in (first, second)]
+        # of one shell there are no moduli: its own is E
         softer_modulus = min([*moduli_of_pair[0], *moduli_of_pair[1]], default=1.0)
         given_stiffness = pair.stiffness if isinstance(pair, PairSection) else None
+        # columns of a single pair need no names to tell pairs apart
         suffix = f"_{first}_{second}" if len(sections) > 1 else ""
         stiffness = given_stiffness or default_stiffness * softer_modulus
         is_given = given_stiffness is not None
@@ -174,6 +185,7 @@ def refuse_unfit_pairs(sections: Sequence[GivenPair], context: Context) -> None:
     ValueError
         With the key and what is allowed.
     """
+    # pairs without the order of their members, and names of several shells if there are any
     earlier_pairs, shells = set[frozenset[str]](), list(context.sections.get("shells") or {})
     for i, pair in enumerate(map(names_of, sections)):
         if frozenset(pair) in earlier_pairs:
@@ -195,6 +207,7 @@ def refuse_unfit_pairs(sections: Sequence[GivenPair], context: Context) -> None:
                     f"contact.{i}: {name}: allowed: {WHOLE_SHELL}; parts are the patches of a "
                     "mesh file"
                 )
+    # both members of the pair of the whole shell and itself are one name
     if len(earlier_pairs) > 1 and frozenset({WHOLE_SHELL}) in earlier_pairs:
         raise ValueError(f"contact: {WHOLE_SHELL} and itself has all other pairs: give it alone")
     context.needs("contact", "a mid-surface")

@@ -8,6 +8,11 @@ deformed area of the cells around, and between nodes their polynomial:
 with t h the undeformed thickness and J = |a_1 x a_2| of the cell at the node. Of a shell that has
 grown V is the natural volume, a polynomial of the amplitude "natural_stretch". The derivatives by
 the displacement and by this amplitude are exact. docs/theory.md, Contact.
+
+The offset H is half the thickness, and half volumes are (h/2) sum V. The thickness factor is t.
+Growth is the value of the amplitude. Places have a second meaning in shapes of arrays: (cells,
+places) are values of each cell at its nodes. The images of a half or a sector are copies of its
+nodes; copies at one place share one H. The unknowns of a node are its displacement.
 """
 
 from dataclasses import dataclass
@@ -99,15 +104,16 @@ class FaceOffsets:
         self._cells, self._r0, self._keeps_volume = cells, r0, keeps_volume
         self._thinning_cells = np.flatnonzero(keeps_volume)
         self._same_place, self.amplitude = same_place, amplitude
-        self._place_numbers = same_place[cells.nodes]
+        self._place_numbers = same_place[cells.nodes]  # of each cell's nodes, one for all copies
         self._components = r0.shape[1]  # of a displacement
         all_cells = slice(None)
         J0 = self._areas(r0, all_cells)
         volumes = [self._sum_at_nodes(all_cells, factor * J0) for factor in volume_factors]
         self._volume_coefficients = h / 2 * np.array(volumes)
-        self._thickness_factor = volume_factors[0]
+        self._thickness_factor = volume_factors[0]  # t: the power zero, without growth
         self._volume_per_factor = h / 2 * volume_factors / volume_factors[0]
         self._fixed_area = self._sum_at_nodes(~keeps_volume, J0[~keeps_volume])
+        # without growth: the power zero
         self.undeformed_half_thickness = np.asarray(
             self._volume_coefficients[0] / self._sum_at_nodes(all_cells, J0)
         )
@@ -127,11 +133,14 @@ class FaceOffsets:
         return np.asarray(self._half_volumes() / self._areas_at_nodes(u))
 
     def growth_derivative(self, u: Array, order: int = 1) -> Array:
-        """Return a derivative (nodes,) of H by the natural stretch, at u (nodes, 3)."""
+        """Return the derivative (nodes,) of H by the natural stretch, of some order, at u."""
         return np.asarray(self._half_volumes(order) / self._areas_at_nodes(u))
 
     def slope(self, u: Array, f: Array) -> Array:
-        """Return the gradient (nodes, 3) of sum f H by u (nodes, 3), for f (nodes,)."""
+        """Return the gradient (nodes, 3) by u (nodes, 3) of the sum of f H over nodes.
+
+        The weights f are (nodes,).
+        """
         if self.is_constant:
             return np.zeros_like(u)
         return np.asarray((self.jacobian(u, f != 0).T @ f).reshape(len(u), -1))
@@ -139,7 +148,8 @@ class FaceOffsets:
     def jacobian(self, u: Array, is_needed: NDArray[np.bool_]) -> Any:
         """Return the sparse derivative (nodes, 3 nodes) of H by the displacement u (nodes, 3).
 
-        Rows of nodes that are not needed, by the flags (nodes,), are zero.
+        Rows of nodes that are not needed, by the flags (nodes,), are zero. As H = V/A with a fixed
+        V, the derivative is -V/A^2 times that of A.
         """
         area = self._areas_at_nodes(u)
         return scipy.sparse.diags_array(
@@ -164,6 +174,7 @@ class FaceOffsets:
         by_volume
             (nodes,) derivatives of the same function by the volumes (h/2) sum V at nodes.
         """
+        # copies of a node share its volume, so their derivatives are added
         by_place_volume = np.bincount(self._same_place, by_volume, len(by_volume))[
             self._place_numbers
         ]
@@ -174,7 +185,8 @@ class FaceOffsets:
         """Return derivatives (nodes, 3) by the undeformed places, through the undeformed areas J0.
 
         J0 is in the volumes V, and in the areas A of cells that do not keep their volume. The
-        deformed areas J also depend on the place, as they do on u; that part is not included.
+        deformed areas J also depend on the undeformed place, in the same way as on u: the caller
+        adds that part as a derivative by u.
 
         Parameters
         ----------
@@ -188,6 +200,7 @@ class FaceOffsets:
         volume_per_factor = np.polynomial.polynomial.polyval(self.growth, self._volume_per_factor)
         by_J0 = by_place_volume * volume_per_factor * self._thickness_factor
         by_J0 += by_place_area * ~self._keeps_volume[:, None]
+        # others have no part; at zero displacement the slopes of J are those of J0
         loaded_cells = np.flatnonzero((by_J0 != 0).any(axis=1))
         forces = np.zeros(self._r0.size)
         by_place = np.einsum(
@@ -205,10 +218,10 @@ class FaceOffsets:
         return np.asarray((self._area_jacobian(u, f != 0).T @ weight).reshape(len(u), -1))
 
     def hessian(self, u: Array, f: Array) -> Any:
-        """Return the sparse Hessian (3 nodes, 3 nodes) of sum f H by u, for f (nodes,).
+        """Return the sparse Hessian (3 nodes, 3 nodes) by u of the sum of f H over nodes.
 
-        H = V/A at each node, so it has a term of first derivatives of A, and one of second
-        derivatives.
+        The weights f are (nodes,). As H = V/A at each node, it is the sum of f (2 V/A^3) A,u A,u
+        and of -f V/A^2 times the Hessian of A.
         """
         loaded_cells, areas = self._cells_around(f != 0), self._areas_at_nodes(u)
         area_jacobian = self._area_jacobian(u, f != 0)
@@ -224,7 +237,9 @@ class FaceOffsets:
     def entries(self, u: Array, entries: Entries, f: Array) -> Entries:
         """Return the entries of a second derivative by the displacement u alone.
 
-        Those given are by the places and offsets H of nodes. The chain rule adds the Hessian of H.
+        Those given are by the places and offsets H of nodes, as if both were independent. By the
+        chain rule the result is T^T K T, with the derivative T of places and H by u, plus the
+        Hessian of H times f.
 
         Parameters
         ----------
@@ -233,12 +248,12 @@ class FaceOffsets:
         entries
             Rows, columns and values by places, then offsets; see `unknown_numbers`.
         f
-            (nodes,) the first derivative by H.
+            (nodes,) the first derivative of the energy by H.
         """
         rows, columns, values = entries
         count = self._components * len(f)
         size = count + len(f)
-        if self.is_constant:
+        if self.is_constant:  # H does not depend on u: entries by places remain
             is_of_places = (rows < count) & (columns < count)
             return rows[is_of_places], columns[is_of_places], values[is_of_places]
         is_coupled = np.zeros(size, dtype=bool)
@@ -274,6 +289,7 @@ class FaceOffsets:
         to_place_numbers = scipy.sparse.coo_array(
             (np.ones(count), (np.arange(count), self._same_place)), (count, count)
         ).tocsr()
+        # nonzero entries of the products are what matters, not their values;
         # (nodes, nodes): nodes on whose displacement the place and H of each node depend
         nodes_of_thickness = (
             scipy.sparse.eye_array(count) + to_place_numbers @ cells_to_places.T @ cells_to_nodes
@@ -286,7 +302,7 @@ class FaceOffsets:
 
     def _half_volumes(self, order: int = 0) -> Array:
         """Return (h/2) sum V (nodes,), or its derivative of an order by the natural stretch."""
-        powers = np.polynomial.polynomial
+        powers = np.polynomial.polynomial  # coefficients are in ascending powers of the growth
         return np.asarray(
             powers.polyval(self.growth, powers.polyder(self._volume_coefficients, order))
         )
@@ -358,8 +374,8 @@ class FaceOffsets:
     def _area_hessians(self, u: Array, cells: Longs, w: Array) -> Array:
         """Return Hessians (cells, dofs, dofs) of the sums of w J over each cell's nodes.
 
-        J is the length of the area vector a_1 x a_2. Its Hessian has a part of first derivatives of
-        that vector, and a part of second ones, which is antisymmetric in components.
+        J is the length of the area vector a = a_1 x a_2, n its direction. Its Hessian is
+        (a,u . a,u - J,u J,u)/J + n . a,uu, where a,uu is antisymmetric in the components of nodes.
 
         Parameters
         ----------
@@ -371,7 +387,7 @@ class FaceOffsets:
         H = np.einsum("cqmi,cqni->cmn", T * (w / vectors.J)[..., None, None], T)
         H -= np.einsum("cqm,cqn->cmn", slope * (w / vectors.J)[..., None], slope)
         # the second derivative of a_1 x a_2 by components i and j of nodes is along e_k
-        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # even permutations
             twist = np.einsum("cq,qm,qn->cmn", w * vectors.normal[..., k], *self._slope_table)
             twist -= np.swapaxes(twist, 1, 2)
             H[:, i::3, j::3] += twist
@@ -395,8 +411,8 @@ class FaceOffsets:
 def unknown_numbers(nodes: Longs, count: int, components: int = 3, dim: int = 3) -> Longs:
     """Return the numbers (n, components functions) of the unknowns at nodes (n, functions).
 
-    The unknowns of places come first, `dim` for each of `count` nodes. The offsets H come after all
-    of them, one for each node, if `components` is dim + 1.
+    The components of places come first, `dim` for each of `count` nodes. The offsets H come after
+    all of them, one for each node, if `components` is dim + 1.
     """
     of_place = dim * nodes[:, :, None] + np.arange(dim)
     dofs = np.concatenate([of_place, dim * count + nodes[:, :, None]], axis=2)[..., :components]

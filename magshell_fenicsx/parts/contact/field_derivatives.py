@@ -8,6 +8,12 @@ weights J0(X). So of e Pi + f w . Pi,u the derivative is
 
 and by r0 that by u, with what the weights and the undeformed areas in V and A add. The points stay
 in their cells.
+
+Here t is the factor of the thickness, J0 the undeformed area at a node, w a displacement, and e and
+f are the two weights (`EnergyWeights`). Growth is the natural stretch, an amplitude on which the
+thickness of a grown shell depends. Forces are derivatives of the energy by places and by H;
+rates are derivatives along a motion. A place is the closest place that a point faces; joined places
+count as one. beta are shape functions of a point and minus those of its place.
 """
 
 from collections.abc import Callable, Sequence
@@ -58,6 +64,8 @@ class ContactFields:
     def shared_by_cells(self, forces: Array) -> Array:
         """Return forces on nodes, split equally among the cells around each node.
 
+        Derivatives by a field are wanted per cell; their sum over cells is the force again.
+
         Parameters
         ----------
         forces
@@ -90,6 +98,8 @@ class ContactState:
         Return entries of the second derivative by places and H, and by u.
     geometry
         Returns distances, normals, and beta with its nodes, for places; see `gap_geometry`.
+
+    On a meridian vectors have two components in place of three.
     """
 
     cells: CellsWithNodes
@@ -112,8 +122,12 @@ class ContactState:
         return self.offsets
 
     def force_rates(self, rates: Array) -> Array:
-        """Return the rates (nodes, 4) of the forces for rates (nodes, 4) of places and H."""
+        """Return the rates (nodes, 4) of the forces for rates (nodes, 4) of places and H.
+
+        They are the second derivative times these rates.
+        """
         rows, columns, values = self.find_entries_by_place_and_offset()
+        # all places come first, then H of all nodes, as in `unknown_numbers`
         flat = np.concatenate([rates[:, :-1].ravel(), rates[:, -1]])
         product = np.bincount(rows, values * flat[columns], len(flat))
         count = self.r0.size
@@ -140,18 +154,19 @@ class ContactState:
             (3, n, 3) the undeformed places, and their derivatives a_1 and a_2.
         """
         n = np.cross(*places[1:])
-        n = n / np.sum(n * n, axis=1)[:, None]
+        n = n / np.sum(n * n, axis=1)[:, None]  # the normal over J0, for relative derivatives
         by_first = np.cross(places[2], n)[:, None]
         by_second = np.cross(n, places[1])[:, None]
         return np.asarray(tables[1][..., None] * by_first + tables[2][..., None] * by_second)
 
     def penetration_rates(self, w: Array) -> Array:
-        """Return the rates (m,) of joined places' penetrations along w (nodes, 3)."""
+        """Return the rates (m,) of the joined places' penetrations along a motion w (nodes, 3)."""
         _, n, beta, nodes = self.geometry(self.places)
         rates = self.unknown_rates(w)
         slopes = distance_slopes(n, beta, rates.shape[1])
         closing = -np.einsum("nki,nki->n", slopes, rates[nodes])
         joined_places = self.joined_places
+        # the distance of a joined place changes by the weighted mean of its places' changes
         of_joined = np.bincount(
             joined_places.group, joined_places.weight * closing, len(joined_places.first)
         )
@@ -180,19 +195,22 @@ class GrowthDerivative:
     amplitude: str | None = None
 
     def energy(self) -> float:
-        """Return this derivative of this rank's contact energy, by the natural stretch.
+        """Return the derivative of this rank's contact energy by the natural stretch g.
 
-        The first is Pi,H dH; the second adds the change of Pi,H.
+        The first is Pi,H H,g. The second is H,g Pi,HH H,g + Pi,H H,gg.
         """
         state = self.find_state()
         offsets, u = state.required_offsets, state.u
-        of_forces = 0.0
+        of_forces = 0.0  # H,g Pi,HH H,g
         if self.order == 2:
             of_forces = float(_growth_forces(state)[:, -1] @ offsets.growth_derivative(u))
         return of_forces + float(state.forces[:, -1] @ offsets.growth_derivative(u, self.order))
 
     def add_residual(self, b: Array, factor: float) -> None:
-        """Add factor times the gradient of the first derivative by u to b; collective."""
+        """Add `factor` times the gradient by u of the energy's first derivative to b; collective.
+
+        The first derivative by the stretch g is Pi,H H,g: both factors depend on u.
+        """
         state = self.find_state()
         forces = state.forces_on_nodes(_growth_forces(state))
         forces = forces + state.required_offsets.slope_by_growth(state.u, state.forces[:, -1])
@@ -206,6 +224,8 @@ def with_growth(
 ) -> FreeParameter:
     """Return the parameter of growth with a contact's derivatives added to its own.
 
+    A free parameter is a number in the energies, with their derivatives by it.
+
     Parameters
     ----------
     growth
@@ -215,7 +235,8 @@ def with_growth(
     """
 
     def second_derivatives(q: object) -> Sequence[Derivative]:
-        of_contact = [GrowthDerivative(find_state, add, 2)] if q is growth.constant else []
+        # of all parameters only growth itself is in the contact
+        of_contact = [GrowthDerivative(find_state, add, order=2)] if q is growth.constant else []
         return [*growth.differentiate_slopes(q), *of_contact]
 
     slopes = [*growth.slopes, GrowthDerivative(find_state, add)]
@@ -239,7 +260,8 @@ class EnergyWeights:
 
 def by_factor(state: ContactState, weights: EnergyWeights) -> Array:
     """Return derivatives (cells, functions) of the weighted sum by the thickness factor."""
-    return state.required_offsets.by_factor(_by_volumes(state, weights)[0])
+    by_volume, _ = _by_volumes(state, weights)
+    return state.required_offsets.by_factor(by_volume)
 
 
 def by_place(state: ContactState, weights: EnergyWeights) -> Array:
@@ -248,6 +270,7 @@ def by_place(state: ContactState, weights: EnergyWeights) -> Array:
     They are those by u, and those through the areas in weights of points and in offsets.
     """
     rows, columns, values = state.find_entries()
+    # the tangent times w: the derivative of w . Pi,u by u
     rates = np.bincount(rows, values * weights.w.ravel()[columns], state.r0.size)
     forces = weights.energy * state.forces_on_nodes(state.forces)
     forces = forces + weights.force * rates.reshape(state.r0.shape) + _by_weights(state, weights)
@@ -257,7 +280,8 @@ def by_place(state: ContactState, weights: EnergyWeights) -> Array:
 def _by_volumes(state: ContactState, weights: EnergyWeights) -> tuple[Array, Array]:
     """Return derivatives (nodes,) of the weighted sum by the volumes V and by the areas A.
 
-    See the module's formula of g_V; V and A are those at nodes.
+    By V they are g_V of the module's formula. As H = V/A and H,u w = -V A,u w/A^2, those by A are
+    -(V/A^2) g - 2 f Pi,H (H,u w)/A.
     """
     H_w = state.required_offsets.change(state.u, weights.w)
     force_rates = state.force_rates(np.column_stack([weights.w, H_w]))
@@ -268,13 +292,17 @@ def _by_volumes(state: ContactState, weights: EnergyWeights) -> tuple[Array, Arr
 
 
 def _by_weights(state: ContactState, weights: EnergyWeights) -> Array:
-    """Return derivatives (nodes, 3) of the weighted sum through the areas around points."""
+    """Return derivatives (nodes, 3) of the weighted sum by places, through the points' weights.
+
+    A weight is the undeformed area that belongs to a point; gaps do not change here.
+    """
     forces = np.zeros_like(state.r0)
     if not len(state.places.point):
         return forces
     value, pressure, _ = state.penalties
     points, point = state.points, state.places.point[state.joined_places.first]
     rates = state.penetration_rates(weights.w)
+    # half, since both surfaces have points; by w the penalty changes by the pressure times the rate
     value_of_places = (weights.energy * value + weights.force * pressure * rates) / 2
     per_weight = np.bincount(point, value_of_places, len(points.cell))
     pressed_points = np.unique(point)

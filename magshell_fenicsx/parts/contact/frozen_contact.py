@@ -5,6 +5,11 @@ are inside of these or on a side, and which places are joined as one. In those c
 on. The penalty is its Taylor polynomial about the penetration of that state, since its stiffness
 grows from zero within a far smaller way than that of a difference; the weights of joined places are
 linear. So energies and forces are smooth in the number, with the exact first derivative.
+
+A place is the closest place to a contact point, in coordinates X of a cell. Joined places are those
+of one point in neighbouring cells, which count as one with a smooth minimum of their distances; its
+blur is a small length. The active set has the places in contact. r0 and u are undeformed places and
+displacements of nodes. Lengths are over R, stiffnesses over E h/R^2.
 """
 
 from dataclasses import dataclass, replace
@@ -87,17 +92,17 @@ class FrozenContact:
         Parameters
         ----------
         search
-            Gives the places of nodes and points.
+            Gives the places of nodes and points; it is not searched.
         u
             (nodes, 3) displacement over R.
         k, h
             Stiffness of the penalty over E h/R^2, and thickness over R.
         with_third_order
-            See `expanded_penalty`.
+            Whether the penalty is expanded to third order, as differences of tangents need.
         """
         places, joined_places, cells = self.places, self.joined_places, self.cells
         soft_penetration = SOFT_PENETRATION * h
-        if not len(places.point):
+        if not len(places.point):  # no contact at the frozen state, nor now
             return places, joined_places, penalty(self.penetration, k, soft_penetration)
         r = search.places_of_nodes(u)
         x = search.places_of_points(self.points, r, places.point)
@@ -109,7 +114,7 @@ class FrozenContact:
         mean_change = np.bincount(
             joined_places.group, joined_places.weight * change, len(joined_places.first)
         )
-        # the smoothed minimum to first order in the changes of its distances
+        # weights exp(-d/e) over their sum, to first order in the changes of distances d
         weight = joined_places.weight * (
             1 - (change - mean_change[joined_places.group]) / (BLUR_DISTANCE * h)
         )
@@ -135,7 +140,7 @@ def _area_ratio(cells: Cells, r0: Array, points: ContactPoints) -> Array:
     """
     if not len(points.cell):
         return np.zeros(0)
-    X = points.shape @ cells.element.points
+    X = points.shape @ cells.element.points  # places in the reference cell, from shape functions
     slopes = cells.element.tabulate(1, X)[1:, ..., 0]
     a1, a2 = np.einsum("dnk,nki->dni", slopes, r0[cells.nodes[points.cell]])
     return np.asarray(np.linalg.norm(np.cross(a1, a2), axis=1))

@@ -1,7 +1,11 @@
 """Derivatives of gaps by the places of nodes, and by the offsets H of faces there.
 
-The unknowns of a node are its place (2 or 3 components), and H where the thickness varies. See
-`surface_contact` for the formulas and for beta.
+The unknowns of a node are its place (dim = 2 or 3 components), and the offset H, half the
+thickness, where that varies. A place of `Projections` is the closest place y of the other surface
+to a point x. beta are the shape functions of x, minus those of y. The distance of mid-surfaces is
+d, its direction n. The second derivative is, see `surface_contact`,
+
+    d,uu = [beta beta (I - n n) - C^T A^-1 C]/d,   C_a = -beta y_a - d n (0, N_y,a).
 """
 
 import numpy as np
@@ -46,6 +50,7 @@ def gap_geometry(
     """
     own_nodes = cells.nodes[points.cell[places.point]]
     nodes = np.concatenate([own_nodes, cells.nodes[places.cell]], axis=1)
+    # the first half of a row's nodes belongs to the point, the second to the place
     half, shape_of_points = nodes.shape[1] // 2, points.shape[places.point]
     (shape_of_places, y), *_ = jets(cells.element, places.X, r[nodes[:, half:]], 0)
     off = np.einsum("nk,nki->ni", shape_of_points, r[nodes[:, :half]]) - y
@@ -79,9 +84,9 @@ def gap_hessians(
 ) -> Array:
     """Return the Hessians (n, dofs, dofs) of the weighted penalty by the nodes of both cells.
 
-    The formula is that of the module `surface_contact`: the first derivative times d,uu, and the
-    second times d,u d,u. It is a product of row vectors with a 4 by 4 matrix, less the terms of
-    places.
+    With the penalty psi they are the weight times psi'' d,u d,u - psi' d,uu. They are computed as
+    V^T c V, where the rows of V are d,u, its part by places, C_1 and C_2, and c is a 4 by 4 matrix.
+    The term beta beta I of d,uu is subtracted at last.
 
     Parameters
     ----------
@@ -95,9 +100,10 @@ def gap_hessians(
     (d, n, beta, nodes), (weight, first, second) = geometry, penalties
     half, components = nodes.shape[1] // 2, r.shape[1]
     shapes, place_jets = zip(*jets(cells.element, places.X, r[nodes[:, half:]]), strict=True)
+    # vectors with a fourth component for H: 0 of the normal n, and d of d n
     normal = np.column_stack([n, 0 * d])[:, None, :components]
     off = d[:, None, None] * np.column_stack([n, np.ones_like(d)])[:, None, :components]
-    A = slopes(off[:, 0], *place_jets[1:])[1]
+    _, A = slopes(off[:, 0], *place_jets[1:])  # the Hessian of d^2/2 by the place
     free_directions = places.free_directions
     # the inverse of A in the directions in which the place can move
     M = np.einsum(
@@ -109,6 +115,7 @@ def gap_hessians(
     # rows C_a: how a change of the nodes moves the closest place along y_a
     place_motion = np.zeros((len(d), 2, *beta.shape[1:], components))
     for a in range(2):
+        # y_a without its component of H and without its part along the normal
         tangential = place_jets[1 + a][:, None] * (COMPONENT_SIGNS[:components] > 0)
         tangential -= np.sum(normal * tangential, axis=2, keepdims=True) * normal
         place_motion[:, a] = -beta[:, :, None] * tangential
@@ -128,7 +135,7 @@ def gap_hessians(
     coefficients[:, 2:, 2:] = pressure_over_distance[:, None, None] * M
     H = row_vectors.transpose(0, 2, 1) @ (coefficients @ row_vectors)
     isotropic_part = pressure_over_distance[:, None, None] * beta[:, :, None] * beta[:, None, :]
-    for i in range(3):
+    for i in range(3):  # components of places
         H[:, i::components, i::components] -= isotropic_part
     return np.asarray(H)
 
@@ -137,6 +144,8 @@ def joint_entries(
     slopes_of_places: Array, nodes: Longs, group: Longs, weight: Array, count: int
 ) -> Entries:
     """Return the tangent's entries that joined places have besides those of each place.
+
+    They are the products D,u D,u of derivatives of the joined distances D, times `weight`.
 
     Parameters
     ----------
@@ -147,7 +156,7 @@ def joint_entries(
     group
         (n,) number of the joined place to which each place belongs.
     weight
-        (m,) factors of the products of derivatives, for each joined place.
+        (m,) factor of the product of each joined place.
     count
         Number of all nodes.
     """
@@ -163,6 +172,8 @@ def joint_entries(
 
 def forces_on_nodes(offsets: FaceOffsets | None, u: Array, forces: Array) -> Array:
     """Return the forces by the displacement u (nodes, dim), where offsets H depend on u.
+
+    Forces are derivatives of the energy Pi: by the chain rule they are Pi,r + Pi,H H,u.
 
     Parameters
     ----------

@@ -15,6 +15,11 @@ Along e_theta the closest place moves as it does along the curve. A wave (U cos,
 theta moves it by C_theta = -rho_y D_V + (x - y)_rho (m U_y + V_y) + (x - y)_z m W_y; without waves
 it stays. The points are those of a rule on each cell. At a free end one is next to the end, which
 an edge stands on. docs/theory.md, Contact.
+
+A place is a closest place y: a cell with a coordinate X from 0 to 1 in it; it is free if it is
+inside the cell, so that it can move along the curve. The sides are the two members of a pair. The
+active set has the places in contact. U, V and W are displacements along rho, theta and z. A frozen
+contact keeps the active set of one state. A sample is a displacement within a step in time.
 """
 
 from collections.abc import Mapping, Sequence
@@ -144,6 +149,7 @@ class ModelMeridian:
             return offsets
         tangents, points = offsets.undeformed_tangents(), curves.element.points
         rates = self.natural.volume_coefficients(tangents, points)
+        # elsewhere the volume does not grow: 1, and zero for the three higher powers
         rates[:, ~keeps_volume] = np.eye(4)[0][:, None, None]
         return MeridianOffsets(curves, r0, h, factor * rates, keeps_volume, self.natural.stretch)
 
@@ -167,6 +173,7 @@ class MeridianContact(ContactTerm):
         self._h, self._u, self._curves = model.h, model.u, model.curves
         self._meridian_offsets = model.offsets
         self._nodes, self._sides, self._r0 = model.nodes, sides, model.places
+        # Gauss's rule of n points is exact to the degree 2 n - 1
         self._points = self._curves.rule(model.degree // 2 + 1, sides)
         self._normals = self._curves.cell_normals()
         self._half: Array = np.full(len(self._r0), self._h / 2)
@@ -176,14 +183,14 @@ class MeridianContact(ContactTerm):
         thickest = 2 * float(self._half[self._nodes_of_pair].max())
         self._reach = self._h + (SEARCH_REACH - 1) * thickest
         self._material: NeighbouringMaterial | None = None
-        if np.any(sides[0] & sides[1]):
+        if np.any(sides[0] & sides[1]):  # a shell and itself
             undeformed = np.column_stack([self._r0, self._half])
             nodal = undeformed[self._nodes]
             undeformed_points = self._places_of_points(undeformed)
             self._material = NeighbouringMaterial(
                 undeformed_points, nodal, self._nodes, self._points.cell
             )
-        self._at = np.full_like(self._r0, np.nan)
+        self._at = np.full_like(self._r0, np.nan)  # of the active set; nan: none has been found
         self._growth = 0.0  # the natural stretch at that displacement
         self._places = no_projections()
         self._active_sets = SampleCache[tuple[Array, MeridianProjections]]()
@@ -210,6 +217,7 @@ class MeridianContact(ContactTerm):
         Where the thickness varies, the third component is the derivative by the offset H.
         """
         places = self._active_set()
+        # half, since the points of the other curve have the same contact
         weight = self._points.weight[places.point] / 2 * self._penalty(places)[1]
         _, n, beta, nodes = self._geometry(places)
         forces = np.zeros((len(self._r0), 3 if self._offsets else 2))
@@ -219,7 +227,8 @@ class MeridianContact(ContactTerm):
 
     def _entries_by_place_and_offset(self) -> Entries:
         """Return entries of the second derivative by places (rho, z) and offsets H of nodes."""
-        return self._block_entries(*self._second_derivative(0.0), [0, 2])
+        blocks, nodes = self._second_derivative(m=0.0)
+        return self._block_entries(blocks, nodes, of_place=[0, 2])  # U and W
 
     def _entries(self) -> Entries:
         """Return the entries of the tangent by the displacement (U, W) of nodes."""
@@ -234,10 +243,12 @@ class MeridianContact(ContactTerm):
         Parameters
         ----------
         H, nodes
-            (n, dofs, dofs) blocks by (U, V, W, H) at nodes (n, functions).
+            (n, dofs, dofs) blocks of second derivatives by (U, V, W, H), and their nodes (n,
+            functions).
         of_place
             Components among (U, V, W) that are unknowns: numbers 0, 1 and 2.
         """
+        # the fourth unknown of a node, number 3, is the offset H
         components = [*of_place, 3] if self._offsets else of_place
         rows_of_block = np.flatnonzero(np.isin(np.arange(H.shape[1]) % 4, components))
         dofs = unknown_numbers(nodes, len(self._r0), len(components), len(of_place))
@@ -269,13 +280,17 @@ class MeridianContact(ContactTerm):
     def entries_of_waves(self, m: float) -> Entries:
         """Return the entries of the second variation along waves (U cos, V sin, W cos) of m theta.
 
-        They are by the coefficients (U + V, V, W), as in `Waves`.
+        They are by the coefficients (U + V, V, W), as in `Waves`. The mean of cos^2 m theta around
+        the axis gives them the factor 1/2.
         """
-        rows, columns, values = self._block_entries(*self._second_derivative(m), [0, 1, 2])
+        blocks, nodes = self._second_derivative(m)
+        rows, columns, values = self._block_entries(blocks, nodes, of_place=[0, 1, 2])
         if self._meridian_offsets:
             offsets, by_offset = self._meridian_offsets.waves(m), self._forces()[:, -1]
             rows, columns, values = offsets.entries(self._at, (rows, columns, values), by_offset)
-        for _ in range(2):  # of rows and columns: with P = U + V, U is P - V
+        # with P = U + V, U is P - V: an entry of U is one of P, less one of V, the next unknown;
+        # each round does so for the columns, and exchanges them with the rows
+        for _ in range(2):
             is_U = columns % 3 == 0
             values = np.concatenate([values, -values[is_U]])
             rows, columns = (
@@ -287,7 +302,9 @@ class MeridianContact(ContactTerm):
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
     ) -> tuple[fem.Function, Array] | None:
-        """Return derivatives of energy Pi + force w . dPi/du by the thickness or the placement.
+        """Return derivatives of a weighted sum by the thickness or the placement.
+
+        The sum is `energy` Pi + `force` w . dPi/du, with the contact energy Pi.
 
         Parameters
         ----------
@@ -296,7 +313,7 @@ class MeridianContact(ContactTerm):
         direction
             The displacement w.
         energy, force
-            The two weights.
+            The weights of both terms.
 
         Returns
         -------
@@ -319,6 +336,7 @@ class MeridianContact(ContactTerm):
         On a meridian each place stands alone: joined places have one place each.
         """
         places = self._active_set()
+        # groups of one place each, with the weight one; none has several places
         numbers, ones = np.arange(len(places.point)), np.ones(len(places.point))
         joined_places = JoinedPlaces(numbers, numbers, places.distance, ones, ones == 0)
         geometry = self._curves, self._r0, self._at, self._offsets, self._points
@@ -332,13 +350,14 @@ class MeridianContact(ContactTerm):
     def force(self) -> float:
         """Return the integral of the contact pressure, over E h R, at the present state."""
         places = self._active_set()
+        # half, since the points of both curves have the same force
         return float(self._points.weight[places.point] @ self._penalty(places)[1]) / 2
 
     def least_gap(self) -> float:
         """Return the least gap over R at present; nan where no faces are within the reach."""
         u = self._displacement()
         reach = self._reach
-        if not self._material:  # no place is farther than nodes
+        if not self._material:  # between two shells no nearest place is farther than the nodes
             reach = min(reach, self._distance_to_nodes(u) * (1 + DISTANCE_TOLERANCE))
         least_distance = self._projections(u, reach).distance.min(initial=np.inf)
         return float(least_distance - self._h) if np.isfinite(least_distance) else np.nan
@@ -374,10 +393,10 @@ class MeridianContact(ContactTerm):
         return float((penetration / (at_points + at_places)).max(initial=0.0))
 
     def gap_at_supports(self, supported_nodes: Longs, u: Array) -> float:
-        """Return the least gap over R at nodes that supports hold, at a displacement u (nodes, 2).
+        """Return the least gap over R at nodes that supports hold, where faces overlap.
 
-        It is infinite if the thickness depends on the displacement, see
-        `ClosestPointSearch.gap_at_supports`.
+        It is infinite if none overlap there at the displacement u (nodes, 2). It is also infinite
+        if the thickness depends on the displacement, which is then not looked at.
         """
         if self._offsets and not self._offsets.is_constant:
             return np.inf
@@ -434,6 +453,7 @@ class MeridianContact(ContactTerm):
         area = np.bincount(cell, weight, count)
         force_of_places = weight[places.point] * self._penalty(places)[1]
         at_end, is_steep = self._end_and_steepness(places)
+        # of a free end alone on a face, half of the force acts on the cell of the face
         own_share = np.where(is_steep & ~at_end, 0.5, 1.0)
         force = np.bincount(cell[places.point], own_share * force_of_places, count)
         force = force + np.bincount(places.cell, (1 - own_share) * force_of_places, count)
@@ -456,7 +476,9 @@ class MeridianContact(ContactTerm):
         ]
         least_thickness = 2 * min(float(half.min()) for half in halves)
         motion = v - u
+        # the mean axial motion moves all curves alike
         motion = motion - [0.0, motion[:, 1].mean()]
+        # twice, since two points may move in opposite directions
         farthest = 2 * np.linalg.norm(motion, axis=1).max()
         count = int(np.ceil(farthest / (MAX_MOTION_PER_SAMPLE * least_thickness)))
         reach = CROSSING_DISTANCE * least_thickness
@@ -468,7 +490,7 @@ class MeridianContact(ContactTerm):
 
     # in a step in time, see `TimeAveragedContact`
 
-    images_pass_through = passes_through
+    images_pass_through = passes_through  # there are no images on a meridian
 
     @property
     def displacement(self) -> Array:
@@ -488,6 +510,7 @@ class MeridianContact(ContactTerm):
             motion = np.column_stack([motion, self._offsets.change(self._at, motion)])
         _, n, beta, nodes = self._geometry(places)
         by_unknowns = distance_slopes(n, beta, motion.shape[1])
+        # increase of the penetration over the step
         closing = -np.einsum("nki,nki->n", by_unknowns, motion[nodes])
         return SampleRates.sum_over_points(
             len(self._points.weight),
@@ -533,6 +556,7 @@ class MeridianContact(ContactTerm):
         penetration, k = self._h - places.distance, self.stiffness.value
         soft_penetration = SOFT_PENETRATION * self._h
         if self._frozen:
+            # a held contact serves differences of tangents, which need the third order
             is_held = self.held is not None
             return expanded_penalty(
                 penetration, self._frozen[1], k, soft_penetration, with_third_order=is_held
@@ -559,7 +583,7 @@ class MeridianContact(ContactTerm):
         """
         r, X = self._places_of_nodes(self._at), places.X
         x, nodal = self._places_of_points(r)[places.point], r[self._nodes[places.cell]]
-        for _ in range(FOLLOW_ITERATIONS):
+        for _ in range(FOLLOW_ITERATIONS):  # a fixed number keeps the result smooth in the state
             descent, curvature, _ = slopes(x, self._curves.jets(X, nodal))
             X = X + np.where(
                 places.is_free, descent / np.where(places.is_free, curvature, 1.0), 0.0
@@ -602,6 +626,7 @@ class MeridianContact(ContactTerm):
         """
         r = self._places_of_nodes(u, to_faces=to_faces)
         x, nodal = self._places_of_points(r), r[self._nodes]
+        # mid-surfaces may be farther apart than faces, by both offsets
         largest_offset = polynomial_bound(nodal[..., 2], self._curves.lebesgue_constant)
         reach = face_reach + 2 * largest_offset
         point, cell = self._candidates(x[:, :2], nodal[..., :2], reach)
@@ -622,7 +647,11 @@ class MeridianContact(ContactTerm):
         return np.asarray(at_end & is_steep & ~self._points.is_on_edge[places.point])
 
     def _end_and_steepness(self, places: MeridianProjections) -> tuple[Flags, Flags]:
-        """Return two flags (n,): whether places are at a free end, and steep to the point."""
+        """Return two flags (n,): whether places are at a free end, and steep to the point.
+
+        They are steep if the normals of both cells have a cosine below `STEEP_COSINE`.
+        """
+        # number of the cell's end, which counts only for places that are at one
         end = (places.X == 1.0).astype(np.int64)
         at_end = ~places.is_free & (self._curves.neighbours[places.cell, end] < 0)
         normals = self._points.normal[places.point] * self._normals[places.cell]
@@ -653,18 +682,20 @@ class MeridianContact(ContactTerm):
         """Return second derivatives (n, dofs, dofs) of the energy of each place, and its nodes.
 
         They are by (U, V, W, H) at the nodes (n, functions) of both cells, over the whole
-        circumference, for waves of m theta. The formula is that of the module: four row vectors
-        with a factor each, and the term D . D.
+        circumference, for waves of m theta. With the penalty psi they are
+        psi'' d,u d,u - psi' d,uu. By the module's formula of d,uu they are the squares of four row
+        vectors with a factor each, and the term D . D.
         """
         places = self._active_set()
         _, first, second = self._penalty(places)
         d, n, beta, nodes = self._geometry(places)
         off, (count, functions) = d[:, None] * n, beta.shape
+        # `half` columns belong to the point, the others to the place
         half, weight = functions // 2, self._points.weight[places.point] / 2
         r = self._places_of_nodes(self._at)
         jets = self._curves.jets(places.X, r[self._nodes[places.cell]])
         shape, shape_slope = self._curves.table(1, places.X)
-        A = slopes(self._places_of_points(r)[places.point], jets)[1]
+        _, A, _ = slopes(self._places_of_points(r)[places.point], jets)
         y, tangent = jets[0], jets[1, :, :2]
         tangential = tangent - np.sum(tangent * n, axis=1)[:, None] * n
         # rows: change of the distance, its part n . D by places, C_s, and C_theta
@@ -682,6 +713,7 @@ class MeridianContact(ContactTerm):
         circumferential[:, half:, 3] += m * d[:, None] * shape
         # factors of the squared rows; the terms of d,uu have the tension over the distance
         B, tension = y[:, 0] * (y[:, 0] + off[:, 0]), -weight * first / d
+        # a place that is not free does not move along the curve, and one on the axis not around it
         by_A, by_B = _inverse_where(places.is_free, A), _inverse_where(B > 0, B)
         flat = rows.reshape(4, count, 4 * functions).swapaxes(0, 1)
         factors = np.column_stack([weight * second, -tension, -tension * by_A, -tension * by_B])
@@ -705,7 +737,7 @@ class MeridianContactState(ContactState):
 
         The weight is rho |r'|, see `ContactState.weight_slopes`.
         """
-        tangent = places[1]
+        tangent = places[1]  # r'; the relative derivative of |r'| is along r'/|r'|^2
         direction = tangent / np.sum(tangent**2, axis=1)[:, None]
         by_place = tables[1][..., None] * direction[:, None]
         by_place[..., 0] += tables[0] / places[0, :, :1]

@@ -10,6 +10,10 @@ Along a wave (U cos, V sin, W cos) of m theta the first has b = U + m V and vari
 the mean of the second is, with P = m U + V and f = rho V' - rho' P - m z' W,
 
     rho (q^2 + V'^2)/|r'| + 2 a b/|r'| + |r'| (P^2 + m^2 W^2)/rho - f^2/(rho |r'|).
+
+A row is a linear form of the displacement: its coefficients by (U, V, W) of a cell's nodes. The
+unknowns of a node are (U, W), or (U, V, W) of a wave. Arrays (cells, places) have values of each
+cell at its nodes. H is half the thickness, the amplitude the natural stretch (`face_offsets`).
 """
 
 from copy import copy
@@ -40,7 +44,7 @@ class MeridianOffsets(FaceOffsets):
         See `FaceOffsets`.
     """
 
-    _wave_number: float | None = None
+    _wave_number: float | None = None  # m; None for displacements that are the same all around
 
     def __init__(
         self,
@@ -52,6 +56,7 @@ class MeridianOffsets(FaceOffsets):
         amplitude: SettableNumber | None = None,
     ) -> None:
         """Tabulate shape functions at nodes; on the axis those of |rho'| stand for rho's."""
+        # elsewhere a shape function is one at its own node: the identity
         self._slopes, rho = curves.slopes_at_nodes, r0[curves.nodes, 0]
         slope = np.einsum("qk,ck->cq", self._slopes, rho)
         on_axis = (np.abs(rho) < AXIS_TOLERANCE)[..., None]
@@ -59,7 +64,8 @@ class MeridianOffsets(FaceOffsets):
             on_axis, np.sign(slope)[..., None] * self._slopes, np.eye(rho.shape[1])
         )
         self._on_axis = on_axis[..., 0]
-        super().__init__(curves, r0, h, volume_factors, keeps_volume, np.arange(len(r0)), amplitude)
+        same_place = np.arange(len(r0))  # there are no images, so no two nodes are at one place
+        super().__init__(curves, r0, h, volume_factors, keeps_volume, same_place, amplitude)
 
     def waves(self, m: float) -> "MeridianOffsets":
         """Return these offsets with derivatives by waves (U cos, V sin, W cos) of m theta.
@@ -130,7 +136,7 @@ class MeridianOffsets(FaceOffsets):
         slopes = self._by_unknowns(speed[..., None, None] * b + (rho / speed)[..., None, None] * a)
         if not self._wave_number:
             return slopes
-        # on the axis there is one value all around
+        # on the axis there is one value all around, so that a wave does not change it
         return np.where(self._on_axis[cells][..., None], 0.0, slopes)
 
     def _area_hessians(self, u: Array, cells: Longs, w: Array) -> Array:
@@ -146,7 +152,7 @@ class MeridianOffsets(FaceOffsets):
         rho, speed, a, b = self._area_rows(u, cells)
         m, tangent = self._wave_number or 0.0, self._radius_and_tangent(self._r0 + u, cells)[1]
         rho1, z1 = np.moveaxis(tangent, -1, 0)[..., None]
-        # rows of q, P, m W, f and V' in the module's formula
+        # rows q, p, c, f, v of q, P, m W, f and V' in the module's formula
         q, p, c, f, v = np.zeros((5, *a.shape))
         value = self._value_table[cells]
         q[..., 0], q[..., 2] = (row * self._slopes / speed[..., None] for row in (-z1, rho1))
@@ -155,6 +161,7 @@ class MeridianOffsets(FaceOffsets):
         f[..., :] = rho[..., None, None] * v - rho1[..., None] * p
         f[..., 2] -= m * z1 * value
         a, b, q, p, c, f, v = (self._by_unknowns(row) for row in (a, b, q, p, c, f, v))
+        # factors of the squares of q and V', of P and m W, and of f
         w_stretch, w_turn = w * rho / speed, w * speed / rho
         w_shear = -w / (rho * speed)
         squares = (w_stretch, q), (w_stretch, v), (w_turn, p), (w_turn, c), (w_shear, f)

@@ -1,7 +1,11 @@
 """Closest-point projection of points on meridians onto other meridians.
 
-Places have rho, z, and half the thickness less h/2, with the other sign for points: see
-`projection` and `meridian_contact`. docs/theory.md, Contact.
+A point is a quadrature point of a cell, a place its projection: a cell with a coordinate X from 0
+to 1 in it. Vectors have rho, z, and half the thickness less h/2, with the other sign for points.
+The distance of x and y is the length of the first two components of x - y, plus the third: that of
+the faces, plus h. A place is free if it is inside its cell, so that it can move along the curve.
+Cells are near along the curve if they are the material around a point, which it does not touch. In
+go points and nodes, out come `MeridianProjections`. docs/theory.md, Contact.
 """
 
 from dataclasses import dataclass, fields
@@ -98,7 +102,7 @@ def neighbours_of(nodes: Longs) -> Longs:
         (cells, functions) node numbers, those of the ends first.
     """
     neighbours = np.full((len(nodes), 2), -1, dtype=np.int64)
-    end_at_vertex = dict[int, tuple[int, int]]()
+    end_at_vertex = dict[int, tuple[int, int]]()  # vertex -> cell and end that came to it first
     for cell, end in np.ndindex(len(nodes), 2):
         vertex = int(nodes[cell, end])
         earlier_end = end_at_vertex.get(vertex)
@@ -130,7 +134,7 @@ class NeighbouringMaterial:
         r0 = np.zeros((int(nodes.max()) + 1, 3))
         r0[nodes] = cells
         is_near: Flags = np.zeros(count * count, dtype=bool)
-        reach = 2 * SELF_CONTACT_DISTANCE * r0[:, 2]
+        reach = 2 * SELF_CONTACT_DISTANCE * r0[:, 2]  # a number of thicknesses
         is_near[near_along_surface(nodes[:, :2], r0[:, :2], reach)] = True
         self._near = is_near.reshape(count, count)
 
@@ -144,8 +148,8 @@ class NeighbouringMaterial:
     def may_touch(self, cell: Longs, other: Longs, nodal: Array) -> Flags:
         """Return flags (n,): whether cells may touch others.
 
-        Cells that are near along the curve may if the curve is folded between them. A cell does not
-        touch itself.
+        Cells that are near along the curve may if the curve is folded between them: two of their
+        nodes are then much nearer than undeformed. A cell does not touch itself.
 
         Parameters
         ----------
@@ -165,8 +169,8 @@ class NeighbouringMaterial:
     def are_distinct(self, places: MeridianProjections, shape: Array, is_above: Flags) -> Flags:
         """Return flags (n,): which places count, as they are not the material around their point.
 
-        Either their cell is far along the curve. Or they were far undeformed, and are now above or
-        below their point.
+        Either their cell is far from the point's along the curve. Or the place was far from the
+        point undeformed, and the point is now above or below it.
 
         Parameters
         ----------
@@ -179,6 +183,7 @@ class NeighbouringMaterial:
         undeformed = np.einsum("nk,nki->ni", shape, self._cells[places.cell])
         off = self._points[places.point] - undeformed
         distance = np.linalg.norm(off[:, :2], axis=1)
+        # the third component is minus the sum of both halves of the thickness
         is_far = distance > SELF_CONTACT_DISTANCE * np.abs(off[:, 2])
         return np.asarray(~is_near | (is_above & is_far))
 
@@ -216,9 +221,11 @@ class CandidateSearch:
         self._counts = np.bincount(points.cell, minlength=len(nodes))
         self._starts = np.zeros_like(self._counts)  # points of a cell follow each other
         self._starts[points.cell[::-1]] = np.arange(len(points.cell))[::-1]
+        # a fine lattice
         X = np.linspace(0.0, 1.0, 20 * element.degree + 1, dtype=np.float64)[:, None]
         inner = np.abs(element.tabulate(0, X)[0, :, 2:, 0])
-        # the bulge of a curve, over that of its nodes
+        # the largest distance of a curve from its chord, over that of its inner nodes; the factor
+        # covers places between those of the lattice
         self._bulge = CELL_RADIUS_FACTOR * float(inner.sum(axis=1).max(initial=0.0))
         self._inner_nodes = element.points[2:, :1]
 
@@ -241,6 +248,7 @@ class CandidateSearch:
         """
         point, cell = self._in_circles(nodal, reach)
         begins, chord = nodal[:, 0], nodal[:, 1] - nodal[:, 0]
+        # inner nodes less the places of the chord at the same parameters
         off_chord = nodal[:, 2:] - begins[:, None] - self._inner_nodes * chord[:, None]
         bulge = self._bulge * np.linalg.norm(off_chord, axis=2).max(axis=1, initial=0.0)
         offset, chords = x[point] - begins[cell], chord[cell]
@@ -254,7 +262,8 @@ class CandidateSearch:
     def _in_circles(self, nodal: Array, reach: float) -> tuple[Longs, Longs]:
         """Return pairs of points and cells whose circles are nearer than the reach.
 
-        The circle of a point is that of its cell. Both shells have points.
+        The circle of a point is that of its cell. Points of both shells are paired with cells of
+        the other shell. For a shell and itself both sides are the same, and one direction has all.
         """
         first, second, centres = self._first_cells, self._second_cells, nodal.mean(axis=1)
         squares = np.sum((nodal - centres[:, None]) ** 2, axis=2)
@@ -269,7 +278,8 @@ class CandidateSearch:
         else:
             own_cell, cell = np.concatenate([own_cell, cell]), np.concatenate([cell, own_cell])
         count = self._counts[own_cell]
-        # numbers of all points of the first cells, one cell after the other
+        # numbers of all points of the own cells, one cell after the other: each cell's points count
+        # up from its start
         start = np.repeat(self._starts[own_cell] - np.cumsum(count) + count, count)
         return start + np.arange(len(start)), np.repeat(cell, count)
 
@@ -283,7 +293,7 @@ def no_projections() -> MeridianProjections:
 
 
 def slopes(x: Array, jets: Array) -> tuple[Array, Array, Array]:
-    """Return derivatives of the distance by the place along the curve, times the distance.
+    """Return derivatives of the distance by the place along the curve, times |x - y|.
 
     Parameters
     ----------
@@ -299,7 +309,7 @@ def slopes(x: Array, jets: Array) -> tuple[Array, Array, Array]:
     curvature
         (n,) the second derivative, A of `meridian_contact`.
     speed
-        (n,) A of a straight line.
+        (n,) A of a straight line, as if the curve had no second derivative.
     """
     y, first, second = jets
     offset = (x - y)[:, :2]
@@ -334,7 +344,7 @@ class MeridianCurves:
     lebesgue_constant
         A bound of the element's Lebesgue constant, see `projection.polynomial_bound`.
     slopes_at_nodes
-        (places, functions) derivatives of shape functions at the nodes.
+        (nodes of a cell, functions) derivatives of shape functions at the nodes.
     """
 
     def __init__(self, element: Any, nodes: Longs, r0: Array, h: float) -> None:
@@ -375,6 +385,7 @@ class MeridianCurves:
         sides
             (cells,) flags of the cells of the first shell, and of the second.
         """
+        # an end on the axis is a pole, where the surface goes on
         off_axis = np.abs(self._r0[self.nodes[:, :2], 0]) > AXIS_TOLERANCE
         is_free_end = (self.neighbours < 0) & off_axis
         point_groups = list[tuple[Longs, Array, Array, Flags, Array, Flags]]()
@@ -388,6 +399,7 @@ class MeridianCurves:
             speed = np.linalg.norm(tangent, axis=2)
             area = 2 * np.pi * x[..., 0] * speed * w
             normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1) / speed[..., None]
+            # the rule's point next to an end is `EDGE_OFFSET` from it
             at_begin, at_end = (X < 2 * EDGE_OFFSET) & begins, (X > 1 - 2 * EDGE_OFFSET) & ends
             is_on_edge = np.tile(at_begin | at_end, len(cells))
             cell, shape = np.repeat(cells, len(X)), np.tile(table[0], (len(cells), 1))
@@ -418,14 +430,17 @@ class MeridianCurves:
         for _ in range(MAX_NEWTON_ITERATIONS):
             jets = self.jets(X[moving], nodal[cell[moving]])
             descent, curvature, speed = slopes(x[point[moving]], jets)
+            # where the distance is not convex a step as of a straight line goes downhill
             step = descent / np.where(curvature > MIN_CURVATURE_RATIO * speed, curvature, speed)
             previous = X[moving]
+            # no step is longer than a quarter of the cell, and none leaves the cell
             X[moving] = np.clip(previous + np.clip(step, -0.25, 0.25), 0.0, 1.0)
             moving = moving[np.abs(X[moving] - previous) >= STEP_TOLERANCE]
             if not len(moving):
                 break
         jets = self.jets(X, nodal[cell])
         descent, *_ = slopes(x[point], jets)
+        # at an end from which the distance falls beyond the cell
         is_fixed = (X == 0.0) & (descent <= 0) | (X == 1.0) & (descent >= 0)
         return MeridianProjections(point, cell, X, ~is_fixed, distances(x[point] - jets[0]))
 
@@ -457,6 +472,7 @@ class MeridianCurves:
             places, is_above = places.select(is_distinct), is_above[is_distinct]
         keys = places.point * cell_count + places.cell
         is_nearest: Flags = np.ones(len(keys), dtype=bool)
+        # a place at an end counts if the cell beyond has no nearer one, or is not searched
         for end, X in enumerate((0.0, 1.0)):
             neighbour = self.neighbours[places.cell, end]
             neighbour_key = places.point * cell_count + neighbour
@@ -495,7 +511,8 @@ class MeridianCurves:
     ) -> Flags | bool:
         """Return flags (n,): whether the curve goes on into a cell that is not searched.
 
-        That is the cell beyond a place, if it is near the point's own cell along the curve.
+        That is the cell beyond a place, if it is near the point's own cell along the curve: the
+        curve is folded there. False stands for all places of two different shells.
 
         Parameters
         ----------
@@ -518,6 +535,7 @@ class MeridianCurves:
         offset = x[places.point, :2] - y
         height = np.abs(offset[:, 0] * tangent[:, 1] - offset[:, 1] * tangent[:, 0])
         product_of_lengths = np.linalg.norm(offset, axis=1) * np.linalg.norm(tangent, axis=1)
+        # the ratio is the sine of the angle between the offset and the curve
         return np.asarray(height > ABOVE_SINE * product_of_lengths)
 
     def cell_normals(self) -> Array:

@@ -3,6 +3,12 @@
 In goes the mid-surface as a model has it (`ModelSurface`), out come the terms of all pairs of a
 case (`surface_contacts`). The cells are gathered on all ranks, and those of a half or a sector are
 copied until they make the whole. See `surface_contact` for the energy, and docs/theory.md, Contact.
+
+Images or copies are the modelled half or sector and what its symmetry makes of it. The sides of a
+pair are the cells of its two members. A shell that keeps its volume gets thinner as its area grows.
+Growth is the natural stretch, an amplitude; the natural shape is what a shell would have without
+stress. J0 is the undeformed area at a node. Nodes are those of the placement's element; ghosts are
+cells of other ranks at the border of this one.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -112,11 +118,13 @@ class ModelSurface:
         if not (self.natural and self.grows):
             return np.array([factor])
         V = self.space
+        # tangents at the nodes of cells, from which the natural shape has its volume
         element = V.element.basix_element
         slopes = element.tabulate(1, element.points)[1:, ..., 0]
         nodal = self.r0.x.array.reshape(-1, 3)[V.dofmap.list]
         tangents = np.einsum("dqk,nki->dnqi", slopes, nodal)
         coefficients = self.natural.volume_coefficients(tangents, element.points)
+        # elsewhere the volume does not grow: 1, and zero for the three higher powers
         coefficients[:, ~self.keeps_volume] = np.eye(4)[0][:, None, None]
         return np.asarray(factor * coefficients[:, : len(factor)])
 
@@ -152,7 +160,7 @@ class _AllCells:
     @classmethod
     def gather(cls, surface: ModelSurface, global_cells: GlobalCells) -> "_AllCells":
         """Return the cells of all ranks, without images; collective."""
-        topology, count = surface.topology, len(global_cells.own_range)
+        topology, count = surface.topology, len(global_cells.own_range)  # own cells come first
         own_corners = topology.connectivity(2, 0).array[: 3 * count].astype(np.int32)
         corners = topology.index_map(0).local_to_global(own_corners).reshape(-1, 3)
         element = surface.space.element.basix_element
@@ -168,7 +176,7 @@ class _AllCells:
         }
         patches[WHOLE_SHELL] = np.ones(len(cells.nodes), dtype=bool)
         keeps_volume = global_cells.gather_values(surface.keeps_volume)
-        same_place = np.arange(len(r0))
+        same_place = np.arange(len(r0))  # without images each node is alone at its place
         return cls(cells, r0, same_place, np.array(factors), keeps_volume, patches)
 
     def with_images(self, surface: ModelSurface) -> "_AllCells":
@@ -208,11 +216,13 @@ def surface_contacts(pairs: Sequence[Pair], surface: ModelSurface) -> list[Surfa
     """
     if not pairs:
         return []
+    # of cells, vertices and edges, which the gathering below needs
     for dims in ((2, 0), (0, 2), (1, 0)):
         surface.topology.create_connectivity(*dims)
     global_cells, index_map = GlobalCells.gather(surface.space), surface.space.dofmap.index_map
     all_cells = _AllCells.gather(surface, global_cells)
-    own_dofs = 3 * index_map.local_range[0], 3 * index_map.size_local
+    first_node, _ = index_map.local_range
+    own_dofs = 3 * first_node, 3 * index_map.size_local
     if surface.images:
         all_cells = all_cells.with_images(surface)
     geometry = _contact_geometry(surface, global_cells, all_cells, own_dofs)
@@ -244,10 +254,10 @@ def _contact_geometry(
     """
     cells, r0, images = all_cells.cells, all_cells.r0, all_cells.images
     element, first_cell = surface.space.element.basix_element, global_cells.own_range.start
-    if images:
+    if images:  # forces are summed over all copies, then added to the model's unknowns
         own_dofs = 0, r0.size
     growth: SettableNumber | None = surface.natural.stretch if surface.natural else None
-    offsets = None
+    offsets = None  # where the thickness is h everywhere and in all states
     if surface.thickness is not None or all_cells.keeps_volume.any():
         offsets = FaceOffsets(
             cells,
@@ -258,6 +268,7 @@ def _contact_geometry(
             all_cells.same_place,
             growth,
         )
+    # on whole cells the degree of the model's quadrature; on small parts of cells less is enough
     own_cells, degrees = np.array(global_cells.own_range), (surface.degree, element.degree)
     segments = Segments(cells, own_cells, r0, degrees, surface.h, surface.planes)
     own_rows = slice(first_cell, global_cells.own_range.stop)
@@ -292,7 +303,7 @@ def _refuse_overlap(contact: SurfaceContact, h: float) -> None:
     """
     penetration, x = contact.deepest_penetration()
     if penetration > PENETRATION_TOLERANCE * h:
-        place = ", ".join(f"{coordinate:.4g}" for coordinate in x + 0.0)
+        place = ", ".join(f"{coordinate:.4g}" for coordinate in x + 0.0)  # no -0
         raise MeshError(
             f"contact: {contact.pair.words} overlap undeformed, by {penetration / h:.4g} h at "
             f"({place}) R: move them apart"
@@ -301,7 +312,7 @@ def _refuse_overlap(contact: SurfaceContact, h: float) -> None:
 
 def _nodes_of_facets(V: fem.FunctionSpace, facets: Sequence[NDArray[np.int32]]) -> Longs:
     """Return the global numbers of the nodes on facets of all ranks; collective."""
-    all_facets = np.concatenate([*facets, np.empty(0, np.int32)])
+    all_facets = np.concatenate([*facets, np.empty(0, np.int32)])  # also where there are none
     local = fem.locate_dofs_topological(V, 1, all_facets, remote=False)
     numbers = V.dofmap.index_map.local_to_global(local)
     return np.asarray(np.unique(gather_rows(V.mesh.comm, numbers)))

@@ -6,8 +6,13 @@ within the undeformed surface is long. In go the places of all nodes and the poi
 places nearest to the points (`Projections`). docs/theory.md, Contact.
 
 Where the thickness varies, or changes with the state, vectors have a fourth component: half of it
-less h/2, with the other sign for points. The distance is then that of the faces and h: |x - y| of
-the three, and the fourth of x - y.
+less h/2, with the other sign for points. The distance is then |x - y| of the three components, plus
+the fourth of x - y: it is the distance of the faces, plus h.
+
+A place is a point of the surface: a cell with coordinates X in its reference triangle. Its free
+directions are those in which it can move: two inside a cell, one along a side, none in a corner.
+Side k of a cell is opposite to its corner k. A strip is a part of the vertices; a key i * cells + j
+stands for the pair of cells i and j. Lengths are over R.
 """
 
 from collections.abc import Iterator
@@ -82,7 +87,7 @@ class Cells:
         keys = pairs[..., 0] * (self.corners.max() + 1) + pairs[..., 1]
         order = np.argsort(keys.ravel(), kind="stable")
         is_shared_with_next = np.flatnonzero(np.diff(keys.ravel()[order]) == 0)
-        # two cells share a side if its key comes twice
+        # two cells share a side if its key comes twice; number 3 cell + k stands for side k
         neighbours = np.full(keys.size, -1)
         first_sides, second_sides = order[is_shared_with_next], order[is_shared_with_next + 1]
         neighbours[first_sides], neighbours[second_sides] = second_sides // 3, first_sides // 3
@@ -108,7 +113,7 @@ class Cells:
             Cosine of the angle above which a turn counts.
         """
         cell, side = np.nonzero(self.neighbours < 0)
-        slopes = self.element.tabulate(1, CORNERS)[1:, :, :, 0]
+        slopes = self.element.tabulate(1, CORNERS)[1:, :, :, 0]  # of shape functions at corners
         # where an edge is even the two tangents away from a vertex cancel
         turn = np.zeros((int(self.corners.max()) + 1, 3))
         sides = CORNERS[(side + 2) % 3] - CORNERS[(side + 1) % 3]
@@ -116,6 +121,7 @@ class Cells:
             tangent = np.einsum("kd,dkn,kni->ki", sides, slopes[:, corner], r0[self.nodes[cell]])
             tangent /= np.linalg.norm(tangent, axis=1)[:, None]
             np.add.at(turn, self.corners[cell, corner], sign * tangent)
+        # the difference of two unit vectors at that angle
         is_turn = np.linalg.norm(turn, axis=1) > np.sqrt(2 * (1 - cosine))
         return np.asarray(is_turn[self.corners])
 
@@ -123,7 +129,8 @@ class Cells:
     def lattices(self) -> list[tuple[Array, Array]]:
         """The coarse and the fine lattice of places in the reference cell, with shape functions.
 
-        Places are (m, 2), shape functions (m, functions).
+        Newton's method starts from the nearest of them. Places are (m, 2), shape functions (m,
+        functions).
         """
         spread = [
             np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
@@ -145,7 +152,8 @@ class Cells:
     def monomials(self) -> Array:
         """(monomials, functions): coefficients of polynomials from their values at nodes.
 
-        The monomials are x^(n-j) y^j, n up to the degree, j from 0 to n.
+        The monomials are x^(n-j) y^j, n up to the degree, j from 0 to n. The compiled Newton's
+        method evaluates polynomials by them.
         """
         x, y = self.element.points.T
         return np.linalg.inv(
@@ -153,15 +161,16 @@ class Cells:
         ).T
 
     def near_within_surface(self, r0: Array, distance: Array) -> Longs:
-        """Return keys of the pairs of cells that are near within the surface.
+        """Return keys of the pairs of cells that are near within the surface, ascending.
 
-        See `near_along_surface`.
+        Cells are near if the way along sides between two of their corners is short.
 
         Parameters
         ----------
         r0, distance
-            (nodes, 3) undeformed places, and (nodes,) reach.
+            (nodes, 3) undeformed places, and (nodes,) length up to which a way is short.
         """
+        # both at vertices, from their values at nodes
         x, reach = np.zeros((int(self.corners.max()) + 1, 3)), np.zeros(int(self.corners.max()) + 1)
         x[self.corners], reach[self.corners] = (
             self.at_corners @ r0[self.nodes],
@@ -173,15 +182,15 @@ class Cells:
 def near_along_surface(corners: Longs, x: Array, reach: Array) -> Longs:
     """Return which cells are near each other within a surface, along the sides of cells.
 
-    Two cells are near if the way between any of their corners is at most the mean of the reach at
-    its two ends.
+    Two cells are near if the way between some corner of each is at most the mean of the reach at
+    its two ends. Ways are the shortest ones in the graph of vertices and sides (Dijkstra).
 
     Parameters
     ----------
     corners
         (cells, 3) vertices, or (cells, 2) of a curve.
     x, reach
-        (vertices, dim) undeformed places, and (vertices,).
+        (vertices, dim) undeformed places, and (vertices,) the largest length of a way.
 
     Returns
     -------
@@ -195,7 +204,7 @@ def near_along_surface(corners: Longs, x: Array, reach: Array) -> Longs:
     edges = scipy.sparse.coo_array(
         (np.ones(len(starts)), vertex_numbers), (vertex_count, vertex_count)
     )
-    edges = edges.tocsr().tocoo()  # each once
+    edges = edges.tocsr().tocoo()  # which sums entries: each edge once
     lengths = np.linalg.norm(x[edges.row] - x[edges.col], axis=1)
     graph = scipy.sparse.coo_array(
         (lengths, (edges.row, edges.col)), (vertex_count, vertex_count)
@@ -211,7 +220,7 @@ def near_along_surface(corners: Longs, x: Array, reach: Array) -> Longs:
         begin, end = np.searchsorted(sorted_x, low), np.searchsorted(sorted_x, high, "right")
         candidates = order[begin:end]
         rows = np.flatnonzero(np.isin(candidates, strip_vertices))
-        strip_graph = graph[candidates][:, candidates]
+        strip_graph = graph[candidates][:, candidates]  # has all ways that are short enough
         lengths = dijkstra(strip_graph, directed=False, indices=rows, limit=farthest)
         mean_reach = (reach[candidates[rows], None] + reach[candidates]) / 2
         row, column = np.nonzero(lengths <= mean_reach)
@@ -222,6 +231,7 @@ def near_along_surface(corners: Longs, x: Array, reach: Array) -> Longs:
         (np.ones(len(i)), (i, j)), (vertex_count, vertex_count)
     ).tocsr()
     cell_of_corner = np.repeat(np.arange(cell_count), per_cell)
+    # nonzero entries of the product below: cells with a near pair of vertices
     flags = np.ones(len(cell_of_corner)), (cell_of_corner, corners.ravel())
     vertices_of_cells = scipy.sparse.coo_array(flags, (cell_count, vertex_count)).tocsr()
     i, j = (vertices_of_cells @ vertex_pairs @ vertices_of_cells.T).nonzero()
@@ -317,6 +327,8 @@ class ProjectionLimits:
 def polynomial_bound(values: Array, lebesgue_constant: float) -> float:
     """Return an upper bound of polynomials with values (cells, functions) at nodes.
 
+    It is the middle of a cell's nodal values plus half their range times Lebesgue's constant.
+
     Parameters
     ----------
     lebesgue_constant
@@ -379,7 +391,8 @@ def nearest_places(
     undeformed
         Undeformed places, which exclude the material around a point; None: nothing is excluded.
     limits
-        Bounds of the distance; None: all places are returned.
+        Bounds of the distance, if only the nearest place of each point is needed; None: all places
+        are returned.
 
     Returns
     -------
@@ -390,6 +403,7 @@ def nearest_places(
     used_cells, row_of_cell = np.unique(cell, return_inverse=True)
     nodal = r[cells.nodes[used_cells]]
     no_flags = np.zeros(len(cell), dtype=bool)
+    # stand-ins for missing arguments: without flags the C function does not read them
     positions, reference = nodal[..., :3], undeformed or UndeformedPairs(no_flags, r, x, 0.0)
     search_limits = limits or ProjectionLimits(no_flags, np.zeros(len(x)))
     # spheres around cells, and the distance of a cell's places from each lattice
@@ -399,6 +413,7 @@ def nearest_places(
         [centres, radii, *(LATTICE_RADIUS_FACTOR / parts * radii for parts in LATTICE_DIVISIONS)]
     )
     lattice_places = [np.matmul(positions.swapaxes(1, 2), shape.T) for _, shape in cells.lattices]
+    # coefficients of each cell's polynomials, deformed and undeformed
     monomials = [
         cells.monomials @ _as_four_components(array)
         for array in (nodal, reference.r[cells.nodes[used_cells]])
@@ -408,7 +423,7 @@ def nearest_places(
     c_cells = ffi.new(
         "Cells *", [*c_sizes, *pointers(*monomials, *lattice_places, cells.lattices[-1][0], bounds)]
     )
-    capacity = int(number.sum())
+    capacity = int(number.sum())  # each pair of point and cell has at most one place
     point, pair = np.empty((2, capacity), dtype=np.int64)
     floats = [np.empty((capacity, *shape)) for shape in PLACE_SHAPES]
     results = point, pair, *floats, np.empty(capacity, dtype=bool)
@@ -424,6 +439,7 @@ def nearest_places(
         reference.least_distance_ratio,
         *pointers(*results),
     )
+    # the first `count` rows have results
     X, free_directions, distance, direction = (array[:count] for array in results[2:6])
     point, pair, is_above = point[:count], pair[:count], results[6][:count]
     side = np.zeros(count, dtype=np.int64)
@@ -447,19 +463,20 @@ def points_in_cells(cells: Cells, r: Array, cell: Longs, shape: Array) -> Array:
     x = np.empty((len(cell), 4))
     nodes = _as_four_components(r * COMPONENT_SIGNS[: r.shape[1]])
     arrays = _pointers(cell, cells.nodes, shape, nodes, x)
-    library()[1].places(*shape.shape, *arrays)
+    _, lib = library()
+    lib.places(*shape.shape, *arrays)
     return x[:, : r.shape[1]]
 
 
 def _pointers(*arrays: NDArray[Any]) -> list[Any]:
     """Return C pointers to arrays of int64, float64 or bool.
 
-    An array that is not contiguous is copied, so results must be contiguous.
+    An array that is not contiguous is copied, so arrays for results must be contiguous.
     """
+    ffi, _ = library()
     kinds = {"int64": "int64_t[]", "float64": "double[]", "bool": "uint8_t[]"}
     return [
-        library()[0].from_buffer(kinds[array.dtype.name], np.ascontiguousarray(array))
-        for array in arrays
+        ffi.from_buffer(kinds[array.dtype.name], np.ascontiguousarray(array)) for array in arrays
     ]
 
 
@@ -477,16 +494,17 @@ def library() -> tuple[Any, Any]:
 
 
 def follow_places(cells: Cells, x: Array, nodal: Array, X: Array, free_directions: Array) -> Array:
-    """Return the places X (n, 2) after a small motion, in the same free directions.
+    """Return the places X (n, 2) nearest to points after a small motion, by Newton's method.
 
-    They stay in their cells' coordinates, but may be beyond a side.
+    A place moves in its free directions alone. It keeps its cell, but may get beyond a side: the
+    result is smooth in the motion.
 
     Parameters
     ----------
     x
         (n, 3 or 4) the points after the motion.
     nodal
-        (n, functions, 3 or 4) nodes of each place's cell after the motion.
+        (n, functions, 3 or 4) places of the nodes of each place's cell after the motion.
     X, free_directions
         Places before the motion, and where they can move: see `Projections`.
     """
@@ -508,7 +526,8 @@ def distances(off: Array) -> Array:
 def with_length(off: Array) -> Array:
     """Return differences (n, 3 or 4) with the length of the first three as fourth component.
 
-    Differences of three components stay.
+    Differences of three components stay. The product with a derivative of the surface is then minus
+    |x - y| times that of the distance, see `slopes`.
     """
     return np.column_stack([off[:, :3], np.linalg.norm(off[:, :3], axis=1)])[:, : off.shape[1]]
 
@@ -518,8 +537,8 @@ def slopes(
 ) -> tuple[Array, Array]:
     """Return gradient (n, 2) and Hessian (n, 2, 2) of half the squared distance by the place.
 
-    With a fourth component both are |x - y| times those of the distance. The Hessian is then right
-    where the gradient is zero.
+    With a fourth component they are |x - y| times the gradient and Hessian of the distance d. The
+    Hessian is then exact where the gradient is zero, as at the nearest place.
 
     Parameters
     ----------
@@ -532,6 +551,7 @@ def slopes(
     def dot(a: Array, b: Array) -> Array:
         return np.asarray(np.sum(a * b, axis=1))
 
+    # the fourth component, half the thickness, has the other sign in products of slopes
     z1, z2 = y1 * COMPONENT_SIGNS[: y1.shape[1]], y2 * COMPONENT_SIGNS[: y2.shape[1]]
     mixed = dot(y1, z2) - dot(off, y12)
     A = np.stack(
@@ -563,7 +583,7 @@ def _in_free_directions(free_directions: Array, g: Array) -> Array:
 def inverse_in_free_directions(free_directions: Array, A: Array) -> Array:
     """Return the inverse (n, 2, 2) of A (n, 2, 2), in components along the free directions.
 
-    Along a direction that is not free the matrix is taken as one.
+    Along a direction that is not free the matrix is taken as one, so that it can be inverted.
     """
     is_fixed = np.asarray(~free_directions.any(axis=1))
     reduced = np.einsum("nji,njk,nkl->nil", free_directions, A, free_directions)
@@ -593,8 +613,9 @@ def near_spheres(
     centres, radii
         (n, 3) and (n,).
     own_spheres
-        Numbers of the spheres among which i is.
+        Numbers of the spheres from which i is taken; j is any sphere.
     """
+    # classes by powers of two
     size_class = np.floor(np.log2(np.maximum(radii, 1e-300) / radii.max())).astype(int)
     classes = [np.flatnonzero(size_class == k) for k in np.unique(size_class)]
     own_classes = [own_spheres[size_class[own_spheres] == k] for k in np.unique(size_class)]
@@ -608,6 +629,7 @@ def near_spheres(
                 other_tree, distance, output_type="ndarray"
             )
             i, j = own_class[near_in_trees["i"]], other_class[near_in_trees["j"]]
+            # the trees' distance is that of the largest radii: each pair has its own
             is_near = (near_in_trees["v"] < radii[i] + radii[j] + reach) & (i != j)
             pairs.append((i[is_near], j[is_near]))
     no_numbers = np.zeros(0, dtype=np.int64)
@@ -646,12 +668,14 @@ class JoinedPlaces:
 
     @classmethod
     def join(cls, places: Projections, blur: float) -> "JoinedPlaces":
-        """Join places; e of the smoothed minimum is `blur`, over R.
+        """Join the places of each point and direction as one.
 
         Parameters
         ----------
         places
             In the order of points, directions and distances.
+        blur
+            Length e over R of the smoothed minimum; small against all distances.
         """
         first = places.firsts
         counts = np.diff([*first, len(places.point)])

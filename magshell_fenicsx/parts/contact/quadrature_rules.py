@@ -1,5 +1,9 @@
 """Quadrature rules for contact: in triangles, also with points on an edge and at its corners, and
 on lines.
+
+The reference triangle has the corners (0, 0), (1, 0) and (0, 1); its third side is opposite to the
+first corner. Gauss's rule has no points at the ends of [0, 1], Radau's has one, Lobatto's has both.
+Here such a point is `EDGE_OFFSET` before the end.
 """
 
 from collections.abc import Sequence
@@ -37,14 +41,18 @@ def edge_rule(degree: int, turning_ends: int = 0, corner: float = 0.0) -> tuple[
     corner
         Distance over the side's length of a further point on it from each turning end.
     """
-    t, weights_t = _rule_with_points((degree + 1) // 2, [1 - EDGE_OFFSET], 1)
+    # on lines from the first corner: the area element has the weight t, the distance from it
+    t, weights_t = _rule_with_points((degree + 1) // 2, fixed_points=[1 - EDGE_OFFSET], power=1)
+    # across these lines: `turning_ends` has the flags 1 and 2 of both ends
     fixed_points = [corner] if turning_ends & 1 else []
     if turning_ends & 2:
         fixed_points.append(1 - corner)
-    inner_line = _rule_with_points((degree + 2) // 2, [], 0)
-    last_line = _rule_with_points((degree + 2 - len(fixed_points)) // 2, fixed_points, 0)
+    # n free and m fixed points are exact to the degree 2 n + m - 1
+    inner_line = _rule_with_points((degree + 2) // 2, fixed_points=[], power=0)
+    last_line = _rule_with_points((degree + 2 - len(fixed_points)) // 2, fixed_points, power=0)
     places, weights = list[Array](), list[Array]()
     for position, weight in zip(t, weights_t, strict=True):
+        # the last line is next to the side
         s, weights_s = last_line if position == t[-1] else inner_line
         places.append(np.stack([position * (1 - s), position * s], axis=1))
         weights.append(weight * weights_s)
@@ -54,7 +62,7 @@ def edge_rule(degree: int, turning_ends: int = 0, corner: float = 0.0) -> tuple[
 def line_rule(count: int, begins: bool, ends: bool) -> tuple[Array, Array]:
     """Return points (n,) and weights (n,) on [0, 1]: Gauss's rule, or Radau's or Lobatto's.
 
-    The latter have points `EDGE_OFFSET` before one end or both ends.
+    Radau's rule has a point `EDGE_OFFSET` before one end, Lobatto's before both ends.
 
     Parameters
     ----------
@@ -68,6 +76,7 @@ def line_rule(count: int, begins: bool, ends: bool) -> tuple[Array, Array]:
     x, w = roots_jacobi(count - begins - ends, float(ends), float(begins))
     # Jacobi's rule has the factors of the fixed ends as weight, which are divided out
     w = w / ((1 - x) ** int(ends) * (1 + x) ** int(begins))
+    # weights of the end points on [-1, 1]: Lobatto's, else Radau's
     end_weight = 2 / (count * (count - 1)) if begins and ends else 2 / count**2
     x = np.concatenate([[-1 + 2 * EDGE_OFFSET] * begins, x, [1 - 2 * EDGE_OFFSET] * ends])
     w = np.concatenate([[end_weight] * begins, w, [end_weight] * ends])
@@ -90,11 +99,14 @@ def _rule_with_points(count: int, fixed_points: Sequence[float], power: int) -> 
     power
         Exponent of the weight.
     """
+    # Gauss's rule on [-1, 1], with enough points for all integrals below
     x, w = scipy.special.roots_legendre(2 * count + 4)
     legendre, point_count = np.polynomial.legendre.legvander, count + len(fixed_points)
     weight = w / 2 * ((1 + x) / 2) ** power
+    # the weight times the polynomial that is zero at the fixed points
     weighted_polynomials = weight * np.prod([(1 + x) / 2 - point for point in fixed_points], axis=0)
     polynomials = legendre(x, count - 1)
+    # made positive on the whole, as the eigenvalue problem needs
     weighted_polynomials = (
         np.sign(weighted_polynomials.sum()) * weighted_polynomials[:, None] * polynomials
     )
@@ -124,4 +136,4 @@ def cover_distance(X: Array) -> float:
     lattice = np.array([(i, j) for i in range(n + 1) for j in range(n + 1 - i)]) / n
     equilateral = np.array([[1.0, 0.0], [0.5, np.sqrt(3) / 2]])
     distances = np.linalg.norm((lattice[:, None] - X) @ equilateral, axis=2)
-    return float(distances.min(axis=1).max()) + 1 / n
+    return float(distances.min(axis=1).max()) + 1 / n  # a place is nearer than 1/n to the lattice

@@ -16,6 +16,11 @@ Two curved surfaces touch in a zone that may be narrower than the distance of th
 then sits on single points and goes along with their material, so that a mode which slides there
 seems to be unstable. For such states the triangles in the zone are divided, as often as the number
 of the cuts says: see `Cuts`.
+
+A segment is a part of a cell that faces one other cell; cuts are all segments made at one
+displacement. Places in cells are in coordinates of the reference triangle, whose area is 1/2. An
+open side of a cell is one on an edge of the surface; an edge turns at its corners. A place of
+`Projections` is the closest place of another cell to a point. Lengths are over R.
 """
 
 import hashlib
@@ -124,8 +129,9 @@ class Triangles:
     first, e1, e2
         (n, 2) the first corner, and the two sides from there.
     ends
-        (n,) `NOT_ON_EDGE` if the third side is not on an edge of the surface. Otherwise it says
-        where the edge turns: 0 nowhere, 1 at the side's begin, 2 at its end, 3 at both.
+        (n,) `NOT_ON_EDGE` if the third side, opposite to the first corner, is not on an edge of the
+        surface. Otherwise a sum of flags that says where the edge turns: 0 nowhere, 1 at the side's
+        begin, 2 at its end, 3 at both.
     """
 
     cell: Longs
@@ -154,6 +160,7 @@ class Triangles:
         """
         half1, half2, middle = self.e1 / 2, self.e2 / 2, self.first + (self.e1 + self.e2) / 2
         not_on_edge = np.full_like(self.ends, NOT_ON_EDGE)
+        # a quarter at one end of the third side has the turn at that end alone: flag 1 or flag 2
         at_begin, at_end = (
             np.where(self.ends == NOT_ON_EDGE, NOT_ON_EDGE, self.ends & corner) for corner in (1, 2)
         )
@@ -218,8 +225,9 @@ class Polygons:
     def triangles(self, open_sides: Flags, edge_turns: Flags) -> Triangles:
         """Return triangles: each polygon is cut from its centroid to its corners.
 
-        A triangle with at most one side on an edge of the surface stays whole. So the triangles do
-        not depend on which corner is the first.
+        The third side of a triangle is then a side of its polygon, which may be on an edge of the
+        surface. A polygon of three sides with at most one on an edge stays whole. So the triangles
+        do not depend on which corner is the first.
 
         Parameters
         ----------
@@ -230,12 +238,13 @@ class Polygons:
         """
         corners, next_corners = self.corners, np.roll(self.corners, -1, axis=1)
         has_side = np.linalg.norm(corners - next_corners, axis=2) > SAME_CORNER_TOLERANCE
+        # barycentric coordinates, of which one is zero on each side of the cell
         coordinates = np.stack([1 - corners.sum(axis=2), corners[..., 0], corners[..., 1]], axis=2)
         on_side = np.abs(coordinates) < SAME_CORNER_TOLERANCE
         # side k of a polygon is on an edge if both its ends are on the same open side of the cell
         on_open_side = on_side & np.roll(on_side, -1, axis=1) & open_sides[self.cell][:, None]
         is_edge = has_side & on_open_side.any(axis=2)
-        # a corner of the cell is on both sides that meet there
+        # a corner of the cell is on the two sides that are not opposite to it
         at_turn = on_side[..., [1, 2, 0]] & on_side[..., [2, 0, 1]]
         turns_at_corner = (at_turn & edge_turns[self.cell][:, None]).any(axis=2)
         ends = np.where(
@@ -244,6 +253,7 @@ class Polygons:
         is_whole = (has_side.sum(axis=1) == 3) & (is_edge.sum(axis=1) <= 1)
         centre = np.zeros((len(corners), 2))
         centre[~is_whole] = centroid(corners[~is_whole])
+        # the other polygons become fans of triangles about their centroids
         polygon, side = np.nonzero(has_side & ~is_whole[:, None])
         sides = (
             corners[polygon, side] - centre[polygon],
@@ -268,10 +278,12 @@ class Polygons:
             (n, m) whether a side of finite length begins at a corner, and the `ends` of that side,
             see `Triangles`.
         """
+        # the three sides of finite length, in their order; repeated corners begin the others
         side_numbers = np.argsort(~has_side, axis=1, kind="stable")[:, :3]
         corners = np.take_along_axis(self.corners, side_numbers[..., None], axis=1)
         side_ends = np.take_along_axis(ends, side_numbers, axis=1)
         has_edge = (side_ends != NOT_ON_EDGE).any(axis=1)
+        # the corner opposite to the side on an edge becomes the first
         apex = np.where(has_edge, (side_ends.argmax(axis=1) + 2) % 3, 0)[:, None]
         first, second, third = (
             np.take_along_axis(corners, ((apex + i) % 3)[..., None], axis=1)[:, 0] for i in range(3)
@@ -281,7 +293,11 @@ class Polygons:
         )
 
     def clip(self, a: Array, b: Array) -> "Polygons":
-        """Return the parts of the polygons to the left of lines from a (n, 2) to b (n, 2)."""
+        """Return the parts of the polygons to the left of lines from a (n, 2) to b (n, 2).
+
+        Each polygon has a line of its own (the algorithm of Sutherland and Hodgman). The result may
+        have polygons without an area.
+        """
         # heights of corners above the line, times its length, whose sign changes at crossings
         normal = np.stack([a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]], axis=1)
         height = np.einsum("nki,ni->nk", self.corners - a[:, None], normal)
@@ -291,6 +307,7 @@ class Polygons:
         crossing_share = height / np.where(is_crossed, height - next_height, 1.0)
         count, m = height.shape
         crossing = self.corners + crossing_share[..., None] * (next_corner - self.corners)
+        # each corner, followed by the crossing on the side that begins there
         candidates = np.stack([self.corners, crossing], axis=2).reshape(count, 2 * m, 2)
         has_side = (next_corner != self.corners).any(axis=2)
         is_kept = np.stack([(height >= 0) & has_side, is_crossed], axis=2).reshape(count, 2 * m)
@@ -367,11 +384,13 @@ class Segments:
         )
         corners = self._corners(r0, np.arange(len(cells.nodes)))
         self._edge_turns = cells.edge_turns(r0, TURN_COSINE)
+        # no corner on a plane of symmetry counts: the edge goes on in the image
         for plane in planes:
             self._edge_turns &= np.abs(plane.signed_distance(corners)) > SAME_CORNER_TOLERANCE
         sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-        inner_cover = cover_distance(triangle_rule(degrees[0])[0])
-        at_edge = cover_distance(edge_rule(degrees[0])[0])
+        # of an equilateral triangle of side one; points of uncut cells have the first degree
+        (inner_points, _), (points_at_edge, _) = triangle_rule(degrees[0]), edge_rule(degrees[0])
+        inner_cover, at_edge = cover_distance(inner_points), cover_distance(points_at_edge)
         has_edge = (cells.neighbours < 0).any(axis=1)
         relative_cover = np.where(has_edge, max(inner_cover, at_edge), inner_cover)
         self.cover_distance: Array = CELL_RADIUS_FACTOR * sides * relative_cover
@@ -404,12 +423,14 @@ class Segments:
             return rule
         keys = np.unique(rule.cell[near_places.point] * cell_count + near_places.cell)
         cell, faced_cell = keys // cell_count, keys % cell_count
+        # an order of faced cells by undeformed places: rounding is the same on any ranks
         centres = self._corners(self._r0, faced_cell).mean(axis=1)
         order = np.argsort(centres @ ORDERING_DIRECTION, kind="stable")
         cell, faced_cell = cell[order], faced_cell[order]
         segments = cut_by_triangles(
             Polygons(cell, faced_cell, self._projected_corners(cell, faced_cell, r))
         )
+        # uncut cells keep the points of the rule
         points, triangles = [rule.select(~np.isin(rule.cell, cell))], self._triangles(segments)
         for level in range(divisions):
             is_closing = self._may_close(triangles, gaps)
@@ -424,7 +445,9 @@ class Segments:
         range.
         """
         X = CORNERS_AND_CENTROID
-        gap = gaps(self._points_by_rule(triangles, X, np.ones(len(X)), 0)).reshape(-1, len(X))
+        # weights and divisions of these points have no meaning: only their gaps are needed
+        corner_points = self._points_by_rule(triangles, X, weights=np.ones(len(X)), divisions=0)
+        gap = gaps(corner_points).reshape(-1, len(X))
         return np.asarray(gap.min(axis=1) < np.ptp(gap, axis=1))
 
     def _triangles(self, polygons: Polygons) -> Triangles:
@@ -435,24 +458,26 @@ class Segments:
     def _points_on(self, triangles: Triangles, divisions: int = 0) -> list[ContactPoints]:
         """Return the contact points on triangles that have been divided a number of times.
 
-        Triangles of one kind have one rule: kinds differ in size, in whether the third side is on
-        an edge, and in where that edge turns.
+        Triangles of one kind have one rule: kinds differ in whether they are small, in `ends`, and
+        in how far the point next to a turn of the edge is from the turn.
         """
         corners, third_side = self._corners(self._r0, triangles.cell), triangles.e2 - triangles.e1
         side_length = np.linalg.norm(
             np.einsum("na,nai->ni", third_side, corners[:, 1:] - corners[:, :1]), axis=1
         )
-        # rounded to few values, so that there are few rules
+        # the offset over the side's length, limited on short sides, and rounded to powers of two so
+        # that there are few rules
         corner_share = np.minimum(
             np.exp2(np.round(np.log2(self._corner_offset / side_length))), 1 / 64
         )
+        # by the size that it had before divisions, which is twice the area
         is_small = triangles.size * 4**divisions <= 2 * LARGE_AREA
         has_turn = triangles.ends > 0
         keys = np.stack([is_small, triangles.ends, np.where(has_turn, corner_share, 0)], axis=1)
         kinds, kind_of_triangle = np.unique(keys, axis=0, return_inverse=True)
         points = list[ContactPoints]()
         for k, (is_small_kind, ends, offset) in enumerate(kinds):
-            degree = self._degrees[int(is_small_kind)]
+            degree = self._degrees[int(is_small_kind)]  # the second one for small triangles
             rule = (
                 triangle_rule(degree)
                 if ends == NOT_ON_EDGE
@@ -481,6 +506,7 @@ class Segments:
         a1, a2 = np.einsum("dnk,nki->dni", table[1:], self._r0[self._cells.nodes[cell]])
         area_ratio = np.linalg.norm(np.cross(a1, a2), axis=1)
         weight = np.outer(triangles.size, weights).ravel() * area_ratio
+        # points of an edge are next to the third side, not on it
         is_on_third_side = X.sum(axis=1) > 1 - 2 * EDGE_OFFSET
         is_on_edge = np.outer(triangles.ends != NOT_ON_EDGE, is_on_third_side).ravel()
         return ContactPoints(
@@ -518,8 +544,10 @@ class Segments:
         """
         corners, other_corners = self._corners(r, cell), self._corners(r, other)
         sides = np.stack([corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]], axis=1)
+        # the pseudoinverse projects along the normal
         X = (other_corners - corners[:, :1]) @ np.linalg.pinv(sides)
         coordinates = np.concatenate([1 - X.sum(axis=2, keepdims=True), X], axis=2)
+        # corners near a side are moved onto it, so that no slivers are cut
         coordinates[np.abs(coordinates) < SNAP_TOLERANCE] = 0.0
         X = np.asarray((coordinates / coordinates.sum(axis=2, keepdims=True))[..., 1:])
         # a fixed order of the corners, so that rounding is the same on any ranks
@@ -554,6 +582,7 @@ class Cuts:
         gaps: Callable[[ContactPoints, Array], Array],
         r0: Array,
     ) -> None:
+        """Begin with the number 0, of the undeformed surfaces."""
         self._segments, self._find_near, self._find_gaps, self._r0 = segments, near_places, gaps, r0
         self._displacements = {0.0: np.zeros_like(r0)}
         self._latest_points = dict[float, tuple[ContactPoints, Array]]()
@@ -561,8 +590,8 @@ class Cuts:
     def points(self, number: float, u: Array) -> tuple[ContactPoints, Array]:
         """Return the points with the cuts of a number, and the cells' normals (cells, 3) there.
 
-        The points of the last two numbers are kept. A number that is unknown, as in a state from
-        elsewhere, then stands for the displacement u (nodes, 3).
+        The points of the last two numbers are kept in memory. A number that is not known yet, as in
+        a state of another run, is given the present displacement u (nodes, 3) for its cuts.
         """
         if number not in self._latest_points:
             cut_u = self._displacements.setdefault(number, np.array(u))
@@ -618,8 +647,10 @@ def oriented_sides(triangles: Array) -> tuple[Array, Array]:
 def cut_by_triangles(triangles: Polygons) -> Polygons:
     """Return reference cells cut along the sides of the triangles that they face.
 
-    Each polygon is the common part of a cell and a triangle, or faces nothing (`NO_CELL`). Where
-    triangles overlap, a later one has only the part outside the earlier ones.
+    Each polygon is the common part of a cell and a triangle, or a part of the cell that faces
+    nothing (`NO_CELL`). Where triangles overlap, a later one has only the part outside the earlier
+    ones. First all triangles are cut at once. Only cells that these do not cover exactly are cut
+    again, by one triangle after the other, which takes longer.
 
     Parameters
     ----------
@@ -635,12 +666,14 @@ def cut_by_triangles(triangles: Polygons) -> Polygons:
     overlaps = np.abs(area(triangles.corners)) > AREA_TOLERANCE
     overlaps &= area(common.corners) > AREA_TOLERANCE
     common, row_of_cell = common.select(overlaps), row_of_cell[overlaps]
+    # the sum of the parts is the cell's area if triangles cover it without an overlap
     covered = np.bincount(row_of_cell, area(common.corners), len(cells))
     is_partial = np.abs(covered - REFERENCE_AREA) > AREA_TOLERANCE
     if not is_partial.any():
         return common
     partial_triangles = triangles.select(overlaps).select(is_partial[row_of_cell])
     common_once, remainder = _cut_one_by_one(partial_triangles, cells[is_partial])
+    # common parts and the rest make the whole cell if no triangles overlap
     uncovered = np.bincount(
         np.searchsorted(cells, remainder.cell), area(remainder.corners), len(cells)
     )
@@ -670,6 +703,7 @@ def _cut_one_by_one(triangles: Polygons, cells: Longs) -> tuple[Polygons, Polygo
     triangle_count = np.searchsorted(triangles.cell, cells, "right") - first
     remainder = Polygons.cells(cells)
     common_parts = remainder.select(np.zeros(0, dtype=np.int64))
+    # in each round one more triangle of each cell cuts all that is left of the cell
     for triangle_number in range(int(triangle_count.max(initial=0))):
         cell_row = np.searchsorted(cells, remainder.cell)
         has_triangle = triangle_count[cell_row] > triangle_number
@@ -682,7 +716,7 @@ def _cut_one_by_one(triangles: Polygons, cells: Longs) -> tuple[Polygons, Polygo
         common_parts = common_parts.concatenate_with(common.select(overlaps))
         remainder = remainder.select(~has_triangle).concatenate_with(cut_cells.select(~overlaps))
         remaining = cut_cells.select(overlaps)
-        # what is left of the cell lies outside one side after the other
+        # a part outside the first side, a part inside it but outside the second, and so on
         for k in range(3):
             outer_part = remaining.clip(b[overlaps, k], a[overlaps, k])
             remainder = remainder.concatenate_with(outer_part.with_area())

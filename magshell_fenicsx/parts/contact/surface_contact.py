@@ -15,9 +15,17 @@ With beta = (N_x, -N_y) of the nodes of both cells, n = (x - y)/d, d the distanc
 where A is the Hessian of F by the place of y, which moves along. P. Wriggers, Computational Contact
 Mechanics, Springer 2006, sec. 4.1 and 9; docs/theory.md, Contact.
 
-Where the thickness varies, half of it H at nodes is a fourth unknown: d is then the least of
-|x - y| - H(y), less H(x), plus h, so that |x - y| need not be the least. Of shells that get thinner
-H follows from the displacement (`FaceOffsets`).
+Where the thickness varies, half of it H at nodes is a fourth unknown, the offset: d is then the
+least of |x - y| - H(y), less H(x), plus h, so that |x - y| need not be the least. Of shells that
+get thinner H follows from the displacement (`FaceOffsets`).
+
+A place is a projection y: a cell with coordinates in it. Sides are the two members of a pair. The
+active set has the places in contact. Places of one point in neighbouring cells are joined as one,
+with a smooth minimum of their distances (`JoinedPlaces`). Where an edge presses on a face steeply,
+the places of the face's points on the edge do not count: they are left to the edge's own points.
+Cuts are the segments made at one displacement, known by a number that is part of a state. A sample
+is a displacement within a step in time. A frozen contact keeps the active set of one state.
+Energies are over E h R^2, forces over E h R, pressures over E h/R.
 """
 
 from collections.abc import Callable
@@ -126,6 +134,11 @@ class SurfaceContact(ContactTerm):
         The cells of the model.
     sides
         (cells,) flags of the cells of the first member of the pair, and of the second.
+
+    Attributes
+    ----------
+    cuts
+        The number of the cuts at present; 0 stands for those of the undeformed surfaces.
     """
 
     def __init__(self, pair: Pair, geometry: ContactGeometry, sides: tuple[Flags, Flags]) -> None:
@@ -145,12 +158,12 @@ class SurfaceContact(ContactTerm):
         self._nodes_of_pair = np.unique(self._cells.nodes[sides[0] | sides[1]])
         thickest = 2 * float(self._search.half_thickness[self._nodes_of_pair].max())
         self._reach = self._h + (SEARCH_REACH - 1) * thickest
-        self._at = np.full_like(self._r0, np.nan)
+        self._at = np.full_like(self._r0, np.nan)  # of the active set; nan: none has been found
         self._growth = 0.0  # the natural stretch at that displacement
         self._cuts = Cuts(self._segments, self._near, self._gaps, self._r0)
         self._points, self._places = self._rule, no_projections()
         self._places_left_to_edges = no_projections()
-        self._joined = JoinedPlaces.join(self._places, 1.0)
+        self._joined = JoinedPlaces.join(self._places, blur=1.0)  # of no places: any blur
         self._active_sets = SampleCache[tuple[Projections, Projections, JoinedPlaces]]()
         self._cell_values = SampleCache[tuple[Array, Array, Flags]]()
         self._frozen: FrozenContact | None = None
@@ -187,7 +200,7 @@ class SurfaceContact(ContactTerm):
         if cached_places is places and cached_stiffness == self.stiffness.value and not self.sample:
             return cached
         entries = self._entries_by_place_and_offset()
-        if self._offsets:
+        if self._offsets:  # to derivatives by the displacement alone, on which offsets depend
             entries = self._offsets.entries(self._at, entries, self._forces()[:, 3])
         if not self.sample:
             self._cached_entries = places, self.stiffness.value, entries
@@ -206,6 +219,7 @@ class SurfaceContact(ContactTerm):
         """
         self._active_set()
         u = self._cuts.displacement(self.cuts.value)
+        # the quotient is the largest thickness of the pair, see `_reach`
         reach = self._h + PATTERN_REACH * (self._reach - self._h) / (SEARCH_REACH - 1)
         places = self._search.projections_in_cells(
             self._points, u, self._search.places_of_nodes(u), reach
@@ -218,7 +232,9 @@ class SurfaceContact(ContactTerm):
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
     ) -> tuple[fem.Function, Array] | None:
-        """Return derivatives of energy Pi + force w . dPi/du by a field; collective.
+        """Return derivatives of a weighted sum by a field; collective.
+
+        The sum is `energy` Pi + `force` w . dPi/du, with the contact energy Pi.
 
         Parameters
         ----------
@@ -227,7 +243,7 @@ class SurfaceContact(ContactTerm):
         direction
             The displacement w.
         energy, force
-            The two weights.
+            The weights of both terms.
 
         Returns
         -------
@@ -262,18 +278,22 @@ class SurfaceContact(ContactTerm):
     def _entries_by_place_and_offset(self) -> Entries:
         """Return this rank's entries of the second derivative by places and offsets H of nodes.
 
-        Blocks of places in the same pair of cells are summed. Collective.
+        With the distance d of a place the penalty psi(h - d) has the second derivative
+        psi'' d,u d,u - psi' d,uu. Blocks of places in the same pair of cells are summed.
+        Collective.
         """
         active_set = self._active_set()
         places, joined_places, (_, slope, curvature) = active_set
         if not len(places.point):
             return no_entries()
-        # of a place that is joined with others the second derivative is that of the smooth minimum
+        # the smooth minimum gives each of its places (psi'/e) d,u d,u, with the blur e; products of
+        # different places are in `_entries_of_joints`
         is_blurred = joined_places.several[joined_places.group]
         first = slope[joined_places.group]
         second = np.where(
             is_blurred, first / (BLUR_DISTANCE * self._h), curvature[joined_places.group]
         )
+        # half, since the points of the other surface have the same contact
         weight = joined_places.weight * self._points.weight[places.point] / 2
         order = np.argsort(self._pair_keys(places), kind="stable")
         blocks = self._blocks(places.select(order), weight[order], first[order], second[order])
@@ -305,16 +325,18 @@ class SurfaceContact(ContactTerm):
         for starts_of_chunk in np.array_split(starts, max(1, len(keys) // BLOCKS_PER_CHUNK)):
             if not len(starts_of_chunk):
                 continue
+            # a chunk ends where the first pair of cells of the next one begins
             later = starts[np.searchsorted(starts, starts_of_chunk[-1]) + 1 :]
             chunk = slice(starts_of_chunk[0], later[0] if len(later) else len(keys))
             chunk_places = places.select(chunk)
             geometry = self._geometry(chunk_places)
+            *_, nodes = geometry
             penalties = weight[chunk], first[chunk], second[chunk]
             H = gap_hessians(self._cells, chunk_places, geometry, positions, penalties)
             begins = starts_of_chunk - starts_of_chunk[0]
             # one block for each pair of cells
             sums = np.add.reduceat(H, begins, axis=0)
-            dofs = unknown_numbers(geometry[3][begins], len(self._r0), self._components)
+            dofs = unknown_numbers(nodes[begins], len(self._r0), self._components)
             i, j = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
             blocks.append((i.ravel(), j.ravel(), sums.ravel()))
         return blocks
@@ -324,8 +346,9 @@ class SurfaceContact(ContactTerm):
     ) -> Entries:
         """Return the entries of joined places, besides those of each place alone.
 
-        The active set is an argument, since to find it is collective. Joined places may lie on one
-        rank only.
+        They are (psi'' - psi'/e) D,u D,u, with the joined distance D and the blur e of its smooth
+        minimum. The active set is an argument, since to find it is collective, and joined places
+        may lie on one rank only.
         """
         _, slope, curvature = penalties
         is_blurred = joined_places.several[joined_places.group]
@@ -333,6 +356,7 @@ class SurfaceContact(ContactTerm):
         slopes = joined_places.weight[is_blurred, None, None] * distance_slopes(
             n, beta, self._components
         )
+        # half, since the points of the other surface have the same contact
         weight = self._points.weight[places.point[joined_places.first]] / 2
         joint_weight = weight * (curvature - slope / (BLUR_DISTANCE * self._h))
         return joint_entries(
@@ -348,6 +372,7 @@ class SurfaceContact(ContactTerm):
     def force(self) -> float:
         """Return the integral of the contact pressure, over E h R; collective."""
         places, joined_places, (_, slope, _) = self._active_set()
+        # half, since the points of both surfaces have the same force
         weight = self._points.weight[places.point[joined_places.first]]
         return float(self._comm.allreduce(float(weight @ slope / 2)))
 
@@ -423,16 +448,16 @@ class SurfaceContact(ContactTerm):
         places, joined_places, (_, slope, _) = self._active_set()
         points, (first_cell, count) = self._points, self._local_cells
         nearest = places.select(joined_places.first)
-        normals = self._cuts.points(self.cuts.value, self._displacement())[1]
+        _, normals = self._cuts.points(self.cuts.value, self._displacement())
         # half of the force of an edge acts on the cell that it faces, maybe on another rank
         is_edge_alone = self._search.are_edges_alone(points, nearest, normals)
-        force = points.weight[nearest.point] * slope
+        force = points.weight[nearest.point] * slope  # in full: the mean pressure of this face
         force_of_edges = np.bincount(
             nearest.cell, force / 2 * is_edge_alone, len(self._cells.nodes)
         )
         force_on_modelled = self._in_modelled(force_of_edges.astype(np.float64)[:, None])[:, 0]
         force_on_faced = self._comm.allreduce(force_on_modelled)[self._fields.own]
-        # an area of one for cells without points, which are ghosts
+        # an area of one for cells without points, which are ghosts and follow the own cells
         area, pressure = np.ones(count), np.zeros(count)
         np.add.at(area, points.cell - first_cell, points.weight)
         area[: len(np.unique(points.cell))] -= 1.0
@@ -510,10 +535,12 @@ class SurfaceContact(ContactTerm):
         least_thickness = self.least_thickness(u, v)
         # motions that are the same for all points do not count
         motion = (v - u) - (v - u).mean(axis=0)
+        # twice, since two points may move in opposite directions
         farthest = 2 * np.linalg.norm(motion, axis=1).max()
         count = int(np.ceil(farthest / (MAX_MOTION_PER_SAMPLE * least_thickness)))
         if not self._search.come_near(u, v):
             return False
+        # both ends of the way are states, where surfaces have not passed through each other
         for k in range(1, count):
             near_places = self._search.projections(
                 u + k / count * (v - u), CROSSING_DISTANCE * least_thickness, to_faces=False
@@ -538,10 +565,11 @@ class SurfaceContact(ContactTerm):
             (nodes, 3) displacement of the whole step, of all nodes.
         """
         places, joined_places, _ = self._active_set()
-        if self._offsets:
+        if self._offsets:  # faces also move as the thickness changes
             motion = np.column_stack([motion, self._offsets.change(self._at, motion)])
         _, n, beta, nodes = self._geometry(places)
         slopes = distance_slopes(n, beta, self._components)
+        # increase of the penetration over the step, of each place and then of each joined place
         closing = -np.einsum("nki,nki->n", slopes, motion[nodes])
         closing = np.bincount(
             joined_places.group, joined_places.weight * closing, len(joined_places.first)
@@ -560,9 +588,10 @@ class SurfaceContact(ContactTerm):
     def improved_cuts(self) -> float | None:
         """Return the number of cuts at the present displacement if these are better; else None.
 
-        The measure is the share of the force on points that have gone astray. Such points do not
-        face the cell that they faced where the cuts were made. Or they face an edge that was steep
-        there and is not now, or the other way round. Collective.
+        Cuts are better if a smaller share of the force is on points that have gone astray. A point
+        is astray if it no longer faces the cell that it faced where the cuts were made. It is also
+        astray if it faces an edge that was steep there and is not now, or the other way round.
+        Collective.
         """
         u = self._displacement()
         places, *_ = self._active_set()
@@ -575,6 +604,7 @@ class SurfaceContact(ContactTerm):
         if astray <= MAX_ASTRAY_FORCE:
             return None
         points, counted = self._with_cuts_at(u, self._divisions)
+        # only cuts count that at least halve the share
         is_better = self._astray_share(points, counted) < astray / 2
         return self._cuts.number_of_displacement(u, self._divisions) if is_better else None
 
@@ -641,7 +671,10 @@ class SurfaceContact(ContactTerm):
         return float(astray_force / total_force) if total_force else float(astray_force > 0)
 
     def _force(self, points: ContactPoints, places: Projections) -> float:
-        """Return twice the force of this rank's points on their nearest places, over E h R."""
+        """Return twice the force of this rank's points on their nearest places, over E h R.
+
+        It is a measure to compare forces, in which each surface counts in full and not by half.
+        """
         nearest = places.select(places.firsts)
         soft_penetration = SOFT_PENETRATION * self._h
         pressures = penalty(self._h - nearest.distance, self.stiffness.value, soft_penetration)[1]
@@ -652,6 +685,7 @@ class SurfaceContact(ContactTerm):
 
         Cells that are near within the surface are left out, as they are not cut.
         """
+        # every place of a cell is within its cover distance of one of the cell's points
         reach = self._h + self._segments.cover_distance
         near_places = self._search.projections_in_cells(
             self._rule, u, self._search.places_of_nodes(u), float(reach.max())
@@ -673,7 +707,10 @@ class SurfaceContact(ContactTerm):
         return self.sample.u if self.sample else self._find_displacement()
 
     def _of_copies(self, u: Array) -> Array:
-        """Return the displacement of all cells for that of the modelled nodes."""
+        """Return the displacement of all cells for that of the modelled nodes.
+
+        Here all are modelled; a subclass adds the copies of a half or a sector.
+        """
         return u
 
     def _in_modelled(self, values: Array) -> Array:
@@ -694,6 +731,7 @@ class SurfaceContact(ContactTerm):
         forces = np.zeros((len(self._r0), self._components))
         if len(places.point):
             _, n, beta, nodes = self._geometry(places)
+            # half, since the points of the other surface have the same contact
             weight = joined_places.weight * self._points.weight[places.point] / 2
             pressure = weight * slope[joined_places.group]
             slopes = distance_slopes(n, beta, self._components)
@@ -709,6 +747,7 @@ class SurfaceContact(ContactTerm):
         soft_penetration = SOFT_PENETRATION * self._h
         if self._frozen:
             self._at, self._points = np.array(self._displacement()), self._frozen.points
+            # a held contact serves differences of tangents, which need the third order
             is_held = self.held is not None
             return self._frozen.evaluate(
                 self._search, self._at, self.stiffness.value, self._h, with_third_order=is_held
@@ -716,6 +755,7 @@ class SurfaceContact(ContactTerm):
         u, growth = self._displacement(), self._offsets.growth if self._offsets else 0.0
         points, normals = self._cuts.points(self.cuts.value, u)
         has_moved = growth != self._growth or not np.array_equal(u, self._at)
+        # the same cuts have the same object: `Cuts` keeps the points of the last numbers
         if points is not self._points or has_moved:
             self._points, self._growth, self._at = points, growth, np.array(u)
             self._places, self._places_left_to_edges, self._joined = self._active_sets.get(
@@ -761,7 +801,7 @@ class SurfaceContact(ContactTerm):
 
         Its weights become those of this scene's undeformed surface.
         """
-        self._cached_entries = None, 0.0, self._cached_entries[2]
+        self._cached_entries = None, 0.0, self._cached_entries[2]  # None: these count no more
         self._frozen = frozen.on_surface(self._r0)
 
     def _geometry(self, places: Projections) -> tuple[Array, Array, Array, Longs]:

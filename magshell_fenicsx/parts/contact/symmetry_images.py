@@ -4,6 +4,11 @@ Images move as the model does, with their matrices Q: the unknowns of all copies
 points on the modelled cells have their part of the energy, Pi(u'), so that the forces are
 P^T Pi,u' and the tangent is P^T Pi,u'u' P. Of additions v that are antisymmetric to a plane the
 mirrored half has -Q v.
+
+Images or copies are the modelled part and its mirrored or turned copies, which make the whole
+surface. Node n of copy k has the number k count + n. Each copy has nodes of its own, but copies
+share vertices on planes of symmetry. Pi is the energy of the points on the modelled cells, r0 are
+undeformed places, u displacements.
 """
 
 from collections.abc import Sequence
@@ -80,7 +85,7 @@ class Images:
         vertices_on_planes
             Numbers of the vertices on planes of symmetry.
         """
-        x = np.zeros((int(cells.corners.max()) + 1, 3))
+        x = np.zeros((int(cells.corners.max()) + 1, 3))  # of vertices, from their cells' nodes
         x[cells.corners] = cells.at_corners @ r0[cells.nodes]
         vertex_numbers = self.shared_numbers(x, vertices_on_planes)
         return Cells(
@@ -101,6 +106,7 @@ class Images:
         tolerance = SAME_PLACE_TOLERANCE * np.ptp(x, axis=0).max()
         numbers = np.arange(len(self.images) * len(x)).reshape(-1, len(x))
         for k, places in enumerate(images):
+            # the first copy comes last, so that its number counts where several coincide
             for earlier in range(k - 1, -1, -1):
                 is_same = np.linalg.norm(places - images[earlier], axis=1) < tolerance
                 numbers[k, on_planes[is_same]] = numbers[earlier, on_planes[is_same]]
@@ -131,7 +137,8 @@ class ContactWithImages(SurfaceContact):
     pair
         The two members, with the stiffness of their penalty.
     geometry
-        The cells and nodes of all copies; its own degrees of freedom are all of theirs.
+        The cells and nodes of all copies. All degrees of freedom of the copies count as those of
+        this rank, since forces are first summed over all of them.
     sides
         See `SurfaceContact`.
     """
@@ -144,6 +151,7 @@ class ContactWithImages(SurfaceContact):
         geometry: ContactGeometry,
         sides: tuple[Flags, Flags],
     ) -> None:
+        """Prepare the contact of all copies as if they were modelled."""
         super().__init__(pair, geometry, sides)
         self._images, self._modelled_dofs = images, modelled_dofs
 
@@ -152,13 +160,14 @@ class ContactWithImages(SurfaceContact):
 
         The state itself stays symmetric.
         """
+        # the search and the active set are those of the symmetric state: only P differs
         antisymmetric_term = copy(self)
         antisymmetric_term._images = replace(self._images, parity=-1.0)
         return antisymmetric_term
 
     def _add(self, b: Array, forces: Array) -> None:
         """Add P^T f, for forces f on all copies, to the vector b of this rank; collective."""
-        of_copies = np.zeros(self._images.matrix.shape[0])
+        of_copies = np.zeros(self._images.matrix.shape[0])  # (3 copies count,)
         super()._add(of_copies, forces)
         start, size = self._modelled_dofs
         b[:size] += self._images.sum_forces(of_copies)[start : start + size]
@@ -167,7 +176,10 @@ class ContactWithImages(SurfaceContact):
         return self._images.sum_entries(super().entries())
 
     def coupled_pairs(self) -> tuple[Longs, Longs]:
-        """Return the pairs of the model's nodes that copies couple, see `SurfaceContact`."""
+        """Return pairs of the model's nodes between which the tangent may have entries; collective.
+
+        A pair of copies' nodes couples the nodes of the model of which they are copies.
+        """
         rows, columns = super().coupled_pairs()
         return rows % self._images.count, columns % self._images.count
 
@@ -175,7 +187,10 @@ class ContactWithImages(SurfaceContact):
         return self._images.displacements(u)
 
     def _in_modelled(self, values: Array) -> Array:
-        """Return derivatives by values in modelled cells: the sum over all copies of each cell."""
+        """Return derivatives by values in modelled cells, from those by values in all cells.
+
+        A value of the model is that of all copies of its cell, so derivatives are added.
+        """
         copies = len(self._images.images)
         return np.asarray(values.reshape(copies, -1, values.shape[1]).sum(axis=0))
 

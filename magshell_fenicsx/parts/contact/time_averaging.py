@@ -1,11 +1,18 @@
 """The force of a contact between shells in a step in time: its mean along the straight way between
 two displacements.
 
-Contact sets in and ceases within a step, so that its force at one place of the step would create
+Contact sets in and ceases within a step, so that its force at one time of the step would create
 energy. The force of a point, and its derivative, are those of Simpson's rule along the way. Where
 that passes a kink of the penalty, factors give the point's force the work that its energy changes
 by, and its derivative that of this quotient: for one place in a straight motion these are the mean
 pressure of `gap.mean_pressure`. See docs/theory.md, Motion.
+
+A sample is a displacement on the way; positions on it go from 0 to 1. The penalty has kinks of its
+second derivative where contact begins, and at the soft penetration, up to which its stiffness
+grows. A place is the closest place that a point faces, with the cell that has it. Offsets are half
+the thickness where it varies (`face_offsets`). Generalised alpha is the scheme of time integration:
+it takes forces at a part of the step, and dissipates high frequencies. A frozen contact has the
+active set, the places in contact, of one state.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -46,7 +53,8 @@ class StepSample:
     first, second
         (points,) factors of the first and second derivative of the penalty; None for 1.
     slope
-        (points,) factor in place of `first` in the tangent.
+        (points,) factor in place of `first` in the tangent, where it multiplies the derivative of
+        the sample's geometry by the displacement.
     """
 
     u: Array
@@ -66,7 +74,7 @@ class StepSample:
         penalties
             (n,) the penalty and its first and second derivatives by the penetration.
         """
-        if self.first is None or self.second is None:
+        if self.first is None or self.second is None:  # a sample that only gives rates
             return penalties
         value, first, second = penalties
         return value, self.first[point] * first, self.second[point] * second
@@ -114,7 +122,9 @@ class SampleRates:
             See `penalty`.
         """
         value, first, second = penalty(penetration, k, soft_penetration)
+        # changes by rounding alone do not count, as they become divisors
         closing = np.where(np.abs(closing) > PENETRATION_ROUNDING * soft_penetration, closing, 0.0)
+        # 0 for an open place, 1 up to the soft penetration, 2 beyond; summed over a point's places
         segment = np.digitize(penetration, (0.0, soft_penetration)).astype(float)
         values_of_places = value, first * closing, second * closing**2, segment
         return cls(
@@ -144,6 +154,7 @@ class SampleCache(Generic[Value]):
                 self._samples.append(self._samples.pop(i))
                 return value
         value = compute()
+        # the oldest value makes room
         copied_state = [np.array(item) for item in state]
         self._samples = [*self._samples[1 - len(SIMPSON_RULE) :], (copied_state, value)]
         return value
@@ -188,8 +199,11 @@ def samples_of_step(
 ) -> list[StepSample]:
     """Return the samples whose weighted sum is the force of a contact in a step; collective.
 
-    That is the mean force, plus what generalised alpha dissipates. The tangent is the derivative by
-    the displacement at a part of the step. See docs/theory.md, Motion.
+    The force is Simpson's mean along the way, plus a force that dissipates as generalised alpha
+    does: the change of the force over the step, times `part` - 1/2. At points that pass a kink the
+    mean gets a factor so that its work is the change of the penalty's energy. The tangent is the
+    derivative by the displacement at `part`, so the end of the way moves by 1/`part` of it. See
+    docs/theory.md, Motion.
 
     Parameters
     ----------
@@ -201,17 +215,18 @@ def samples_of_step(
     ends = [begin + position * (end - begin) for position, _ in SIMPSON_RULE]
     rates = list[SampleRates]()
     for u in ends:
-        contact.sample = StepSample(u)
+        contact.sample = StepSample(u)  # without factors
         rates.append(contact.sample_rates(end - begin))
     contact.sample = None
     positions, weights = np.transpose(SIMPSON_RULE)
+    # work of Simpson's mean force, and its derivative by the end of the way
     work = weights @ [sample_rates.rate for sample_rates in rates]
     curvature = (positions * weights) @ [sample_rates.curvature for sample_rates in rates]
     is_kink = np.any(
         [earlier.segment != later.segment for earlier, later in pairwise(rates)], axis=0
     )
     energy_change = rates[-1].value - rates[0].value
-    # factors give Simpson's sums the change of energy, and its derivative by the end
+    # targets: the change of energy, and the derivative of the mean force by the end
     end_slope, off_middle = rates[-1].rate - energy_change, part - 0.5
     force_factor = _factor(energy_change, work, is_kink)
     slope_factor = _factor(end_slope, curvature, is_kink)
@@ -222,6 +237,7 @@ def samples_of_step(
     )
     samples = list[StepSample]()
     for u, (position, weight) in zip(ends, SIMPSON_RULE, strict=True):
+        # the dissipative force is at the end less that at the begin; the middle has none
         dissipative = {0.0: -off_middle, 1.0: off_middle}.get(position, 0.0)
         slope = position * (weight * force_factor + dissipative) / part
         second = position * (weight * slope_factor + dissipative) / part
@@ -237,9 +253,10 @@ def samples_of_step(
 
 
 def _factor(target: Array, computed: Array, is_kink: Flags) -> Array:
-    """Return factors (points,) of computed numbers that make them the target, at kinks.
+    """Return factors (points,) with which computed numbers are the target at points with a kink.
 
-    They are 1 elsewhere, and between 0 and `MAX_FACTOR`.
+    They are 1 elsewhere, and where the computed number is zero. Factors are limited to 0 and
+    `MAX_FACTOR`, for computed numbers that nearly vanish.
     """
     is_changed = is_kink & (computed != 0)
     ratio = np.divide(target, computed, out=np.ones_like(computed), where=is_changed)
@@ -288,12 +305,25 @@ class ContactTerm:
         See `TimeAveragedContact`.
     held
         The frozen contact that stands for all states, see `hold`; None without.
+    pair, name, group
+        The two members, and the name of the term, which is also that of its group.
+    amplitude, column
+        None and "": no load parameter multiplies the energy, which has no column in results.
     """
 
     amplitude = None
     column = ""
 
     def __init__(self, pair: Pair, fields: ContactFields, offsets: FaceOffsets | None) -> None:
+        """Begin outside a step in time, with the pair's stiffness, and with no contact held.
+
+        Parameters
+        ----------
+        fields
+            The fields of the case on which gaps depend, such as the thickness.
+        offsets
+            Half the thickness at nodes; None where it is h/2 everywhere and in all states.
+        """
         self.pair, self.name = pair, f"contact{pair.suffix}"
         self._fields, self._offsets = fields, offsets
         self._at: Array = np.zeros((0, 0))  # the displacement of the active set
@@ -302,7 +332,7 @@ class ContactTerm:
         self.samples: Sequence[StepSample] = ()
         self.sample: StepSample | None = None
         self.held: Any = None
-        self._frozen: Any = None
+        self._frozen: Any = None  # the frozen contact that replaces the search, if there is one
 
     def hold(self, frozen: Any) -> None:
         """Fix the active set for all states by a frozen contact, or release it with None.
@@ -313,6 +343,7 @@ class ContactTerm:
             The result of `freeze` at one state.
         """
         self.held = self._frozen = None
+        # `expand_about` alone is for another scene's contact, which is not held
         if frozen is not None:
             self.expand_about(frozen)
             self.held = frozen
@@ -344,6 +375,7 @@ class ContactTerm:
 
         See `NonlocalTerm`.
         """
+        # a position in the matrix may come several times: such entries are added
         samples = at_each_sample(self, self._entries, tangent=True)  # type: ignore[arg-type]
         rows, columns, values = zip(*samples, strict=True)
         return np.concatenate(rows), np.concatenate(columns), np.concatenate(values)
@@ -351,10 +383,12 @@ class ContactTerm:
     def entered(self, parameters: Mapping[str, FreeParameter]) -> dict[str, FreeParameter]:
         """Return the free parameters on which the faces depend, with this term's derivatives.
 
+        Only the natural stretch moves faces, through the thickness of a shell that has grown.
+
         Parameters
         ----------
         parameters
-            Name -> number that varies in the energies. The result has those that move faces.
+            Name -> number that varies in the energies.
         """
         amplitude = self._offsets.amplitude if self._offsets else None
         return {

@@ -1,4 +1,12 @@
-"""The step `kind: dead`: loads that keep their direction, and the observables of forces."""
+"""The step `kind: dead`: loads that keep their direction, and the observables of forces.
+
+A step of a case drives one amplitude, a load parameter by name, here the common factor of its
+loads. The conjugate -dPi/dmu of an amplitude mu, with the energy Pi, is the displacement on which
+it does work; steps may prescribe or hold it. A load varies if it is a formula of the undeformed
+place. A potential is an energy as a formula of the deformed place. A context is the case around a
+section, an outline the undeformed shell, its meridian the curve that it is revolved from, if it is.
+E, h and R are modulus, thickness and reference length.
+"""
 
 from collections.abc import Iterable, Sequence
 from math import copysign, sqrt
@@ -188,7 +196,10 @@ class DeadSection(PathStep):
 
     @model_validator(mode="after")
     def _moments_have_no_displacement(self) -> Self:
-        """Refuse targets and branches that loads with a moment or a potential cannot have."""
+        """Refuse targets and branches that loads with a moment or a potential cannot have.
+
+        The energy of such loads is not linear in the displacement, so they have none along them.
+        """
         if self.control == "displacement" or self.displacement is not None:
             for is_loaded, kind in ((self.turns, "moment"), (self.by_place, "potential")):
                 if is_loaded:
@@ -228,7 +239,8 @@ class DeadSection(PathStep):
     def warning(self, step: ProgrammeStep, outline: "Outline", length: float) -> str | None:
         """Return a warning that a pressure by formula keeps its direction, unlike that of a fluid.
 
-        Components along the normals of a curved surface are such a pressure. None without.
+        Components along the normals of a curved surface are such a pressure. None without such a
+        load.
 
         Parameters
         ----------
@@ -275,6 +287,7 @@ class DeadSection(PathStep):
         """
         length, meridian = context.shell.reference, outline.meridian
         constant_loads = [load for load in self.loads if not load.varies]
+        # vectors and places that a mirror plane must contain
         forces = [
             np.array(v)
             for load in constant_loads
@@ -289,6 +302,7 @@ class DeadSection(PathStep):
             if potentials or len(constant_loads) < len(self.loads)
             else np.zeros((0, 3))
         )
+        # parts that are the same all around e3: all, and each shell of several on meridians
         all_patches = {
             None,
             "all",
@@ -310,6 +324,7 @@ class DeadSection(PathStep):
                 for a in self.loads
             )
 
+        # why rotations about e3 are not preserved; None if they are
         reason = "a patch is loaded" if has_patches else None
         if any(tilted(v) for v in vectors):
             reason = "a load is not along e3, or off the axis"
@@ -323,6 +338,7 @@ class DeadSection(PathStep):
             and all(scalar_is_axisymmetric(text, meridian, length) for text in potentials)
         ):
             reason = reason or "a load differs around e3"
+        # each potential finds its symmetry by itself, as an energy of the case's frame
         energies = [
             potential(f"potential_{i}", text, np.eye(3), context.scales)
             for i, text in enumerate(potentials)
@@ -341,12 +357,14 @@ class DeadSection(PathStep):
     ) -> list[Feature]:
         """Return the disc of small elements around a loaded point in the chart."""
         x, y = map(float, place)
-        return [DiscFeature((x, y), 0.0, sizing.h, loads[0].growth(sizing))]
+        growth = loads[0].growth(sizing)
+        # of no radius: elements grow from the point on
+        return [DiscFeature((x, y), radius=0.0, size=sizing.h, growth=growth)]
 
     def largest(self, sizing: SizingContext) -> float | None:
         """Return the largest size of elements over R, 2 sqrt(h/R) for thin shells; else None."""
         size = 2 * sqrt(sizing.h)
-        return size if size < 0.35 else None
+        return size if size < 0.35 else None  # of a thick shell no bound
 
     def formulas(self, key: str, context: Context) -> Iterable[Formulas]:
         """Yield the keys of all loads that may be formulas, with bounds and unit of places.
@@ -365,6 +383,7 @@ class DeadSection(PathStep):
             for name in ("per_length", "per_area", "pressure"):
                 value = getattr(load, name)
                 values = value if isinstance(value, list) else [value]
+                # a load of the model, per E h and per E h/R, in the case's units
                 largest = MAX_COMPONENT * (
                     scales.E * scales.h / (scales.R if name != "per_length" else 1.0)
                 )
@@ -424,11 +443,12 @@ def is_normal(components: Sequence[Varying], outline: "Outline", length: float) 
         Length R in the unit of the formulas' places.
     """
     sampled = outline.samples_with_normals()
-    if sampled is None:
+    if sampled is None:  # normals are not known
         return False
     places, normals = sampled
     load = np.stack([formula_function(v)(*(length * places).T) for v in components], axis=-1)
     largest_tangential = np.linalg.norm(np.cross(load, normals), axis=1).max()
+    # on a plane one direction is along all normals, and no pressure of a fluid is meant
     is_curved = np.linalg.norm(np.ptp(normals, axis=0)) > ROUNDING
     return bool(
         is_curved and largest_tangential < NORMAL_TOLERANCE * np.linalg.norm(load, axis=1).max()
@@ -447,7 +467,7 @@ def is_image(
     R
         Length of the shell in the unit of formulas' places.
     """
-    if load.varies or other.varies:
+    if load.varies or other.varies:  # values of formulas are compared at places
         return _mirrored_formula(load, other, mirror, R * x, R * mirror.image(x))
     edge = load.edge and mirror.image_of_edge(load.edge)
     if (edge, load.at, load.over, load.moment, load.pressure, load.potential is None) != (
@@ -464,6 +484,7 @@ def is_image(
     ):
         if (vector is None) != (other_vector is None):
             return False
+        # to rounding
         if vector and np.abs(
             mirror.reflection @ vector - other_vector
         ).max() > 1e-10 * np.linalg.norm(vector):
@@ -494,6 +515,7 @@ def _mirrored_formula(
         )
         for one_load, places in ((load, x), (other, image))
     )
+    # a pressure has no direction to reflect
     return equal_to_rounding(
         values_at_places if load.vector is None else values_at_places @ mirror.reflection,
         values_at_images,
@@ -503,7 +525,8 @@ def _mirrored_formula(
 def potential(name: str, text: str, Q: Array, scales: Scales) -> OwnTerm:
     """Return the energy of a load that is a formula of the deformed place.
 
-    It is zero where nothing has moved.
+    The term's density is V(r) - V(r0) over E h, with the formula V: it is zero where nothing has
+    moved.
 
     Parameters
     ----------
@@ -518,13 +541,15 @@ def potential(name: str, text: str, Q: Array, scales: Scales) -> OwnTerm:
     """
 
     def energy_at(r: "Expr", scale: "Expr", energy_scale: "Expr") -> "Expr":
+        # coordinates in the case's frame and unit, of a place r over R in the model's frame
         x = [scale * sum(float(Q[j, i]) * r[j] for j in range(3) if Q[j, i]) for i in range(3)]
         return energy_scale * symbolic(text, symbolic_functions(), *x)
 
     def density(r0: Jet, u: Jet, scale: "Expr", energy_scale: "Expr") -> "Expr":
         return energy_at(r0.r + u.r, scale, energy_scale) - energy_at(r0.r, scale, energy_scale)
 
-    return OwnTerm(name, density, (scales.R, 1 / (scales.E * scales.h)))
+    # numbers as parameters of the density: other values of them need no new kernel
+    return OwnTerm(name, density, parameters=(scales.R, 1 / (scales.E * scales.h)))
 
 
 def also_displaced(loads: "Loads") -> tuple[str, ...]:
@@ -582,6 +607,7 @@ class ForcesObservables(Observables):
         """
         if name in view.loads.forces:
             return view.model.force_unit * view.h
+        # loads of a moment or a potential alone have no size, and no displacement along them
         return (
             view.model.load_size.get(name, 0.0) / view.length if name in view.loads.dead else None
         )

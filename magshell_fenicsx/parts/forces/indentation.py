@@ -1,4 +1,11 @@
-"""A force that pushes on one place."""
+"""The step `kind: indentation`: a force that pushes on one place.
+
+A step of a case drives one amplitude, a load parameter by name, here the force F over 2 pi D/R. Its
+conjugate is the displacement w under the force, inward. The chart has the coordinates of the
+mid-surface; on a sphere their distance from the origin is the polar angle. An outline is the
+undeformed shell, a disc one with a pole or a centre, its edge the largest distance in the chart.
+e3 is the axis. h, R and D are thickness, reference length and bending stiffness.
+"""
 
 from collections.abc import Sequence
 from math import copysign, radians, sqrt
@@ -121,22 +128,24 @@ class IndentationSection(PathStep):
             raise CaseError(
                 f"{key}.at.polar: {at.polar:g}: a {geometry} is loaded {allowed_places}"
             )
+        # `highest` is the chart of the pole, centre or tip
         if outline.highest is None or not (outline.disc or geometry == "strip"):
             raise CaseError(f"{key}.at: a {geometry} has no pole: give {{point: NAME}}, of points")
         if not outline.sphere:
             return np.asarray(outline.embedding(outline.highest[None])[0])
-        if 0 < polar < 1 / context.shell.R_over_h:
+        if 0 < polar < 1 / context.shell.R_over_h:  # the mesh could not tell it from the pole
             raise CaseError(
                 f"{key}.at.polar: {at.polar:g}: 0, or more than a thickness from the pole"
             )
+        # 1e-300: at the pole itself, where the azimuth has no meaning, the quotient is zero
         chart = polar * at.vector()[:2] / max(np.hypot(*at.vector()[:2]), 1e-300)
         return np.asarray(outline.embedding(chart[None])[0])
 
     def chart_of(self, place: Array, outline: "Outline", turn: float, *, half: bool) -> Array:
         """Return the place of the force in the chart of a frame turned about e3 by `turn` radians.
 
-        On a sphere it follows from the angles, which are exact; `half` puts it on the plane of a
-        half model.
+        On a sphere it follows from the angles, which are exact. With `half` only half of the shell
+        is modelled, and the place is put exactly on its plane of symmetry: coordinate zero.
         """
         if self.at.point is not None or not outline.sphere:
             return super().chart_of(place, outline, turn, half=half)
@@ -157,6 +166,7 @@ class IndentationSection(PathStep):
         CaseError
             With the radii that are allowed, over h.
         """
+        # lengths are over R; but on a sphere the edge is taken to be 1 away, or a strip's width
         width = getattr(context.shell, "width", None) if context.shell.geometry == "strip" else None
         distance_to_edge = (
             outline.edge - float(np.hypot(*chart_place[:2]))
@@ -186,14 +196,16 @@ class IndentationSection(PathStep):
             Coordinates of the place in the chart.
         """
         h, (x, y) = sizing.h, map(float, place)
+        # the smallest patch and the largest dent; ten thicknesses are assumed without a depth
         patch = min(load.patch for load in loads)
         depth = max(abs(load.depth) if load.depth else 10.0 for load in loads)
+        # the ridge's radius times a factor by experience, and a margin
         dent = (1.0 if sizing.solid else 0.85) * sqrt(2 * depth * h) + 0.5 * sqrt(h)
         growth = loads[0].growth(sizing)
         # finer than h the point force's logarithmic stretch would be resolved, which has no limit
         return [
-            DiscFeature((x, y), dent, sqrt(h) / sizing.refinement, growth),
-            DiscFeature((x, y), patch * h, max(patch * h / 2, h), growth),
+            DiscFeature((x, y), radius=dent, size=sqrt(h) / sizing.refinement, growth=growth),
+            DiscFeature((x, y), radius=patch * h, size=max(patch * h / 2, h), growth=growth),
         ]
 
     def growth(self, sizing: SizingContext) -> float:
@@ -224,7 +236,7 @@ class IndentationSection(PathStep):
         Towards the top of an energy barrier it is small. Under a prescribed force it is an equal
         part of the way, otherwise one.
         """
-        if self.until == "zero":
+        if self.until == "zero":  # the other end of an energy barrier
             return LEAST_HUMP
         return change / self.points if self.control == "load" else copysign(1.0, change)
 

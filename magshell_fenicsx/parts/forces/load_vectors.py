@@ -2,6 +2,13 @@
 
 Sizes are over E h R, in the model's frame. A section of a case becomes a load of the model by
 `dead_load`; `assemble_dead_loads` makes vectors l of these with l . u = their work at u.
+
+A dead load keeps its direction. Its density is a force per length or area; a pattern is a density
+that is a function of the undeformed place and normal, as of a formula. Entries of a vector are
+numbers of degrees of freedom and values, owned by this rank. A log compiles forms and keeps account
+of them. r0 is the undeformed placement, a jet a map with its derivatives at quadrature points, an
+amplitude a load parameter by name. A patch is a part of the surface: of a mesh by name, or a disc
+around a point over which its force is spread.
 """
 
 from collections.abc import Sequence
@@ -136,6 +143,7 @@ def averaged(
         On every rank, if the mesh is too coarse for the patch.
     """
     weight_integral = measure.total(V, log, "patch weight")
+    # pi radius^2/3 is the integral of `smooth` on a plane
     if (
         radius is not None
         and not MIN_PATCH_SHARE <= weight_integral / (np.pi * radius**2 / 3) <= 1 / MIN_PATCH_SHARE
@@ -167,6 +175,7 @@ def point_entries(
     cells
         Flags of the local cells that may have the vertex; None for all.
     """
+    # nodes at the place, which may be several where sheets meet; numbers are those of blocks of 3
     dofs_at_x = fem.locate_dofs_geometrical(
         V, lambda points: np.linalg.norm(points.T - x, axis=1) < 1e-9
     )
@@ -214,6 +223,7 @@ def patch_entries(
     centre, patch_radius = (fem.Constant(domain, v) for v in (x, radius))
     dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * degree})
     weight = smooth(r0 - centre, patch_radius) * kin.area_ratio(kin.jet(r0, domain))
+    # on other sheets near the point the weight is zero
     weight = weight if cells is None else weight * patch_indicator(domain, cells)
     return averaged(V, direction, Weighted(weight, dx), log, radius)
 
@@ -233,6 +243,7 @@ def vertex_normal(
         Flags of the local cells that count; None for all.
     """
     _, is_at_vertex, (a1, a2) = _corners(r0, x, cells)
+    # a1 x a2 is twice a triangle's area along its normal
     area_vector = r0.function_space.mesh.comm.allreduce(
         np.cross(a1[is_at_vertex], a2[is_at_vertex]).sum(axis=0)
     )
@@ -240,9 +251,10 @@ def vertex_normal(
 
 
 def by_vertex_normal(r0: fem.Function, x: Array, v: Array, cells: Inside | None = None) -> Array:
-    """Return derivatives (own cells, nodes, 3) of v . n by the nodes; collective.
+    """Return derivatives (own cells, nodes, 3) of v . n by the places of nodes; collective.
 
-    n is the `vertex_normal` at x.
+    n is the unit normal of the mid-surface at the vertex x, see `vertex_normal`. Each cell has its
+    part of a node's derivative, which is their sum.
 
     Parameters
     ----------
@@ -256,8 +268,9 @@ def by_vertex_normal(r0: fem.Function, x: Array, v: Array, cells: Inside | None 
         np.cross(a1[is_at_vertex], a2[is_at_vertex]).sum(axis=0)
     )
     area = np.linalg.norm(area_vector)
-    # n = t/|t| of the sum t of area vectors: its component along v has the gradient p by t
+    # n = t/|t| of the sum t of area vectors: v . n has the gradient p by t
     p = (v - area_vector * (area_vector @ v) / area**2) / area
+    # p . (a1 x a2) has the gradients a2 x p by a1, and p x a1 by a2
     by_tangents = np.stack([np.cross(a2, p), np.cross(p, a1)]) * is_at_vertex[..., None]
     return np.asarray(np.einsum("dvk,dcvi->cki", table, by_tangents))
 
@@ -289,7 +302,8 @@ def _corners(r0: fem.Function, x: Array, cells: Inside | None) -> tuple[Array, I
 def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Modelled) -> DeadLoad:
     """Return a load of the case as the model takes it: dimensionless and in the model's frame.
 
-    A force that the mirror planes share is divided by the number of copies.
+    A half or a sector is modelled where there are mirror planes. A force of the whole shell is then
+    divided by the number of copies, but not one on an edge that is not its own mirror image.
 
     Parameters
     ----------
@@ -301,6 +315,7 @@ def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Mode
         The case around the load, and the part of the shell that is modelled.
     """
     mirror = modelled.mirror
+    # not an edge with an image of its own: each copy has a part of the load
     is_shared = mirror is not None and (
         load.edge is None or mirror.image_of_edge(load.edge) == load.edge
     )
@@ -309,13 +324,14 @@ def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Mode
     if load.potential is not None:
         return Potential(potential(name, load.potential, Q, scales))
     if load.varies:
-        load_unit = E * thickness if load.edge else E * thickness / R
+        load_unit = E * thickness if load.edge else E * thickness / R  # per length, or per area
         pattern = _pattern(load, Q, R, 1 / load_unit)
         return (
             EdgeForce(load.edge, pattern, total=False)
             if load.edge
             else AreaForce(_patch_of_load(load), pattern)
         )
+    # only of a load with `force`; else zero, and not used
     force = np.asarray(
         (1 / mirror.copies if mirror and is_shared else 1.0)
         * (Q @ (load.force or np.zeros(3)))
@@ -363,7 +379,7 @@ def _pattern(load: DeadLoadSection, Q: Array, length: float, factor: float) -> P
     factor
         Factor of the formula's values.
     """
-    if load.vector is not None:
+    if load.vector is not None:  # whose values turn with the frame, as those of a pressure do not
         return FormulaVectors(
             [formula_function(v) for v in load.vector], Q, length, factor, vectors=True
         )
@@ -419,13 +435,14 @@ class DeadLoads:
     entries
         Owned entries of the load vector l, where l . u is the work of the loads at u, over E h R^2.
     size
-        The sum of the loads' sizes over E h R. The size of a force is its length. That of a
-        distributed load is the integral of its density's length.
+        The sum of the loads' sizes over E h R, by which work is divided to get a displacement along
+        the loads. The size of a force is its length. That of a distributed load is the integral of
+        its density's length.
     spread
         For each distributed load its density, its measure, and whether the density is a total force
-        divided by the measure.
+        divided by the length of its edge.
     sizes
-        Parts of `size` as forms, where it depends on the placement.
+        Parts of `size` as forms, where it depends on the undeformed placement.
     """
 
     entries: Entries
@@ -466,7 +483,7 @@ class _DeadLoadSum:
     def _add_edge_force(self, load: EdgeForce) -> None:
         """Add a force on an edge: a total, a density, or a pattern."""
         ds = self._measures.edge(load.edge)
-        if callable(load.force):
+        if callable(load.force):  # a pattern
             self._add_pattern(load.force, ds, load.edge)
             return
         length = ds.total(self._V, self._log)
@@ -478,10 +495,10 @@ class _DeadLoadSum:
     def _add_area_force(self, load: AreaForce) -> None:
         """Add a force per area: a pressure against the normal, a vector, or a pattern."""
         dx = self._measures.area(load.patch)
-        if callable(load.force):
+        if callable(load.force):  # a pattern
             self._add_pattern(load.force, dx, is_part=load.patch is not None)
             return
-        if isinstance(load.force, float):
+        if isinstance(load.force, float):  # a pressure
             direction = -self._constant(load.force) * self._measures.normal
             strength = abs(load.force)
         else:
@@ -493,14 +510,14 @@ class _DeadLoadSum:
     def _add_pattern(
         self, pattern: Pattern, measure: Weighted, edge: str | None = None, *, is_part: bool = False
     ) -> None:
-        """Add a pattern, and the integral of its length.
+        """Add a load by formula, and the integral of its density's length to the size.
 
         Parameters
         ----------
         edge
             Name of its edge; None for a surface.
         is_part
-            Whether it is on a patch, where the integral is not known from the pattern.
+            Whether it is on a patch: the integral that the pattern knows is over all the surface.
         """
         density, known_size = self._measures.field(pattern, edge)
         strength = ufl.sqrt(ufl.dot(density, density))
@@ -522,7 +539,7 @@ class _DeadLoadSum:
             Length of the density.
         is_total
             Whether the density is a total force over the length of its edge: then the load's size
-            does not depend on the placement.
+            does not depend on the placement, and has no form.
         """
         self.parts.append(load_entries(self._V, density, measure, self._log))
         self.densities.append((density, measure, is_total))
@@ -541,6 +558,7 @@ def assemble_dead_loads(
     load_sum = _DeadLoadSum(V, measures, log)
     for load in loads:
         load_sum.add(load)
+    # several loads may have entries of one degree of freedom, which are added
     vector = np.zeros(3 * V.dofmap.index_map.size_local)
     for dofs, values in load_sum.parts:
         np.add.at(vector, dofs, values)
@@ -588,15 +606,17 @@ class SurfaceMeasures:
         """Return the measure of undeformed length on a named edge."""
         domain, facets = self._midsurface.mesh, self._midsurface.edges[name]
         tags = mesh.meshtags(domain, 1, facets, np.ones_like(facets))
+        # two degrees more, as lengths and formulas along the edge are no polynomials
         rule = {"quadrature_degree": edge_quadrature(self._degree) + 2}
         ds = ufl.Measure("ds", domain=domain, subdomain_data=tags, metadata=rule)(1)
-        return Weighted(kin.conormal(self._j0, kin.facet_covector(domain))[2], ds)
+        *_, length_ratio = kin.conormal(self._j0, kin.facet_covector(domain))
+        return Weighted(length_ratio, ds)
 
     def area(self, patch: str | None) -> Weighted:
         """Return the measure of undeformed area on a named patch; None for all."""
         domain = self._midsurface.mesh
         dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": 2 * self._degree})
-        weight = kin.area_ratio(self._j0)
+        weight = kin.area_ratio(self._j0)  # undeformed area per area of the flat mesh
         if patch is not None:
             weight = weight * patch_indicator(domain, patch_of(self._midsurface.patches, patch))
         return Weighted(weight, dx)

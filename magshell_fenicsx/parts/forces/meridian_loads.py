@@ -1,4 +1,12 @@
-"""Loads on a meridian that keep their direction: energies that are linear in u."""
+"""Loads on a meridian that keep their direction: energies that are linear in u.
+
+A meridian is the curve in (rho, z) that a shell of revolution has all around the axis e3; vectors
+have three components (rho, theta, z). Integrals are per radian: those all around are 2 pi times as
+much. An integral is a function here, from an integrand to its form. A dead load is a force at a
+point of the axis (`pole`), on an end, or per area; a pattern is a load by formula. u and r0 are
+displacement and undeformed placement, a jet is a map with its derivatives at quadrature points.
+Sizes of loads are over E h R, lengths over R.
+"""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -51,7 +59,7 @@ class RevolutionIntegrals:
     def with_parts(self, loads: Sequence[DeadLoad]) -> "RevolutionIntegrals":
         """Return these integrals with one boundary measure for all ends and points of some loads.
 
-        A form may have only one measure of the boundary.
+        A form may have only one measure of the boundary, so loads of one form have to share it.
         """
         parts = list[Facets]()
         for load in forces(loads):
@@ -62,6 +70,7 @@ class RevolutionIntegrals:
                 if isinstance(load, PointForce)
                 else self.meridian.ends[load.edge]
             )
+            # several loads at one place need one part
             if not any(np.array_equal(facets, part) for part in parts):
                 parts.append(facets)
         return replace(self, parts=parts, measures=self.domain.measures_on(parts) if parts else [])
@@ -99,7 +108,7 @@ class RevolutionIntegrals:
 
         d is the distance from a named point on the axis.
         """
-        parameter = np.array([self.meridian.points[point][0]])
+        parameter = np.array([self.meridian.points[point][0]])  # along the meridian
         a, pole = (
             self.domain.constant(radius),
             self.domain.constant(self.meridian.section(parameter)[0]),
@@ -114,7 +123,9 @@ def dead_loads(
 ) -> tuple[Energy, float, Sequence[ufl.Form]]:
     """Return the energy of dead loads without moments, the sum of their sizes, and its forms.
 
-    Vectors are along e3, and points are on the axis. Sizes are over E h R, see `DeadLoads`.
+    Vectors are along e3, and points are on the axis. The size of a force is its length, that of a
+    distributed load the integral of its density's length; forms of the sizes show how the sum
+    depends on the placement.
 
     Parameters
     ----------
@@ -136,14 +147,16 @@ def dead_loads(
             integral = integrals.end(load.edge, mean=load.total)
         else:
             integral = integrals.area(load)
-        if not isinstance(load, PointForce) and callable(load.force):
+        if not isinstance(load, PointForce) and callable(load.force):  # a pattern
             direction, total = pattern_field(load.force, integrals.domain.r0, ADDED_LOAD_DEGREE)
             terms.append((direction, integral))
+            # the pattern's own integral is over all of the surface
             is_known = total is not None and isinstance(load, AreaForce) and load.patch is None
             density = ufl.sqrt(ufl.dot(direction, direction))
             size += total if is_known and total is not None else _integral(density, integral, log)
             sizes.append(2 * np.pi * integral(density))
             continue
+        # length, area, or 1 of a total force and of a point
         total = _circumferential_integral(integral, integrals, log)
         if isinstance(load, AreaForce) and isinstance(load.force, float):
             direction, strength = (
@@ -158,9 +171,11 @@ def dead_loads(
         sizes.append(2 * np.pi * integral(integrals.domain.constant(strength)))
 
     def energy(u: Jet) -> ufl.Form:
+        # a sum of forms needs a form to begin with, not 0
+        (first_direction, first_integral), *others = terms
         return sum(
-            (integral(-ufl.dot(direction, u.r)) for direction, integral in terms[1:]),
-            terms[0][1](-ufl.dot(terms[0][0], u.r)),
+            (integral(-ufl.dot(direction, u.r)) for direction, integral in others),
+            first_integral(-ufl.dot(first_direction, u.r)),
         )
 
     return Energy(name, energy, name, linear=True), size, sizes
@@ -187,7 +202,8 @@ def pole_force(
     )
     is_begin = np.isclose(
         integrals.meridian.cells[:, 0], integrals.meridian.points[force.point][0]
-    ).any()  # the normal is e3 there
+    ).any()  # the normal is e3 there, and -e3 at an end of the meridian
+    # divided by the weight's integral, so that the total force is exact on any mesh
     density = integrals.domain.constant(
         (1.0 if is_begin else -1.0) * unit / _circumferential_integral(integral, integrals, log)
     )

@@ -1,4 +1,11 @@
-"""Concentrated and spread loads of a solid: the entries of their load vectors."""
+"""Concentrated and spread loads of a solid: the entries of their load vectors.
+
+A body is a shell as a solid of hexahedra, between an inner and an outer face. Loads of its
+mid-surface are spread through the thickness, so measures of length and area are integrals over
+faces and volumes, divided by the thickness. A pattern is a load as a function of the undeformed
+place and normal, as by a formula. Entries of a load vector are numbers of degrees of freedom and
+values, owned by this rank. Lengths are over R.
+"""
 
 from dataclasses import replace
 
@@ -51,6 +58,7 @@ class BodyMeasures:
     def __init__(self, body: BodyMesh, V: fem.FunctionSpace, log: KernelLog) -> None:
         """Take the body's mesh, with its normals and the thickness as fields."""
         self._body, self._V, self._log = body, V, log
+        # the first two reference directions of a cell are along the surface
         J = ufl.Jacobian(body.mesh)
         area_vector = ufl.cross(J[:, 0], J[:, 1])
         self.normal = area_vector / ufl.sqrt(ufl.dot(area_vector, area_vector))
@@ -60,9 +68,9 @@ class BodyMeasures:
 
     def edge(self, name: str) -> Weighted:
         """Return the measure of undeformed length: the edge's face over the thickness."""
-        return Weighted(
-            1 / self._thickness, face_measure(self._body.mesh, [self._body.faces[name]])(1)
-        )
+        # (1) is the tag of the first face of the list
+        ds = face_measure(self._body.mesh, [self._body.faces[name]])(1)
+        return Weighted(1 / self._thickness, ds)
 
     def area(self, patch: str | None) -> Weighted:
         """Return the measure of undeformed area on a named patch: volume over the thickness."""
@@ -80,6 +88,7 @@ class BodyMeasures:
         known, hence None.
         """
         nodes, normals = body_positions_and_normals(self._V)
+        # of each cell's nodes over the mid-surface, along the normal
         height = self._body.at_nodes(
             self._V, (self._body.heights - MIDSURFACE_HEIGHT) * self._body.thickness
         )[self._V.dofmap.list]
@@ -88,7 +97,7 @@ class BodyMeasures:
         )
         vectors = pattern(nodes - height[..., None] * normals, normals)
         refuse_unbounded(vectors, nodes, self._V.mesh.comm, "loading.loads")
-        if edge is None:
+        if edge is None:  # over the surface moments are exact; on an edge the values at nodes count
             midsurface_cells = replace(
                 body_cell_geometry(self._V), nodal=nodes - height[..., None] * normals
             )
@@ -101,8 +110,8 @@ class BodyMeasures:
     def at_point(self, name: str, force: Array) -> Entries:
         """Return the entries of a force (3,) over a patch around a named point; collective.
 
-        The patch has the radius h, or is as large as the elements around the point. It reaches
-        through the thickness.
+        In a solid a force at a point would sink in without limit. The patch has the radius h, or is
+        as large as the elements around the point. It reaches through the thickness.
         """
         domain, x, n = self._body.mesh, self._body.points[name], self._body.normals[name]
         centre, normal = (fem.Constant(domain, v) for v in (x, n))
@@ -159,6 +168,7 @@ def outer_patch(
         Radius of the patch over R.
     """
     x, normal = body.points[point], body.normals[point]
+    # the centre on the outer face, half a thickness from the mid-surface
     values = x + thickness_at(body, x) / 2 * normal, radius
     centre, a = (fem.Constant(body.mesh, value) for value in values)
     ds = face_measure(body.mesh, [body.faces[OUTER_FACE]])(1)

@@ -1,6 +1,9 @@
 """A measured imperfection: a smooth function through heights over the perfect surface.
 
-w0 is the deviation along the outward normal. Places, lengths and w0 are over R from `Scan` on.
+w0 is the deviation of the real from the perfect surface, along the outward normal. Places, lengths
+and w0 are over R, the reference length, from `Scan` on; h is the thickness. A scan has measured
+places and perhaps w0. The chart is the pair of coordinates of the perfect surface, an `Outline`.
+Its `sample` are places all over it. The foot of a place is the nearest point of that surface.
 """
 
 from collections.abc import Sequence
@@ -80,7 +83,7 @@ class DataSection(FileKeys, ImperfectionSection):
         """
         fit_key = (self.digest, str(self.path), str(self.noise), *reference.identity)
         if fit_key not in _fits:
-            if len(_fits) > 3:
+            if len(_fits) > 3:  # fits are large: a few are kept
                 _fits.clear()
             lengths = Lengths(reference.h, reference.R, reference.with_units)
             try:
@@ -178,6 +181,7 @@ def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
         If the file cannot be read, or lacks the columns.
     """
     columns, units = read_table(file, files or Files())
+    # without w0 only x, y, z do: they are then on the real surface
     place_columns = next(
         (
             names
@@ -193,6 +197,7 @@ def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
             "z, w0 of a cylinder"
         )
     names = [*place_columns, *(["w0"] if "w0" in columns else [])]
+    # w0 alone without a unit would be over h, which is most likely a mistake
     if (
         "w0" in units
         and units["w0"] is None
@@ -239,6 +244,7 @@ def _finite_rows(names: Sequence[str], columns: Sequence[Array]) -> Scan:
             "neighbours"
         )
     is_finite = np.isfinite(rows).all(axis=1)
+    # fewer do not show the shape of the shell
     if is_finite.sum() < max(20, len(rows) // 2):
         raise TableError(
             f"has {is_finite.sum()} rows of finite numbers in {len(rows)}; needed are 20, and "
@@ -291,7 +297,7 @@ def _fit_of_scan(standard: float | None, scan: Scan, reference: ReferenceShell) 
     tree = scipy.spatial.cKDTree(places)
     # the eighth neighbour of a place is taken to be 1.7 spacings away
     spacing = float(np.median(tree.query(places, [9])[0])) / 1.7
-    distances = tree.query(surface)[0]
+    distances = tree.query(surface)[0]  # from places of the surface to the nearest value
     if distances.max() > max(MAX_HOLE * sqrt(h), MAX_HOLE_OVER_SPACING * spacing):
         place = place_text(surface[np.argmax(distances)])
         raise TableError(
@@ -299,7 +305,7 @@ def _fit_of_scan(standard: float | None, scan: Scan, reference: ReferenceShell) 
             "hole is too large to guess; give values there, w0 = 0 where the shell is perfect"
         )
     places, w0 = _averaged_in_cubes(places, w0, MERGE_DISTANCE * spacing)
-    noise = None if standard is None else standard * h
+    noise = None if standard is None else standard * h  # None: the fit estimates it
     function = fit_scattered(places, w0, surface, noise=noise)
     estimated = "estimated" if noise is None else "given"
     account = (
@@ -307,6 +313,7 @@ def _fit_of_scan(standard: float | None, scan: Scan, reference: ReferenceShell) 
         f"{function.residual / h:.3g} h, noise {function.noise / h:.3g} h ({estimated}), largest "
         f"gap {distances.max():.3g} R"
     )
+    # elements resolve the sharpest bend, but need not be smaller than for the shell's own waves
     lost_rows = f", {scan.lost} rows without a number left out" if scan.lost else ""
     return _Fit(
         function,
@@ -346,6 +353,7 @@ def _on_surface(scan: Scan, reference: ReferenceShell, surface: Array) -> tuple[
                 else "polar and azimuth are of a sphere"
             )
             raise TableError(f"{angles}; on geometry: {reference.geometry} give x, y, z")
+        # distance from the axis and height, over R: of a cylinder, or of a sphere
         rho, z = (1.0, columns["z"]) if polar is None else (np.sin(polar), np.cos(polar))
         return np.column_stack(
             [rho * np.cos(columns["azimuth"]), rho * np.sin(columns["azimuth"]), z]
@@ -361,6 +369,7 @@ def _on_surface(scan: Scan, reference: ReferenceShell, surface: Array) -> tuple[
     places, heights = feet(reference.perfect, x)
     if w0 is None:
         return places, heights
+    # places may be measured on either surface: their heights are then about w0, or zero
     if np.abs(heights).max() > 0.02 + 2 * np.abs(w0).max():
         row = int(np.argmax(np.abs(heights)))
         raise TableError(
@@ -376,6 +385,7 @@ def _averaged_in_cubes(places: Array, w0: Array, distance: float) -> tuple[Array
 
     `distance` is the side of the cubes over R.
     """
+    # number of the cube of each place
     _, cube = np.unique(np.floor(places / distance).astype(np.int64), axis=0, return_inverse=True)
     cube = cube.ravel()
     count = np.bincount(cube)
@@ -385,14 +395,12 @@ def _averaged_in_cubes(places: Array, w0: Array, distance: float) -> tuple[Array
 
 
 def _sharpest_bend(function: "ScatteredSpline", x: Array, length: float) -> float:
-    """Return 1/k of the shortest wave sin(k x) that a function resembles.
+    """Return 1/k of the shortest wave sin(k x) that a function resembles; infinite for a constant.
 
-    It is infinite for a constant function.
-
-    The second differences at places `x` (n, 3) show the sharpest bend. They are over 0.7 times
-    `length`, which is over R.
+    A wave a sin(k x) has the range 2 a and the largest second derivative a k². The derivatives are
+    taken as second differences at places `x` (n, 3), over 0.7 times `length`, which is over R.
     """
-    x = x[:: max(1, len(x) // 2000)]
+    x = x[:: max(1, len(x) // 2000)]  # some 2000 places are enough
     w, d = function(x), 0.7 * length
     second_differences = (
         sum(np.abs(function(x + d * e) - 2 * w + function(x - d * e)) for e in np.eye(3)) / d**2
@@ -414,6 +422,7 @@ def feet(perfect: "Outline", x: Array) -> tuple[Array, Array]:
     if perfect.sphere:
         r = np.linalg.norm(x, axis=1)
         return x / r[:, None], r - 1
+    # Newton's method begins at the nearest place of a sample; each of these is inverted once
     sample = perfect.sample()
     nearest, row_of_place = np.unique(
         scipy.spatial.cKDTree(sample).query(x)[1], return_inverse=True
@@ -431,7 +440,7 @@ def feet(perfect: "Outline", x: Array) -> tuple[Array, Array]:
         step = np.linalg.solve(
             np.einsum("nij,nik->njk", tangents_matrix, tangents_matrix), residual[..., None]
         )[..., 0]
-        chart = chart + np.clip(step, -0.2, 0.2)
+        chart = chart + np.clip(step, -0.2, 0.2)  # a long step could leave the chart
         if np.abs(step).max() < 1e-12:
             break
     places = perfect.perfect(chart)
@@ -442,7 +451,8 @@ def _on_quadrics(nodes: Array, x: Array) -> tuple[Array, Array]:
     """Return feet (n, 3) and heights (n,) of places x (n, 3) on quadrics through nodes.
 
     Each place has the quadric z(s, t) through the nodes nearest to it, in the frame of the tangents
-    and the normal at the nearest node.
+    and the normal at the nearest node. The foot is on the normal of the quadric at (s, t) of the
+    place, which is exact to first order in the height.
 
     Parameters
     ----------
@@ -451,11 +461,13 @@ def _on_quadrics(nodes: Array, x: Array) -> tuple[Array, Array]:
     """
     import scipy
 
+    # a node twice would count twice
     nodes = np.unique(nodes.round(14), axis=0)
     tree = scipy.spatial.cKDTree(nodes[:, :3])
     nearest = tree.query(x, NODES_PER_QUADRIC)[1]
     centre, normal = nodes[nearest[:, 0], :3], nodes[nearest[:, 0], 3:]
     normal = normal / np.linalg.norm(normal, axis=1)[:, None]
+    # a tangent: normal to the axis that is farthest from the normal
     first_tangent = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal), axis=1)])
     first_tangent /= np.linalg.norm(first_tangent, axis=1)[:, None]
     frame = np.stack([first_tangent, np.cross(normal, first_tangent), normal], axis=1)
@@ -466,6 +478,7 @@ def _on_quadrics(nodes: Array, x: Array) -> tuple[Array, Array]:
     quadric = (
         np.linalg.pinv(np.stack([0 * s + 1, s, t, s * s, s * t, t * t], axis=-1)) @ z[..., None]
     )
+    # z = a + b s + c t + d s^2 + e s t + f t^2; p, q and height are the place's coordinates
     a, b, c, d, e, f = quadric[..., 0].T
     p, q, height = np.einsum("nj,nij->ni", x - centre, frame).T
     slope_s, slope_t = b + 2 * d * p + e * q, c + e * p + 2 * f * q

@@ -1,4 +1,8 @@
-"""An imperfection by a formula of the place."""
+"""An imperfection by a formula of the place.
+
+w0 is the deviation along the outward normal; places and w0 are over R, the reference length, from
+`ByFormula` on.
+"""
 
 from dataclasses import dataclass
 from typing import Literal
@@ -37,8 +41,9 @@ class FormulaSection(ImperfectionSection):
     def geometry(self, reference: ReferenceShell, key: str) -> ImperfectionGeometry:
         """Return the geometry of the formula, see `ImperfectionSection`.
 
-        The element size is 2.5/k of the shortest wave sin(k x) that the formula resembles. It
-        varies from place to place if only a small part of the surface needs small elements.
+        The element size is 2.5/k of the shortest wave a sin(k x) that the formula resembles: a is
+        half its range, a k² its largest second derivative. It varies from place to place if only a
+        small part of the surface needs small elements.
 
         Raises
         ------
@@ -54,16 +59,18 @@ class FormulaSection(ImperfectionSection):
                 f"{key}.w0: {shown_value(self.w0)}: has no finite value, or one above half a "
                 f"radius, at (x, y, z)/R = ({place})"
             )
+        # without the factor, so that the size does not depend on the amplitude
         range_of_formula, formula_derivatives = (
             np.ptp(deviation(x)) / abs(deviation.factor or 1.0),
             formula_with_derivatives(self.w0),
         )
 
         def sizes(places: Array) -> Array:
-            """Return 2.5/k (n,) of a wave with the whole depth and the curvature at each place."""
+            """Return 2.5/k (n,) of a wave with the whole range and the curvature at each place."""
             taylor = formula_derivatives(places)
             curvature = np.nan_to_num(np.linalg.norm(taylor.hessian, axis=(0, 1)))
             depth = max(range_of_formula, float(np.ptp(np.nan_to_num(taylor.value))))
+            # the least divisor makes the size huge, not infinite, where the formula is flat
             return np.asarray(
                 2.5 * np.sqrt(depth / 2 / np.maximum(curvature, 1e-300 + 1e-12 * depth))
             )

@@ -1,4 +1,9 @@
-"""An imperfection as a load: its depth grows while other loads are held."""
+"""An imperfection as a load: its depth grows while other loads are held.
+
+A step is a part of a case's load programme; it drives an amplitude, that is a load parameter. The
+amplitude of a growing imperfection is the factor of its deviation w0. Imperfections have keys below
+`shell`, such as "imperfections.0".
+"""
 
 from collections.abc import Collection, Iterable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar, Literal
@@ -74,6 +79,7 @@ class ImperfectionStep(LoadStep):
                 f"{step.key}.item: {self.item}: shell.imperfections has no such item, counted "
                 "from 0"
             )
+        # without an item the step grows all, which another step may not
         if load_of_amplitude[step.name].item is None and len(load_of_amplitude) > 1:
             raise ValueError(
                 f"{step.key}.item: give it: another step grows another item of shell.imperfections"
@@ -97,7 +103,7 @@ class GrowingObservables(Observables):
 
 
 def grown_by(steps: Iterable[ProgrammeStep], keys: Collection[str]) -> dict[str, list[str]]:
-    """Return amplitude of a step -> keys of the imperfections that its factor multiplies.
+    """Return name of each growth step's amplitude -> keys of the imperfections that it multiplies.
 
     Parameters
     ----------
@@ -109,6 +115,7 @@ def grown_by(steps: Iterable[ProgrammeStep], keys: Collection[str]) -> dict[str,
     items = {step.name: step.load.item for step in steps if isinstance(step.load, ImperfectionStep)}
 
     def grows(key: str, item: int | None) -> bool:
+        # the dots distinguish items 1 and 10; random dimples have longer keys
         return item is None or f"{key}.".startswith(f"imperfections.{item}.")
 
     return {name: [key for key in keys if grows(key, item)] for name, item in items.items()}

@@ -1,4 +1,11 @@
-"""Base of all imperfections: their sections, sizes with units, and geometry."""
+"""Base of all imperfections: their sections, sizes with units, and geometry.
+
+An imperfection is a deviation w0 from the perfect surface, along its outward normal. R is the
+reference length of the shell, h its thickness, nu Poisson's ratio. A local imperfection has a
+centre and a width; `locate` gives its place and the function of distances from there, which are
+angles on a sphere. A case gives lengths as numbers over h or over a dimple's unit of width, or with
+a unit: these are divided when the case is validated, by sizes in the context of the validation.
+"""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -162,8 +169,9 @@ def note_sizes(
 ) -> None:
     """Note in the context of a validation by which sizes lengths of imperfections are divided.
 
-    The shell without its imperfections has these sizes. Nothing is noted for a wrong shell, whose
-    own message says what is wrong, or if no imperfection has a text.
+    They are sizes in metres of the shell without its imperfections, and none without units. Nothing
+    is noted for a wrong shell, whose own message says what is wrong, or if no imperfection has a
+    text, so that the shell need not be validated twice.
 
     Parameters
     ----------
@@ -180,7 +188,7 @@ def note_sizes(
         or not any(map(_has_text, _imperfections(data)))
     ):
         return
-    info.context.pop(CONTEXT, None)
+    info.context.pop(CONTEXT, None)  # of an earlier shell of the case
     try:
         shell: Sized = handler({key: value for key, value in data.items() if key not in KEYS})
     except ValidationError:
@@ -309,6 +317,7 @@ class LocalSection(ImperfectionSection):
         """
         profile_class, width = self.deviation, self.half_width(reference.R_over_h, reference.nu)
         place, distance = locate(self.at, reference, key)
+        # the shell's own bending length, or the profile where that is narrower
         size = min(
             DIMPLE_ELEMENT_SIZE / sqrt(reference.R_over_h), profile_class.element_widths * width
         )
@@ -348,7 +357,7 @@ class Imperfect(KeyAbility[Mapping[str, ImperfectionSection]]):
                 "shell.imperfections: give these or defect; a dimple of the list is the same as "
                 "defect"
             )
-        edge = None if shell.edge_polar is None else radians(shell.edge_polar)
+        edge = None if shell.edge_polar is None else radians(shell.edge_polar)  # of spheres
         for key, section in self.sections.items():
             try:
                 section.refuse_unfit(shell.R_over_h, shell.poisson_ratio, edge)

@@ -1,4 +1,11 @@
-"""Modes of the perfect shell as imperfections."""
+"""Modes of the perfect shell as imperfections.
+
+A mode is how the perfect shell begins to buckle. It becomes a shape: a function of places over R,
+1 where its displacement w along the normal is largest, inwards positive. w0 is the deviation along
+the outward normal, h the thickness, R the reference length. Modes of several shells have a part on
+each; a pose maps the frame of one shell to the frame of all. A run computes the modes first, and
+then gives them to the section by `become`.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -108,11 +115,14 @@ class ModesSection(FileKeys, ImperfectionSection):
         """
 
         def part_of(mode: Mode) -> Shape | None:
+            """Return the mode on this shell; None if it does not move it."""
             if not isinstance(mode, OfShells):
                 return mode
+            # on one of several shells, in the frame of this shell
             return PlacedMode(mode.parts[name], place) if place and name in mode.parts else None
 
         parts = [part_of(mode) for mode in modes[: len(self.amplitudes)]]
+        # of modes with an amplitude, at least one must move this shell
         moving_parts = [
             part for amplitude, part in zip(self.amplitudes, parts, strict=True) if amplitude
         ]
@@ -136,7 +146,7 @@ class ModesSection(FileKeys, ImperfectionSection):
             self.become((_read(self, reference.perfect.sample(), f"{key}.file: {self.file}"),))
         shapes = self.shapes or ()
         amplitudes = tuple(a * h for a in self.amplitudes[: len(shapes)])
-        waves = [getattr(shape, "m", None) for shape in shapes]
+        waves = [getattr(shape, "m", None) for shape in shapes]  # around e3, if it is such a wave
         names = [f"mode {i}{'' if m is None else f' (m = {m})'}" for i, m in enumerate(waves, 1)]
         words = [
             f"{a:g} h of {self.file or name}"
@@ -327,5 +337,6 @@ def over_largest(places: Array, w: Array) -> Array:
     """
     size = np.abs(w)
     largest_places = np.flatnonzero(size > (1 - CREST_TOLERANCE) * size.max())
+    # lexsort sorts by its last key first, z; places count as equal if six decimals are
     chosen_row = largest_places[np.lexsort(places[largest_places].round(6).T)[-1]]
     return np.asarray(w / np.copysign(size.max(), w[chosen_row]))

@@ -1,4 +1,8 @@
-"""Random imperfections from a seed: a smooth field, or dimples at random places."""
+"""Random imperfections from a seed: a smooth field, or dimples at random places.
+
+w0 is the deviation along the outward normal, over R, the reference length. The length of
+correlation is given in the unit of a dimple's width, which `half_width` converts.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -54,7 +58,7 @@ class RandomSection(ImperfectionSection):
         ):
             raise ValueError("give amplitude and length of a random field, or dimples")
         if self.dimples:
-            self._sizes = sizes_noted(info)
+            self._sizes = sizes_noted(info)  # the dimples are validated once more, when drawn
             _ = self.random_dimples  # refuses what has no room
         return self
 
@@ -77,6 +81,7 @@ class RandomSection(ImperfectionSection):
         """
         if self.dimples is None:
             return {}
+        # a stream of its own: number 0, with the name of this list
         items = self.dimples.draw(generator(self.seed, 0, "shell.imperfections"))
         section_class = DimpleSection if self.dimples.kind == "dimple" else GaussianSection
         try:
@@ -84,7 +89,7 @@ class RandomSection(ImperfectionSection):
                 section_class.model_validate(item, context=dict(self._sizes)) for item in items
             ]
         except ValidationError as e:
-            error = e.errors()[0]
+            error = e.errors()[0]  # of the first: all are alike
             raise ValueError(
                 f"dimples: {error['loc'][-1]}: {error['msg'].removeprefix('Value error, ')}"
             ) from None
@@ -125,12 +130,15 @@ class RandomWaves:
         import scipy
 
         bits = np.random.PCG64(self.seed).random_raw(4 * WAVE_COUNT).reshape(4, WAVE_COUNT)
+        # 53 of the 64 bits, in the middle of their interval: never 0 or 1
         uniform = ((bits >> np.uint64(11)) + 0.5) / 2.0**53
+        # three normal numbers by the inverse of their distribution, and a phase, for each wave
         return np.vstack([scipy.special.ndtri(uniform[:3]) / self.length, 2 * np.pi * uniform[3:]])
 
     def __call__(self, places: Array) -> Array:
         """Return w0 (n,) over R at places (n, 3) over R."""
         w0 = np.empty(len(places))
+        # in parts, since the array of places times waves would be large
         for i in range(0, len(places), PLACES_AT_ONCE):
             x = places[i : i + PLACES_AT_ONCE]
             angles = self._waves[3] + sum(x[:, j : j + 1] * self._waves[j] for j in range(3))

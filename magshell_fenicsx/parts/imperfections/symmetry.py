@@ -1,6 +1,11 @@
 """The symmetry that imperfections leave, by their values, and their places in the chart.
 
-w0 is the deviation along the outward normal. Places, widths and depths are over R.
+w0 is the deviation along the outward normal. Places, widths and depths are over R, the reference
+length. A local imperfection is a deviation -depth f((distance/width)²) around a centre, with a
+profile f; its reach is where it ends, its rim the curve on which its curvature jumps. A symmetry
+constraint says which planes mirror a part of a case, and why it is not axisymmetric about e3. The
+chart is the pair of coordinates of the perfect surface; `perfect.perfect` maps it to places,
+`perfect.inverse` back. A mirror is a plane, and `image` the reflection in it.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -72,7 +77,7 @@ class _Numbers:
         """
         centres, widths = self.rows[:, :3], self.rows[:, 3]
         distance = np.linalg.norm(x[:, None] - centres, axis=-1)
-        if self.angles:
+        if self.angles:  # of unit vectors, exact also for small angles
             distance = 2 * np.arctan2(distance, np.linalg.norm(x[:, None] + centres, axis=-1))
         squared = (distance / widths) ** 2
         w0 = np.zeros(len(x))
@@ -106,6 +111,7 @@ class _Sum:
         places = angles or [
             d.distance.place for d in local_deviations if isinstance(d.distance, StraightDistance)
         ]
+        # some are not local, or their distances are of both kinds
         if not places or len(places) < len(self.deviations):
             return None
         shapes = [(d.width, classes.index(type(d))) for d in local_deviations]
@@ -127,6 +133,7 @@ class _Sum:
         None means that the deviations must be compared by their values at many places.
         """
         numbers = self.numbers
+        # the image of a unit vector is one only under a plane through the origin
         if numbers is None or (numbers.angles and mirror.offset):
             return None
         rows, depths = numbers.rows, numbers.depths
@@ -136,8 +143,9 @@ class _Sum:
         has_no_image = (distance > 4 * IMAGE_TOLERANCE) | (
             np.abs(depths[image] - depths) > IMAGE_TOLERANCE * np.abs(depths).max()
         )
-        if not has_no_image.any():
+        if not has_no_image.any():  # two that share an image are not decided
             return True if len(np.unique(image)) == len(image) else None
+        # others may still make up for those without an image: values at some centres show it
         centres = rows[np.flatnonzero(has_no_image)[:FIRST_COMPARED], :3]
         differs = np.abs(numbers(centres) - numbers(mirror.image(centres))).max()
         return False if differs > 2 * EQUALITY_TOLERANCE * np.abs(depths).sum() else None
@@ -166,7 +174,7 @@ def imperfection_constraints(
     )
     groups = [_Sum([imperfection.deviation for imperfection in group]) for group in grouped]
 
-    sample = cache(lambda: _sample(imperfections, perfect))
+    sample = cache(lambda: _sample(imperfections, perfect))  # costly, and often not needed
 
     def mirrors(mirror: Mirror) -> bool:
         """Return whether a plane is a plane of symmetry of all groups of imperfections."""
@@ -196,6 +204,8 @@ def imperfection_constraints(
         ]
         if not all(_are_equal(w0_at_angles[0], w0) for w0 in w0_at_angles):
             reason = "an imperfection differs around e3"
+    # candidates for planes: of a shell that is not round it has its own; of a round one they go
+    # through the centres, or between centres that have no azimuth in common
     if not perfect.round:
         return [SymmetryConstraint(reason, (), mirrors)]
     if common_azimuth(centres_off_axis) is None:
@@ -218,6 +228,7 @@ def _azimuths_of_planes(centres: Sequence[Array]) -> tuple[float, ...]:
         if abs(np.hypot(*x[:2]) - np.hypot(*first_place[:2])) < AXIS_TOLERANCE
         and abs(x[2] - first_place[2]) < AXIS_TOLERANCE
     ]
+    # the plane of the mean azimuth maps one to the other; of the first alone it contains that place
     return tuple(
         (atan2(x[1], x[0]) + atan2(first_place[1], first_place[0])) / 2
         for x in (first_place, *at_same_distance)
@@ -236,9 +247,12 @@ def _sample(imperfections: Mapping[str, ImperfectionGeometry], perfect: Outline)
             continue
         places.append(imperfection.centre[None])
         chart = perfect.inverse(imperfection.centre)
-        if len(chart) == 2:
+        if len(chart) == 2:  # a surface without a chart has no contours
             places += [
-                perfect.perfect(contour(key, imperfection, perfect, 0.0, chart, part)[::7])
+                # every seventh of the contour's 128 points
+                perfect.perfect(
+                    contour(key, imperfection, perfect, turn=0.0, centre=chart, part=part)[::7]
+                )
                 for part in COMPARED_PARTS_OF_REACH
             ]
     return np.concatenate(places)
@@ -266,7 +280,7 @@ class LocalImperfection:
     circle
         Whether its outline is a circle around the chart's origin.
     jumps
-        Whether the curvature jumps on that circle.
+        Whether the curvature jumps where it ends.
     rim
         Points (n, 2) of the closed curve on which the curvature jumps; None where it does not, and
         of a circle.
@@ -314,6 +328,7 @@ def local_imperfections(
     for key, imperfection in imperfections:
         if imperfection.centre is None:
             continue
+        # at the pole of a disc: a circle about the origin of the chart, needing no contour
         if perfect.disc and np.hypot(*imperfection.centre[:2]) < AXIS_TOLERANCE:
             local_imperfections.append(
                 LocalImperfection(
@@ -326,16 +341,16 @@ def local_imperfections(
             )
             continue
         centre = perfect.inverse(rotation(turn) @ imperfection.centre)
-        curve = contour(key, imperfection, perfect, turn, centre, 1.0)
+        curve = contour(key, imperfection, perfect, turn, centre, part=1.0)  # the whole reach
         radius = float(np.linalg.norm(curve - centre, axis=1).max())
         local_imperfections.append(
             LocalImperfection(
                 centre,
                 radius,
                 imperfection.size,
-                False,
-                imperfection.rim,
-                curve if imperfection.rim else None,
+                circle=False,
+                jumps=imperfection.rim,
+                rim=curve if imperfection.rim else None,
             )
         )
     return local_imperfections
@@ -375,6 +390,8 @@ def contour(
         Angle about e3 of the frame of the chart (rad).
     centre
         Centre (2,) of the imperfection in the chart.
+    part
+        Part of the reach, 1 for all of it.
 
     Raises
     ------
@@ -398,6 +415,7 @@ def contour(
             f"shell.{key}.width: its width over R, {imperfection.reach:.3g}, is too much for this "
             "place: it would reach around the shell or its axis"
         )
+    # the wanted point of a ray is between low and high: the first interval that ends outside
     high = ray_lengths[is_outside.argmax(axis=0)]
     low, distance_low, distance_high = (
         high - ray_lengths[0],
@@ -414,6 +432,7 @@ def contour(
             np.where(is_crossed, high, low),
             np.where(is_crossed, distance_high, distance_low / 2),
         )
+        # where the point is hit, a tiny distance keeps the quotient from 0/0
         high, distance_high = middle, np.where(distance_at_middle == 0, 1e-300, distance_at_middle)
     return np.asarray(centre + high[:, None] * rays)
 
@@ -425,6 +444,7 @@ def images(local_imperfection: LocalImperfection, perfect: Outline) -> list[Arra
     """
     if not (grid := perfect.grid):
         return [local_imperfection.centre]
+    # by a width of the grid in either direction that is glued
     steps = product(*((-1, 0, 1) if glued else (0,) for glued in grid.glued))
     return [
         local_imperfection.centre + np.multiply(step, np.subtract(grid.high, grid.low))

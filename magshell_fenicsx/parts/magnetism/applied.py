@@ -4,6 +4,17 @@ The polynomial of second order has the first and second derivatives of the field
 the energies that take it: the forms and kernels are the same for every field. A shell that has
 passed through a magnet between two states is noticed, however thin that is. The amplitudes of
 fields that are driven are free parameters of a system.
+
+- B, G and H are the flux density with its first and second derivatives: (n, 3), (n, 3, 3) and (n,
+  3, 3, 3). Places are over R.
+- The entries of the polynomial at a point are: u (3), B at the undeformed place (3), then at the
+  present place B (3), G (9) and the coefficients of second order (18).
+- A field at rest depends on no amplitude. A moving, or driven, field is moved or multiplied by
+  amplitudes: load parameters by name, which `mu` holds.
+- A point field is a fem.Function with values at quadrature points, computed again when its inputs
+  change; a `Memo` is such an array.
+- Pi is an energy; terms are energies with their forms. Energies of a remanence are linear in the
+  field, energies of a soft magnet are quadratic in it.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -44,8 +55,9 @@ def crossed_place(distance: Callable[[Array], Array], starts: Array, ends: Array
 
     Notes
     -----
-    A distance changes by at most the length of a segment. So no place of a segment is inside if the
-    distances at both ends add up to more than its length; the other segments are halved.
+    From one place to another the distance from a body changes by at most the length between them.
+    So no place of a segment is inside if the distances at both ends add up to more than its length.
+    Other segments are halved, at most `MAX_HALVINGS` times; a graze that is shorter is ignored.
     """
     distance_before, distance_after = distance(starts), distance(ends)
     for _ in range(MAX_HALVINGS):
@@ -107,6 +119,10 @@ class AppliedField:
         degree: int,
         moving_fields: Sequence[MovingField] = (),
     ) -> None:
+        """Set up the quantities that follow r0, u and mu, and check the undeformed field.
+
+        Arrays in a `Memo` are computed again where their inputs, the second argument, have changed.
+        """
         V = u.function_space
         self._degree = degree
         self.polynomial = PointField(V.mesh, degree, FIELD_POLYNOMIAL_SIZE)
@@ -136,15 +152,16 @@ class AppliedField:
         return tuple(self.mu)
 
     def _polynomials(self) -> Array:
-        """Return the values of `polynomial` at the present state: (cells, points, size).
+        """Return the values (cells, points, size) of `polynomial` at the present state.
 
-        If the field is not finite at a present place, `lost` describes this place.
+        As a side effect `lost` is set to a description of the first present place at which the
+        field is not finite. Later states do not clear it.
         """
         displacement, places = self._displacement.renew(), self.places
         B, G, H = self._total_field(self._values_at_rest.renew(), places)
         is_lost = ~np.isfinite(B).all(axis=1)
         self.lost = self._lost_description(places[is_lost][0]) if is_lost.any() else self.lost
-        # the terms of second order, B,jk dx_j dx_k/2: those with j and k different count twice
+        # second order: B,jk dx_j dx_k/2 over pairs j <= k, where j < k stands for two equal terms
         second_order = H[:, :, *COMPONENT_PAIRS] * np.where(
             COMPONENT_PAIRS[0] == COMPONENT_PAIRS[1], 0.5, 1.0
         )
@@ -157,14 +174,17 @@ class AppliedField:
     def slope(self, name: str, other: str = "", *, at_present_places: bool = True) -> PointField:
         """Return a point field of the derivative of the Taylor polynomial by one or two amplitudes.
 
-        With `name` alone this is dB/dmu and its gradient; with `other` too, d2B/dmu_i dmu_j without
-        a gradient. Fields that no amplitude drives do not contribute. The values follow the state.
+        With `name` alone it has dB/dmu and its gradient; with `other` too, d2B/dmu_i dmu_j without
+        a gradient. The values follow the state.
 
         Parameters
         ----------
+        name, other
+            Names of amplitudes; `other` is empty for a first derivative.
         at_present_places
-            True for a polynomial about the present places, to take the place of `polynomial`. False
-            for a change of the entries of `polynomial`, whose displacement then does not change.
+            True for a field that replaces `polynomial` in a form: its first entries are then the
+            displacement. False for a direction in which a form is differentiated by `polynomial`:
+            these entries are then zero.
         """
         field = PointField(self._u.function_space.mesh, self._degree, FIELD_POLYNOMIAL_SIZE)
         field.compute_by(
@@ -174,11 +194,12 @@ class AppliedField:
         return field
 
     def _slopes(self, name: str, other: str, *, at_present_places: bool) -> Array:
-        """Return the values (cells, points, size) of the point field `slope`."""
+        """Return the values (cells, points, size) of the point field that `slope` returns."""
         values = np.zeros_like(self.polynomial.values)
         values[..., :3] = self.polynomial.values[..., :3] if at_present_places else 0.0
         shape = values.shape[:2]
         for at_places in self._fields_at_places:
+            # a field that does not depend on the amplitudes has no derivative by them
             if name in at_places.moving_field.names and (
                 not other or other in at_places.moving_field.names
             ):
@@ -205,7 +226,8 @@ class AppliedField:
         """Describe the body through which a point has moved between two states; "" without one.
 
         Each state is given by the places (n, 3) of all quadrature points and the amplitudes by
-        name. Only fields of bodies, which have a `distance`, are looked at.
+        name. Only fields of bodies can be passed through: they have a function `distance` of
+        places. Sums of fields list their summands in `parts`.
         """
         parts_at_rest: list[tuple[FieldInSpace, MovingField]] = [
             (field_part, MovingField(field_part))
@@ -231,10 +253,10 @@ class AppliedField:
     def _total_field(
         self, at_rest: tuple[Array, Array, Array], x: Array
     ) -> tuple[Array, Array, Array]:
-        """Return B, its gradient and its second derivatives of the whole field at places x (n, 3).
+        """Return B, G and H of the whole field at places x (n, 3).
 
-        The shapes are (n, 3), (n, 3, 3) and (n, 3, 3, 3). They are those of the field at rest,
-        `at_rest`, plus those of the moving fields. The moving fields at x are kept for `_slopes`.
+        `at_rest` are B, G and H of the field at rest, to which the moving fields are added. As a
+        side effect the moving fields at x are kept for `_slopes`.
         """
         self._fields_at_places = [moving.field_at(x, self.mu) for moving in self._moving_fields]
         fields = [at_rest, *(at_places.value for at_places in self._fields_at_places)]
@@ -243,6 +265,7 @@ class AppliedField:
 
     def _lost_description(self, x: Array) -> str:
         """Describe for the user why the field is not finite at a place (3,); "" if it is finite."""
+        # a sum of fields is looked at summand by summand, so that the right one is named
         values_at_rest = [
             (field_part, field_part(x[None])[0])
             for field_part in getattr(self._field_at_rest, "parts", [self._field_at_rest])
@@ -265,7 +288,10 @@ class AppliedField:
 
 @dataclass(eq=False)
 class FieldAmplitude:
-    """The amplitude of a moving field, which takes the place of a constant in a form.
+    """The amplitude of a moving field, as a free parameter: it takes the place of a UFL constant.
+
+    Forms do not contain the amplitude, but the field's Taylor polynomial. So derivatives by it are
+    made by exchanging the polynomial, or by differentiating along a change of the polynomial.
 
     Attributes
     ----------
@@ -299,8 +325,8 @@ class FieldAmplitude:
     def slopes(self) -> list[FormTerm]:
         """Return dPi/dmu as terms, one for each energy.
 
-        An energy linear in the field is taken in the field dB/dmu; a quadratic one is
-        differentiated along the change of the Taylor polynomial.
+        For an energy that is linear in the field, dB/dmu replaces the field in the form. A
+        quadratic energy is differentiated along the change of the Taylor polynomial.
         """
         linear = [self._with_polynomial(t, self.applied.slope(self.name)) for t in self._linear]
         return linear + [
@@ -315,7 +341,7 @@ class FieldAmplitude:
         list is empty for an amplitude of another field.
         """
         if not isinstance(q, FieldAmplitude):
-            if hasattr(q, "second_derivatives"):
+            if hasattr(q, "second_derivatives"):  # q knows the mixed derivative
                 derivatives: Sequence[Derivative] = q.second_derivatives(self)
                 return derivatives
             terms_with_q = [t for t in self.slopes() if q in t.form.constants()]
@@ -368,8 +394,9 @@ def field_parameters(
 ) -> dict[str, FreeParameter]:
     """Return the amplitudes of moving fields as free parameters, by name; collective.
 
-    Only the `terms` whose forms have a field's polynomial are differentiated. The residuals of the
-    derivatives are compiled.
+    A `FreeParameter` holds the amplitude, the terms dPi/dmu and a function to second derivatives.
+    Only `terms` whose forms contain the polynomial of the field depend on it. The residuals of the
+    derivatives are compiled here.
     """
     parameters = {}
     for field in fields:

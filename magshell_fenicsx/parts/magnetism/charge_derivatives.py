@@ -4,6 +4,13 @@ The energy W = sum of q_i q_j/|x_i - x_j| has dW/dq_i = sum of q_j/|x_i - x_j|. 
 the force term v . dW/du is the rate of this sum along v. The rates v of nodes are the imaginary
 parts of complex nodes, times a step so small that derivatives are exact to rounding (W. Squire, G.
 Trapp, SIAM Review 40, 1998, 110).
+
+- Left and right are the first and the second cell of a pair; q and x are charges and places on the
+  left, p and y on the right.
+- An element is a cell's face or edge with charged points (`Points`): P points, each with charges in
+  several layers through the thickness. Heights are those of charges over the mid-surface.
+- Arrays (n, 1 or P, charges) have n pairs of elements. Either all charges of both elements act on
+  each other (1), or each of P points on the left has its own points on the right (P).
 """
 
 from dataclasses import dataclass
@@ -45,7 +52,7 @@ def places(points: Points, rows: Ints, nodes: Complex) -> tuple[Complex, Complex
     nodes
         (n, k, 3) nodes of their cells, with rates as imaginary parts.
     """
-    T = np.moveaxis(points.tables, -2, 0)
+    T = np.moveaxis(points.tables, -2, 0)  # shape functions, and their two derivatives
     # real and imaginary parts side by side, so that a real matrix product interpolates both
     flat_nodes = (
         np.ascontiguousarray(nodes.transpose(1, 0, 2)).view(np.float64).reshape(nodes.shape[1], -1)
@@ -75,11 +82,11 @@ def pair_derivatives(
     *,
     heights: bool = False,
 ) -> tuple[Array, Array]:
-    """Return derivatives of sums over pairs of cells, by the charges of left and right points.
+    """Return derivatives of a sum over pairs of cells, by the charges on the left and on the right.
 
-    Both arrays have the shape of `Points.q`. With `heights`, they are derivatives by the heights of
-    the charges over the mid-surface. What is differentiated is `weights.energy` W + `weights.force`
-    v . dW/du, with the rates v of the nodes.
+    The number that is differentiated is `weights.energy` W + `weights.force` v . dW/du, with the
+    rates v of the nodes. Both arrays have the shape of `Points.q`. With `heights`, they are
+    derivatives by the heights of the charges over the mid-surface instead.
 
     Parameters
     ----------
@@ -94,6 +101,7 @@ def pair_derivatives(
     # either all pairs of points count, or each left point has right points of its own
     is_shared = right[0].tables.ndim == 3
     size = left[0].q[0].size * (right[0].q[0].size if is_shared else right[0].q[0, 0].size)
+    # derivatives by heights need about four times the memory
     batch_size, derivatives = (
         max(1, MAX_CHARGE_PAIRS // (4 * size if heights else size)),
         _by_heights if heights else _by_charges,
@@ -104,6 +112,7 @@ def pair_derivatives(
             _components(points, rows[batch], nodes[cells[batch, i]], is_shared)
             for i, (points, rows) in enumerate((left, right))
         )
+        # charges in the shape of the components of places
         q, p = (
             points.q[rows[batch]].reshape(*z[0][0].shape)
             for (points, rows), z in ((left, x), (right, y))
@@ -118,10 +127,10 @@ def pair_derivatives(
 def _by_charges(
     x: Components, y: Components, q: Array, p: Array, weights: Weights
 ) -> tuple[Array, Array]:
-    """Return derivatives (n, 1 or P, charges) by left charges q and right charges p.
+    """Return derivatives (n, 1 or P, charges) by the left charges q and by the right charges p.
 
     `x` and `y` are components of places and normals of left and right charges. With d = x - y the
-    kernel is 1/|d|, and its rate -d . d'/|d|³.
+    kernel is 1/|d|; its rate along v is -d . d'/|d|³, with the rate d' of d.
     """
     places_and_rates = [
         [
@@ -143,7 +152,7 @@ def _by_charges(
 def _by_heights(
     x: Components, y: Components, q: Array, p: Array, weights: Weights
 ) -> tuple[Array, Array]:
-    """Return derivatives (n, 1 or P, charges) by the heights of left charges q and right charges p.
+    """Return derivatives (n, 1 or P, charges) by the heights of the left and the right charges.
 
     A charge moves along its normal n with its height, so that q p/|d|, d = x - y, has the
     derivative -q p n . d/|d|³. `x` and `y` are components of places and normals of left and right
@@ -153,7 +162,7 @@ def _by_heights(
     square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
     inverse_cube = 1 / (square * np.sqrt(square))
     by_left_heights, by_right_heights = np.zeros(q.shape, complex), np.zeros(p.shape, complex)
-    for separation, n, m in zip(d, x[1], y[1], strict=True):
+    for separation, n, m in zip(d, x[1], y[1], strict=True):  # components x, y, z
         force = inverse_cube * separation
         by_left_heights -= n * (force @ p[..., None])[..., 0]
         by_right_heights += m * (q[..., None, :] @ force)[..., 0, :]
@@ -165,10 +174,10 @@ def _by_heights(
 
 
 def _components(points: Points, rows: Ints, nodes: Complex, is_shared: bool) -> Components:
-    """Return the components x, y, z of the charges' places, and those of their normals.
+    """Return the three components of the charges' places, and the three of their normals.
 
-    Each is (n, 1, charges) if the points are `is_shared` by all points of the other element, else
-    (n, P, charges): one set for each of its P points.
+    If `is_shared`, all charges of the element act on all of the other one: (n, 1, charges). Else
+    they are (n, P, charges), with the charges that belong to each of P points.
     """
     _, n, x = places(points, rows, nodes)
     shape = len(x), 1 if is_shared else x.shape[1], -1, 3

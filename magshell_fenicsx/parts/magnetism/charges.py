@@ -14,6 +14,17 @@ thickness is modelled as it is. Theory: docs/theory.md, the field of a magnetise
 
 In: a `MagnetisedShell` (nodal values, lengths over R). Out: flux density over the remanence's
 magnitude, magnetic moment, derivatives of both, and flat charged triangles.
+
+- An element is a piece of surface or volume with charges, such as the faces above one cell. It has
+  coordinates (a, b) in [0, 1]², or (a, b, c) in [0, 1]³. A family is a set of such elements.
+- A box is a part of an element, a rectangle of its coordinates; arrays (n, m, ...) have n boxes
+  with m points in each.
+- A layer is a surface at a constant height through the thickness: the two faces, or one inside. Its
+  height eta is over the thickness, from -1/2 to 1/2.
+- Jets (`SurfaceJets`) are the values and derivatives by a and b of place, thickness and remanence.
+- `swept` cells are those of a meridian, swept around the axis. Each is divided into `SECTORS`
+  elements, one behind the other around the ring.
+- q is the size of a charge; `NodalDerivatives` collect the derivatives of a number by nodal values.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -56,7 +67,8 @@ BOUNDARY_INSET = 1e-3  # over the square, as a cell may have no normal at a corn
 def _extent_points(dimension: int) -> Array:
     """Return points of the unit square or cube that show the extent of a box.
 
-    The middle, the middles of opposite sides one after the other, and the corners.
+    They are the middle, then the middles of sides (two opposite ones after each other), then the
+    corners.
     """
     middles_of_sides = [
         np.where(np.arange(dimension) == axis, end, 0.5)
@@ -69,7 +81,8 @@ def _extent_points(dimension: int) -> Array:
 
 EXTENT_POINTS = {dimension: _extent_points(dimension) for dimension in (2, 3)}
 
-# height over the thickness, and what B and its derivatives by a and b are multiplied by
+# height over the thickness, and the three factors of the remanence and its derivatives by a and b:
+# a charge is the sum of their scalar products
 Layer = tuple[Any, tuple[Array, Array, Array]]
 
 
@@ -120,7 +133,7 @@ class Boxes:
         return Boxes(self.elements[which], self.low[which], self.size[which])
 
     def halves(self, sides: Ints) -> "Boxes":
-        """Return both halves of each box, divided along side number `sides` (n,).
+        """Return both halves of each box; box i is divided across its coordinate `sides[i]`.
 
         The 2 n boxes are all lower halves, then all upper halves.
         """
@@ -146,11 +159,11 @@ class PointCharges:
     x
         (n, m, layers, 3) places of the charges.
     q
-        (n, m, layers) charges per (a, b), without the weights of layers that are in `x`.
+        (n, m, layers) charges, with the weights of points and layers and the size of the box.
     add_derivatives
-        Adds the derivatives of a number J by nodal values to the `NodalDerivatives` with which
-        the charges were computed, from dJ/dx (n, m, layers, 3) and dJ/dq (n, m, layers). None if
-        no derivatives were asked for.
+        Function of dJ/dx (n, m, layers, 3) and dJ/dq (n, m, layers) of some number J. It adds the
+        derivatives of J by nodal values to the `NodalDerivatives` that were given to `charges_at`.
+        None if none were given.
     """
 
     x: Array
@@ -175,7 +188,7 @@ class ChargedElements:
     def box_places(self, boxes: Boxes, x: Array) -> Array:
         """Return deformed places (n, m, k, 3) over R of points x (m, 2 or 3) of n boxes.
 
-        There are k places at each point, through the thickness.
+        There are k places at each point, through the thickness. They show the extent of a box.
         """
         raise NotImplementedError
 
@@ -188,22 +201,30 @@ class ChargedElements:
     ) -> PointCharges:
         """Return the charges at points x (m, 2 or 3) of the unit square or cube, in each box.
 
-        They are multiplied by the weights (m,) of the points. With `nodal_derivatives`, the
-        returned charges have an `add_derivatives`, which adds to it.
+        They are multiplied by the weights (m,) of the points and by the size of the box. If
+        `nodal_derivatives` is given, `add_derivatives` of the result adds to it.
         """
         raise NotImplementedError
 
     def separated_boxes(self, places: Array) -> Iterator[tuple[Boxes, Ints, Ints]]:
-        """Yield boxes with pairs (box number, place number) that are far enough apart.
+        """Yield sets of boxes, each with the places that are far enough from them for Gauss's rule.
 
-        The numbers are two arrays (pairs,). The boxes of all pairs together cover all elements once
-        for each of the places (n, 3) over R. A box belongs to one of the yielded sets only.
+        A box that is too near to a place is halved for this place. So for each of the places (n, 3)
+        over R, the boxes with which it is paired cover all elements once.
+
+        Yields
+        ------
+        boxes
+            A set of boxes.
+        box_of_pair, place_of_pair
+            (pairs,) numbers of the box in this set and of the place, for each pair.
 
         Raises
         ------
         TooNear
             If a place is in the shell's surface, after all others have their boxes.
         """
+        # a little inside, as a cell may have no normal at a corner
         corners = np.clip(EXTENT_POINTS[self.dimension], BOUNDARY_INSET, 1 - BOUNDARY_INSET)
         boxes = Boxes.undivided(self.count, self.dimension)
         place_of_pair = np.repeat(np.arange(len(places)), self.count)
@@ -220,10 +241,10 @@ class ChargedElements:
             is_separated = distance > SEPARATION_IN_RADII * radius[box_of_pair]
             if is_separated.any():
                 yield boxes, box_of_pair[is_separated], place_of_pair[is_separated]
-            # boxes too near to a place are halved along their longest side, for this place alone
+            # boxes too near to a place are halved across their longest direction, for this place
             halved, box_of_pair = np.unique(box_of_pair[~is_separated], return_inverse=True)
             place_of_pair, x = place_of_pair[~is_separated], x[halved]
-            ends = x[:, 1 : 1 + 2 * self.dimension]
+            ends = x[:, 1 : 1 + 2 * self.dimension]  # middles of opposite sides
             sides = np.linalg.norm(ends[:, 1::2] - ends[:, ::2], axis=-1).max(axis=-1)
             boxes = boxes[halved].halves(sides.argmax(axis=1))
             box_of_pair, place_of_pair = (
@@ -235,14 +256,17 @@ class ChargedElements:
 
 
 class ShellFaces(ChargedElements):
-    """Charges of both faces of a shell, and of its interior where the remanence varies there.
+    """Charges of both faces of a shell, and of its interior where the remanence varies.
 
-    With `include_uncharged`, layers of the interior are kept even if they have no charge.
+    The interior is represented by Gauss layers through the thickness. A uniform remanence has no
+    charge inside, so these layers are left out; with `include_uncharged` they are kept, as
+    derivatives by the remanence need them.
     """
 
     def __init__(
         self, shape: MagnetisedShell, cells: Ints, *, include_uncharged: bool = False
     ) -> None:
+        """Divide swept cells into sectors, and decide whether layers inside are needed."""
         self.shape = shape
         sectors = SECTORS if shape.swept else 1
         self._cells, self._sector = (
@@ -279,9 +303,11 @@ class ShellFaces(ChargedElements):
         return np.stack([jets.place(0.5), jets.place(-0.5)], axis=2)
 
     def contains(self, places: Array) -> NDArray[np.bool_]:
-        """Return which of the places (n, 3) over R are in the deformed shell.
+        """Return flags (n,) of the places (n, 3) over R that are in the deformed shell.
 
-        Such a place has a foot on the mid-surface, at a distance below half of the thickness.
+        Such a place has a foot, the nearest point of the mid-surface, at a distance below half of
+        the thickness. Newton's method for the foot starts from the nearest point of a grid on each
+        element.
         """
         from scipy.spatial import cKDTree  # takes long to import
 
@@ -298,13 +324,15 @@ class ShellFaces(ChargedElements):
             grid_places[:, 1:, 1:] - grid_places[:, :-1, :-1],
             grid_places[:, 1:, :-1] - grid_places[:, :-1, 1:],
         ]
-        # a place in the shell is within `reach` of a grid point of its box
+        # a place in the shell is within `reach` of a grid point of its box: the longest diagonal of
+        # the grid's squares, and the thickness
         reach = np.max(
             [np.linalg.norm(array, axis=-1).max(axis=(1, 2)) for array in diagonals], axis=0
         )
         reach = reach + grid.thickness.max(axis=1)
         candidates = cKDTree(grid.r[0].reshape(-1, 3)).query_ball_point(places, reach.max())
         place = np.repeat(np.arange(len(places)), [len(array) for array in candidates])
+        # the tree counts grid points box by box
         box, point = np.divmod(np.concatenate([*candidates, []]).astype(np.intp), len(start))
         distance_to_point = np.linalg.norm(places[place] - grid.r[0][box, point], axis=-1)
         # of each pair (place, box) the nearest grid point, where Newton's method starts
@@ -321,15 +349,16 @@ class ShellFaces(ChargedElements):
         return is_inside
 
     def _feet_within(self, boxes: Boxes, ab: Array, x: Array) -> NDArray[np.bool_]:
-        """Return whether places x (n, 1, 3) have a foot in their box within half of the thickness.
+        """Return flags (n,): whether place x[i] has a foot in box i within half of the thickness.
 
-        Newton's method for the foot starts from coordinates `ab` (n, 1, 2). The result is (n,).
+        Places x are (n, 1, 3): one for each box. Newton's method for the foot starts from the
+        coordinates `ab` (n, 1, 2).
         """
         for _ in range(NEWTON_STEPS):
             foot = self._jets_at(boxes, ab)
             J = np.stack([foot.r[1], foot.r[2]], axis=-1)
             step = np.einsum("nmdi,nmi->nmd", np.linalg.pinv(J), x - foot.r[0])
-            # b of an element is a part of the ring's azimuth
+            # the Jacobian is by b of the whole ring, of which an element is one sector
             step[..., 1] *= self._sectors
             ab = np.clip(ab + step, BOUNDARY_INSET**3, 1 - BOUNDARY_INSET**3)
         foot = self._jets_at(boxes, ab)
@@ -347,17 +376,21 @@ class ShellFaces(ChargedElements):
         weights: Array,
         nodal_derivatives: NodalDerivatives | None = None,
     ) -> PointCharges:
-        """Return the charges of both faces and of the layers inside, like `ChargedElements`.
+        """Return the charges of both faces and of the layers inside, at points x (m, 2) of boxes.
 
-        By Nanson the area vector is dX/da x dX/db of the undeformed layer. The divergence has the
-        cofactors dX/db x dX/deta and dX/deta x dX/da, with the derivatives of Br by a and b.
+        By Nanson, a face has the charge Br . (dX/da x dX/db), with X on the undeformed layer. A
+        layer inside has -Div Br dV0: derivatives of Br by a and b times the cofactors dX/db x
+        dX/deta and dX/deta x dX/da. Br does not vary through the thickness.
         """
         area = np.prod(boxes.size, axis=1)[:, None] * weights / self._sectors
 
         def layers(at: SurfaceJets) -> list[Layer]:
-            """Return the layers of jets at the points: both faces, then those inside."""
+            """Return the layers at the points of jets: both faces, then the ones inside.
+
+            A face has a factor of Br alone, a layer inside of the derivatives of Br alone.
+            """
             layers_of_jets = list[Layer]()
-            for eta, sign in ((0.5, 1.0), (-0.5, -1.0)):
+            for eta, sign in ((0.5, 1.0), (-0.5, -1.0)):  # outward normals are opposite
                 G1, G2, _ = at.layer(eta)
                 layers_of_jets.append(
                     (eta, ((sign * area)[..., None] * np.cross(G1, G2), 0 * G1, 0 * G1))
@@ -387,15 +420,23 @@ class EdgeStrips(ChargedElements):
         self.count = len(self._cells)
 
     def _coordinates(self, boxes: Boxes, x: Array) -> tuple[Array, Array, Array]:
-        """Return surface coordinates (n, m, 2), tangents (n, 2) and heights (n, m) in boxes.
+        """Return where the points x (m, 2) of the unit square are in each box of a strip.
 
-        The points x (m, 2) of the unit square run along the edge and through the thickness. A
-        tangent is the derivative of the surface coordinates along the edge; heights are over the
-        thickness.
+        The first coordinate of a point runs along the edge, the second through the thickness.
+
+        Returns
+        -------
+        ab
+            (n, m, 2) surface coordinates.
+        tangents
+            (n, 2) derivative of the surface coordinates along the edge.
+        heights
+            (n, m) heights over the thickness.
         """
         s, eta = np.moveaxis(boxes.points(x), -1, 0)
         edge = self._edges[boxes.elements][:, None]
         if self.shape.swept:
+            # edge 1 is the circle a = 1, edge 0 the circle a = 0, which runs backwards
             b = (self._sector[boxes.elements][:, None] + s) / self._sectors
             tangents = np.where(edge == 1, 1.0, -1.0)[..., None] * np.array([0.0, 1.0])
             return (
@@ -410,7 +451,10 @@ class EdgeStrips(ChargedElements):
         return np.stack([a, b], axis=-1), tangents, eta - 0.5
 
     def _jets(self, boxes: Boxes, x: Array) -> tuple[SurfaceJets, Array, Array]:
-        """Return the surface's jets at points x (m, 2) of boxes, tangents and heights."""
+        """Return the surface's jets at points x (m, 2) of boxes, then tangents and heights.
+
+        Tangents and heights are those of `_coordinates`.
+        """
         ab, tangents, eta = self._coordinates(boxes, x)
         return SurfaceJets.at_points(self.shape, self._cells[boxes.elements], ab), tangents, eta
 
@@ -426,9 +470,9 @@ class EdgeStrips(ChargedElements):
         weights: Array,
         nodal_derivatives: NodalDerivatives | None = None,
     ) -> PointCharges:
-        """Return the charges Br . N dA0 of the strips; see `ChargedElements.charges_at`.
+        """Return the charges Br . N dA0 of the strips at points x (m, 2) of boxes.
 
-        The outward area vector is the tangent of the undeformed edge times dX/deta.
+        The outward area vector is the cross product of the undeformed edge's tangent and dX/deta.
         """
         jets, tangents, eta = self._jets(boxes, x)
         area = (
@@ -448,7 +492,7 @@ class EdgeStrips(ChargedElements):
 
 
 def heights(faces: ShellFaces) -> Array:
-    """Return the heights of a shell's layers of charges, over the thickness, faces first."""
+    """Return the heights (layers,) of a shell's charges over the thickness: faces, then inside."""
     return np.array([0.5, -0.5, *(eta for eta, _ in faces._inside)])
 
 
@@ -468,18 +512,21 @@ def _point_charges(
     Parameters
     ----------
     jets
-        Jets of the surface at the points, with the remanence and its derivatives B (3, n, m, 3).
+        Jets of the surface at the points. B (3, n, m, 3) are the remanence and its derivatives.
     layers_of
         Jets -> the layers, each with its height and the factors of B in its charges.
     nodal_derivatives
-        Derivatives to which `PointCharges.add_derivatives` adds; None without.
+        Derivatives to which `PointCharges.add_derivatives` adds; None if none are wanted.
     """
     n, layers = unit(np.cross(jets.r[1], jets.r[2])), layers_of(jets)
     thickness = jets.thickness[..., None]
     x = np.stack([jets.r[0] + eta * thickness * n for eta, _ in layers], axis=2)
 
     def charges(layers: list[Layer]) -> Array:
-        """Return the charges (n, m, layers): factors of layers times B and its derivatives."""
+        """Return the charges (n, m, layers): factors of layers times B and its derivatives.
+
+        B does not depend on the shape, the factors do.
+        """
         return np.stack(
             [
                 sum(np.sum(c * b, axis=-1) for c, b in zip(C, jets.B, strict=True))
@@ -493,7 +540,11 @@ def _point_charges(
         return PointCharges(x, q)
 
     def add_derivatives(on_x: Array, on_q: Array) -> None:
-        """Add derivatives of a number, from those by places and sizes of the charges."""
+        """Add the derivatives of a number J by nodal values to `nodal_derivatives`.
+
+        `on_x` and `on_q` are dJ/dx and dJ/dq by places and sizes of the charges.
+        """
+        # the place x = r + height n: its derivatives by r and n
         heights = np.stack([eta * thickness + 0 * jets.r[0][..., :1] for eta, _ in layers], axis=2)
         by_B = [
             sum(on_q[:, :, i, None] * C[j] for i, (_, C) in enumerate(layers)) for j in range(3)
@@ -501,7 +552,7 @@ def _point_charges(
         jets.add_derivatives(
             nodal_derivatives, on_x.sum(axis=2), (heights * on_x).sum(axis=2), np.stack(by_B)
         )
-        # heights and factors depend on the undeformed shell, too
+        # the charges' factors depend on the undeformed shell, too
         jets.add_reference_derivatives(
             nodal_derivatives, lambda other: charges(layers_of(other)), on_q
         )
@@ -512,8 +563,8 @@ def _point_charges(
 def field(families: Sequence[ChargedElements], places: Array) -> Array:
     """Return the flux density (n, 3) of charges at places (n, 3); nan in the shell's surface.
 
-    Places are over R; the flux density is over the remanence's magnitude. Not collective: these are
-    the charges of this rank's elements.
+    `families` are sets of charged elements, such as faces and edge strips. Places are over R; the
+    flux density is over the remanence's magnitude. Not collective: only this rank's elements count.
     """
     B = np.zeros_like(places)
     for family in families:
@@ -523,8 +574,7 @@ def field(families: Sequence[ChargedElements], places: Array) -> Array:
                 for boxes, box_of_pair, place_of_pair in family.separated_boxes(
                     places[part_of_places]
                 ):
-                    # charges are computed once for each box that is used, then summed over its
-                    # pairs
+                    # the charges of a box are computed once, for all places that are paired with it
                     used_boxes, box_of_pair = np.unique(box_of_pair, return_inverse=True)
                     parts_of_charges = [
                         family.charges_at(part_of_boxes, rule, weights)
@@ -556,6 +606,7 @@ def _add_field(
     x, q
         (boxes, points, 3) places and (boxes, points) sizes of the charges.
     """
+    # each component of places, and of differences, is an array of its own, for speed
     components = np.ascontiguousarray(np.moveaxis(x, -1, 0))
     for pairs in _slices(len(place_of_pair), q.shape[1]):
         d = [
@@ -577,7 +628,8 @@ def gradient(
 ) -> float:
     """Return e . B at one place (3,), and add its derivatives to `nodal_derivatives`.
 
-    B is over the remanence's magnitude, e a vector (3,). Only this rank's elements are counted.
+    B is the flux density over the remanence's magnitude, e a vector (3,), as the axis of a sensor.
+    Only this rank's elements are counted.
 
     Raises
     ------
@@ -596,7 +648,7 @@ def gradient(
         charges = family.charges_at(chunk, rule, weights, nodal_derivatives)
         d = place - charges.x
         r = np.linalg.norm(d, axis=-1)
-        kernel = d @ e / (4 * np.pi * r**3)
+        kernel = d @ e / (4 * np.pi * r**3)  # e . B of a unit charge
         value += float(np.sum(charges.q * kernel))
         # 4 pi times the derivative of the kernel by the place; by a charge's place it is opposite
         kernel_slope = e / r[..., None] ** 3 - 3 * (d @ e / r**5)[..., None] * d
@@ -606,9 +658,10 @@ def gradient(
 
 
 def moment(families: Sequence[ChargedElements]) -> Array:
-    """Return the moment (3,) of all charges, the sum of q x, over R³ and the remanence's size.
+    """Return the magnetic moment (3,) of this rank's charges: the sum of q x.
 
-    It is the integral of the remanence as the shell carries it.
+    It is over R³ and the remanence's magnitude. Its value is the integral of the remanence F Br as
+    the deformed shell carries it.
     """
     total = np.zeros(3)
     for family in families:
@@ -640,16 +693,21 @@ def _chunks_of_boxes(boxes: Boxes, points_per_box: int) -> Iterator[Boxes]:
 
 
 def _slices(count: int, points_per_item: int) -> Iterator[slice]:
-    """Divide `count` items into slices of at most `MAX_CHARGE_PLACE_PAIRS` points together."""
+    """Divide `count` items into slices of at most `MAX_CHARGE_PLACE_PAIRS` points together.
+
+    A slice has at least one item.
+    """
     size = max(1, MAX_CHARGE_PLACE_PAIRS // max(points_per_item, 1))
     return (slice(first, first + size) for first in range(0, count, size))
 
 
 def triangles(family: ChargedElements, parts: int) -> list[tuple[Array, Array]]:
-    """Return flat triangles, corners (n, 3, 3) over R, with their charges (n,), chunk by chunk.
+    """Return flat charged triangles that approximate the charges of the elements.
 
-    Each element is divided into parts² quadrangles of two triangles each. A quadrangle's charge is
-    shared by area; triangles almost without area are left out.
+    The list has one pair of arrays for each chunk of elements: corners (n, 3, 3) over R and charges
+    (n,). Each element is divided into parts² quadrangles, and each of these, on every layer, into
+    two triangles. They share the quadrangle's charge by area; triangles almost without area are
+    left out.
     """
     low = np.stack(np.meshgrid(*[np.arange(parts) / parts] * 2, indexing="ij"), axis=-1).reshape(
         -1, 2
@@ -666,6 +724,7 @@ def triangles(family: ChargedElements, parts: int) -> list[tuple[Array, Array]]:
     )
     triangles_and_charges = []
     for chunk in _chunks_of_boxes(boxes, len(weights)):
+        # at the corners only places are wanted: their charges have the weight zero
         x = family.charges_at(chunk, corners, np.zeros(len(corners))).x
         q = family.charges_at(chunk, rule, weights).q.sum(axis=1).ravel()
         quads = np.moveaxis(x, 1, 2).reshape(-1, 4, 3)

@@ -3,6 +3,12 @@
 As the charges of a shell (see `charges`) they stay with the material: Br.N dA0 on faces, -Div Br
 dV0 inside. Here both are exact for the mesh, whose cells are mapped from a cube; between cells only
 a jump of the remanence leaves a charge. Theory: docs/theory.md, the field of a magnetised shell.
+
+- An element is the face or the interior of a cell with its charges; a family is a set of elements.
+- A box is a part of an element, a rectangle or cuboid of its coordinates (a, b) or (a, b, c) in
+  [0, 1]. Arrays (n, m, ...) have n boxes with m points in each.
+- X is the undeformed place, u the displacement, Br the remanence; places are over R.
+- q is the size of a charge; `NodalDerivatives` collect the derivatives of a number by nodal values.
 """
 
 from collections.abc import Sequence
@@ -35,7 +41,7 @@ CUBE_TOLERANCE = 1e-9  # places that are outside the unit cube by less count as 
 RADIUS_FACTOR = 1.1  # of the radius of a cell's nodes: no place of it is farther from its middle
 CORNERS_OF_CUBE = basix.geometry(basix.CellType.hexahedron)
 CORNERS_OF_FACES = np.array(basix.topology(basix.CellType.hexahedron)[2])  # (6, 4)
-# of the coordinates (a, b) of each face
+# corner at which the coordinates (a, b) of each face begin, and the vectors along them
 FACE_ORIGINS = CORNERS_OF_CUBE[CORNERS_OF_FACES[:, 0]]
 FACE_TANGENTS = CORNERS_OF_CUBE[CORNERS_OF_FACES[:, 1:3]] - CORNERS_OF_CUBE[CORNERS_OF_FACES[:, :1]]
 OUTWARD_SIGNS = np.sign(
@@ -70,9 +76,9 @@ class MagnetisedSolid:
     remanence: Array
 
     def contains(self, places: Array) -> NDArray[np.bool_]:
-        """Return which of the places (n, 3) over R are in the deformed cells of this rank.
+        """Return flags (n,) of the places (n, 3) over R that are in deformed cells of this rank.
 
-        Candidates are cells whose nodes' ball, slightly enlarged, contains the place.
+        A cell is looked at if the ball around its nodes, slightly enlarged, contains the place.
         """
         from scipy.spatial import cKDTree  # takes long to import
 
@@ -96,9 +102,10 @@ class MagnetisedSolid:
         return is_inside
 
     def _are_in_cells(self, nodes: Array, x: Array) -> NDArray[np.bool_]:
-        """Return whether each of places x (n, 3) is in its deformed cell, of nodes (n, k, 3).
+        """Return flags (n,): whether place x[i] is in the deformed cell with nodes `nodes[i]`.
 
-        Newton's method for the reference coordinates starts from the nearest node.
+        Places are (n, 3), nodes (n, k, 3). Newton's method for the reference coordinates of a place
+        starts from the nearest node.
         """
         nearest = np.linalg.norm(nodes - x[:, None], axis=-1).argmin(axis=1)
         reference = self.element.points[nearest]
@@ -140,7 +147,8 @@ class SolidCharges(ChargedElements):
     def remanence_factors(self, boxes: Boxes, X: Array, weights: Array) -> Array:
         """Return factors C (4, n, m, 3) of the remanence and its derivatives in the charges.
 
-        The charges are q = C . (Br, Br_a, Br_b, Br_c), summed over components.
+        A charge is q = C[0] . Br + C[1] . Br_a + C[2] . Br_b + C[3] . Br_c, with derivatives by the
+        reference coordinates.
 
         Parameters
         ----------
@@ -176,7 +184,11 @@ class SolidCharges(ChargedElements):
         weights: Array,
         nodal_derivatives: NodalDerivatives | None = None,
     ) -> PointCharges:
-        """Return the charges at points of boxes, in one layer; see `ChargedElements.charges_at`."""
+        """Return the charges at points x (m, 2 or 3) of each of n boxes, in one layer.
+
+        They are multiplied by the weights (m,) and the size of the box. If `nodal_derivatives` is
+        given, `add_derivatives` of the result adds to it.
+        """
         reference, cells, solid = self.reference(boxes, x), self.cells[boxes.elements], self.shape
         shape_tables, remanence_tables = (
             tables(solid.element, reference, 1),
@@ -191,7 +203,11 @@ class SolidCharges(ChargedElements):
             return PointCharges(place[:, :, None], q[..., None])
 
         def add_derivatives(on_x: Array, on_q: Array) -> None:
-            """Add derivatives of a number, from those by places and sizes of the charges."""
+            """Add a number's derivatives by nodal values to `nodal_derivatives`.
+
+            `on_x` and `on_q` are its derivatives by places and sizes of the charges. The undeformed
+            place is fixed.
+            """
             np.add.at(
                 nodal_derivatives.by_u,
                 cells,
@@ -217,7 +233,7 @@ class CellFaces(SolidCharges):
         return places_on_faces(self._faces[boxes.elements], boxes.points(x))
 
     def remanence_factors(self, boxes: Boxes, X: Array, weights: Array) -> Array:
-        """Return outward area vectors times weights for Br, zero for its derivatives."""
+        """Return outward area vectors times weights as factors of Br, zero for its derivatives."""
         faces, factors = self._faces[boxes.elements], np.zeros((4, *X.shape[1:]))
         tangent_a, tangent_b = (
             np.einsum("nd,dnmi->nmi", FACE_TANGENTS[faces, side], X) for side in range(2)
@@ -237,7 +253,10 @@ class CellInteriors(SolidCharges):
         return boxes.points(x)
 
     def remanence_factors(self, boxes: Boxes, X: Array, weights: Array) -> Array:
-        """Return minus cofactors times weights for Br's derivatives: -Div Br dV0."""
+        """Return factors of Br's derivatives for -Div Br dV0: minus cofactors times weights.
+
+        The volume element cancels the determinant in the inverse of dX/d(a, b, c).
+        """
         factors, density = np.zeros((4, *X.shape[1:])), -weights[..., None]
         for d in range(3):
             factors[1 + d] = density * np.cross(X[(d + 1) % 3], X[(d + 2) % 3])
@@ -262,10 +281,11 @@ class ChargeLayers(ChargedElements):
     ) -> PointCharges:
         """Return the charges of cells' interiors, in `GAUSS_LAYERS` layers, without derivatives.
 
-        The points x (m, 2) of boxes are repeated at the height of each layer; `nodal_derivatives`
-        is not used.
+        The points x (m, 2) of the n boxes are repeated at the height of each layer: the result has
+        the shape (n, m, layers). `nodal_derivatives` is not used.
         """
         heights, weights_through = gauss(GAUSS_LAYERS)
+        # boxes of (a, b) become boxes of (a, b, c) through the whole thickness
         zero, one = np.zeros((len(boxes.elements), 1)), np.ones((len(boxes.elements), 1))
         boxes_in_solid = Boxes(
             boxes.elements, np.hstack([boxes.low, zero]), np.hstack([boxes.size, one])

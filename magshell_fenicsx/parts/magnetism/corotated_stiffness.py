@@ -2,6 +2,11 @@
 
 The blocks of a `Stiffness` and the rotations of nodes go in, rotated blocks come out. The loop is
 in C; see docs/theory.md.
+
+- A block is the second derivative (3, 3) by two nodes. Rows are local nodes, columns all nodes.
+- Images are mirror images of the modelled part; their blocks follow the modelled ones.
+- Compressed rows are those of a sparse matrix: the blocks of row i have the positions from
+  starts[i] to starts[i + 1].
 """
 
 from dataclasses import dataclass
@@ -33,9 +38,10 @@ class StoredBlocks:
     Attributes
     ----------
     starts, numbers
-        Start of each row of blocks in `numbers`, and the numbers of the selected blocks.
+        Start of each row in `numbers`, and the numbers of the selected blocks in the `Stiffness`.
     first
-        For each row, the position in `numbers` of the first block that is stored.
+        For each row, the position in `numbers` of the first block that is stored: blocks before it
+        are below the diagonal.
     row_starts, columns
         Compressed rows of the stored blocks: start of each row, column of each block.
     """
@@ -55,14 +61,15 @@ class StoredBlocks:
         Parameters
         ----------
         upper
-            Whether selected blocks below the diagonal are not stored.
+            Whether only the upper half of the symmetric matrix is stored: no blocks below the
+            diagonal.
         """
         numbers = np.flatnonzero(is_selected).astype(np.int32)
         counts = np.append(0, np.cumsum(is_selected, dtype=np.int32))
         starts = counts[stiffness.starts].astype(np.int32)
         rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))
         columns = stiffness.columns[numbers]
-        is_stored = columns >= (rows if upper else 0)
+        is_stored = columns >= (rows if upper else 0)  # all columns are at least 0
         stored_counts = np.append(0, np.cumsum(is_stored, dtype=np.int32))
         row_starts = stored_counts[starts].astype(np.int32)
         # columns ascend, so the stored blocks are the last ones of a row
@@ -90,7 +97,7 @@ class BlockRotation:
     ) -> SinglePrecisionBlocks | None:
         """Return the stored blocks of `Stiffness.matrix(sign)` after a rotation of the nodes.
 
-        None if there are several images, whose blocks are not stored apart.
+        None if there is more than one image, as the blocks of several images are not kept apart.
 
         Parameters
         ----------
@@ -108,7 +115,7 @@ class BlockRotation:
             return None
         pointer = self._pointer
         values = np.empty((len(stored.columns), 3, 3), dtype=np.float32)
-        images = self._ffi.NULL
+        images = self._ffi.NULL  # blocks of the image, if there is one
         if len(stiffness.turn) > 1:
             images = pointer(stiffness.blocks[count:])
         blocks = (

@@ -10,6 +10,17 @@ the places alone. Forces and stiffness are their derivatives, exact for the rule
 each other act by multipoles (`multipole_expansion`). All other pairs have a Gauss rule whose error
 is below `PRECISION` at their distance (`least_distance`), the same for both. Adjacent cells
 have the rules of `singular_pairs`, cells above each other those of `stacked_faces`.
+
+- A part is a set of connected cells; parts act on each other, or each also on itself.
+- Copies are the modelled cells and their images under mirrors and rotations, which make the whole
+  shell; arrays (copies * cells, ...) list one copy after the other. An image may have opposite
+  charges, and its normals may be turned over.
+- A kind (`ElementKind`) is either the faces of all cells, with the layers of charges inside, or the
+  edges with one local number.
+- A rule is a quadrature rule on the reference triangle or edge, by its position in `DEGREES`. The
+  charged points of a rule (`Points`) move with the nodes; their charges stay.
+- A multipole expansion stands for the charges of a box of cells at places far from it.
+- Own cells are those of this rank. Nodes are (copies * cells, k, 3), deformed and over R.
 """
 
 from itertools import product
@@ -60,12 +71,13 @@ MIN_DISTANCE = 1e-3  # that adjacent cells count to have, over their size
 
 
 def least_distance(number: int) -> float:
-    """Return the distance over the size of cells from which a rule's error is `PRECISION`.
+    """Return the least distance, over the size of cells, at which a rule's error is `PRECISION`.
 
-    The error of Gauss's rule of degree n falls as rho^-(n + 1), with the sum of half axes rho of
-    the largest ellipse around the cell in which the integrand has no pole (Trefethen, Approximation
-    Theory, theorem 19.3).
+    `number` is the degree n of Gauss's rule. Its error falls as rho^-(n + 1). Here rho is the sum
+    of the half axes of the largest ellipse around the cell in which the integrand has no pole
+    (Trefethen, Approximation Theory, theorem 19.3).
     """
+    # the short half axis of that ellipse is sinh(log rho), for a cell of the size 2
     return float(np.sinh(log(1 / PRECISION) / (number + 1)) / 2)
 
 
@@ -74,7 +86,9 @@ class PartsTooNear(ValueError):
 
 
 class ElementKind:
-    """Charges of the faces of all cells, or of edges with one local number, by quadrature rule.
+    """Charged points of the faces of cells, or of edges with one local number, for each rule.
+
+    Points and charges are computed for the undeformed cells, at the first use of a rule.
 
     Parameters
     ----------
@@ -108,6 +122,7 @@ class ElementKind:
         *,
         include_uncharged: bool = False,
     ) -> None:
+        """Number the elements of all copies: cells of copy c follow after c times all cells."""
         self._modelled, self._edge, self._shape, self._copies = cells, edge, shape, copies
         self.faces = edge is None
         self.family = (
@@ -122,9 +137,9 @@ class ElementKind:
         self._rules: dict[int, Points] = {}
 
     def rule(self, which: int) -> Points:
-        """Return the charged points of a rule, on the elements of all copies.
+        """Return the charged points of a rule on the elements of all copies; computed once.
 
-        `which` is the position of the rule's degree in `DEGREES`. Points are computed once.
+        `which` is the position of the rule's degree in `DEGREES`.
         """
         if which not in self._rules:
             self._rules[which] = (
@@ -144,16 +159,18 @@ class ElementKind:
         return self._charged_points(X, heights(self.family), q)
 
     def _face_points(self, which: int) -> tuple[Array, Array, Array]:
-        """Return a rule's points (P, 2) of the reference triangle, coordinates (a, b), weights.
+        """Return a rule on faces: points, their coordinates (a, b), and weights.
 
-        Here X = a, Y = (1 - a) b; weights are those of an integral over the square of (a, b).
+        Points (P, 2) are in the reference triangle, which the square of (a, b) covers by X = a, Y =
+        (1 - a) b. The weights (P,) are those of an integral over this square, so they are over the
+        Jacobian 1 - a.
         """
         X, w = basix.make_quadrature(basix.CellType.triangle, DEGREES[which])
         ab = np.stack([X[:, 0], X[:, 1] / (1 - X[:, 0])], axis=-1)
         return X, ab, np.array(w / (1 - X[:, 0]), dtype=np.float64)
 
     def _strip_rule(self, which: int) -> Points:
-        """Return the charged points of a rule on edges, as many layers as points across."""
+        """Return the charged points of a rule on edges, whose points across are layers."""
         s, eta, points, weights = self._strip_points(which)
         q = self.family.charges_at(Boxes.undivided(self.family.count), points, weights).q.reshape(
             -1, len(s), len(eta)
@@ -161,7 +178,10 @@ class ElementKind:
         return self._charged_points(self._points_on_edge(s), eta - 0.5, q)
 
     def _points_on_edge(self, s: Array) -> Array:
-        """Return points (n, 2) of the reference triangle on the edge, s (n,) along it."""
+        """Return points (n, 2) of the reference triangle on the kind's edge, s (n,) along it.
+
+        The edges run around the triangle with the surface on their left.
+        """
         return [np.stack([1 - s, s], -1), np.stack([0 * s, 1 - s], -1), np.stack([s, 0 * s], -1)][
             self._edge or 0
         ]
@@ -176,18 +196,19 @@ class ElementKind:
         points, weights
             (P L, 2) all pairs of these, and their weights (P L,).
         """
-        s, ws = gauss((DEGREES[which] + 2) // 2)
-        eta, we = gauss(2 + which)
+        s, ws = gauss((DEGREES[which] + 2) // 2)  # exact at least at the faces' degree
+        eta, we = gauss(2 + which)  # more points across for a finer rule
         points = np.stack(np.meshgrid(s, eta, indexing="ij"), axis=-1).reshape(-1, 2)
         return s, eta, points, np.asarray(np.outer(ws, we).ravel(), dtype=np.float64)
 
     def add_derivatives(
         self, which: int, by_charges: Array, nodal_derivatives: NodalDerivatives
     ) -> None:
-        """Add derivatives by nodal values, from derivatives by the charges of a rule.
+        """Add a number's derivatives by nodal values to `nodal_derivatives`, by the chain rule.
 
-        They are added to `nodal_derivatives`. `by_charges` has the shape of `Points.q` for the rule
-        `which`, with the images' charges.
+        `by_charges` are the number's derivatives by the charges of the rule `which`, in the shape
+        of `Points.q`. Charges of images are modelled ones times 1 or -1, so that their derivatives
+        add up. Places are fixed here.
         """
         count, boxes = len(self._copies.images), Boxes.undivided(self.family.count)
         by_modelled_charges = np.einsum(
@@ -197,7 +218,7 @@ class ElementKind:
         )
         points_and_weights = (
             self._face_points(which)[1:] if self._edge is None else self._strip_points(which)[2:]
-        )
+        )  # coordinates (a, b), or along and across an edge, and their weights
         charges = self.family.charges_at(boxes, *points_and_weights, nodal_derivatives)
         assert charges.add_derivatives
         charges.add_derivatives(
@@ -207,10 +228,11 @@ class ElementKind:
     def add_height_derivatives(
         self, which: int, by_heights: Array, nodal_derivatives: NodalDerivatives
     ) -> None:
-        """Add derivatives by the thickness, from derivatives by the heights of charges.
+        """Add a number's derivatives by the nodal thickness to `nodal_derivatives`.
 
-        They are added to `nodal_derivatives`. `by_heights` has the shape of `Points.q` for the rule
-        `which`. An image whose normals are turned over has opposite heights.
+        `by_heights` are its derivatives by the heights of charges over the mid-surface, in the
+        shape of `Points.q` for the rule `which`. A height is the thickness times a fixed ratio. An
+        image whose normals are turned over has opposite heights.
         """
         X = (
             self._face_points(which)[0]
@@ -228,9 +250,10 @@ class ElementKind:
         )
 
     def _charged_points(self, X: Array, eta: Array, q: Array) -> Points:
-        """Return charges q (cells, P, L) at points X (P, 2) in layers eta (L,), and their images.
+        """Return the charged points of all copies, from those of the modelled cells.
 
-        Heights `eta` are over the thickness.
+        They have charges q (cells, P, L) at reference points X (P, 2), in layers at the heights
+        `eta` (L,) over the thickness.
         """
         T = self._shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2)
         t = self._shape.thickness(
@@ -242,9 +265,10 @@ class ElementKind:
 
 
 class InteractingCharges:
-    """All charges of a shell; either charges of different parts act on each other, or all do.
+    """All charges of a shell: their energy, its gradient and its second derivatives.
 
-    The constructor is collective.
+    Either charges of different parts alone act on each other, or all charges do. The constructor is
+    collective.
 
     Parameters
     ----------
@@ -259,7 +283,7 @@ class InteractingCharges:
     copies
         The modelled cells and their images.
     include_uncharged
-        Whether elements without a charge are kept.
+        Whether elements without a charge are kept, as derivatives by the remanence need them.
     """
 
     def __init__(
@@ -274,6 +298,7 @@ class InteractingCharges:
         *,
         include_uncharged: bool = False,
     ) -> None:
+        """Collect the charged elements, and find out which pairs of cells act on each other."""
         self._pairs, self._h, self._singular_pairs, self._shape = (
             Pairs(comm),
             shape.h,
@@ -290,6 +315,7 @@ class InteractingCharges:
             for edge in range(3)
             if (edges == edge).any()
         ]
+        # kinds whose charges are rounding are left out; the coarsest rule, 0, shows that
         sizes = [element_kind.largest_charge(0) for element_kind in kinds]
         self._kinds = [
             element_kind
@@ -297,6 +323,7 @@ class InteractingCharges:
             if include_uncharged or size > CHARGE_TOLERANCE * max(sizes)
         ]
         self._of_different_parts = np.asarray(parts[:, None] != parts)  # pairs of different parts
+        # pairs that a Gauss rule or multipoles may serve: not a cell with itself or an adjacent one
         self._acts_by_rule = self._of_different_parts.astype(np.uint8)
         for cell, adjacent_cells in enumerate(singular_pairs.neighbours if singular_pairs else ()):
             self._acts_by_rule[cell] = 1
@@ -311,6 +338,8 @@ class InteractingCharges:
             np.arange(len(parts))
         )
         self._stacked_faces = StackedFaces(shape, kinds[0].family, copies, parts, order, comm)
+        # only images along the axes map boxes of the octree to boxes; other copies are groups that
+        # act on each other without multipoles
         along_axes = all(np.allclose(np.abs(image.Q).max(axis=0), 1) for image in copies.images)
         self._groups = np.repeat(np.arange(len(copies.images)) * (not along_axes), len(shape.r0))
         self._places, self._radii = _balls(copies.nodes_of_all(shape.r0))
@@ -318,10 +347,12 @@ class InteractingCharges:
         self._boxes: tuple[Ints, MultipoleExpansion, NDArray[np.bool_]] | None = None
 
     def rules(self, nodes: Array, own_cells: range) -> tuple[NDArray[np.int8], NDArray[np.bool_]]:
-        """Return the number in `DEGREES` of the rule of each pair, and which faces are stacked.
+        """Return the rule of each pair of cells, and which pairs have stacked faces.
 
-        Both arrays are (own cells, copies * cells). The number is -1 for a pair without a rule: it
-        acts by multipoles, is adjacent, or does not act.
+        Both arrays are (own cells, copies * cells). A rule is a position in `DEGREES`, or -1 for a
+        pair that acts by multipoles, is adjacent, or does not act. Stacked faces are those of cells
+        of two parts that lie above each other; `StackedFaces` integrates them, and their edges have
+        the finest rule.
 
         Parameters
         ----------
@@ -350,15 +381,15 @@ class InteractingCharges:
         rules = self._pairs.rules(nodes, own_cells, has_rule, least_distances, limits)
         if rules is None:
             raise PartsTooNear
-        rules[is_stacked] = len(DEGREES) - 1
+        rules[is_stacked] = len(DEGREES) - 1  # the finest, for their edges
         return rules, is_stacked
 
     def boxes(self, nodes: Array, own_cells: range) -> tuple[MultipoleExpansion, NDArray[np.bool_]]:
-        """Return the multipole expansion, and the pairs of cells too near each other for it.
+        """Return the multipole expansion, and flags of the pairs of cells too near for it.
 
-        The pairs are flags (own cells, copies * cells). Both depend on the present nodes alone, not
-        on earlier ones. They are computed again only if a cell has moved to another box or has
-        grown.
+        The flags are (own cells, copies * cells). Cells are sorted into the boxes of an octree.
+        Both results depend on the present nodes alone, not on earlier ones. They are computed again
+        only if a cell has moved to another box or has grown.
         """
         acts_on_itself = self._singular_pairs is not None
         self._octree = self._octree or Octree(
@@ -369,6 +400,7 @@ class InteractingCharges:
         growth_steps = np.maximum(
             0, np.ceil(np.log(radii / self._radii) / np.log(RADIUS_RATIO) - 0.5)
         ).astype(np.int64)
+        # the boxes follow from this key: steps of each cell on a grid, and its growth
         key = np.column_stack([self._octree.steps_moved(places), growth_steps])
         if self._boxes is None or not np.array_equal(key, self._boxes[0]):
             tree = self._octree.tree(
@@ -383,8 +415,9 @@ class InteractingCharges:
     ) -> tuple[float, Array]:
         """Return this rank's part of the energy, and its gradient (own cells, k, 3) by nodes.
 
-        The energy is that of pairs with own cells. A pair with a cell of another rank or an image
-        counts half here.
+        The energy is over Br² R³/(4 pi mu_0). It is the sum over pairs with an own cell. A pair of
+        an own cell with a cell of another rank or with an image counts half, as the other cell's
+        side counts the other half.
 
         Parameters
         ----------
@@ -394,7 +427,7 @@ class InteractingCharges:
             Cells of this rank.
         stiffness
             Matrix to which second derivatives by nodes of own cells and nodes of all cells are
-            added.
+            added; None if they are not wanted.
 
         Raises
         ------
@@ -411,6 +444,7 @@ class InteractingCharges:
         is_own_pair = (second >= own_cells.start) & (
             second < own_cells.stop
         )  # such a pair stands in both orders
+        # of both orders one is counted, wholly
         shares = (is_own_pair & (first < second), 1.0), (~is_own_pair, 0.5)
         # pairs by rule, then by kind of elements (faces or edges) on the first and second cell
         for number, (counted, share) in product(np.unique(rule_of_pair), shares):
@@ -419,7 +453,7 @@ class InteractingCharges:
             for first_kind, second_kind in product(self._kinds, self._kinds):
                 one_row, other_row = first_kind.number[cells[:, 0]], second_kind.number[cells[:, 1]]
                 is_charged = (one_row >= 0) & (other_row >= 0)
-                if first_kind.faces and second_kind.faces:
+                if first_kind.faces and second_kind.faces:  # stacked faces follow below
                     is_charged &= ~is_stacked[cells[:, 0] - own_cells.start, cells[:, 1]]
                 left, right = (
                     (first_kind.rule(int(number)), one_row[is_charged]),
@@ -429,6 +463,7 @@ class InteractingCharges:
                 energy += share * self._pairs.add(
                     nodes, cells[is_charged], count, left, right, gradient, stiffness
                 )
+        # derivatives by points, which the sums have collected, are taken to the nodes
         for number, kind in product({MULTIPOLE_RULE, *np.unique(rule_of_pair)}, self._kinds):
             self._pairs.finish(nodes, kind.cells, kind.rule(int(number)), gradient, stiffness)
         if self._singular_pairs:
@@ -452,9 +487,9 @@ class InteractingCharges:
     ) -> NodalDerivatives:
         """Return derivatives of energy and forces by the remanence, at fixed deformed nodes.
 
-        What is differentiated is `weights.energy` W + `weights.force` v . dW/du, with this rank's
-        part W of the energy and the rates v of nodes. With `of_shape`, there are also derivatives
-        by the undeformed place and by the thickness.
+        The number that is differentiated is `weights.energy` W + `weights.force` v . dW/du. W is
+        this rank's part of the energy, v are the rates of nodes. With `of_shape`, derivatives by
+        the undeformed place and by the thickness are included.
 
         Parameters
         ----------
@@ -470,7 +505,7 @@ class InteractingCharges:
         """
         (rules, is_stacked), moved_nodes = (
             self.rules(nodes, own_cells),
-            nodes + COMPLEX_STEP * 1j * rates,
+            nodes + COMPLEX_STEP * 1j * rates,  # imaginary parts of results are rates along v
         )
         nodal_derivatives = self._shape.zero_derivatives(of_shape=of_shape)
         multipoles, cells_and_points = (

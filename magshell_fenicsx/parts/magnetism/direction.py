@@ -1,4 +1,13 @@
-"""The direction of the applied field in a programme, and the curves of its components."""
+"""The direction of the applied field in a programme, and the curves of its components.
+
+- A programme is the list of a case's steps. Only steps of kind `rotation` turn the field.
+- An amplitude is a load parameter, by name; mu holds them all. The components of a field along its
+  `axes` are the amplitudes `FIELD`: along its first direction, and across it.
+- A curve is a function of one parameter t that returns an amplitude with its first and second
+  derivatives; a step follows it.
+- A field in space (of sources or formulas) has one strength and turns as a whole, by an amplitude
+  for each rotation.
+"""
 
 from collections.abc import Mapping, Sequence
 from math import atan2, copysign, cos, degrees, hypot, sin
@@ -21,8 +30,8 @@ def directions(
 ) -> Array:
     """Return unit vectors (steps + 1, 3) of the field before each step and after the last one.
 
-    They are in a frame turned by `turn` about e3 (rad). Only steps of kind `rotation` change the
-    direction. Without a field the first direction is e3.
+    Row i is the direction before the step with the index i. The vectors are in a frame turned by
+    `turn` about e3 (rad). Without a field the first direction is e3.
     """
     vectors = [field.axes[0] if field else np.eye(3)[2]]
     for step in programme:
@@ -46,29 +55,29 @@ def field_at(mu: Mapping[str, float]) -> Array:
 
 
 def straight(direction: Array) -> dict[str, Curve]:
-    """Return curves of the components of a field of strength t along a direction.
+    """Return amplitude -> curve for a field of strength t along a direction.
 
-    A curve returns the value of an amplitude at t and its first and second derivatives. The curves
-    are by name of the amplitude.
+    `direction` has a component for each amplitude of `FIELD` that exists.
     """
 
     def curve(c: float) -> Curve:
+        """Return the curve c t."""
         return lambda t: (c * t, c, 0.0)
 
     return {name: curve(float(c)) for name, c in zip(FIELD, direction, strict=False)}
 
 
 def circle(size: float, start: Array, end: Array) -> dict[str, Curve]:
-    """Return curves of the components of a field turned by t (rad) from `start` towards `end`.
+    """Return amplitude -> curve for a field that is turned by t (rad) from `start` towards `end`.
 
-    `start` and `end` are unit vectors of components, `size` is the field's signed magnitude. A
-    curve returns the value of an amplitude at t and its first and second derivatives.
+    `start` and `end` are unit vectors of the field's components, `size` is its signed magnitude.
     """
     normal_part = end - (start @ end) * start
     # the direction after a turn by 90 degrees
     quarter_turn = normal_part / np.linalg.norm(normal_part)
 
     def curve(b: float, a: float) -> Curve:
+        """Return the curve b cos t + a sin t."""
         return lambda t: (
             b * cos(t) + a * sin(t),
             a * cos(t) - b * sin(t),
@@ -85,9 +94,9 @@ def as_a_whole(name: str, total: float) -> dict[str, Curve]:
 
 
 def field_size(mu: Mapping[str, float], sense: float) -> float:
-    """Return the magnitude of the field with the sign `sense`.
+    """Return the magnitude of the field from amplitudes `mu`, with the sign `sense` of the case.
 
-    A field that has not turned has the sign of its amplitude lambda_m.
+    A field that has not turned is returned as lambda_m, with its own sign.
     """
     first, second, third = (mu.get(name, 0.0) for name in FIELD)
     return copysign(hypot(first, second, third), sense) if second or third else first
@@ -96,14 +105,15 @@ def field_size(mu: Mapping[str, float], sense: float) -> float:
 def field_angle(mu: Mapping[str, float], field: Magnetisation | None, sense: float = 1.0) -> float:
     """Return the angle between the field and its first direction (degrees), from amplitudes `mu`.
 
-    `sense` is the sign of the field of the case. The angle is signed if the field turns in one
-    plane.
+    `sense` is the sign of the field of the case. The angle is signed, from -180 to 180, if the
+    field turns in one plane; else it is from 0 to 180.
     """
     if field and field.turns:
         first, axis = field.axes[0], field.turns[0].turn / np.linalg.norm(field.turns[0].turn)
         direction = combined_motion(field.turns, mu)[0] @ first
         normal = np.cross(first, direction)
         is_planar = all(np.abs(np.cross(axis, motion.turn)).max() < 1e-9 for motion in field.turns)
+        # sine of the angle, signed about the common axis
         second = float(normal @ axis) if is_planar else float(np.linalg.norm(normal))
         return degrees(atan2(second, float(first @ direction)))
     along, second, third = (mu.get(name, 0.0) for name in FIELD)

@@ -4,6 +4,14 @@ Each point of the first cell sees the second along rays from its own place, or f
 be in the plane of the second. In polar coordinates with r = s sinh v, a rule is exact for charges
 in one surface: the area r dr dangle cancels the pole. It is also exact for charges in two surfaces
 at a distance s: both faces, with the same points.
+
+- A rule is points (n, 2) of the reference triangle, or of an edge strip, with weights (n,).
+- An edge strip is the charged surface of a cell's edge: coordinate t along the edge and eta through
+  the thickness, both in [0, 1].
+- s is a scale: a distance, over the size of the cell or the length of the edge, at which the pole
+  lies beside the points. Rules are dense on this scale.
+- The apex is the place from which the rays start, at r = 0.
+- Local edges run around the triangle with the surface on their left.
 """
 
 from itertools import pairwise
@@ -30,7 +38,7 @@ STRIP_SCALE = 0.15  # scale of rules from an edge strip to the faces, over the t
 def graded(n: int, s: float, end: float = 1.0) -> tuple[Array, Array]:
     """Return n points in [0, end] and their weights, dense at 0 on the scale s.
 
-    The map t = s sinh v removes the near pole of 1/sqrt(t² + s²).
+    They are Gauss's in v, with t = s sinh v: this map removes the near pole of 1/sqrt(t² + s²).
     """
     x, w = gauss(n)
     top = np.arcsinh(end / s)
@@ -50,8 +58,9 @@ def barycentric(X: Array) -> Array:
 def polar(apex: Array, s: float) -> tuple[Array, Array]:
     """Return a rule of the reference triangle in polar coordinates: points (n, 2), weights (n,).
 
-    The pole is a place `apex` (2,) in the triangle's plane, inside or outside it. Points are dense
-    there on the scale s.
+    The pole is a place `apex` (2,) in the triangle's plane, inside or outside the triangle. Points
+    are dense there on the scale s. The triangle is divided into sectors of rays from the apex; each
+    ray from its entrance to its exit has a rule in v, with r = s sinh v.
     """
     corners = CORNERS - apex
     is_inside = min(_spanned_area(corners[i], corners[j]) for i, j in ENDS) > -AREA_TOLERANCE
@@ -66,6 +75,7 @@ def polar(apex: Array, s: float) -> tuple[Array, Array]:
         start = corners[ENDS[nearest_side][0]]
         normal = start - (start @ direction) * direction
         normal = normal / np.linalg.norm(normal)
+        # mu of a ray: sinh(mu) is the tangent of its angle from the side's normal
         sector_ends = [np.arcsinh((C @ direction) / (C @ normal)) for C in (A, B)]
         x, w = gauss(SECTOR_POINTS + int(abs(sector_ends[1] - sector_ends[0])))
         mu = sector_ends[0] + (sector_ends[1] - sector_ends[0]) * x
@@ -84,10 +94,11 @@ def polar(apex: Array, s: float) -> tuple[Array, Array]:
 
 
 def _sectors(V: Array, is_inside: bool) -> list[tuple[Array, Array]]:
-    """Return sectors, pairs of rays through corners V (3, 2) of a triangle, in order of angle.
+    """Divide a triangle, seen from the origin, into sectors between two rays, in order of angle.
 
-    The rays start in the origin, which is inside the triangle or beside it. No corner lies between
-    the rays of a sector; sectors almost without an angle are left out.
+    The rays are the vectors to corners V (3, 2) of the triangle. The origin is inside the triangle
+    (`is_inside`) or beside it. No corner lies between the rays of a sector; sectors almost without
+    an angle are left out.
     """
     if is_inside:
         return [(V[i], V[j]) for i, j in ENDS if _spanned_area(V[i], V[j]) > AREA_TOLERANCE]
@@ -104,6 +115,7 @@ def _ray_lengths(lines: Array, starts: Array, rays: Array) -> Array:
     where a ray does not meet a side.
     """
     starts = starts[[i for i, _ in ENDS]]
+    # solves r ray = start + t line, with t in [0, 1] on the side
     det = rays[:, :1] * lines[:, 1] - rays[:, 1:] * lines[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
         r = (starts[:, 0] * lines[:, 1] - starts[:, 1] * lines[:, 0]) / det
@@ -118,16 +130,18 @@ def _ray_lengths(lines: Array, starts: Array, rays: Array) -> Array:
 
 
 def rule_along_sides(dense_sides: tuple[bool, bool, bool], s: float) -> tuple[Array, Array]:
-    """Return a rule of the reference triangle, dense at some of its sides: points, weights.
+    """Return a rule of the reference triangle that is dense at some of its sides.
 
-    Points are (n, 2). They are dense on the scale 3 s where `dense_sides` is true, in the order of
-    local edges.
+    The triangle is divided into three by its centre. The points of a part are dense at its side, on
+    the scale 3 s, if `dense_sides` (in the order of local edges) is true; else the part has a
+    coarse rule. Points are (n, 2), weights (n,).
     """
     if not any(dense_sides):
         X, w = basix.make_quadrature(basix.CellType.triangle, INNER_DEGREE)
         return np.asarray(X), np.asarray(w)
     points, weights, centre = list[Array](), list[Array](), CORNERS.mean(axis=0)
     for (i, j), is_free in zip(ENDS, dense_sides, strict=True):
+        # a runs from the side to the centre, b along the side
         a, wa = graded(POINTS_FROM_FREE_EDGE, 3 * s) if is_free else gauss(3)
         b, wb = gauss(POINTS_ALONG_FREE_EDGE if is_free else 3)
         side = CORNERS[i] + b[:, None] * (CORNERS[j] - CORNERS[i])
@@ -140,8 +154,9 @@ def at_corner(corner: int) -> tuple[Array, Array]:
     """Return a rule of the reference triangle for integrands nearly singular at a corner.
 
     It has points (n, 2) and weights (n,), by the Duffy transform: X = V + a (A - V + b (B - A)).
+    The corner is V, the opposite side runs from A to B.
     """
-    (a, wa), (b, wb) = gauss(6), gauss(5)
+    (a, wa), (b, wb) = gauss(6), gauss(5)  # more points towards the corner
     V, A, B = CORNERS[corner], CORNERS[(corner + 1) % 3], CORNERS[(corner + 2) % 3]
     side = A - V + b[:, None] * (B - A)
     return (V + a[:, None, None] * side).reshape(-1, 2), np.asarray(
@@ -158,9 +173,9 @@ def on_edge(edge: int, t: Array) -> Array:
 def continued_across_side(X: Array, sides: tuple[int, int], flip: bool) -> Array:
     """Return points X (n, 2) of a triangle in the reference coordinates of its neighbour.
 
-    The coordinates are continued linearly beyond the shared side, so that they are outside the
-    neighbour. The side has the local numbers `sides` in both triangles; `flip` if it runs the other
-    way in the second one.
+    The neighbour's coordinates are continued linearly beyond the shared side, so that the results
+    are outside of its reference triangle. The shared side has the local numbers `sides` in the
+    first and the second triangle; `flip` says that it runs the other way in the second one.
     """
     bary, (i, j), (m, n) = barycentric(X), ENDS[sides[0]], ENDS[sides[1]]
     m, n = (n, m) if flip else (m, n)
@@ -181,7 +196,7 @@ def strip() -> tuple[Array, Array, Array]:
     All three are (n,). Points are dense at both ends of the edge.
     """
     (x, wt), (eta, we) = (gauss(n) for n in STRIP_POINTS)
-    t, wt = x**2 * (3 - 2 * x), 6 * x * (1 - x) * wt  # dense at both ends
+    t, wt = x**2 * (3 - 2 * x), 6 * x * (1 - x) * wt  # dense at both ends; dt = 6 x (1 - x) dx
     a, b = (coordinate.ravel() for coordinate in np.meshgrid(t, eta, indexing="ij"))
     return a, b, np.asarray(np.outer(wt, we).ravel(), dtype=np.float64)
 
@@ -203,10 +218,11 @@ def strip_rule_seen_from(t: float, eta: float, s: float) -> tuple[Array, Array, 
     """
     x, w = gauss(STRIP_POINTS[1])
     v, wv = gauss(RAY_POINTS)
-    # beyond an end normals may differ, so that no points come too near each other
+    # on the strip itself points are dense at the place, by a cubic map. Beyond an end normals may
+    # differ, so that no points may come too near each other: the map is linear
     is_beyond = not 0 <= t <= 1
     power, min_scale = (1, 0.1) if is_beyond else (3, 0.02)
-    # (start, end, sign) of distances from t along the edge
+    # (start, end, sign): the first and last distance from t on a segment, and its direction
     segments = (
         [(0.0, t, -1.0), (0.0, 1 - t, 1.0)]
         if not is_beyond

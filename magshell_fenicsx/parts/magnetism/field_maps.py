@@ -78,7 +78,7 @@ FieldMaps = Annotated[dict[str, FieldMapSection], Field(max_length=100)]
 
 @dataclass(frozen=True)
 class FieldMap:
-    """A map of the magnetic field, in the frame of the model.
+    """A map of the magnetic field, in the frame of the model: a grid, without values.
 
     Attributes
     ----------
@@ -89,7 +89,8 @@ class FieldMap:
     total
         Whether the applied field is added.
     own, applied
-        Flux densities of a remanence of length one and of lambda_m = 1, in T or over |Br|.
+        Flux densities of a remanence of length one and of lambda_m = 1 (the amplitude of the
+        applied field), in T or over |Br|.
     """
 
     grid: MapGrid
@@ -102,7 +103,7 @@ class FieldMap:
 def field_maps(context: Context, turn: float) -> tuple[FieldMap, ...]:
     """Return the maps of a case, in the frame of the model.
 
-    That frame is turned by `turn` about e3 (rad) from the one of the case.
+    `turn` (rad) is the angle about e3 by which this frame is turned from that of the case.
     """
     sections: dict[str, FieldMapSection] = context.sections.get("field_maps") or {}
     field_units, R = units(context), context.shell.reference
@@ -121,8 +122,15 @@ def field_maps(context: Context, turn: float) -> tuple[FieldMap, ...]:
         )
         for name, section in sections.items()
     ]
+    tesla_of_remanence, tesla_of_lambda = field_units
     return tuple(
-        FieldMap(grid, grid.places @ rotation(turn).T, section.field == "total", *field_units)
+        FieldMap(
+            grid,
+            grid.places @ rotation(turn).T,
+            total=section.field == "total",
+            own=tesla_of_remanence,
+            applied=tesla_of_lambda,
+        )
         for section, grid in grids
     )
 
@@ -174,7 +182,7 @@ class FieldMapsObservables(Observables):
         """Return the grids of all maps with the flux density at a state; collective.
 
         Each has values (n, 3) in the unit of its `MapGrid`. `view` is the model with the frame and
-        units in which it is reported.
+        units in which it is reported. A map of the shell's own field has no applied field.
         """
         from magshell_fenicsx.parts.magnetism.readings import (
             field_at,

@@ -1,4 +1,13 @@
-"""The applied field as a load: its strength and its direction."""
+"""The applied magnetic field as a load: steps that change its strength or its direction.
+
+- lambda_m is the amplitude (load parameter) of the field along its first direction. A uniform field
+  that turns has further amplitudes, one for each direction normal to the first; mu holds all
+  amplitudes by name. Curves give the amplitudes as functions of one parameter.
+- A programme is a list of steps; a step's course says how it goes on from its begin.
+- A field in space (of sources, formulas or a gradient) has one strength and turns as a whole.
+- The conjugate of an amplitude is the displacement on which it does work; the field has none.
+- `turn` is the angle (rad) about e3 by which the model's frame is turned.
+"""
 
 from collections.abc import Iterable, Mapping
 from math import acos, degrees
@@ -48,6 +57,7 @@ class FieldSection(FactorStep):
     """Target over the field of `magnetic`; 1 by default, 0 switches the field off"""
 
     def scale(self, load_start: LoadStart) -> float:
+        """Return lambda_m of the case: it counts as of order one in the arc length."""
         return load_start.size
 
     def size(self, context: Context) -> float:
@@ -55,7 +65,9 @@ class FieldSection(FactorStep):
 
     @classmethod
     def level(cls, text: str, context: Context) -> float:
-        """Return a flux density with a unit, as of a history, over that of `magnetic.applied`.
+        """Return a flux density as a factor of that of `magnetic.applied`.
+
+        `text` is a number with a unit, a value of a load as a function of time.
 
         Raises
         ------
@@ -68,9 +80,10 @@ class FieldSection(FactorStep):
         return float(in_units("tesla")(text)) / magnetic.applied.flux_density
 
     def curves(self, step_start: StepStart) -> tuple[Curves, float] | None:
-        """Return curves of the field's components, and the present strength along the direction.
+        """Return curves of the field's components, and the strength where they begin.
 
-        None if the field has its first direction, which the amplitude lambda_m alone drives.
+        The curves are by amplitude, as functions of the strength along the present direction. None
+        if this is the first direction: then lambda_m alone drives the field.
         """
         from magshell_fenicsx.parts.magnetism.direction import (
             straight,
@@ -80,33 +93,35 @@ class FieldSection(FactorStep):
         return (straight(direction), value) if direction[1:].any() else None
 
     def _direction_and_value(self, step_start: StepStart) -> tuple[Array, float]:
-        """Return the field's direction at the begin of the step, and the strength along it.
+        """Return the field's direction at the begin of the step, and its strength there.
 
-        The direction has a component for each amplitude of `direction.FIELD` that exists.
+        The direction is an array of components, one for each amplitude of the field that exists:
+        lambda_m, then those across its first direction. A field in space has the component 1.
         """
         from magshell_fenicsx.parts.magnetism.direction import components, directions, field_at
 
         field = step_start.loads.magnetic
         direction = components(
             directions(step_start.context.steps, field, step_start.turn)[
-                step_start.step.number - 1
+                step_start.step.number - 1  # steps are counted from 1
             ],
             field,
         )
         return direction, float(direction @ field_at(step_start.mu))
 
     def load_start(self, step_start: StepStart) -> LoadStart:
-        """Return the amplitude where the step begins: the strength along its direction.
+        """Return the field's strength where the step begins, along its direction.
 
-        The field has no conjugate, so both of its entries are zero.
+        The field has no conjugate displacement: the two entries for it are zero.
         """
+        _, value = self._direction_and_value(step_start)
         return LoadStart(
-            self._direction_and_value(step_start)[1],
-            0.0,
-            0.0,
-            step_start.is_driven,
-            self.size(step_start.context),
-            step_start.h,
+            value=value,
+            conjugate=0.0,
+            unit=0.0,
+            is_driven=step_start.is_driven,
+            size=self.size(step_start.context),
+            h=step_start.h,
         )
 
     @classmethod
@@ -183,10 +198,11 @@ class RotationSection(Step):
         return {name} | {amplitude for amplitude in mu if amplitude.startswith("lambda_")}
 
     def course(self, step_start: StepStart) -> StepCourse:
-        """Return how the field turns: by arc length along curves of its components.
+        """Return how the step goes on: the field turns to its last direction at constant magnitude.
 
-        The parameter of the curves is the angle (rad) from the begin of the step. The course is
-        impossible if the field is zero.
+        The path is followed by arc length along curves of the field's components, whose parameter
+        is the angle (rad) from the begin of the step. The course is impossible if the field is
+        zero.
         """
         from magshell_fenicsx.parts.magnetism import direction  # the solver takes long to import
 
@@ -199,12 +215,21 @@ class RotationSection(Step):
             float(start @ direction.field_at(step_start.mu)),
             acos(float(end_directions[0] @ end_directions[1])),
         )
+        # the requested points, without the begin of the step
         targets = [float(t) for t in np.linspace(0.0, total, self.points + 1)[1:]]
-        drive = Drive("arc", "load", total, targets, total / self.points, total / self.points)
+        drive = Drive(
+            "arc",
+            "load",
+            total,
+            targets,
+            first=total / self.points,
+            scale=total / self.points,
+        )
         if size == 0:
             return StepCourse(drive, "limit", impossible="the field is zero and cannot turn")
 
         def forbidden(mu: Mapping[str, float], what: str) -> str:
+            """Tell the user at which angle the shell gets unstable, by the instability `what`."""
             angle = direction.field_angle(mu, field) % 360
             return f"the turning field makes the shell unstable at {angle:.4g} degrees: {what}"
 
@@ -219,9 +244,10 @@ class RotationSection(Step):
     def expected_end(
         self, step: ProgrammeStep, context: Context, loads: "Loads", turn: float
     ) -> ExpectedEnd:
-        """Return the end of the step: its angle from the first direction of the field (degrees).
+        """Return the expected end of the step, in words and as an angle (degrees).
 
-        The angle is None if the step does not begin at the first direction.
+        The angle is counted from the first direction of the field. It is None if the step does not
+        begin there: the angle that is reported is then not the one by which the step turns.
         """
         from magshell_fenicsx.parts.magnetism.direction import (
             directions,
@@ -238,7 +264,7 @@ class RotationSection(Step):
 def turn_name(step: ProgrammeStep) -> str:
     """Return the name of the amplitude by which a step of kind `rotation` turns a field in space.
 
-    It contains a space, which no name of a user has.
+    It is the step's name and number. The space in it keeps it apart from names of users.
     """
     return f"{step.name} {step.number}"
 

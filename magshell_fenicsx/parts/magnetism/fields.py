@@ -1,4 +1,17 @@
-"""The magnetisation and the applied field."""
+"""The section `magnetic` of a case: the magnetisation of a shell and the applied field.
+
+Out: checks of the section's keys against each other and against the case, the amplitude lambda_m,
+and what the section adds to a model.
+
+- lambda_m = |Br||Ba|/(mu_0 E) is the load parameter of the field, with the remanence Br, the
+  applied flux density Ba and Young's modulus E. Without a remanence it is |Ba|/sqrt(mu_0 E).
+- A shell is soft (soft-magnetic) if it has a susceptibility: a field magnetises it. It is soft
+  alone if it has no remanence.
+- Sources are magnets, coils and given fields, in tesla.
+- Places are over R, the reference length of the shell; an outline is its undeformed shape.
+- A `Context` is the case as a part sees it: its sections, steps and shell.
+- "Refuse" means: raise an error with the key and what is allowed.
+"""
 
 from collections.abc import Collection, Iterable
 from dataclasses import replace
@@ -115,9 +128,10 @@ class AppliedSection(Direction):
 
 
 def _of_places(value: Any) -> Any:
-    """Return the value of the key `susceptibility` after checking it.
+    """Return the value of the key `susceptibility`, unchanged, after checking it.
 
-    Allowed are a number, a formula, or a mapping of patches to numbers.
+    Allowed are a number from 0 to `MAX_SUSCEPTIBILITY`, a formula, or a mapping of patches to such
+    numbers.
 
     Raises
     ------
@@ -246,7 +260,10 @@ class MagneticSection(Section, Ability):
 
     @model_validator(mode="after")
     def _one_amplitude(self) -> Self:
-        """Refuse keys that give the strength of the field twice, not at all, or as zero."""
+        """Refuse keys that give the strength of the field twice, not at all, or as zero.
+
+        It is given by lambda_m, or by both flux densities.
+        """
         if self.remanent is None:
             self._one_field()
             return self
@@ -279,7 +296,11 @@ class MagneticSection(Section, Ability):
 
     @property
     def without_field(self) -> bool:
-        """Whether the remanence is alone: no key says how strong a field is."""
+        """Whether the case has a remanence and no applied field.
+
+        So it is if the section has `remanent`, and neither lambda_m nor `applied`: such a shell is
+        only read by sensors, or its parts act on each other.
+        """
         keys_given = self.model_fields_set
         return (
             self.remanent is not None
@@ -300,12 +321,14 @@ class MagneticSection(Section, Ability):
             raise ValueError("remanence: is a law of remanent, which this shell has not")
 
     def amplitude(self, youngs_modulus: float | None) -> float:
-        """Return lambda_m = |Br||Ba|/(mu_0 E); of a shell that is soft alone |Ba|/sqrt(mu_0 E).
+        """Return lambda_m = |Br||Ba|/(mu_0 E), or |Ba|/sqrt(mu_0 E) without a remanence.
+
+        It is 0 without an applied field. `youngs_modulus` is in Pa.
 
         Raises
         ------
         ValueError
-            If it follows from flux densities, and there is no modulus (Pa).
+            If lambda_m follows from flux densities, and there is no modulus.
         """
         if self.lambda_m is not None:
             return self.lambda_m
@@ -324,7 +347,9 @@ class MagneticSection(Section, Ability):
         return MU_0 * youngs_modulus / self.remanent.flux_density
 
     def refuse_unfit(self, context: Context) -> None:
-        """Refuse a field of unknown strength, and shells that its energies do not allow.
+        """Refuse a field of unknown strength, and shells that the magnetic energies do not allow.
+
+        The energy `full` without interaction is allowed for all shells and solids.
 
         Raises
         ------
@@ -334,7 +359,7 @@ class MagneticSection(Section, Ability):
         from magshell_fenicsx.parts.magnetism.sensors import is_read  # it needs this section
 
         shell = context.shell
-        self.amplitude(shell.youngs_modulus)
+        self.amplitude(shell.youngs_modulus)  # raises if the strength is unknown
         if self.applied.sources and not shell.with_units:
             raise ValueError(
                 "magnetic.applied.sources: are in metres and tesla: give youngs_modulus and the "
@@ -367,6 +392,7 @@ class MagneticSection(Section, Ability):
             )
         if self.remanent and isinstance(self.remanent.components, UserField):
             context.needs("magnetic.remanent", "a mid-surface", hint="of a solid give formulas")
+        # a shell knows the average alone, a solid has the layers
         layers = self.remanent.layers if self.remanent else None
         if layers and not context.solid and np.linalg.norm(layer_average(layers)) < 1e-9:
             raise ValueError(
@@ -378,7 +404,11 @@ class MagneticSection(Section, Ability):
             raise ValueError("magnetic.remanent: patches needs the patch rest")
 
     def in_time(self, context: Context, driven: Collection[str]) -> InTime:
-        """Return the field as a load in time, with the reason if it may not be one."""
+        """Return the field as a load in time.
+
+        `driven` are the amplitudes that earlier steps drive. The second entry of the result is the
+        reason why the field may not be a load in time, "" if it may.
+        """
         refused_because = "not after kind: rotation" if ANGLE in driven else ""
         if not strength(context):
             refused_because = "needs magnetic.lambda_m, not zero"
@@ -395,9 +425,10 @@ class MagneticSection(Section, Ability):
     def symmetry_constraints(
         self, context: Context, outline: "Outline"
     ) -> list[SymmetryConstraint]:
-        """Return the symmetry that magnetism preserves of a shell.
+        """Return constraints that leave a model only the symmetries that magnetism preserves.
 
-        There is no constraint if nothing magnetic acts on the shell or is read.
+        The list is empty if no field acts on the shell, nothing magnetic is read, and parts do not
+        act on each other. Parts that do exclude an axisymmetric model.
         """
         from magshell_fenicsx.parts.magnetism.magnetisation import (
             remanence_constraints,
@@ -411,7 +442,7 @@ class MagneticSection(Section, Ability):
         return interacting + (remanence_constraints(context, outline) if is_visible else [])
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
-        """Yield the formulas of the undeformed place, with the values that they may have."""
+        """Yield the formulas of the undeformed place, with the range of values that is allowed."""
         from magshell_fenicsx.models.shell.spatial_fields import (
             MAX_COMPONENT,
         )  # the solver takes long to import
@@ -420,13 +451,17 @@ class MagneticSection(Section, Ability):
             yield Formulas(
                 "magnetic.remanent.components",
                 self.remanent.components,
-                -MAX_COMPONENT,
-                MAX_COMPONENT,
-                1.0,
+                minimum=-MAX_COMPONENT,
+                maximum=MAX_COMPONENT,
+                length=1.0,  # places are over R
             )
         if isinstance(self.susceptibility, str):
             yield Formulas(
-                "magnetic.susceptibility", [self.susceptibility], 0.0, MAX_SUSCEPTIBILITY, 1.0
+                "magnetic.susceptibility",
+                [self.susceptibility],
+                minimum=0.0,
+                maximum=MAX_SUSCEPTIBILITY,
+                length=1.0,  # places are over R
             )
 
     def adds(self, context: Context, modelled: Modelled) -> dict[str, Any]:
@@ -452,16 +487,16 @@ class MagneticSection(Section, Ability):
 
         refuse_unfit_interaction(context)
         lambda_m = strength(context)
-        largest = MAX_LAMBDA * (
-            100.0 if self.applied.sources else 1.0
-        )  # of 1 T, which no source makes on a shell
+        # with sources lambda_m is that of 1 T, and sources make less than 1 T on a shell
+        largest = MAX_LAMBDA * (100.0 if self.applied.sources else 1.0)
         if lambda_m and not MIN_LAMBDA <= abs(lambda_m) <= largest:
             raise CaseError(
                 f"magnetic: lambda_m is {lambda_m:.4g}; allowed are 0 and, of either sign, "
                 f"{MIN_LAMBDA:g} to {largest:g}"
             )
         for source in placed_sources(context):
-            B = source(places)[0]
+            B, *_ = source(places)
+            # finite but too strong; values that are not finite have another message
             if len(
                 strong_places := places[
                     np.isfinite(B).all(axis=1) & (np.abs(B) > MAX_FIELD_RATIO).any(axis=1)
@@ -498,14 +533,15 @@ class MagneticSection(Section, Ability):
                 )
 
     def warning(self, context: Context, places: Array) -> str | None:
-        """Return a warning if the formula of the field has a divergence or a curl; else None.
+        """Return a warning if the formula of the applied field has a divergence or a curl.
 
-        A field of magnets and currents elsewhere has neither. It is sampled at places (n, 3) over
-        R.
+        The field of magnets and currents elsewhere has neither. The formula is sampled at `places`
+        (n, 3) over R. None if there is no such formula, or both vanish to rounding.
         """
         components = self.applied.components if strength(context) else None
         if not components:
             return None
+        # gradient as [component, coordinate, place]; the curl is the skew part, by its norm
         G = np.stack([formula_with_derivatives(text)(places).gradient for text in components])
         divergence, curl = (
             np.abs(np.trace(G)),
@@ -525,8 +561,7 @@ class MagneticSection(Section, Ability):
     def numbers(self, context: Context) -> list[str]:
         """Return a line of `magshell check` with the strength (mT) of all sources on the shell.
 
-        If it is too weak, a place was probably meant in another unit. The list is empty without
-        sources.
+        A user sees there if a source was placed in a wrong unit. The list is empty without sources.
         """
         from magshell_fenicsx.parts.magnetism.sources.field import (
             placed_sources,
@@ -535,6 +570,7 @@ class MagneticSection(Section, Ability):
 
         if not (sources := placed_sources(context)):
             return []
+        # values of sources are over the applied field's reference (T)
         places, unit = outline(context.shell).sample(), 1e3 * abs(self.applied.reference or 1.0)
         sizes = unit * np.linalg.norm(
             np.sum([source(places)[0] for source in sources], axis=0), axis=1
@@ -545,10 +581,10 @@ class MagneticSection(Section, Ability):
         ]
 
     def units(self, context: Context, units: CaseSizes) -> CaseSizes:
-        """Return the sizes of units, with the flux density or strength of lambda_m = 1 where known.
+        """Return the units of a case, with the physical size of lambda_m = 1 added where known.
 
-        The flux density is in mT; the strength is in percent of that of sources that are the whole
-        field.
+        It is a flux density in mT (`applied`). If sources are the whole field, it is their strength
+        in percent of the strength in the case (`strength`).
         """
         if (
             isnan(units.E)

@@ -2,6 +2,15 @@
 
 Input: forces that were computed at states (`ForceExtrapolation.add_state`) and an earlier second
 derivative. Output: forces at nearby states. See docs/theory.md.
+
+- A state is the displacement u of all nodes. Forces are the gradient of the energy by the unknowns
+  of this rank.
+- A point is a group of states near each other on a path of equilibria, its last state the newest.
+- D is an earlier second derivative of the energy: only its stored part, between near nodes.
+- The remainder at a state are the forces less D u. It varies slowly along the path.
+- A change is the difference of two states; q is its unit vector, y the change of the remainder.
+- A secant makes the model right along a change: it adds y (q . s) to the forces at u, s the change
+  of u from the newest state.
 """
 
 from collections import deque
@@ -49,14 +58,14 @@ class ForceState:
 
 
 class ForceExtrapolation:
-    """Forces near states at which they were computed, by an earlier second derivative D.
+    """Model of the forces near states at which they were computed, by an earlier D.
 
-    D is the part that is stored, between nodes of cells in boxes that touch. What it lacks is
-    smooth along the path, and small beside it. Along the path, the forces without D u are a
-    polynomial through the last points. It also has the slope at points where two states near each
-    other are known. Changes of u beside the path correct D and the polynomial by secants, the
-    newest change first (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443: secants of several
-    steps).
+    D is the stored part of a second derivative, between nodes of cells in boxes that touch. The
+    part that is not stored is smooth along the path, and small across it. Along the path, the
+    remainder is a polynomial through the last points. It also has the right slope at points where
+    two states near each other are known. Changes of u across the path correct D and the polynomial
+    by secants, the newest change first (J. E. Dennis, R. B. Schnabel, SIAM Review 21, 1979, 443:
+    secants of several steps).
 
     Parameters
     ----------
@@ -76,6 +85,7 @@ class ForceExtrapolation:
         *,
         is_single_rank: bool,
     ) -> None:
+        """Begin without states and without a second derivative."""
         self._blocks, self._rotations, self._is_single_rank = blocks, rotations, is_single_rank
         self._points = list[list[ForceState]]()  # the newest last; of each point several states
         self._distances = list[float]()  # to each point from the one before
@@ -86,14 +96,16 @@ class ForceExtrapolation:
         self._model: tuple[PathPolynomial, list[tuple[Array, Array]]] | None = None
 
     def add_state(self, u: Array, forces: Array) -> None:
-        """Add this rank's part of forces, as computed at a state u of all nodes.
+        """Add this rank's part of forces that were computed at a state u of all nodes.
 
-        The state is a new point of the path, or one more state of the last point.
+        The state starts a new point of the path if it is far from the last point. Otherwise it is
+        one more state of that point.
         """
         state = ForceState(u, forces, self._product(u) if self._D else np.zeros_like(forces))
         if self._points and not self._is_new_point(u):
             self._points[-1] = [*self._points[-1][-MAX_CHANGES:], state]
         else:
+            # from the latest state of the last point
             distance = float(np.linalg.norm(u - self._points[-1][-1].u)) if self._points else 0.0
             # of earlier points a few states are kept, and the new point begins with this one
             earlier_points = [
@@ -103,10 +115,12 @@ class ForceExtrapolation:
                 [*earlier_points, [state]],
                 [*self._distances[1 - PATH_POINTS :], distance],
             )
-        self._model = None
+        self._model = None  # made again when forces are asked for
 
     def forces(self, u: Array, D: InteractionHessian, u_of_D: Array) -> Array | None:
-        """Return this rank's part of the forces at a state u; None if nothing is known.
+        """Return this rank's part of the extrapolated forces at a state u.
+
+        None if no state has been added, or u is not finite.
 
         Parameters
         ----------
@@ -128,7 +142,10 @@ class ForceExtrapolation:
         return forces
 
     def extrapolation_holds_along(self, u: Array, step: Array) -> bool:
-        """Return whether forces are known at two states near u that differ along `step`."""
+        """Return whether forces are known at two states near u that differ along `step`.
+
+        Then the secant of these states makes extrapolated forces accurate along the step.
+        """
         if not self._points or self._is_new_point(u):
             return False
         largest_distance, step_size = (
@@ -153,18 +170,20 @@ class ForceExtrapolation:
         )
 
     def _rotate_stiffness(self, u: Array, D: InteractionHessian, u_of_D: Array) -> None:
-        """Rotate D with the nodes from `u_of_D` to u, if they have rotated enough since.
+        """Rotate the blocks of D with the nodes, from the state `u_of_D` to u.
 
-        The products D u of all stored states are then computed again.
+        Nothing is done if no node has rotated by `ROTATION_TOLERANCE` since the last time. Else, as
+        D u changes, the products with all stored states are computed again.
         """
         earlier_u = self._rotated_u if D is self._D else None
         if (
             earlier_u is not None
+            # twice the vector part of a quaternion is a small angle in rad
             and 2 * np.abs(self._rotations(u, earlier_u)[:, :3]).max() < ROTATION_TOLERANCE
         ):
             return
         rotated = D.rotated_blocks(self._rotations(u, u_of_D))
-        if rotated is None and earlier_u is not None:
+        if rotated is None and earlier_u is not None:  # D cannot be rotated and is stored already
             return
         self._D, self._rotated_u = D, u
         self._stored = (
@@ -180,10 +199,10 @@ class ForceExtrapolation:
         ]
 
     def _make_model(self) -> tuple["PathPolynomial", list[tuple[Array, Array]]]:
-        """Return the polynomial along the path, and corrections along changes beside it.
+        """Return the polynomial along the path, and secant corrections.
 
-        A correction is an orthonormal change q of u, with the change y of forces along q that D and
-        the polynomial lack.
+        A correction is a pair (q, y). The unit vectors q are changes of u, normal to each other; y
+        is the change of forces along q that D and the polynomial do not have.
         """
         polynomial, changes = PathPolynomial.from_points(self._points), list[tuple[Array, Array]]()
         pairs = [pair for point in reversed(self._points) for pair in pairwise(reversed(point))]
@@ -207,7 +226,7 @@ class ForceExtrapolation:
         return polynomial, changes
 
     def _product(self, u: Array) -> Array:
-        """Return this rank's part of D u; products with the last states are kept."""
+        """Return this rank's part of D u; the last `STORED_PRODUCTS` products are kept."""
         for stored_u, product in self._products:
             if np.array_equal(u, stored_u):
                 return product
@@ -220,7 +239,7 @@ class ForceExtrapolation:
 
 @dataclass(frozen=True)
 class PathPolynomial:
-    """The forces without D u as a polynomial of the position along a direction.
+    """The remainder (forces less D u) as a polynomial of the position along a direction.
 
     Attributes
     ----------
@@ -231,7 +250,7 @@ class PathPolynomial:
     distance
         The distance of these points, which is the unit of positions.
     coefficients
-        (n, forces) coefficients of the powers from the first on.
+        (n, forces) coefficients of the first, second, ... power; the constant is that of `base`.
     """
 
     base: ForceState
@@ -244,13 +263,15 @@ class PathPolynomial:
         """Return the polynomial through the last state of each point, with slopes where known.
 
         Each point of the path is a list of states near each other; the newest point and state are
-        last. Points beside the direction, or at nearly the same position, are left out.
+        last. Points that lie across the direction, or at nearly the same position as others, are
+        left out. With a single point the polynomial is constant.
         """
         base, previous = points[-1][-1], points[-2][-1] if len(points) > 1 else None
         if previous is None or np.array_equal(previous.u, base.u):
             return cls(base, np.zeros_like(base.u), 1.0, np.zeros((0, len(base.forces))))
         direction, distance = base.u - previous.u, float(np.linalg.norm(base.u - previous.u))
         direction = np.asarray(direction / distance)
+        # one row of the linear system for each value or slope that the polynomial must have
         rows, values, positions = list[Array](), list[Array](), [0.0]
         powers = np.arange(1.0, MAX_COEFFICIENTS + 1)
         for point in reversed(points):

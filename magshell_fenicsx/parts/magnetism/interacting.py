@@ -2,6 +2,17 @@
 
 The energy couples all nodes, so the second derivative is dense: near blocks and multipoles
 (`multipole_expansion.InteractionHessian`). Theory: docs/theory.md, parts in each other's field.
+
+- A part is a set of connected cells. Its remanence leaves charges on its faces and edges, and
+  inside; the energy Pi is a sum over pairs of charges (`InteractingCharges`).
+- A half or a sector of a shell is modelled; copies are the modelled cells and their images, in
+  arrays (copies * cells, ...) one after the other. Even changes of u move the images as mirror
+  images of the modelled cells, odd changes move them oppositely.
+- Own cells are those of this rank; the cells of all ranks are gathered (`GlobalCells`), and a
+  "global" value is one for all nodes of the mesh, the same on every rank.
+- D is the second derivative of the energy. A block is its part (3, 3) for two nodes. An "inexact"
+  or extrapolated value is taken from earlier states.
+- A state is one displacement u of all nodes.
 """
 
 from collections import deque
@@ -86,6 +97,7 @@ class InteractionTerm:
     group, column = "magnetic", "magnetic"
 
     def __init__(self, model: "ModelBase", u: fem.Function, interaction: Interaction) -> None:
+        """Gather the cells of all ranks; charges and derivatives are computed when asked for."""
         self.name = self.amplitude = AMPLITUDE
         self._acts_on_itself = interaction.itself
         self._model, self._u = model, u
@@ -125,9 +137,10 @@ class InteractionTerm:
         )
 
     def antisymmetric(self) -> "InteractionTerm":
-        """Return the same term for changes of u that are opposite in the images.
+        """Return this term with the second derivative by odd changes of u.
 
-        The returned term takes its second derivative from this one, which computes both at once.
+        It serves the modes that a mirror plane excludes. The returned term takes its second
+        derivative from this one, which computes that by even and by odd changes at once.
         """
         odd_term = copy(self)
         odd_term._even_term = self
@@ -169,14 +182,15 @@ class InteractionTerm:
     def add_extrapolated_residual(self, b: Array, factor: float) -> None:
         """Add factor dPi/du to b, extrapolated from forces at earlier states; collective.
 
-        The forces are computed if nothing is known; see `assembly.dense_tangent.DenseTerm`.
+        The forces are computed exactly if no earlier forces or second derivative are known. The
+        contract is that of `assembly.dense_tangent.DenseTerm`.
         """
-        self._nodes()  # what is known is forgotten if shape or remanence changed
+        self._nodes()  # earlier results are forgotten here if shape or remanence changed
         extrapolated = (
             self._extrapolation.forces(
                 global_values(self._u).ravel(),
-                self._latest_hessians[1][0],
-                self._latest_hessians[2],
+                self._latest_hessians[1][0],  # by even changes
+                self._latest_hessians[2],  # the u at which it was computed
             )
             if self._latest_hessians
             else None
@@ -186,10 +200,10 @@ class InteractionTerm:
     def extrapolation_holds_along(self, step: Array) -> bool:
         """Return whether extrapolated forces are accurate along a step; collective.
 
-        `step` is a change of all local unknowns, with ghosts; see
-        `assembly.dense_tangent.DenseTerm`.
+        They are where forces are known at two states near the present one that differ along the
+        step. `step` is a change of all local unknowns, with ghosts.
         """
-        self._nodes()
+        self._nodes()  # earlier results are forgotten here if shape or remanence changed
         displacement, index_map = global_values(self._u), self._u.function_space.dofmap.index_map
         step_of_rank = step.reshape(-1, 3)[: index_map.size_local]
         return self._extrapolation.extrapolation_holds_along(
@@ -203,7 +217,11 @@ class InteractionTerm:
         """Add nothing: distant nodes act on each other, and the tangent is dense."""
 
     def hessian(self, *, inexact: bool = False) -> "InteractionHessian":
-        """Return the second derivative by u; an earlier one may do if `inexact`. Collective."""
+        """Return the second derivative by u; collective.
+
+        If `inexact`, it may be that of an earlier state. A term from `antisymmetric` returns the
+        derivative by odd changes.
+        """
         return (
             self._even_term.even_and_odd_hessians(inexact=inexact)[1]
             if self._even_term
@@ -215,30 +233,32 @@ class InteractionTerm:
     ) -> tuple["InteractionHessian", "InteractionHessian"]:
         """Return the second derivatives by even and by odd changes of u; collective.
 
-        Even changes move the images along as mirror images, odd ones oppositely. Both are those of
-        the present state; if `inexact`, they may be those of an earlier one.
+        Even changes move the images along as mirror images, odd ones oppositely. Both are computed
+        at the present state unless `inexact`: then the latest ones are returned, if there are any.
         """
         nodes = self._nodes()
         if self._latest_hessians is None or not (
             inexact or np.array_equal(nodes, self._latest_hessians[0])
         ):
-            self._latest_hessians = None  # two are not kept at once
+            self._latest_hessians = None  # the old ones free their memory first
             self._latest_hessians = nodes, self._hessians_at(nodes), global_values(self._u).ravel()
         return self._latest_hessians[1]
 
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
     ) -> tuple[fem.Function, Array] | None:
-        """Return derivatives of energy Pi + force v . dPi/du by a field's values; collective.
+        """Return derivatives of `energy` Pi + `force` v . dPi/du by a field's values; collective.
+
+        Pi is the energy over E h R², `energy` and `force` are two numbers.
 
         Parameters
         ----------
         name
             Name of the remanence, "thickness", or "r0" for the placement.
         direction
-            The direction v.
+            The direction v, a displacement.
         energy, force
-            The two factors.
+            The factors of Pi and of v . dPi/du.
 
         Returns
         -------
@@ -268,6 +288,7 @@ class InteractionTerm:
             return self._model.r0, by_place + self._at_fixed_charges(direction, energy, force)
         if name != field_of_model.Br.name:
             return None
+        # by the remanence: elements without a charge count too, as another remanence charges them
         shape, cells, edges = self._cells_and_charged_edges(include_uncharged=True)
         singular_pairs = SingularPairs(
             shape,
@@ -297,9 +318,9 @@ class InteractionTerm:
     def _at_fixed_charges(self, direction: fem.Function, energy: float, force: float) -> Array:
         """Return derivatives (own cells, nodes, 3) by the placement at fixed charges; collective.
 
-        A placement moves charges as a displacement does. So the derivatives of energy Pi + force v
-        . dPi/du are energy dPi/du + force D v, with the direction v. Those by a node are shared
-        equally by its local cells.
+        The number is that of `by_field`. A placement moves charges as a displacement does, so its
+        derivatives are `energy` dPi/du + `force` D v, with the direction v. Derivatives are wanted
+        by the nodes of each cell: the one by a shared node is divided equally among its own cells.
         """
         V, count = self._u.function_space, len(self._cells.own_range)
         D, v = self.hessian(), global_values(direction).ravel()
@@ -314,12 +335,13 @@ class InteractionTerm:
         """Return the second derivatives by even and odd changes of u; collective.
 
         The deformed `nodes` (copies * cells, k, 3) are the same on all ranks. Near pairs of cells
-        fill stored blocks; others act by multipoles.
+        fill stored blocks; others act by multipoles. Without images both are the same. The blocks
+        are nan if parts overlap.
         """
         own_cells, images, V = self._cells.own_range, self._copies.images, self._u.function_space
         count, has_images = V.dofmap.index_map.size_global, len(images) > 1
         column_of = np.tile(self._cells.nodes, (len(images), 1)).astype(np.int64)
-        column_of[len(self._cells.nodes) :] += count  # those of images are apart
+        column_of[len(self._cells.nodes) :] += count  # nodes of images have columns of their own
         # rows are local nodes of own cells; those of other ranks and of images are -1
         row_of = np.full(column_of.shape, -1)
         row_of[own_cells.start : own_cells.stop] = V.dofmap.list[: len(own_cells)]
@@ -371,9 +393,10 @@ class InteractionTerm:
         return even_hessian, odd_hessian
 
     def _evaluated(self) -> tuple[float, Array]:
-        """Return this rank's part of the energy and its gradient by local nodes; collective.
+        """Return this rank's part of the energy, and its gradient by local unknowns; collective.
 
-        The gradient includes ghosts. Both are nan if parts overlap. The last states are kept.
+        Both are over E h R²; the gradient includes ghosts. Both are nan if parts overlap. Results
+        at the last states are kept, as a point of a path is evaluated more than once.
         """
         nodes, V = self._nodes(), self._u.function_space
         for nodes_before, energy, forces in self._evaluations:
@@ -391,6 +414,7 @@ class InteractionTerm:
             self._scale * gradient,
         )
         self._evaluations.appendleft((nodes, self._scale * energy, forces))
+        # only forces that are finite on all ranks may be extrapolated
         if self._comm.allreduce(bool(np.isfinite(energy)), MPI.LAND):
             self._extrapolation.add_state(global_values(self._u).ravel(), forces)
         return self._scale * energy, forces
@@ -398,8 +422,9 @@ class InteractionTerm:
     def _nodes(self) -> Array:
         """Return the deformed nodes (copies * cells, k, 3) over R of all cells; collective.
 
-        If placement, remanence or thickness have changed, all that follows from them is forgotten:
-        charges, evaluations, second derivatives and extrapolated forces.
+        As a side effect, results that depend on placement, remanence or thickness are forgotten if
+        one of these has changed since the last call: charges, evaluations, second derivatives and
+        forces for extrapolation.
         """
         r0, u = (global_values(f) for f in (self._model.r0, self._u))
         field_of_model = self_field(self._view)
@@ -420,7 +445,7 @@ class InteractionTerm:
             self._extrapolation = ForceExtrapolation(
                 self._blocks, self._rotations, is_single_rank=self._comm.size == 1
             )
-            for name in ("_charges", "_singular_pairs"):
+            for name in ("_charges", "_singular_pairs"):  # cached properties
                 self.__dict__.pop(name, None)
         return self._copies.nodes_of_all((r0 + u)[self._cells.nodes])
 
@@ -432,7 +457,7 @@ class InteractionTerm:
         """
         r0, nodes = global_values(self._model.r0), self._cells.nodes
         element = self._u.function_space.element.basix_element
-        T = element.tabulate(1, element.points)[1:, :, :, 0]
+        T = element.tabulate(1, element.points)[1:, :, :, 0]  # first derivatives at the nodes
 
         def frames(u: Array) -> Array:
             """Return tangents and normal as columns (cells, nodes, 3, 3), at a displacement."""
@@ -465,17 +490,20 @@ class InteractionTerm:
     def _cells_and_charged_edges(
         self, *, include_uncharged: bool = False
     ) -> tuple[MagnetisedShell, Ints, Ints]:
-        """Return the cells of all ranks, and cell and local number of charged edges; collective.
+        """Return the cells of all ranks, and the edges that have charges; collective.
 
-        With `include_uncharged`, edges that another remanence could charge are included.
+        The edges are two arrays: the number of the cell, among all ranks' cells, and the local
+        number of the edge in it. With `include_uncharged`, edges that another remanence could
+        charge are included.
         """
         field_of_model = self_field(self._view)
         shape, (cells, edges) = (
             field_of_model.shape({}),
             field_of_model.chargeable if include_uncharged else field_of_model.edges,
         )
+        # inputs as gathered by `_nodes`: placement, remanence, and perhaps the thickness factor
         factor = shape.thickness_factor and (
-            shape.thickness_factor[0],
+            shape.thickness_factor[0],  # its element
             self._inputs_of_charges[2],
         )
         r0, remanence = self._inputs_of_charges[0][self._cells.nodes], self._inputs_of_charges[1]
@@ -487,7 +515,10 @@ class InteractionTerm:
 
     @cached_property
     def _copies(self) -> Copies:
-        """The modelled cells, and the images that make the whole of a half or a sector."""
+        """The modelled cells and the images that make a half or a sector whole; collective.
+
+        Images whose field is opposite have opposite charges.
+        """
         if self._model.multiplicity == 1:
             return NO_IMAGES
         field_of_model, mirror = self_field(self._view), self._view.mirror
@@ -498,9 +529,10 @@ class InteractionTerm:
     def _corners(self) -> Ints:
         """(copies * cells, 3) numbers of the cells' corners; collective.
 
-        A corner on a mirror plane and its image have the same number.
+        A corner on a mirror plane and its image have the same number, so that cells on both sides
+        count as adjacent.
         """
-        r0, corners = global_values(self._model.r0), self._cells.nodes[:, :3]
+        r0, corners = global_values(self._model.r0), self._cells.nodes[:, :3]  # corners come first
         places = self._copies.nodes_of_all(r0[None])
         numbers = np.arange(places[..., 0].size).reshape(len(places), -1)
         for later, x in enumerate(places):
@@ -513,7 +545,7 @@ class InteractionTerm:
     def _part_of_cells(self) -> Ints:
         """(copies * cells,) number of the connected part of each cell; collective."""
         V, corners = self._u.function_space, self._corners
-        if len(self._copies.images) == 1:
+        if len(self._copies.images) == 1:  # the parts are those of the mesh
             return np.asarray(self._cells.gather_values(component_numbers(V)[V.dofmap.list[:, 0]]))
         ones, size = np.ones(corners.size, dtype=np.int8), int(corners.max()) + 1
         # parts are the components of a graph whose links join corners of a cell
@@ -525,6 +557,8 @@ class InteractionTerm:
 
     @property
     def _view(self) -> ModelView:
-        """The model as its self-field needs it, in its own units and frame."""
+        """The model as its self-field needs it: in its own units and frame, with its mirror."""
         mirror = self._model.mirror if self._model.multiplicity > 1 else None  # type: ignore[attr-defined]  # of shells
-        return ModelView(self._model, 1.0, 1.0, mirror, 0.0, False)
+        return ModelView(
+            self._model, length=1.0, modulus=1.0, mirror=mirror, azimuth=0.0, reactions=False
+        )

@@ -1,4 +1,9 @@
-"""The interaction of magnetised parts as a load: from none to all of it."""
+"""The interaction of magnetised parts as a load: from none to all of it.
+
+Parts are shells, or pieces of a mesh file, that are not connected. Each has a remanence and acts on
+the others by its field. The load parameter (amplitude) `interaction` multiplies the energy of this
+interaction; 1 is the physical value.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,7 +34,7 @@ class Interaction:
     Attributes
     ----------
     strength
-        |Br|²/(mu_0 E).
+        |Br|²/(mu_0 E), with the remanence Br in T and Young's modulus E.
     itself
         Whether each part acts on itself, too.
     """
@@ -96,12 +101,15 @@ def interaction(context: Context) -> Interaction | None:
     assert magnetic.remanent.flux_density
     assert E
     return Interaction(
-        magnetic.remanent.flux_density**2 / (MU_0 * E), magnetic.interaction == "all"
+        strength=magnetic.remanent.flux_density**2 / (MU_0 * E),
+        itself=magnetic.interaction == "all",
     )
 
 
 def refuse_unfit_interaction(context: Context) -> None:
     """Check that the case has what its interaction needs: flux density, units, parts and a step.
+
+    A case without an interaction passes.
 
     Raises
     ------

@@ -5,6 +5,13 @@ place of F Br. R is the rotation of the polar decomposition of F = a_i (x) a0^i 
 surface let C = U², U = (C + J 1)/T, T² = tr C + 2 J and J = sqrt(det C). Then R = F U^-1 = (F + J F
 C^-1)/T, and J F C^-1 = J a^i (x) a0_i. All roots are of positive numbers, at equal stretches too.
 Units and arguments are those of `densities`.
+
+- r0 and u are the jets of placement and displacement: values with first and second derivatives.
+- Br and Ba are the remanence and the applied flux density over their magnitudes.
+- n is the unit normal, a_i the tangents, a^i the dual basis; a 0 marks the undeformed surface. In
+  the code `up1` and `up2` are a0^1 and a0^2.
+- The expansions of the energy in u have the terms U1 (linear), Uq (rotational springs), Utau
+  (torques from surface gradients) and the couple.
 """
 
 import ufl
@@ -20,13 +27,14 @@ from magshell_fenicsx.parts.magnetism.magnetised import MagneticEnergy, Remanenc
 def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     """Return the full energy density -Ba . (R - R0) Br of a remanence that only rotates.
 
-    r0 and u are the jets of placement and displacement; R is that of the module's docstring.
+    R is the rotation of the polar decomposition of F, R0 = 1 its value at u = 0.
     """
     r, n0, up = r0 + u, kin.normal(r0), kin.dual_basis(r0)
     n, area0 = kin.normal(r), kin.area_ratio(r0)
     J = kin.area_ratio(r) / area0
     trace = ufl.inner(kin.inverse_metric(r0), kin.metric(r))
     in_surface = r.r1 * ufl.dot(up[0], Br) + r.r2 * ufl.dot(up[1], Br)
+    # F Br and J F C^-1 Br in the surface; the sum over T is the rotated part of Br there
     cofactor_part = (
         ufl.cross(r.r2, n) * ufl.dot(r0.r1, Br) + ufl.cross(n, r.r1) * ufl.dot(r0.r2, Br)
     ) / area0
@@ -37,7 +45,8 @@ def magnetic(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
 def magnetic_first(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     """Return the term U1, linear in u, of a remanence that only rotates.
 
-    It is the antisymmetric part of the U1 of `densities`: the surface turns in itself.
+    It is the part of `densities.magnetic_first` that is antisymmetric in Br and Ba: the surface
+    turns in itself and does not stretch the remanence.
     """
     return (densities.magnetic_first(r0, u, Br, Ba) - densities.magnetic_first(r0, u, Ba, Br)) / 2
 
@@ -45,7 +54,7 @@ def magnetic_first(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
 def magnetic_torque(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     """Return the term Uq of a remanence that only rotates.
 
-    It is quadratic in the rotations q_i = n0 . u,_i of the normal and w in the surface.
+    It is quadratic in the rotations: q_i = n0 . u,_i of the normal, and w in the surface.
     """
     n0, q = kin.normal(r0), densities.rotation(r0, u)
     up1, up2 = kin.dual_basis(r0)
@@ -58,8 +67,8 @@ def magnetic_torque(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
 def magnetic_tau(r0: Jet, u: Jet, Br: Expr, Ba: Expr) -> Expr:
     """Return the term Utau of a remanence that only rotates.
 
-    The normal part of the remanence contributes rotations times surface gradients of u, its part in
-    the surface rotations times strains.
+    The normal part of the remanence contributes rotations times surface gradients of u. Its part
+    in the surface contributes rotations times strains (`stretched`, `widened`).
     """
     n0, q = kin.normal(r0), densities.rotation(r0, u)
     up1, up2 = kin.dual_basis(r0)
@@ -113,7 +122,7 @@ def magnetic_densities(
 ) -> dict[str, MagneticDensity]:
     """Return the densities of a magnetic energy under a law of the remanence, by name of the term.
 
-    They are linear in the applied field. `thins` is as in `full_density`.
+    They are linear in the applied field. `thins` says whether the thickness changes with the area.
     """
     if energy == "full":
         return {"magnetic": full_density(law, thins=thins)}

@@ -1,4 +1,19 @@
-"""The field section in the model's frame."""
+"""The magnetisation and the applied field of a case, in the model's frame.
+
+In: the section `magnetic`. Out: a `Magnetisation` for the model's loads, and the symmetries that it
+leaves to a model.
+
+- A model's frame is that of the case, turned by `turn` (rad) about e3.
+- The remanence is a vector (3,) if it is uniform, else a pattern: a function of undeformed places
+  and normals (both (..., 3), places over R) that gives vectors. It is over its magnitude.
+- lambda_m is the amplitude (load parameter) of the applied field; a field in space, as of sources,
+  is a function of the deformed place.
+- A rim is the edge of a dimple, which is a patch: a part of the surface with a name. "rest" names
+  everything outside all patches.
+- An outline is the undeformed shape of a shell, with its meridian if it is one of revolution.
+- A symmetry constraint says which mirror planes, and whether axisymmetry, a part of a case leaves
+  to a model.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -61,6 +76,8 @@ EQUALITY_TOLERANCE = 1e-9  # part of a direction outside a plane: rounding
 def by_points(section: RemanentSection, turn: float = 0.0) -> ControlledPattern:
     """Return a remanence given by vectors at points, in a frame turned by `turn` about e3 (rad).
 
+    The vectors are read from the section's file, and averaged over its filter length.
+
     Raises
     ------
     CaseError
@@ -89,7 +106,8 @@ def magnetisation(
     patch_rims
         Name of the patch of each dimple -> whether places (n, 3) are within its rim.
     to
-        Directions that the field turns to, in the order of steps.
+        Directions that steps turn the field to, in the order of the steps. A uniform or linear
+        field needs one amplitude for each dimension that they span.
 
     Raises
     ------
@@ -101,7 +119,7 @@ def magnetisation(
         magnetic.applied.gradient,
     )
     field, moving_fields = in_space(context, turn)
-    tesla_of_remanence = units(context)[0]
+    tesla_of_remanence, tesla_of_lambda = units(context)
     basis = [magnetic.applied.vector(turn)]
     # Gram-Schmidt: unit vectors that span all directions of a field that is uniform or linear
     for direction in () if field else to:
@@ -119,27 +137,28 @@ def magnetisation(
     remanent = _remanence(section, context, turn, patch_rims) if magnetic.remanent else np.zeros(3)
     Q = rotation(turn)
     layers = tuple((layer.fraction, layer.vector(turn)) for layer in section.layers or [])
+    # the gradient's tensor in the turned frame; a field in space has its own gradient
     G = Q @ np.array(gradient) @ Q.T if gradient and not field else None
     return Magnetisation(
         remanent,
         applied,
-        magnetic.energy,
-        G,
-        tuple(other_components),
-        patches,
-        layers,
-        magnetic.remanence,
-        field,
-        tuple(basis),
-        moving_fields,
-        turns(context, turn),
-        section.components if isinstance(section.components, UserField) else None,
-        soft_magnet(context, turn, patch_rims),
-        tesla_of_remanence if np.isfinite(tesla_of_remanence) else 1.0,
-        context.shell.reference
-        if context.shell.with_units and np.isfinite(units(context)[1])
+        energy=magnetic.energy,
+        gradient=G,
+        across=tuple(other_components),
+        patches=patches,
+        layers=layers,
+        law=magnetic.remanence,
+        in_space=field,
+        axes=tuple(basis),
+        driven=moving_fields,
+        turns=turns(context, turn),
+        given=section.components if isinstance(section.components, UserField) else None,
+        soft=soft_magnet(context, turn, patch_rims),
+        tesla=tesla_of_remanence if np.isfinite(tesla_of_remanence) else 1.0,
+        metres=context.shell.reference
+        if context.shell.with_units and np.isfinite(tesla_of_lambda)
         else 0.0,
-        magnetic.lambda_m == 0 and not is_read(context),
+        absent=magnetic.lambda_m == 0 and not is_read(context),
     )
 
 
@@ -148,8 +167,9 @@ def soft_magnet(
 ) -> SoftMagnet | None:
     """Return the soft-magnetic material, in a frame turned by `turn` about e3 (rad).
 
-    None without a susceptibility. `patch_rims` maps the name of each dimple's patch to a function
-    that says whether places (n, 3) are within its rim.
+    None without a susceptibility. The susceptibility may be a number, a formula, or a mapping of
+    patches to numbers. `patch_rims` maps the name of each dimple's patch to a function that says
+    whether places (n, 3) are within its rim.
     """
     magnetic = context.section_of(MagneticSection)
     if magnetic is None or magnetic.susceptibility is None:
@@ -168,6 +188,7 @@ def soft_magnet(
             for name, inside in patch_rims.items()
         )
         pattern = WithinRims(rims, rest_value) if rims else float(rest_value[0])
+    # |Ba| over sqrt(mu_0 E) for lambda_m = 1: a soft energy is quadratic in the field itself
     scale = (
         sqrt(MU_0 * E) / remanent.flux_density if remanent and remanent.flux_density and E else 1.0
     )
@@ -187,12 +208,13 @@ def soft_mirrored(chi: Any, outline: Outline, mirror: Mirror) -> bool:
 def _on_patch(section: Direction, context: Context, turn: float) -> Array | Pattern:
     """Return the remanence on a patch, in a frame turned by `turn` about e3 (rad).
 
-    It is a vector (3,) or a pattern. A patch that is one of several shells has the remanence of
-    that shell's own frame, moved to its place.
+    It is a vector (3,) or a pattern. A patch may be one of several shells. Its remanence is then
+    given in the shell's own frame, and moved with the shell to its pose in the model.
     """
     if not isinstance(section, RemanentSection) or section.of_shell is None:
         return section.vector(turn)
     place, factor = section.of_shell
+    # in the shell's own frame there is no turn and no dimple
     remanence = _remanence(section, context, 0.0, {})
     return (
         factor * remanence @ place.Q.T
@@ -206,8 +228,8 @@ def _remanence(
 ) -> NDArray[np.float64] | Pattern:
     """Return the remanence over its magnitude, in a frame turned by `turn` about e3 (rad).
 
-    It is a vector (3,) or a pattern: a function of undeformed places and normals. Patches of a mesh
-    are not included. `patch_rims` are as in `magnetisation`.
+    It is a vector (3,) or a pattern. Patches of a mesh are not included, dimples are: `patch_rims`
+    maps their names to functions that say whether places (n, 3) are within the rim.
     """
     if section.kind == "radial":
         return radial
@@ -234,11 +256,13 @@ def _remanence(
 def remanence_constraints(context: Context, outline: Outline) -> list[SymmetryConstraint]:
     """Return the symmetry that the magnetisation preserves, as one constraint in a list.
 
-    Remanence and applied field must both be symmetric to a plane, or both antisymmetric. The
-    constraint has the reason, if any, why the problem is not axisymmetric about e3.
+    A plane is a mirror if it maps remanence and applied field to themselves, or both to their
+    opposites: the energy is a product of both. The constraint also has the reason, if any, why the
+    problem is not axisymmetric about e3.
     """
     magnetic = context.section_of(MagneticSection)
     assert magnetic
+    # what is compared: uniform `vectors`, and `fields` that are functions of the place
     formulas = magnetic.applied.components if magnetic.applied.has_field_beside_sources else None
     without_uniform_field = (
         formulas or not magnetic.applied.has_field_beside_sources or not strength(context)
@@ -302,6 +326,7 @@ def remanence_constraints(context: Context, outline: Outline) -> list[SymmetryCo
     def mirrors(mirror: Mirror) -> bool:
         """Return whether a plane maps remanence and field to themselves or both to opposites."""
         S, x = mirror.reflection, outline.sample() if fields or sources else np.zeros((0, 3))
+        # the applied formula is one of the deformed place, which is beside the surface
         x = with_nearby_places(x) if formulas else x
 
         def images(sign: float) -> bool:
@@ -319,6 +344,8 @@ def remanence_constraints(context: Context, outline: Outline) -> list[SymmetryCo
                     *((field, some_places) for field in sources),
                 )
             )
+            # a radial remanence is its own mirror image; a tangential one is so for planes through
+            # e3, and its opposite for planes normal to e3
             kinds = {"radial": 1.0, "tangential": float(S[2, 2])}
             shell_patterns = [
                 (pattern_of_shell.pattern, pattern_of_shell.place.Q[:, 2])
@@ -350,10 +377,11 @@ def remanence_constraints(context: Context, outline: Outline) -> list[SymmetryCo
 def _axisymmetry_of_formulas(
     magnetic: MagneticSection, outline: Outline, sources: Sequence[Callable[[Array], Array]]
 ) -> dict[str, bool]:
-    """Return whether formulas and fields of sources are the same around e3, by description.
+    """Return description -> whether a formula, or the field of sources, is axisymmetric about e3.
 
-    The descriptions, of those that exist, are subjects of a message for the user. Values along the
-    outline's meridian are compared; without a meridian none is axisymmetric.
+    A description is the subject of a message for the user. Only formulas and fields that the case
+    has are listed. Values around the axis are compared at places of the outline's meridian;
+    without a meridian nothing counts as axisymmetric.
     """
     meridian = outline.meridian
     remanence = magnetic.remanent.components if magnetic.remanent else None
@@ -379,14 +407,17 @@ def _axisymmetry_of_formulas(
 
 
 def _at_places(pattern: Pattern, x: Array) -> Array:
-    """Return the values (n, 3) at places x (n, 3) of a pattern that ignores the normal."""
+    """Return the values (n, 3) at places x (n, 3) of a pattern that ignores the normal.
+
+    The pattern takes places (cells, n, 3), here of one cell; zero stands for the normals.
+    """
     return np.asarray(pattern(x[None], 0 * x[None])[0])
 
 
 def _vectors_of_sources(sources: Sequence[SourceSection], R: float) -> list[Array]:
     """Return a vector (3,) for each source that a mirror plane through e3 must contain.
 
-    It is the place of the source over R or, of a source on e3, its axis.
+    It is the place of the source over R or, if the source is on e3, its axis.
     """
     places = [np.array(source.position) / R for source in sources]
     axes = [source.axes[:, 2] for source in sources]
@@ -396,8 +427,9 @@ def _vectors_of_sources(sources: Sequence[SourceSection], R: float) -> list[Arra
 def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
     """Return the fields of the model's `Loads` that magnetism adds, by name.
 
-    If a step drives the field, `magnetic` is the magnetisation with it. Otherwise `remanence` is
-    the magnetisation alone; it is left out where a reduced model does not represent it.
+    If a step drives the field, `magnetic` is the magnetisation with the applied field. Otherwise
+    `remanence` is the magnetisation alone, as sensors read it. It is left out if the modelled part
+    (an axisymmetric meridian, or one side of `modelled.plane`) does not share its symmetry.
     """
     magnetic, turn, patch_rims = (
         context.section_of(MagneticSection),
@@ -417,6 +449,7 @@ def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
     if magnetic.remanent is None:
         return observed
     (constraint,) = remanence_constraints(context, modelled.outline)
+    # whether an axisymmetric model can represent the remanence; other models always can
     is_visible = constraint.not_axisymmetric is None or not modelled.axisymmetric
     if not is_visible or (modelled.plane and not constraint.mirrors(modelled.plane)):
         return observed
@@ -429,7 +462,10 @@ def _rotations(context: Context) -> list[RotationSection]:
 
 
 def account(context: Context, loads: Loads) -> Account:
-    """Return the lines of `magshell check` on the energy of the field and on its sources."""
+    """Return the lines of `magshell check` on the energy of the field and on its sources.
+
+    The second entry of the account lists what is left out, with the reason.
+    """
     magnetic, field, words = context.section_of(MagneticSection), loads.magnetic, list[str]()
     if loads.interaction:
         words = [

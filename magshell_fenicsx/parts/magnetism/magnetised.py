@@ -1,4 +1,12 @@
-"""The magnetisation of a model, and the applied field, in the model's frame."""
+"""The magnetisation of a model, and the applied field, in the model's frame.
+
+- lambda_m is the amplitude (load parameter) of the applied field. A uniform field that turns has
+  further amplitudes for directions across its first one; mu holds all amplitudes by name.
+- A pattern is a function of undeformed places and normals that gives vectors. A field in space is a
+  function of the deformed place that gives flux density and derivatives. Places are over R.
+- An image is the mirror image of the modelled half, or a copy of a sector.
+- A patch is a named part of a mesh, given by flags of its cells.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
@@ -91,10 +99,11 @@ class Magnetisation:
     def field_at(self, mu: Mapping[str, float], r: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the applied flux density (..., 3) at deformed places r (..., 3) over R.
 
-        A uniform one has the magnitude lambda_m. `mu` are all amplitudes by name.
+        It is in the unit of lambda_m: a uniform field has the magnitude lambda_m. `mu` are all
+        amplitudes by name.
         """
         lambda_m = mu.get("lambda_m", 0.0)
-        if self.in_space and not lambda_m:
+        if self.in_space and not lambda_m:  # lambda_m multiplies all of it
             return np.zeros_like(r)
         if self.in_space:
             x = r.reshape(-1, 3)
@@ -113,7 +122,7 @@ class Magnetisation:
         """Return 1 if the field's mirror images continue it, -1 if their opposites do; collective.
 
         The applied field at some nodes of the placement r0 is compared with the reflected field at
-        their images.
+        their mirror images, by the sign of the sum of scalar products over all ranks.
         """
         x = r0.x.array.reshape(-1, 3)
         x = x[:: len(x) // PLACES + 1]
@@ -125,7 +134,7 @@ class Magnetisation:
         )
 
     def on_cells(self, patches: Mapping[str, NDArray[np.bool_]], cells: int) -> "Magnetisation":
-        """Return the magnetisation with patterns in place of values of named patches.
+        """Return the magnetisation with patterns of cells in place of values on named patches.
 
         Parameters
         ----------

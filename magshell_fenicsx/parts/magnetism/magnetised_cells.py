@@ -4,6 +4,17 @@ Coordinates (a, b) in [0, 1]² are the same for both kinds of cells. A triangle 
 one side drawn together into a corner; a cell of a meridian is swept around the axis. Lengths are
 over R, remanences over a magnitude of their own. Theory: docs/theory.md, the field of a magnetised
 shell.
+
+- Jets (`SurfaceJets`) are values with derivatives by a and b: six for places (value, two first and
+  three second derivatives), three for other fields. Arrays (d, n, m, ...) have derivative d at m
+  points in each of n cells.
+- r0 and r are undeformed and deformed places of the mid-surface, u is the displacement, n0 and n
+  are unit normals, t is the thickness, B the remanence in the undeformed shell.
+- eta is the height over the mid-surface, over the thickness: from -1/2 to 1/2.
+- A swept cell is an interval of a meridian; b is its azimuth over a full turn. Its nodal values
+  have components along e_rho and e_z, for places, or along three directions, for the remanence.
+- J is any number that depends on the shell, as the field at a place; `NodalDerivatives` collect
+  its derivatives by nodal values.
 """
 
 from collections.abc import Callable
@@ -77,13 +88,14 @@ class MagnetisedShell:
     def reference(self, ab: Array) -> tuple[Array, Array, Array]:
         """Map coordinates ab (n, m, 2) to places on the reference cell.
 
-        A triangle is a square whose side a = 1 is a corner; a ring has the azimuth b.
+        A triangle (d = 2) is a square whose side a = 1 is a corner; a cell of a meridian (d = 1)
+        has the place a and the azimuth b.
 
         Returns
         -------
         tuple
             Places (n, m, d), their derivatives (n, m, 2, d) by a and b, and azimuths (n, m) over a
-            full turn.
+            full turn, zero for a triangle.
         """
         a, b = ab[..., 0], ab[..., 1]
         if self.swept:
@@ -93,10 +105,10 @@ class MagnetisedShell:
         return np.stack([a, (1 - a) * b], -1), slopes, 0 * a
 
     def thickness(self, cells: Ints, X: Array) -> Array:
-        """Return the undeformed thickness over R and its derivatives by X: (1 + d or 3, n, m).
+        """Return the undeformed thickness over R, then its derivatives by X.
 
-        X (n, m, d) are places on the reference cell, m for each of the cells (n,). A constant
-        thickness has three entries, whatever d.
+        X (n, m, d) are places on the reference cell, m for each of the cells (n,). The result is (1
+        + d, n, m); for a constant thickness it is (3, n, m) whatever d, with zero derivatives.
         """
         if self.thickness_factor is None:
             thickness = np.zeros((3, *X.shape[:2]))
@@ -106,9 +118,10 @@ class MagnetisedShell:
         return np.asarray(self.h * np.einsum("dnmk,nk->dnm", tables(element, X, 1), values[cells]))
 
     def zero_derivatives(self, *, of_shape: bool = False) -> NodalDerivatives:
-        """Return derivatives that are zero, to which others are added.
+        """Return derivatives that are all zero, to which contributions are added.
 
-        With `of_shape`, those by the undeformed place and the thickness are included.
+        With `of_shape`, derivatives by the undeformed place and by the thickness are included.
+        Without a thickness factor the latter are an empty array.
         """
         zero = NodalDerivatives(np.zeros_like(self.r0), np.zeros_like(self.remanence))
         if not of_shape:
@@ -121,10 +134,10 @@ class MagnetisedShell:
     def add_thickness_derivatives(
         self, cells: Ints, X: Array, by_thickness: Array, nodal_derivatives: NodalDerivatives
     ) -> None:
-        """Add derivatives by nodal factors of the thickness to `nodal_derivatives`.
+        """Add a number's derivatives by nodal factors of the thickness to `nodal_derivatives`.
 
-        They follow from derivatives `by_thickness` (n, m) by the thickness over R, at places X (m,
-        d) of the reference cell in cells (n,).
+        `by_thickness` (n, m) are its derivatives by the thickness over R at places X (m, d) of the
+        reference cell, in cells (n,). Nothing is added to derivatives without `by_thickness`.
         """
         if self.thickness_factor and nodal_derivatives.by_thickness is not None:
             T = self.thickness_factor[0].tabulate(0, X)[0, :, :, 0]
@@ -156,11 +169,12 @@ class SurfaceJets:
     Attributes
     ----------
     r0, r
-        (6, n, m, 3) of undeformed places, up to second derivatives; (3, n, m, 3) of deformed ones.
+        (6, n, m, 3) jet of the undeformed place, up to second derivatives; (3, n, m, 3) jet of the
+        deformed one.
     B
-        (3, n, m, 3) of the remanence.
+        (3, n, m, 3) jet of the remanence.
     t
-        (3, n, m) of the undeformed thickness over R.
+        (3, n, m) jet of the undeformed thickness over R.
     shape, cells
         The shell, and the numbers (n,) of the cells.
     shape_tables, remanence_tables
@@ -186,7 +200,8 @@ class SurfaceJets:
     def at_points(cls, shape: MagnetisedShell, cells: Ints, ab: Array) -> "SurfaceJets":
         """Return the jets at coordinates ab (n, m, 2) in cells (n,).
 
-        Jets on a meridian are first taken at azimuth zero and then rotated about e3.
+        On a meridian they are first taken at azimuth zero and then rotated about e3. On a triangle
+        derivatives by reference coordinates are first turned into derivatives by a and b.
         """
         X, slopes, b = shape.reference(ab)
         angle = 2 * np.pi * b
@@ -202,9 +217,11 @@ class SurfaceJets:
                 at_azimuth_zero = _ring(on_meridian, full_turn)
                 jets.append(np.stack([rotate_about_axis(d, angle) for d in at_azimuth_zero]))
             B = np.einsum("dnmk,nki->dnmi", remanence_tables, shape.remanence[cells])
+            # components along e_rho and e_theta turn with the azimuth
             by_azimuth = full_turn * np.stack([-B[0, ..., 1], B[0, ..., 0], 0 * B[0, ..., 0]], -1)
             fields = np.stack([rotate_about_axis(d, angle) for d in (B[0], B[1], by_azimuth)])
             thickness = shape.thickness(cells, X)
+            # value, derivative along the meridian, and none around the axis
             thickness = np.stack([thickness[0], thickness[1], 0 * thickness[0]])
             r0, u = jets
             return cls(
@@ -248,7 +265,7 @@ class SurfaceJets:
     def layer(self, eta: float) -> tuple[Array, Array, Array]:
         """Return dX/da, dX/db and dX/deta (n, m, 3) of the undeformed shell at the height `eta`.
 
-        Here X = r0 + eta t n0; heights are over the thickness t.
+        X = r0 + eta t n0 is a place in the shell, with the thickness t over R.
         """
         _, a1, a2, _a11, _a12, _a22 = self.r0
         n0, (n1, n2) = _normals(self.r0)
@@ -257,7 +274,10 @@ class SurfaceJets:
 
     @property
     def thickness(self) -> Array:
-        """Thickness (n, m) of the deformed shell, over R."""
+        """Thickness (n, m) of the deformed shell, over R.
+
+        Incompressible cells get thinner as their area grows.
+        """
         if not np.any(self.shape.incompressible):
             return np.asarray(self.t[0])
         area0, area = (np.linalg.norm(np.cross(a[1], a[2]), axis=-1) for a in (self.r0, self.r))
@@ -278,25 +298,30 @@ class SurfaceJets:
     def add_derivatives(
         self, nodal_derivatives: NodalDerivatives, by_place: Array, by_normal: Array, by_B: Array
     ) -> None:
-        """Add the derivatives dJ/du and dJ/dBr of a number J at nodes to `nodal_derivatives`.
+        """Add dJ/du and dJ/dBr by nodal values to `nodal_derivatives`, for a number J.
+
+        J depends on the deformed shell by its mid-surface places, by its normals times height, and
+        by the remanence.
 
         Parameters
         ----------
         by_place, by_normal
-            (n, m, 3) derivatives dJ/dr and dJ/dn by mid-surface places and normals.
+            (n, m, 3) derivatives by mid-surface places, and by normals with the factor of the
+            height.
         by_B
             (3, n, m, 3) derivatives by the remanence and its derivatives by a and b.
         """
         area_vector = np.cross(self.r[1], self.r[2])
         area = np.linalg.norm(area_vector, axis=-1, keepdims=True)
         n = area_vector / area
-        # n is over |m| of m = r_a x r_b, and so is the thickness of what is incompressible
+        # n = m/|m| with m = r_a x r_b; the thickness of incompressible cells is over |m| as well
         normal_factor = 1 + np.asarray(self._incompressible)[..., None]
         along_normal = np.sum(by_normal * n, axis=-1, keepdims=True)
         by_area_vector = (by_normal - normal_factor * along_normal * n) / area
         by_tangents = np.cross(self.r[2], by_area_vector), np.cross(by_area_vector, self.r[1])
         by_jets = np.stack([by_place, *by_tangents])
         if self.shape.swept:
+            # back to azimuth zero, where nodal values have their components
             by_jets, by_B = (
                 np.stack([rotate_about_axis(d, self.angle, -1.0) for d in derivatives])
                 for derivatives in (by_jets, by_B)
@@ -321,10 +346,11 @@ class SurfaceJets:
         charges_of: "Callable[[SurfaceJets], Array]",
         by_charges: Array,
     ) -> None:
-        """Add a number's derivatives by the undeformed place and the thickness; only of triangles.
+        """Add a number's derivatives by the undeformed place and the thickness; triangles only.
 
-        They are added to `nodal_derivatives` if it has arrays for them. Derivatives of charges by
-        the jets are found along an imaginary change, exact to rounding.
+        They are added to `nodal_derivatives` if it has arrays for them. The number depends on the
+        undeformed shell by its charges. Their derivatives by each component of the jets r0 and t
+        are found by an imaginary change, so they are exact to rounding.
 
         Parameters
         ----------
@@ -343,7 +369,7 @@ class SurfaceJets:
             total = np.sum(by_charges * change, axis=-1)
             return np.asarray(total / COMPLEX_STEP, dtype=np.float64)
 
-        for d, i in product(range(1, 6), range(3)):
+        for d, i in product(range(1, 6), range(3)):  # charges do not depend on the place r0[0]
             r0 = self.r0.astype(np.complex128)
             r0[d, ..., i] += COMPLEX_STEP * 1j
             by_r0[d, ..., i] = rate(r0=r0)
@@ -372,13 +398,14 @@ def unit(m: Array) -> Array:
 
 
 def _normals(jet: Array) -> tuple[Array, tuple[Array, Array]]:
-    """Return the normal (..., 3) of a surface with a jet (6, ..., 3), and its two derivatives.
+    """Return the unit normal (..., 3) of a surface, and its two derivatives by the coordinates.
 
-    It uses no absolute values, so that it is analytic in the jet.
+    The jet (6, ..., 3) may be complex: no absolute values are taken, so that the result is analytic
+    in the jet.
     """
     _, a1, a2, a11, a12, a22 = jet
     m = np.cross(a1, a2)
-    size = np.sqrt(np.sum(m * m, axis=-1, keepdims=True))  # analytic
+    size = np.sqrt(np.sum(m * m, axis=-1, keepdims=True))  # np.linalg.norm is not analytic
     n, slopes = m / size, []
     for first, second in ((a11, a12), (a12, a22)):
         change = (np.cross(first, a2) + np.cross(a1, second)) / size
@@ -387,10 +414,10 @@ def _normals(jet: Array) -> tuple[Array, tuple[Array, Array]]:
 
 
 def _ring(f: Array, ring: float) -> Array:
-    """Return jets (6, n, m, 3) by (s, b) at azimuth zero of an axisymmetric field.
+    """Return the jet (6, n, m, 3) of an axisymmetric field by (s, b), at azimuth zero.
 
-    `f` (3, n, m, 2) are its radial and axial components with two derivatives by the meridian's
-    coordinate s; `ring` is the angle (rad) for b = 1.
+    `f` (3, n, m, 2) are its components along e_rho and e_z with two derivatives by the meridian's
+    coordinate s. The azimuth is `ring` times b, so that `ring` (rad) is the angle for b = 1.
     """
     (U, W), (Us, Ws), (Uss, Wss) = (np.moveaxis(components, -1, 0) for components in f)
     zero = np.zeros_like(U)
@@ -400,16 +427,24 @@ def _ring(f: Array, ring: float) -> Array:
 
 
 def _chain(T: Array, slopes: Array, ab: Array) -> Array:
-    """Return derivatives by (a, b) of shape functions, from those by reference coordinates X, Y.
+    """Return derivatives by (a, b) of shape functions, from derivatives by X and Y.
 
-    A triangle has X = a, Y = (1 - a) b. `T` has the values and first, perhaps also second,
-    derivatives of n, m points and k functions; `slopes` (n, m, 2, 2) are those of X and Y by a and
-    b.
+    A triangle has the reference coordinates X = a, Y = (1 - a) b.
+
+    Parameters
+    ----------
+    T
+        (3 or 6, n, m, k) values and first, perhaps also second derivatives of k functions.
+    slopes
+        (n, m, 2, 2) derivatives of X and Y by a and b.
+    ab
+        (n, m, 2) the coordinates.
     """
     value, first = T[0], np.einsum("nmad,dnmk->anmk", slopes, T[1:3])
-    if len(T) == 3:
+    if len(T) == 3:  # no second derivatives
         return np.stack([value, *first])
     XX, XY, YY = T[3:6]
     b, c = ab[..., 1, None], 1 - ab[..., 0, None]
+    # by aa, ab and bb; X and Y have the single second derivative Y_ab = -1
     twice = [XX - 2 * b * XY + b**2 * YY, c * (XY - b * YY) - T[2], c**2 * YY]
     return np.stack([value, *first, *twice])

@@ -3,6 +3,10 @@
 A motion with the velocity w(x) = A x + v carries a field B along: dB/dmu = A B - G w, with the
 gradient G of B. Its own gradient needs the second derivatives H of B. So place and angle of a
 source need no derivatives but those of the field.
+
+mu are the amplitudes, by name: load parameters that move a field (`motions`) or multiply it
+(`factors`). A motion is a shift or a rotation in proportion to its amplitude; w is its velocity per
+unit of the amplitude. Places and shifts are over R.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -100,6 +104,7 @@ class FieldAtPlaces:
 
     def second_derivative(self, name: str, other: str) -> Array:
         """Return d2B/dmu_i dmu_j (n, 3) by the amplitudes `name` and `other`."""
+        # three cases: two factors, a factor and a motion, two motions (or one twice)
         factor_names = [
             amplitude for amplitude in (name, other) if amplitude in self.moving_field.factors
         ]
@@ -150,11 +155,13 @@ class FieldAtPlaces:
     def _velocity(self, name: str) -> Velocity:
         """Return A (3, 3) and v (3,) of the velocity w(x) = A x + v of a motion.
 
-        Later motions carry the velocity along.
+        A motion turns with the angular velocity `turn` about its centre, and shifts. Later motions
+        carry this velocity along.
         """
         motions = self.moving_field.motions
         motion_number = next(i for i, motion in enumerate(motions) if motion.name == name)
         motion = motions[motion_number]
+        # the matrix of the cross product: A x = turn x x
         A = np.asarray(np.cross(np.eye(3), motion.turn), dtype=np.float64)
         v = motion.shift - A @ motion.centre
         # later motions x -> Q x + t carry it to Q A Q^T x + Q v - Q A Q^T t
@@ -165,5 +172,6 @@ class FieldAtPlaces:
 
 def combined_motion(motions: Sequence[RigidMotion], mu: Mapping[str, float]) -> tuple[Array, Array]:
     """Return rotation Q (3, 3) and shift t (3,) of x -> Q x + t, all motions together."""
+    # images of the origin and of the unit vectors
     origin, *ends = apply_motions(motions, mu, np.vstack([np.zeros(3), np.eye(3)])).x
     return np.column_stack(ends) - origin[:, None], np.asarray(origin)

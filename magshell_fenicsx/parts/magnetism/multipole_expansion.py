@@ -5,6 +5,14 @@ their places, and the energy is a quadratic form of them, E = sum of M_A . G_AB 
 from each other, with constant G. So forces and stiffness are its derivatives, without any sum over
 pairs of charges: those by the moments are L = G M, and D = dM/du^T G dM/du + L . d2M/du2. Moments
 go up to larger boxes and L comes down, so the cost grows like n.
+
+Y are the COUNT regular solid harmonics of a place about the middle of its box, M the sums of
+charges times Y, L the local expansions: the potential of distant charges at a place is Y . L. N_i
+are the matrices with dY/dx_i = N_i Y. Y, M and L take lengths over the width of the box; so each
+derivative divides by the width, and so does the potential. A kind of elements (faces, or strips of
+edges) has P points with `layers` charges each, at heights over the mid-surface; "rows" are its
+elements. Copies are the modelled cells and their images. Cells near each other interact without
+multipoles. Lengths are over R.
 """
 
 from collections.abc import Iterator, Sequence
@@ -33,7 +41,7 @@ SECOND_DERIVATIVES = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))  # as in p
 class SurfacePoints:
     """Points on the mid-surface: places r, unit normals n and dual bases, each (rows, P, 3).
 
-    The dual basis is that of the tangents: a^1 . a_1 = 1, a^1 . a_2 = 0.
+    The dual basis (a^1, a^2) is that of the tangents: a^1 . a_1 = 1, a^1 . a_2 = 0.
     """
 
     r: Array
@@ -93,6 +101,7 @@ class MultipoleExpansion:
         self._own_rows = [
             (cells >= own_cells.start) & (cells < own_cells.stop) for cells, _ in kinds
         ]
+        # box of each charge; `points.q[0].size` is the number of charges of an element
         box = np.concatenate(
             [self._leaf.of_cell[cells].repeat(points.q[0].size) for cells, points in kinds]
         )
@@ -125,8 +134,9 @@ class MultipoleExpansion:
     def add(self, charges: PlacedCharges, *, with_second_derivatives: bool) -> float:
         """Add derivatives of the energy to points' sums, and return the energy of own cells.
 
-        The energy counts half of each pair. First derivatives are added, and second ones if
-        `with_second_derivatives`. See `Points.sums` for the sums at points.
+        The energy counts half of each pair. First derivatives by places and normals are added, and
+        second ones if `with_second_derivatives`: only their part at one point, L . d2M/du2. See
+        `Points.sums` for the sums at points.
         """
         N, L = derivatives(), self.local_expansions(self._moments(self._q * charges.Y))[..., 0]
         matrices = (
@@ -141,6 +151,7 @@ class MultipoleExpansion:
             values_at_charges[self._order[first:last]] = (
                 charges.Y[:, first:last].T @ expansion_of_boxes[box]
             )
+        # from lengths over the width: 1 potential, 3 first, and 6 second derivatives
         values_at_charges *= (
             self._leaf.width
             ** -np.array([1.0] + [2.0] * 3 + [3.0] * 6)[: values_at_charges.shape[1]]
@@ -159,6 +170,7 @@ class MultipoleExpansion:
                 stop,
                 energy + weighted[..., 0].sum() / 2,
             )
+            # first and second derivatives by the charge's place
             f, K = weighted[..., 1:4], weighted[..., 4:]
             # derivatives by places and, times heights, by normals
             columns = [
@@ -182,7 +194,8 @@ class MultipoleExpansion:
         """Return derivatives of the energy and of its rate by the charges of own cells.
 
         The result has one list for each kind, of arrays like `q`: derivatives by charges and, with
-        `heights`, by the heights of the charges over the mid-surface.
+        `heights`, by the heights of the charges over the mid-surface. The number that is
+        differentiated is `weights.energy` W + `weights.force` times the rate of the energy W.
 
         Parameters
         ----------
@@ -201,6 +214,7 @@ class MultipoleExpansion:
         ]
 
         def directional_derivatives(v: NDArray[np.floating[Any]], Y: Array) -> Array:
+            """Return the derivatives of harmonics Y along v (charges, 3), over the box's width."""
             return np.asarray(v[:, 0] * (N[0] @ Y) + v[:, 1] * (N[1] @ Y) + v[:, 2] * (N[2] @ Y))
 
         rate = (
@@ -213,7 +227,8 @@ class MultipoleExpansion:
             self.local_expansions(self._moments(self._q * factor_harmonics))[..., 0]
             for factor_harmonics in (Y, dY)
         )
-        # factor, harmonics and their rates for derivatives by charges, then by heights
+        # factor, harmonics and their rates for derivatives by charges, then by heights: a height
+        # moves a charge q along the normal
         factors_and_rates: list[tuple[Array | float, Array, Array]] = [(1.0, Y, dY)]
         if heights:
             normals = [
@@ -266,7 +281,7 @@ class MultipoleExpansion:
 
         L is that of the finest level too.
         """
-        levels, moments = self._tree.levels, [M]
+        levels, moments = self._tree.levels, [M]  # moments of levels, the present one first
         # moments go up to larger boxes
         for k, level in reversed(list(enumerate(levels))[1:]):
             moments_of_parents = np.zeros((len(levels[k - 1].keys), *M.shape[1:]))
@@ -288,7 +303,7 @@ class MultipoleExpansion:
         return L
 
     def adjacent_cells(self, own_cells: range) -> NDArray[np.bool_]:
-        """Return a mask (own cells, cells) of pairs of cells that share a box or a box's border."""
+        """Return a mask (own cells, cells) of pairs of cells in one box or in boxes that touch."""
         grid_places = self._leaf.keys[self._leaf.of_cell, 2:]
         return np.asarray(
             np.abs(grid_places[own_cells.start : own_cells.stop, None] - grid_places).max(axis=-1)
@@ -298,7 +313,8 @@ class MultipoleExpansion:
     def local_expansions_of_cells(self, moments: Array) -> tuple[Ints, Array]:
         """Return the box of each cell (cells,), and the local expansions (boxes, COUNT, n).
 
-        `moments` (cells, COUNT, n) are first summed over boxes.
+        `moments` (cells, COUNT, n) are first summed over boxes. The width is divided out, so that
+        expansions times moments are energies.
         """
         M = np.zeros((len(self._leaf.keys), *moments.shape[1:]))
         np.add.at(M, self._leaf.of_cell, moments)
@@ -309,11 +325,13 @@ class MultipoleExpansion:
     def jacobian(self, charges: PlacedCharges) -> Array:
         """Return derivatives (cells, COUNT, 3 k) of moments by the nodes of each cell.
 
-        The moments are those of the cell's charges about the middle of the cell's box.
+        The moments are those of the cell's charges about the middle of the cell's box. A charge
+        moves with its mid-surface place, and at a height with the normal too.
         """
         N, start, k = derivatives(), 0, self._kinds[0][1].tables.shape[-1]
         B = np.zeros((len(self._leaf.of_cell), COUNT, k, 3))
         slopes = np.empty((3, len(self._q), COUNT))
+        # derivatives of moments by the places of charges, in the order of kinds again
         for i in range(3):
             slopes[i, self._order] = (self._q * (N[i] @ charges.Y)).T / self._leaf.width
         for (cells, points), heights, surface in zip(
@@ -363,7 +381,8 @@ class CellNodes:
     def changes_of_copies(self, v: Array, sign: float) -> Array:
         """Return changes (copies * cells, 3 k, n) of all copies' cells from nodal changes v.
 
-        v is (3 nodes, n); `sign` is -1 for changes that are opposite in the images.
+        v is (3 nodes, n); `sign` is -1 for changes that are opposite in the images. The first copy,
+        the modelled part itself, has no sign.
         """
         n, moved = v.shape[-1], v.reshape(-1, 3, v.shape[-1])
         changes = [
@@ -422,9 +441,10 @@ class InteractionHessian:
         return self.near.matrix(self.sign)
 
     def rotated_blocks(self, q: Array) -> SinglePrecisionBlocks | None:
-        """Return the blocks `is_adjacent` where nodes are rotated; None with several images.
+        """Return the blocks `is_adjacent`, each rotated with its nodes; None with several images.
 
-        q (nodes, 4) are unit quaternions, scalar last.
+        So blocks of an earlier state serve a later one. q (nodes, 4) are unit quaternions, scalar
+        last.
         """
         return self.block_rotation.rotated_blocks(
             self.near, self.sign, self.cells.numbers, q, self._stored_blocks
@@ -437,7 +457,7 @@ class InteractionHessian:
     def times_far(self, v: Array) -> Array:
         """Return products of the multipoles' part with vectors v (3 nodes, n); collective.
 
-        See `assembly.dense_tangent.DenseHessian`.
+        The rows (3 local nodes, n) are those of this rank's cells; v has all nodes.
         """
         own_cells = slice(self.cells.own.start, self.cells.own.stop)
         # dM = B du, then L = G dM, then forces B^T L
@@ -466,7 +486,7 @@ def _matrix_products(Z: Array, M: Array) -> Array:
 def _octants(keys: Ints) -> Iterator[tuple[Array, Ints]]:
     """Yield, for each of the eight octants, the shift to the parent and the boxes in that octant.
 
-    `keys` (boxes, 5) end with the place in the grid.
+    `keys` (boxes, 5) end with the place in the grid, whose last bits tell the octant.
     """
     bits = keys[:, 2:] & 1
     octant = bits @ np.array([4, 2, 1])

@@ -6,6 +6,10 @@ conj(R_l^m(a) R_l'^m'(b)) I_(l + l')^(m + m')(D) (L. Greengard, V. Rokhlin, Acta
 M. A. Epton, B. Dembart, SIAM J. Sci. Comput. 16, 1995, 865). Real and imaginary parts are taken
 apart: Y has ORDER + 1 squared numbers. The sum ends with l + l' = ORDER: it is then Taylor's
 polynomial in a - b, so that what two charges do to each other is opposite to rounding.
+
+R are the regular solid harmonics, I the irregular ones; the degree is l, the order m. Y holds the
+real and imaginary parts of all R_l^m with m from 0 to l, by degree: COUNT numbers at a place, see
+`place_of`. Negative m follow from R_l^-m = (-1)^m conj(R_l^m). Lengths are over any unit.
 """
 
 from functools import cache
@@ -16,8 +20,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-ORDER = 7
-COUNT = (ORDER + 1) ** 2
+ORDER = 7  # highest degree
+COUNT = (ORDER + 1) ** 2  # numbers in Y
 
 
 def place_of(degree: int, m: int) -> int:
@@ -55,6 +59,7 @@ def harmonics(x: Array) -> Array:
 def derivatives() -> tuple[Array, Array, Array]:
     """Return the matrices N (COUNT, COUNT) with dY/dx_i = N_i Y, for x, y and z."""
     matrices = [np.zeros((COUNT, COUNT)) for _ in range(3)]
+    # R_l^m as combinations of Y; zero where |m| > l
     coefficients, zero_row = _complex()
     for degree, m in product(range(1, ORDER + 1), range(ORDER + 1)):
         if m > degree:
@@ -119,6 +124,7 @@ def translations(D: Array) -> Array:
                 irregular[degree, m] -= (
                     ((degree - 1) ** 2 - m * m) / square * irregular[degree - 2, m]
                 )
+    # from Y to all R_l^m, as matrix C
     rows, _ = _complex()
     C, keys = np.array(list(rows.values())).conj(), list(rows)
     G = np.zeros((len(D), COUNT, COUNT), dtype=np.complex128)
@@ -133,7 +139,10 @@ def translations(D: Array) -> Array:
 
 
 def ends() -> Ints:
-    """Return how many of the first rows of each column of `translations` are not zero, (COUNT,)."""
+    """Return how many of the first rows of each column of `translations` are not zero, (COUNT,).
+
+    Entries with l + l' above ORDER are zero: rows of degree l' are needed up to ORDER - l.
+    """
     return np.concatenate(
         [np.full(2 * degree + 1, (ORDER - degree + 1) ** 2) for degree in range(ORDER + 1)]
     )

@@ -3,6 +3,14 @@
 The C functions are in pairs.c, multipole_expansion.c and stacked_faces.c, which are compiled
 together and work at `LANES` pairs at once. Lengths are over R, charges over Br R², energies over
 Br² R³/(4 pi mu_0).
+
+Charges are at points of elements, in layers through the thickness: a charge of height eta is at
+r + eta t n, with the mid-surface place r, its normal n and the thickness t. So derivatives by a
+cell's k nodes come from those by r and n. They are summed at points first (`Points.sums`), then at
+nodes (`Pairs.finish`). Copies are the modelled cells and their images, which make the whole shell;
+cells of all copies are numbered copy by copy. A rule is a set of quadrature points; distant cells
+have rules with few points. Boxes, moments and expansions are those of `multipole_expansion`,
+stacked cells those of `stacked_faces`. Functions in C take pointers to contiguous arrays.
 """
 
 from dataclasses import dataclass
@@ -21,7 +29,7 @@ from magshell_fenicsx.platform.native import load_native
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
-LANES, SUMS = 8, 24  # as in pairs.c
+LANES, SUMS = 8, 24  # pairs at once, numbers at a point; as in pairs.c
 FUNCTIONS = """
     double pairs(int64_t, int64_t, int64_t, const int64_t *, int64_t, const double *, int64_t,
         int64_t, const double *, const double *, const double *, const double *, double *,
@@ -120,7 +128,7 @@ class Points:
 
 
 class Stiffness:
-    """Blocks of a matrix to which second derivatives are added.
+    """Blocks (3, 3) of a matrix between nodes, to which second derivatives are added.
 
     Second derivatives by the nodes of one cell are first summed for each cell: see `finish`.
 
@@ -153,6 +161,7 @@ class Stiffness:
     ) -> None:
         """Number the blocks and set them to zero; parameters are those of the class."""
         self.factor, self.row_of, self.column_of = factor, row_of, column_of
+        # blocks are numbered row by row; -1 where there is none
         block_numbers = np.where(
             pattern, np.cumsum(pattern, dtype=np.int32).reshape(pattern.shape) - 1, -1
         ).astype(np.int32)
@@ -162,6 +171,7 @@ class Stiffness:
             np.int32
         )
         self.shape = 3 * pattern.shape[0], 3 * pattern.shape[1]
+        # images have one more set of blocks, so that `matrix` can give it a sign
         image_block_numbers = [block_numbers + self._count] if len(turn) > 1 else []
         self.where = np.concatenate([block_numbers, *image_block_numbers], axis=1)
         self.blocks = np.zeros((self._count * (1 + len(image_block_numbers)), 3, 3))
@@ -174,6 +184,7 @@ class Stiffness:
         k = self.row_of.shape[1]
         a, b = np.triu_indices(k)
         block = np.zeros((k, k, 3, 3))
+        # own modelled cells; rows of all others are -1
         for cell in np.flatnonzero(self.row_of[:, 0] >= 0):
             sums = self.factor * self.onto[cell]
             block[b, a], block[a, b] = sums.transpose(0, 2, 1), sums
@@ -182,7 +193,7 @@ class Stiffness:
     def matrix(self, sign: float) -> bsr_array:
         """Return the matrix (3 local nodes, 3 all nodes).
 
-        Blocks of images are added times `sign`.
+        Blocks of images are added times `sign`: -1 for displacements that are opposite in images.
         """
         blocks, blocks_of_images = self.blocks[: self._count], self.blocks[self._count :]
         if len(blocks_of_images):
@@ -240,7 +251,9 @@ class Pairs:
         """Return the energy of the first `counted` pairs, and add derivatives of all pairs.
 
         Derivatives by nodes of pairs are added to `gradient` (cells, k, 3) and `stiffness`. Those
-        at points go first to the sums of `Points`; `finish` brings them to the nodes.
+        at points go first to the sums of `Points`; `finish` brings them to the nodes. Where points
+        of the second cell differ from point to point of the first one, they have no sums: their
+        derivatives go to the nodes at once.
 
         Parameters
         ----------
@@ -251,6 +264,7 @@ class Pairs:
         """
         if not len(cells):
             return 0.0
+        # to a multiple of `LANES`, with the last pair, whose repetitions C leaves out
         padding = -len(cells) % LANES
         filled_cells, left_rows, right_rows = (
             _filled(rows, padding) for rows in (cells, left[1], right[1])
@@ -295,7 +309,10 @@ class Pairs:
         )
 
     def _matrix(self, nodes: Array, stiffness: Stiffness | None) -> list[Any]:
-        """Return the arguments of C functions for a stiffness; null pointers for None."""
+        """Return the arguments of C functions for a stiffness; null pointers for None.
+
+        `nodes` (cells, k, 3) are those of all copies.
+        """
         if not stiffness:
             return [0.0, *3 * [self._ffi.NULL], 0, *3 * [self._ffi.NULL], 1]
         p, block_numbers = self._pointer, stiffness.where
@@ -368,6 +385,7 @@ class Pairs:
         outputs = p(point_counts), p(X), p(w), p(inward), p(shift)
         if self._lib.seen_of(struct, first, second, p(nodes), max_points, *outputs):
             return None
+        # C left the places and weights of padding as they were: the middle and zero
         longest = point_counts.max()
         return X[:, :longest], w[:, :longest], inward, shift
 
@@ -406,6 +424,8 @@ class Pairs:
 
         Parameters
         ----------
+        nodes
+            (cells, k, 3) nodes, corners first.
         has_rule
             (own cells, cells) 1 for the pairs that have a rule.
         least_distances
@@ -443,6 +463,8 @@ class Pairs:
         L: Array,
     ) -> None:
         """Add the translated moments M of acting boxes to the expansions L of receiving boxes.
+
+        An expansion gives the potential of distant charges in a box; see `multipole_expansion`.
 
         Parameters
         ----------

@@ -2,6 +2,14 @@
 
 The solver takes long to import, and a case that is only checked needs no more than the names: its
 imports are late.
+
+Observables are the columns and maps that one part of a case reads from a state: a displacement u
+with amplitudes mu, the load parameters by name. `columns` gives their names, `observe` their values
+at a state, `refuse_unfit` checks them against the mesh. A model view is a model with the units and
+the frame in which it is reported; `rotation(view.azimuth)` turns a vector of the model's frame,
+written as a row, into the frame of the case. An evaluation, `system.at_state(state)`, calls a
+function at that state (`evaluate`) or integrates a form there. Lengths are over R, fields over |Br|
+or, of a shell that is soft alone, over √(μ0 E).
 """
 
 from collections.abc import Sequence
@@ -63,6 +71,7 @@ class FieldObservables(Observables):
         """Return the magnetic moment at the end of a path, in the frame of the case; collective.
 
         It is in A m² with units, else over |Br| R³/μ0, or √(E/μ0) R³ of a shell that is soft alone.
+        The result is {"magnetic_moment": {"value", "unit"}}, or empty if nothing is magnetised.
         """
         from magshell_fenicsx.parts.magnetism.self_field import magnetic_moment, magnetisation_of
 
@@ -98,6 +107,7 @@ class SoftObservables(Observables):
 
         soft_magnet = loads.magnetic.soft if loads.magnetic else None
         if soft_magnet and soft_magnet.patches:
+            # called for its check alone
             by_patch(
                 soft_magnet.patches, surface.patches, len(surface.cells), "magnetic.susceptibility"
             )
@@ -114,12 +124,14 @@ class SoftObservables(Observables):
         if field is None or field.soft is None:
             return {}
         at_state, forms = view.model.system.at_state(state), view.model.observed
+        # integrals over the modelled part, divided by its volume
         J = np.array(
             [at_state.integral(forms[f"induced {axis}"]) for axis in "xyz"]
         ) / at_state.integral(forms["induced volume"])
         # on a meridian, components across e3 turn around it: their mean is zero
         if 1 not in view.model.axes:
             J[:2] = 0.0
+        # the mean over all copies of the modelled part
         if view.mirror:
             sign = field.sign_of_images(state.mu, view.model.r0, view.mirror)
             J = view.mirror.sum_over_images(J, sign) / view.mirror.copies
@@ -141,7 +153,7 @@ class SensorsObservables(Observables):
         """
         from scipy.spatial import cKDTree
 
-        # only mesh files: `sensors.depth` tests charts
+        # nodes in space: a mesh file; charts (n, 2) were tested by `sensors.depth`
         if not loads.sensors or surface.nodes.shape[1] < 3:
             return
         corners = surface.embedding(surface.nodes)[surface.cells[:, :3]]
@@ -174,7 +186,8 @@ class SensorsObservables(Observables):
         """Return a sensor's column with its derivatives; None for other columns. Collective.
 
         Derivatives by displacement and remanence are those of the shell's own field. Derivatives by
-        amplitudes, of the applied field, are differences of fourth order.
+        amplitudes of the applied field are central differences of fourth order: it is read too, or
+        induces a polarisation.
         """
         from magshell_fenicsx.continuation.system import State
         from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES
@@ -193,11 +206,13 @@ class SensorsObservables(Observables):
         if not matching:
             return None
         (sensor, i), self_field_of_model = matching[0], self_field(view)
+        # e_i of the case in the model's frame, times the unit: the column is direction . B
         direction = sensor.own * rotation(view.azimuth)[:, i]
         system = view.model.system
         at_state, nodes = system.at_state(state), view.model.r0.function_space.dofmap.list
 
         def nodal_derivatives() -> tuple[Array, Array]:
+            """Return derivatives by u, summed at nodes, and by the remanence in cells."""
             derivatives, by_u = (
                 self_field_of_model.derivatives(state.mu, sensor.place, direction),
                 np.zeros_like(system.u.x.array),
@@ -233,7 +248,10 @@ class SensorsObservables(Observables):
         return Slope(value, at_state.summed(by_u), by_mu, self_field_of_model.Br, by_remanence)
 
     def _readings(self, view: ModelView, state: "State", sensors: Sequence[Sensor]) -> Array:
-        """Return the readings (sensors, 3) in the frame of the case; collective."""
+        """Return the readings (sensors, 3) in the frame of the case; collective.
+
+        Only sensors of the total field read the applied one.
+        """
         places, reads_total = (
             np.array([sensor.place for sensor in sensors]),
             np.array([sensor.total for sensor in sensors]),
@@ -269,6 +287,7 @@ def field_at(
     from magshell_fenicsx.parts.magnetism.self_field import magnetisation_of, self_field
 
     def own_field_there() -> Array:
+        """Return the shell's own field at the places, times its unit; collective."""
         if magnetisation_of(view.loads) is None:
             return np.zeros_like(places)
         field_of_model = self_field(view)

@@ -1,4 +1,9 @@
-"""The remanence: the section `remanent` of a case, or of one of its shells."""
+"""The remanence: the section `remanent` of a case, or of one of its shells.
+
+A section is a part of a case file, checked by pydantic; validators raise ValueError. The remanence
+B^r is the flux density of the magnetised material without a field; its direction is by polar angle
+from e3 and azimuth around it. A pose is the place of one of several shells in the case.
+"""
 
 from typing import Annotated, Literal, Self
 
@@ -58,6 +63,7 @@ class RemanentSection(FileKeys, Direction):
     @model_validator(mode="after")
     def _keys_of_the_kind(self) -> Self:
         """Refuse keys that do not belong to the kind, or are missing for it, with a ValueError."""
+        # key -> the kind that needs it, and alone may have it
         belongs = {"components": "expression", "patches": "patches", "layers": "layers"}
         belongs |= {"file": "points", "filter": "points"}
         for key, kind in belongs.items():

@@ -3,7 +3,8 @@
 F = R U. With C = U^2 and the invariants i1, i2, i3 of U, the theorem of Cayley and Hamilton gives R
 = (i1 cof F + (i1^2 - i2) F - F C)/(i1 i2 - i3). The denominator is the product of the sums of two
 stretches, so that it is smooth at equal stretches too. Units and arguments are those of
-`body_densities`: X place, u displacement, H = du/dX, Br remanence, h thickness over R.
+`body_densities`: X place, u displacement, H = du/dX, Br remanence, h thickness over R. Densities
+are per undeformed volume; they are divided by h, as energies are over E h R². cof F = det(F) F^-T.
 """
 
 import ufl
@@ -42,6 +43,7 @@ def rotated(F: Expr, v: Expr) -> Expr:
 
     Cayley and Hamilton's theorem gives R without a decomposition; see the module.
     """
+    # invariants of C: I = F:F, II = cof F : cof F; i1, i2, i3 are those of U
     f1, f2, f3 = (F[:, i] for i in range(3))
     cofactor = ufl.as_tensor([ufl.cross(f2, f3), ufl.cross(f3, f1), ufl.cross(f1, f2)]).T
     first, second, i3 = (
@@ -51,6 +53,7 @@ def rotated(F: Expr, v: Expr) -> Expr:
     )
     i1 = _trace(first, second, i3)
     i2 = ufl.sqrt(second + 2 * i3 * i1)
+    # vectors only: F C v = F F^T F v
     Fv = ufl.dot(F, v)
     FCv = ufl.dot(F, ufl.dot(F.T, Fv))
     return (i1 * ufl.dot(cofactor, v) + (i1**2 - i2) * Fv - FCv) / (i1 * i2 - i3)
@@ -67,5 +70,6 @@ def _trace(first: Expr, second: Expr, i3: Expr) -> Expr:
     for _ in range(STEPS):
         i2 = ufl.sqrt(second + 2 * i3 * x)
         image = ufl.sqrt(first + 2 * i2)
+        # Newton's step to the fixed point; i3/(i2 image) is the map's slope
         x += (image - x) / (1 - i3 / (i2 * image))
     return x

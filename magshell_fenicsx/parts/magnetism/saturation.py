@@ -14,6 +14,12 @@ is stationary. With p = B_n², s = |B_t|² and kappa = chi k its derivatives are
 kappa)/2 and e_s = -kappa/2. So what is solved for stays out of compiled kernels: they take a
 polynomial of third order about the present p and s, whose derivatives are those of e itself, as
 many as tangents and their derivatives ask for.
+
+Symbols: L is Langevin's function, chi the initial susceptibility, J the saturation, x = 3 chi |b|/J
+its argument, k the ratio of the magnetisation to that of a linear material. B is the applied field,
+n the sheet's unit normal; indices n and t are components across and along the sheet. Fields and J
+have one unit, that of lambda_m. Above `SERIES_LIMIT` functions of y have closed forms, below they
+are series, as closed forms lose digits there.
 """
 
 from collections.abc import Callable, Sequence
@@ -28,7 +34,7 @@ from ufl.core.expr import Expr
 from magshell_fenicsx.assembly.memo import PointField, at_quadrature
 
 Array = NDArray[np.float64]
-# orders of derivatives by p and s
+# orders (i, j) of derivatives by p and s, up to the third: (0, 0), (1, 0), (0, 1), (2, 0), ...
 ORDERS = [(i, j) for total in range(4) for i in range(total, -1, -1) for j in [total - i]]
 SIZE = 2 + len(ORDERS)  # numbers of a polynomial: p and s, then its coefficients
 SERIES_LIMIT = 1.0  # y below which a series is summed; its terms are those of y/pi²
@@ -37,19 +43,24 @@ MAX_NEWTON_STEPS = 100  # limit of Newton's method, which takes some six
 
 
 def _series() -> Array:
-    """Return the coefficients of k(y) in powers of y, from its differential equation."""
-    a = [1.0]
+    """Return the coefficients of k(y) in powers of y, from its differential equation.
+
+    The power y^n of 2 y k' + 3 k + y k²/3 = 3 gives (2 n + 3) a_n = -(sum of a_i a_(n-1-i))/3.
+    """
+    a = [1.0]  # k(0) = 1
     for n in range(1, SERIES_TERMS):
         a.append(-sum(a[i] * a[n - 1 - i] for i in range(n)) / (3 * (2 * n + 3)))
     return np.array(a)
 
 
-RATIO = np.polynomial.Polynomial(_series())
+RATIO = np.polynomial.Polynomial(_series())  # k(y)
+# W(y), from (y W)' = k
 COENERGY = np.polynomial.Polynomial(_series() / np.arange(1, SERIES_TERMS + 1))
 
 
 def ratio(y: Array) -> Array:
     """Return k(y) = 3 L(x)/x, with Langevin's function L and y = x²; a series for small y."""
+    # both branches are computed everywhere; the limit keeps each of them finite
     y_above = np.maximum(y, SERIES_LIMIT)
     x = np.sqrt(y_above)
     return np.asarray(
@@ -82,6 +93,7 @@ def coenergy(y: Array) -> Array:
     """Return W(y) = 6 ln(sinh x/x)/x², y = x²; the coenergy is chi b² W/2."""
     y_above = np.maximum(y, SERIES_LIMIT)
     x = np.sqrt(y_above)
+    # ln(sinh x/x) without overflow
     log = x + np.log(-np.expm1(-2 * x) / (2 * x))
     return np.asarray(
         np.where(y < SERIES_LIMIT, COENERGY(np.minimum(y, SERIES_LIMIT)), 6 * log / y_above)
@@ -102,6 +114,7 @@ def normal_field(chi: Array, p: Array, s: Array, J: float) -> Array:
     J
         Saturation, in the unit of B.
     """
+    # y = scale |b|²
     scale, normal = (3 * chi / J) ** 2, np.sqrt(p)
     # bounds: k lies between 0 and 1
     lowest = normal / (1 + chi)
@@ -113,7 +126,7 @@ def normal_field(chi: Array, p: Array, s: Array, J: float) -> Array:
             1 + chi * (k + 2 * scale * b**2 * slopes_of_ratio(y, k)[0])
         )
         b = np.clip(b + newton_step, lowest, normal)
-        if np.all(np.abs(newton_step) <= 4e-16 * normal):
+        if np.all(np.abs(newton_step) <= 4e-16 * normal):  # to rounding
             break
     return np.asarray(b)
 
@@ -134,6 +147,7 @@ def expand_energy(chi: Array, p: Array, s: Array, J: float) -> Array:
     It is Taylor's polynomial of third order about p = B_n² and s = |B_t|², in the order of
     `ORDERS`; `energy` evaluates it. `chi` is the susceptibility, `J` the saturation.
     """
+    # indices s and p are derivatives by these, k1, k2, T1 and T2 those by y
     b, scale = normal_field(chi, p, s, J), (3 * chi / J) ** 2
     y = scale * (s + b**2)
     k = ratio(y)
@@ -166,6 +180,7 @@ def expand_energy(chi: Array, p: Array, s: Array, J: float) -> Array:
 
 def energy(P: Sequence[Expr], p: Expr, s: Expr) -> Expr:
     """Return the energy e(p, s) from the polynomial P (`SIZE`,); see `expand_energy`."""
+    # about the field of the last update; coefficients follow in the order of `ORDERS`
     dp, ds = p - P[0], s - P[1]
     return sum(P[2 + number] * dp**i * ds**j for number, (i, j) in enumerate(ORDERS))
 
@@ -173,7 +188,7 @@ def energy(P: Sequence[Expr], p: Expr, s: Expr) -> Expr:
 def induced(P: Sequence[Expr], B: Expr, normal: Expr, n: Expr) -> Expr:
     """Return mu0 M = -de/dB at the present field B, of which `normal` is the component along n.
 
-    P is the polynomial at this field.
+    P is the polynomial at this field, so that its first coefficients are the derivatives there.
     """
     by_normal, by_along = (P[2 + ORDERS.index(order)] for order in ((1, 0), (0, 1)))
     return -2 * (by_along * (B - normal * n) + by_normal * normal * n)
@@ -206,6 +221,7 @@ def point_field(
     """
 
     def values() -> Array:
+        """Return both polynomials (cells, points, 2 SIZE) for the present fields and normals."""
         chi_at_points = (
             at_quadrature(chi, field.points)[..., 0] if isinstance(chi, fem.Function) else chi.value
         )

@@ -1,8 +1,15 @@
 """The self-field of a model's shell: flux density, its derivatives, moment, and export to magpylib.
 
 The model's remanence and what a field induces become charges (`charges`), at the displacement that
-the model's system has. Fields are over the remanence's magnitude, lengths over R, in the frame of
-the model. Theory: docs/theory.md, the field of a magnetised shell.
+the model's system has. Fields are over the remanence's magnitude |Br|, lengths over R, in the frame
+of the model. Theory: docs/theory.md, the field of a magnetised shell.
+
+mu are the amplitudes (load parameters) of a state, by name. A remanence is convected if it moves
+with F: then its charges stay with the material. What else there is, a rotated remanence or an
+induced polarisation J, is taken back to the undeformed shell as F^-1 J. Families are the charged
+elements of one kind: all faces, or strips along all charged edges. Images are the modelled cells
+and their copies by mirrors and rotations, which together make the whole shell; a mirrored copy may
+have opposite charges. A jet is a field with its derivatives by reference coordinates.
 """
 
 from collections.abc import Mapping, Sequence
@@ -41,6 +48,7 @@ Array = NDArray[np.float64]
 JUMP_TOLERANCE = 1e-6  # jump of the remanence between two cells, over the largest remanence
 AXIS_TOLERANCE = 1e-9  # distance from the axis, over R
 DIFFERENCE_STEP = 1e-4  # step of central differences of fourth order
+# steps and weights of these differences
 DIFFERENCE_WEIGHTS = ((-2, 1 / 12), (-1, -2 / 3), (1, 2 / 3), (2, -1 / 12))
 
 
@@ -52,8 +60,8 @@ def magnetisation_of(loads: Loads) -> Magnetisation | None:
 class SelfField:
     """Field of a model's shell; solids have `self_field_of_solid.SelfFieldOfSolid`.
 
-    Fields are over |Br|. Amplitudes mu matter for induced magnetisation and mirror images.
-    Construction is collective.
+    Fields are over |Br|. Amplitudes mu matter for induced magnetisation and for the sign of mirror
+    images. Methods without "collective" take this rank's cells alone. Construction is collective.
 
     Parameters
     ----------
@@ -108,8 +116,9 @@ class SelfField:
     ) -> tuple[Any, list[ChargedElements]]:
         """Return the magnetised cells and their charges at the system's displacement.
 
-        The charges are families of charged elements: faces, then edges. With `include_uncharged`,
-        elements that another remanence may charge are there too.
+        The charges are families of charged elements: faces, then edges if there are any. With
+        `include_uncharged`, elements that another remanence may charge are there too, as
+        derivatives by the remanence need.
         """
         shape = self.shape(mu)
         cells, edges = self.chargeable if include_uncharged else self.edges
@@ -130,6 +139,7 @@ class SelfField:
         """
         total = np.zeros_like(places)
         for image in self._images:
+            # only reflections (determinant -1) may have opposite charges
             sign = self.sign_of_images(mu) if image.sign < 0 else 1.0
             # the field of an image is the image of the field where it came from
             original_places = image.apply_inverse(places)
@@ -154,7 +164,8 @@ class SelfField:
         `x` (3,) is a place over R and `e` (3,) a direction.
         """
         derivatives_of_families = list[NodalDerivatives]()
-        # uncharged elements have derivatives by the remanence, too
+        # uncharged elements have derivatives by the remanence, too. Derivatives by u are taken from
+        # the first run, those by the remanence from the last.
         for include_uncharged in (False, True) if self._is_convected else (True,):
             shape, families = self.families(mu, include_uncharged=include_uncharged)
             nodal_derivatives = NodalDerivatives(
@@ -162,6 +173,7 @@ class SelfField:
             )
             for image in self._images:
                 sign = self.sign_of_images(mu) if image.sign < 0 else 1.0
+                # place and direction are taken back to the modelled cells
                 gradient(families, image.apply_inverse(x), sign * image.Q.T @ e, nodal_derivatives)
             derivatives_of_families.append(nodal_derivatives)
         first, last = derivatives_of_families[0], derivatives_of_families[-1]
@@ -188,8 +200,8 @@ class SelfField:
     def shape(self, mu: Mapping[str, float]) -> Any:
         """Return the magnetised cells of this rank at the system's displacement.
 
-        Their remanence is what stays with the material: it stays constant, or is computed as F^-1
-        J.
+        Their remanence is the field that stays with the material: the remanence itself if it is
+        convected, else F^-1 J at the present displacement.
         """
         model, V = self._model, self._model.r0.function_space
         nodes, components = V.dofmap.list[: self._owned], V.dofmap.bs
@@ -213,7 +225,7 @@ class SelfField:
             remanence,
             model.material.h,
             thickness_factor,
-            swept=components == 2,
+            swept=components == 2,  # a meridian, with (U, W)
             incompressible=self._incompressible,
         )
 
@@ -245,6 +257,7 @@ class SelfField:
         jets = np.einsum("dmk,nki->dnmi", T, nodal)
         if self._dim > 1:
             return np.asarray(jets)
+        # e_rho, e_theta and e_z at the azimuth zero; d/dtheta of U e_rho + W e_z is U e_theta
         zero = np.zeros(jets.shape[1:3])
         components = [(f[..., 0], zero, f[..., 1]) for f in jets] + [(zero, jets[0][..., 0], zero)]
         return np.stack([np.stack(derivative, axis=-1) for derivative in components])
@@ -255,12 +268,14 @@ class SelfField:
         Charges of this field stay with the material. `r0` and `u` are jets of placement and
         displacement at the interpolation nodes; see `_jets`.
         """
+        # the frame takes second derivatives too, which are not used here: zeros stand for them
         frame, magnetisation = (
             TangentFrame.from_jet(np.concatenate([r0, 0 * r0])),
             self.magnetisation,
         )
         n = frame.normal(u)
         J, soft = np.zeros_like(n), magnetisation.soft
+        # a soft magnet alone has no remanence
         if not (soft and soft.alone):
             space_of_Br = self.Br.function_space
             tables = space_of_Br.element.basix_element.tabulate(0, self._interpolation.points)
@@ -273,6 +288,7 @@ class SelfField:
             )
         if soft:
             B = magnetisation.field_at(mu, r0[0] + u[0])
+            # scale²: from the unit mu0 E/|Br| of B to |Br|
             J = J + soft.scale**2 * soft.polarisation(r0[0], frame.n0, n, B)
         r1, r2 = r0[1] + u[1], r0[2] + u[2]
         area_vector = np.cross(r1, r2)
@@ -295,14 +311,15 @@ class SelfField:
     ) -> NodalDerivatives:
         """Return derivatives by displacement and remanence, from those by F^-1 J.
 
-        See `_material` for F^-1 J. The chain rule takes differences of fourth order by u; in the
-        remanence F^-1 J is linear.
+        See `_material` for F^-1 J. The chain rule takes central differences of fourth order by u.
+        F^-1 J is affine in the remanence, so that a step of one is exact.
         """
         V, model = self._model.r0.function_space, self._model
         nodes, components = V.dofmap.list[: self._owned], V.dofmap.bs
         r0, u = (
             self._jets(f.x.array.reshape(-1, components)[nodes]) for f in (model.r0, model.system.u)
         )
+        # by the value (d = 0) and the derivatives of u at interpolation nodes, component i
         by_jets = np.zeros_like(u)
         for d in range(len(u)):
             for i in range(3):
@@ -318,12 +335,14 @@ class SelfField:
                         )
                     )
         T = V.element.basix_element.tabulate(1, self._interpolation.points)[..., 0]
+        # on a meridian du/dtheta = U e_theta: its component adds to that of U; see `_jets`
         if self._dim == 1:
             by_meridian = by_jets[:2][..., [0, 2]]
             by_meridian[0][..., 0] += by_jets[2][..., 1]
             by_jets = by_meridian
         by_u = nodal_derivatives.by_u + np.einsum("dmk,dnmi->nki", T, by_jets)
         space_of_Br = self.Br.function_space
+        # tables of Br's shape functions, transposed below: from interpolation nodes to nodes of Br
         TB = space_of_Br.element.basix_element.tabulate(0, self._interpolation.points)[0, :, :, 0]
         Br, by_B = np.array(self.Br.x.array), np.zeros_like(self._nodal_remanence())
         for i in range(3):
@@ -345,8 +364,9 @@ class SelfField:
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
         """Return own cells and local edges that are charged, each (n,).
 
-        Edges at the boundary are charged, and edges across which the remanence jumps, or all with
-        `include_all`. Edges on a mirror plane or at a pole are not.
+        Edges at the boundary are charged, and edges across which the remanence jumps. With
+        `include_all`, or if the remanence is not convected, all edges are: a jump may come with the
+        state. Edges on a mirror plane or at a pole are not charged.
         """
         V = self._model.r0.function_space
         mesh = V.mesh
@@ -368,7 +388,7 @@ class SelfField:
             for local_edge, facet in enumerate(facets_of_cells[cell]):
                 if facet in mirrored_facets:
                     continue
-                if cells_of_facet[facet] == 1:
+                if cells_of_facet[facet] == 1:  # at the boundary
                     cells.append(cell)
                     edges.append(local_edge)
                     continue
@@ -391,12 +411,14 @@ class SelfField:
             "mk,nk->nm", T, self._model.r0.x.array.reshape(-1, 2)[V.dofmap.list][..., 0]
         )
         is_off_axis = np.abs(rho[charged_sides]) > AXIS_TOLERANCE
-        return charged_sides[0][is_off_axis], charged_sides[1][is_off_axis]
+        cells_of_sides, local_edges = charged_sides
+        return cells_of_sides[is_off_axis], local_edges[is_off_axis]
 
     def _remanence_at_edges(self, count: int, values: Array) -> Array:
         """Return the remanence in the middle of each local edge, (count, edges, 3).
 
-        `values` (cells, nodes, 3) are nodal; the first `count` cells are taken.
+        On a meridian, edges are ends of cells. `values` (cells, nodes, 3) are nodal; the first
+        `count` cells are taken.
         """
         middles = np.array([[0.0], [1.0]])
         if self._dim == 2:
@@ -411,6 +433,7 @@ class SelfField:
         collective.
         """
         sign = self._image_sign
+        # a field of amplitude zero induces nothing; an amplitude of one has the same symmetry
         if sign == 0.0 and self._sight.loads.magnetic and self._sight.mirror:
             amplitudes_shown = {**mu, "lambda_m": mu.get("lambda_m", 0.0) or 1.0}
             return self._sight.loads.magnetic.sign_of_images(
@@ -419,13 +442,14 @@ class SelfField:
         return sign
 
     def _parity(self) -> float:
-        """Return 1 if mirror images continue the remanence, -1 if their opposites do, else 0.
+        """Return 1 if mirror images continue the remanence, -1 if their opposites do; collective.
 
-        It is 1 without a mirror. Collective.
+        0 if no remanence decides it, 1 without a mirror.
         """
         if self._sight.mirror is None:
             return 1.0
         x, n = (at_nodes[: self._owned] for at_nodes in self._node_places())
+        # mean product of the remanence at each place with that of its mirror image, mirrored
         S, pattern = self._sight.mirror.reflection, self._pattern
         images = pattern(self._sight.mirror.image(x), n @ S) @ S
         return float(
@@ -470,8 +494,10 @@ def to_magpylib(view: ModelView, state: State, parts: int = 8) -> Any:
     ----------
     view
         The model and its frame.
+    state
+        Displacement and amplitudes.
     parts
-        Number of parts into which each side of a cell is divided.
+        Number of parts into which each side of a cell is divided, for flat triangles.
 
     Raises
     ------
@@ -486,9 +512,11 @@ def to_magpylib(view: ModelView, state: State, parts: int = 8) -> Any:
             "to_magpylib: of a shell with a remanence or a susceptibility, this has neither"
         )
     module, field_of_model, mirror = magpylib("to_magpylib"), self_field(view), view.mirror
+    # from the model's frame, which a mirror plane may have turned, to that of the case; R in metres
     Q, R = rotation(view.azimuth), magnetisation.metres or 1.0
 
     def charged_triangles() -> list[tuple[Array, Array]]:
+        """Return corners (n, 3, 3) and charges (n,) of this rank's triangles and their images."""
         _, families = field_of_model.families(state.mu)
         triangles_and_charges = [
             chunk

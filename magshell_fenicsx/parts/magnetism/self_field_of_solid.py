@@ -1,4 +1,12 @@
-"""The self-field of a magnetised solid, from the charges of its cells (`charges_of_solid`)."""
+"""The self-field of a magnetised solid, from the charges of its cells (`charges_of_solid`).
+
+A remanence is convected if it moves with F: then its charges stay with the material. A rotated
+remanence, or what a field induces, is taken back to the undeformed solid as F^-1 J, J the
+polarisation per undeformed volume. Families are the charged elements of one kind: faces of cells,
+then interiors, where the remanence varies. X is the undeformed place, u the displacement; a jet is
+a field with its derivatives by reference coordinates. mu are the amplitudes (load parameters) by
+name. Fields are over the remanence's magnitude |Br|, lengths over R.
+"""
 
 from collections.abc import Mapping, Sequence
 from functools import cached_property
@@ -48,7 +56,7 @@ class SelfFieldOfSolid(SelfField):
     def _interpolation_element(self) -> Any:
         """Return the element that interpolates a remanence that rotates or is induced.
 
-        Its degree is above that of the displacement.
+        Its degree is above the displacement's, since F^-1 J is no polynomial.
         """
         family, degree = (
             basix.ElementFamily.P,
@@ -67,6 +75,7 @@ class SelfFieldOfSolid(SelfField):
         elements that another remanence may charge are there.
         """
         shape = self.shape(mu)
+        # charges inside are -Div Br: only a remanence that varies has some
         cells = np.arange(self._owned) if include_uncharged else cells_with_varying_remanence(shape)
         inside = [CellInteriors(shape, cells)] if len(cells) else []
         return shape, [
@@ -114,6 +123,8 @@ class SelfFieldOfSolid(SelfField):
             Amplitudes of the applied field, which induces a part of J.
         """
         magnetisation = self.magnetisation
+        # derivatives of places and displacements by reference coordinates, as columns; layers of
+        # the solid are surfaces of the first two of these
         G, H = (np.moveaxis(jet[1:], 0, -1) for jet in (X, u))
         F, n0 = np.eye(3) + H @ np.linalg.inv(G), unit(np.cross(X[1], X[2]))
         J, soft = np.zeros_like(n0), magnetisation.soft
@@ -128,13 +139,15 @@ class SelfFieldOfSolid(SelfField):
             # F^-T n0: the deformed normal of layers
             n = unit(np.asarray(np.linalg.solve(np.swapaxes(F, -1, -2), n0[..., None]))[..., 0])
             B = magnetisation.field_at(mu, X[0] + u[0])
+            # scale²: from the unit mu0 E/|Br| of B to |Br|
             J = J + soft.scale**2 * soft.polarisation(X[0], n0, n, B)
         return F, J
 
     def _material(self, r0: Array, u: Array, mu: Mapping[str, float]) -> Array:
         """Return F^-1 J (cells, nodes, 3), the polarisation that stays with the material.
 
-        `r0` and `u` are jets at the interpolation nodes.
+        `r0` and `u` are jets (4, cells, nodes, 3) of undeformed places and displacements at the
+        interpolation nodes.
         """
         element = self.Br.function_space.element.basix_element
         T = element.tabulate(0, self._interpolation.points)[0, :, :, 0]
@@ -154,6 +167,7 @@ class SelfFieldOfSolid(SelfField):
             for f in (self._model.r0, self._model.system.u)
         )
         _, J = self._polarised(X, u, np.einsum("qk,cki->cqi", TB[0], self._nodal_remanence()), mu)
+        # undeformed volume of each point; the moment is the integral of J over it
         volume = np.abs(np.linalg.det(np.moveaxis(X[1:], 0, -1))) * weights
         return np.asarray(np.einsum("cq,cqi->i", volume, J))
 
@@ -164,8 +178,9 @@ class SelfFieldOfSolid(SelfField):
     def _charged_sides(self, *, include_all: bool = False) -> CellsAndFaces:
         """Return own cells and local faces that are charged, each (n,).
 
-        Faces on the surface are charged, and faces across which the remanence jumps, or all with
-        `include_all`. Faces on a mirror plane are not.
+        Faces on the surface are charged, and faces across which the remanence jumps. With
+        `include_all`, or if the remanence is not convected, all faces are: a jump may come with the
+        state. Faces on a mirror plane are not charged.
         """
         V = self._model.r0.function_space
         topology = V.mesh.topology
@@ -180,7 +195,11 @@ class SelfFieldOfSolid(SelfField):
         return cells, faces
 
     def _jumps(self, facets_of_cells: NDArray[np.int32]) -> NDArray[np.bool_]:
-        """Return a mask (cells, 6) of faces across which the remanence jumps."""
+        """Return a mask (cells, 6) of faces across which the remanence jumps.
+
+        `facets_of_cells` (cells, 6) are the mesh's numbers of the cells' faces, ghosts included.
+        Both cells of a face are compared at the five places of `FACE_SAMPLES`.
+        """
         space_of_Br, V = self.Br.function_space, self._model.r0.function_space
         nodal_remanence = self._nodal_remanence(len(facets_of_cells))
         coordinates = np.broadcast_to(FACE_SAMPLES, (6, *FACE_SAMPLES.shape))
@@ -196,6 +215,7 @@ class SelfFieldOfSolid(SelfField):
         order = np.argsort(facets_of_cells.ravel(), kind="stable")
         pairs = np.flatnonzero(np.diff(facets_of_cells.ravel()[order]) == 0)
         sides, sides_of_neighbours = order[pairs], order[pairs + 1]
+        # two cells have their samples of a common face in different orders
         distances = X[sides][:, :, None] - X[sides_of_neighbours][:, None]
         # sample places of both sides, matched by distance
         matching = np.linalg.norm(distances, axis=-1).argmin(axis=2)

@@ -1,4 +1,11 @@
-"""Sensors of the magnetic field: their section, places and units."""
+"""Sensors of the magnetic field: their section, places and units.
+
+A sensor reads the flux density at a fixed place outside the shell: of the shell alone ("own"), or
+with the applied one ("total"). A context holds the sections of a case. An offer is a property that
+a case may have or lack, such as "the whole shell"; `context.needs(key, offer)` refuses a case that
+lacks it. "Refuse" means: raise an error that names the key. lambda_m is the strength of the applied
+field, which has a unit only if the case has flux densities.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -76,6 +83,7 @@ def sensors(context: Context, turn: float) -> tuple[Sensor, ...]:
     `turn` is the azimuth of that frame about e3 in radians.
     """
     sections: dict[str, SensorSection] = context.sections.get("sensors") or {}
+    # of the shell's own field and of the applied one
     shell, field_units = context.shell, units(context)
     R, half = shell.reference, 0.5 / shell.R_over_h
     return tuple(
@@ -93,7 +101,8 @@ def sensors(context: Context, turn: float) -> tuple[Sensor, ...]:
 def units(context: Context) -> tuple[float, float]:
     """Return the flux densities of a remanence of length one and of lambda_m = 1.
 
-    They are in T, or over |Br| without flux densities; nan if unknown.
+    They are in T, or over |Br| without flux densities; nan if unknown. Without remanence, a shell
+    that is soft alone has √(μ0 E) in place of |Br|.
     """
     magnetic, E = context.section_of(MagneticSection), context.shell.youngs_modulus
     if magnetic is None:
@@ -101,6 +110,7 @@ def units(context: Context) -> tuple[float, float]:
     if magnetic.remanent is None:
         tesla = sqrt(MU_0 * E) if E and magnetic.lambda_m is None else 1.0
         return tesla, tesla
+    # the applied field's strength in T needs both Br and E
     Br = magnetic.remanent.flux_density
     return (Br, magnetic.tesla(E)) if Br and E else (Br or 1.0, nan)
 
@@ -182,7 +192,8 @@ def is_read(context: Context) -> bool:
 def depth(shell: "ShellSection | Surface", x: Array) -> float:
     """Return the distance over R of a place from the nearest face of an undeformed shell.
 
-    It is negative inside. `x` (3,) is over R.
+    It is negative inside. `x` (3,) is over R. A chart is a place on the surface, in the coordinates
+    of its outline.
     """
     from magshell_fenicsx.shape.outline import outline  # reads meshes
 
@@ -197,11 +208,12 @@ def depth(shell: "ShellSection | Surface", x: Array) -> float:
             x - foot,
             rcond=None,
         )[0]
+        # through space and back: charts beyond the edge return to it
         next_chart = np.asarray(
             outline_of_shell.inverse(outline_of_shell.embedding((chart + newton_step)[None])[0]),
             dtype=float,
         )
-        if not np.isfinite(next_chart).all():
+        if not np.isfinite(next_chart).all():  # the last chart is kept
             break
         chart = next_chart
     return float(np.linalg.norm(x - outline_of_shell.embedding(chart[None])[0])) - half

@@ -3,6 +3,15 @@
 The charges of one cell act on those of its neighbours, of the same part of a shell, at distances
 from zero on. As they stay with the material, energy, forces and stiffness are derivatives of one
 sum over pairs of points, whose rules (`duffy_rules`) are the same for all pairs of one kind.
+
+Elements are what has charges: the faces of a cell (both, with layers of charges between them), or
+the strip along one local edge, of the height of the thickness. Copies are the modelled cells and
+their images, which make the whole shell; cells of all copies are numbered copy by copy. The kind of
+a pair of elements tells which elements they are and where they touch: they are one and the same
+("self"), have a common side, corner or end of an edge, or touch elsewhere in their cells ("apart").
+`flip` says that a common side runs the other way in the second cell. A rule is a set of quadrature
+points and weights; it is shared if the second element has the same points for all points of the
+first one. Lengths are over R, charges over Br R², heights over the thickness.
 """
 
 from collections.abc import Iterator
@@ -52,7 +61,7 @@ FACE_NODES = basix.create_element(
     lagrange_variant=basix.LagrangeVariant.gl_isaac,
     discontinuous=True,
 )
-# kind of a pair of elements: the first one with its sides, the second, and where they touch
+# kind of a pair of elements, see `SingularPairs._kinds_of_pair`
 PairKind = tuple[Any, ...]
 
 
@@ -126,7 +135,7 @@ class SingularPairs:
     Attributes
     ----------
     neighbours
-        Of each cell: all cells with a common node, itself included.
+        For each cell of all copies, the cells with a common corner, itself included.
     """
 
     def __init__(
@@ -141,13 +150,14 @@ class SingularPairs:
         *,
         include_uncharged: bool = False,
     ) -> None:
-        """Find all singular pairs of cells and compute their charges."""
+        """Find all singular pairs of cells and compute the charges of each."""
         self._pairs, self._copies, self._include_uncharged = Pairs(comm), copies, include_uncharged
         self._shape, self._corners, self._own = shape, corners, own_cells
         strips = np.zeros((len(shape.r0), 3), dtype=bool)
         strips[cells, edges] = True
         self._strips = np.tile(strips, (len(copies.images), 1))
         side_lengths = [np.linalg.norm(shape.r0[:, i] - shape.r0[:, j], axis=-1) for i, j in ENDS]
+        # thickness over a typical side: on this scale rules are dense
         self._scale = float(shape.h / np.median(side_lengths))
         self._heights = heights(
             ShellFaces(shape, np.arange(1), include_uncharged=include_uncharged)
@@ -182,12 +192,14 @@ class SingularPairs:
         """
         energy = 0.0
         for batch in self._batches:
+            # each pair of a batch has a row of thickness and charges of its own
             rows = np.arange(len(batch.pairs))
             left, right = (batch.left, rows), (batch.right, rows)
             energy += self._pairs.add(
                 nodes, batch.pairs, batch.own, left, right, gradient, stiffness
             )
             self._pairs.finish(nodes, batch.pairs[:, 0], batch.left, gradient, stiffness)
+            # where the second element's points differ from point to point, `Pairs.add` has done it
             if batch.right.tables.ndim == 3:
                 self._pairs.finish(nodes, batch.pairs[:, 1], batch.right, gradient, stiffness)
         return energy
@@ -217,8 +229,14 @@ class SingularPairs:
     def _kinds_of_pair(self, c: int, d: int) -> Iterator[PairKind]:
         """Yield the kinds of all pairs of elements of two adjacent cells c and d.
 
-        Elements are the faces of a cell and the strips of its charged edges. A kind begins with
-        "faces", "strip" (of c, with the faces of d) or "strips"; it tells where the elements touch.
+        Elements are the faces of a cell and the strips of its charged edges. Kinds are tuples:
+
+        - ("faces", boundary sides of c, where they touch, and there: local side in c, in d and
+          `flip`, or the local corner of d);
+        - ("strip", edge of c, where it touches the faces of d, and there: local side in d and
+          `flip`, or the local corner of d);
+        - ("strips", edge of c, where they touch, edge of d, and there: `flip`, or the common end of
+          the edge of d and of c, 0 or 1).
         """
         own_corners, other_corners = (
             [int(corner) for corner in self._corners[cell]] for cell in (c, d)
@@ -232,6 +250,7 @@ class SingularPairs:
         if c == d:
             yield "faces", boundary_sides, "self"
         elif common_sides:
+            # two cells have at most one common side
             edge, (side_of_other, flip) = common_sides[0]
             yield "faces", boundary_sides, "side", edge, side_of_other, flip
         else:
@@ -273,7 +292,8 @@ class SingularPairs:
     def _charged_batches(self, kinds: dict[PairKind, list[tuple[int, int]]]) -> Iterator[Batch]:
         """Yield the batches of all kinds, without those whose elements have no charge.
 
-        `kinds` gives the pairs of cells of each kind.
+        `kinds` gives the pairs of cells of each kind. Pairs with a first cell of this rank come
+        first. Kinds are sorted by their text, so that sums have the same order in each run.
         """
         batches = []
         for kind, pairs in sorted(kinds.items(), key=lambda batch: str(batch[0])):
@@ -305,9 +325,10 @@ class SingularPairs:
         """
         first, second, is_shared = self._rules_of_pair(kind)
         on_strips = kind[0] == "strips"
+        # local edges of the strips, see `_kinds_of_pair`; None for faces
         left = self._points(pairs[:, 0], first, kind[1] if kind[0] != "faces" else None)
         right = self._points(pairs[:, 1], second, kind[3] if on_strips else None)
-        T, heights_of_points, t, q = right
+        T, heights_of_points, t, q = right  # shape functions, heights, thickness, charges
         # each point of the first element has points of its own on the second
         if not is_shared:
             points_of_first = len(first.weights)
@@ -329,7 +350,8 @@ class SingularPairs:
         """Return the points of both elements of a kind of pairs, and whether they are shared.
 
         If true, the second element has the same points for all points of the first one. Otherwise
-        it has others for each, one group after the other.
+        it has others for each, one group after the other. Indices of `kind` are as in
+        `_kinds_of_pair`.
         """
         s = self._scale
         if kind[0] == "faces":
@@ -341,6 +363,7 @@ class SingularPairs:
                 first.X if kind[2] == "self" else continued_across_side(first.X, kind[3:5], kind[5])
             )
             return first, self._padded([polar(point, s) for point in apex]), False
+        # a strip is the first element: t along it, eta across it
         t, eta, w = strip()
         first = Places.of_strip(kind[1], t, eta, w)
         if kind[0] == "strip":
@@ -348,6 +371,7 @@ class SingularPairs:
                 return first, Places(*at_corner(kind[3])), True
             if kind[2] == "apart":
                 return first, Places(*_quadrature(REGULAR_DEGREE)), True
+            # the pole of each polar rule is the strip's point on the common side
             foot = on_edge(kind[3], 1 - t if kind[4] else t)
             return first, self._padded([polar(point, STRIP_SCALE * s) for point in foot]), False
         if kind[2] in ("side", "end"):
@@ -369,7 +393,10 @@ class SingularPairs:
         return first, Places.of_strip(kind[3], t, eta, w), True
 
     def _padded(self, rules: list[tuple[Array, Array]]) -> Places:
-        """Return rules as one, each padded to the longest with points of weight zero."""
+        """Return rules as one, one after the other.
+
+        Each is padded to the length of the longest one with points of weight zero.
+        """
         count = max(len(w) for _, w in rules)
         X = [np.concatenate([X, np.repeat(X[:1], count - len(X), axis=0)]) for X, _ in rules]
         w = [np.concatenate([w, np.zeros(count - len(w))]) for _, w in rules]
@@ -380,8 +407,9 @@ class SingularPairs:
     ) -> tuple[Array, Array, Array, Array]:
         """Return shape functions, heights, thickness and charges at points of cells.
 
-        They are (n, 3, k), (n, layers), (cells, n) and (cells, n, layers). `edge` is the local edge
-        of strips, None for faces; charges are times the weights of the points.
+        They are (n, 3, k), (n, layers), (cells, n) and (cells, n, layers). `cells` are numbers
+        among all copies. `edge` is the local edge of strips, None for faces. Thickness is negative
+        where a copy's normal is turned over; charges are times the weights of the points.
         """
         shape, X = self._shape, points.X
         copy, cells = np.divmod(cells, len(shape.r0))
@@ -418,7 +446,8 @@ class SingularPairs:
         With `nodal_derivatives` the charges can add derivatives to them; see `PointCharges`.
         """
         X, cells = FACE_NODES.points, np.arange(len(self._shape.r0))
-        # coordinates of the square that is folded onto the triangle
+        # coordinates (a, b) of the square that is folded onto the triangle: X = (a, (1 - a) b). The
+        # weights are the inverse of its Jacobian: charges come per area of the triangle.
         ab, weights = np.column_stack([X[:, 0], X[:, 1] / (1 - X[:, 0])]), 1 / (1 - X[:, 0])
         cells_at_once = max(1, MAX_POINTS_AT_ONCE // len(X))
         for first in range(0, len(cells), cells_at_once):
@@ -465,14 +494,17 @@ class SingularPairs:
     ) -> None:
         """Add derivatives by nodal values to `nodal_derivatives`.
 
-        The number that is differentiated is `weights.energy` W + `weights.force` v . dW/du, see
-        `Weights`. Arguments are those of `InteractingCharges.field_derivatives`.
+        Nodal values are the displacement, the remanence and perhaps the thickness. The number
+        that is differentiated is `weights.energy` W + `weights.force` v . dW/du, with the energy W
+        and a change v of the nodes. `moved_nodes` (cells, k, 3) are the nodes of all copies, with v
+        times a small step as imaginary part.
         """
         on_faces, on_strips = (
             np.zeros_like(self._on_faces),
             [np.zeros_like(charges_of_edge) for charges_of_edge in self._on_strips],
         )
         for batch in self._batches:
+            # pairs whose first cell is on this rank
             pairs = batch.pairs[: batch.own]
             rows = np.arange(len(pairs))
             sides = zip((0, 1), (batch.charges_of_left, batch.charges_of_right), strict=True)
@@ -481,6 +513,7 @@ class SingularPairs:
             )
             if nodal_derivatives.by_thickness is not None:
                 self._by_heights(batch, pairs, moved_nodes, weights, nodal_derivatives)
+            # derivatives by charges of both elements, brought to the nodes of their charges
             for side, (points, edge, factor) in sides:
                 copy, cells = np.divmod(pairs[:, side], len(self._shape.r0))
                 by_charges = by_charges_of_both[side][: len(pairs)].reshape(
@@ -518,7 +551,8 @@ class SingularPairs:
     ) -> None:
         """Add the derivatives by the thickness, which moves charges off the mid-surface.
 
-        `pairs` are those of the batch whose first cell is on this rank.
+        `pairs` are those of the batch whose first cell is on this rank. Other arguments are those
+        of `field_derivatives`.
         """
         rows, points_of_both = np.arange(len(pairs)), (batch.left, batch.right)
         by_heights = pair_derivatives(
@@ -549,8 +583,12 @@ def _basis(points: Places) -> Array:
 
 def _lagrange(n: int, x: Array) -> Array:
     """Return values (m, n) at places x (m,) of the Lagrange basis of n Gauss points on [0, 1]."""
-    V = np.polynomial.legendre.legvander
-    return np.asarray(np.linalg.solve(V(2 * gauss(n)[0] - 1, n - 1).T, V(2 * x - 1, n - 1).T).T)
+    # both points and places in Legendre polynomials, on [-1, 1]
+    legendre = np.polynomial.legendre.legvander
+    points, _ = gauss(n)
+    return np.asarray(
+        np.linalg.solve(legendre(2 * points - 1, n - 1).T, legendre(2 * x - 1, n - 1).T).T
+    )
 
 
 def _quadrature(degree: int) -> tuple[Array, Array]:

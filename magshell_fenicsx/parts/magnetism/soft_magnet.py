@@ -7,6 +7,13 @@ with s = sqrt(mu0 E)/|Br|. A shell without remanence has sqrt(mu0 E) in place of
 other places of the shell is left out.
 
 With a saturation J the material follows Langevin's law: `saturation.py`.
+
+B_t and B_n are the parts of the applied field B along and across the sheet, n is the present unit
+normal, n0 the undeformed one. A solid is taken as a stack of sheets. chi is the susceptibility mu_r
+- 1. The material's data, `law` in the densities, are chi or, with a saturation, the coefficients of
+two polynomials of the energy in the field: at the displacement u and at u = 0. A field is uniform,
+linear in space (with a gradient), or "known by its values": then a Taylor polynomial at each
+quadrature point takes its place. An amplitude is a factor of a uniform part of the field.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -136,7 +143,8 @@ class Sheet:
     def fields(self, x0: Expr, u: Expr, given: Sequence[Expr]) -> tuple[Expr, Expr]:
         """Return the applied field at the displacement u and at u = 0, as vectors of UFL.
 
-        `given` are the amplitudes, then the field's vectors or its polynomial.
+        `given` are the amplitudes, then the field's vectors or its polynomial. `x0` and `u` are
+        undeformed place and displacement, over R.
         """
         count = len(self.amplitudes)
         amplitudes, vectors = given[:count], given[count:]
@@ -149,6 +157,7 @@ class Sheet:
         )
         if self.field.gradient is None:
             return B, B
+        # the gradient, last among the vectors, has the amplitude lambda_m
         G = amplitudes[0] * vectors[-1]
         return B + ufl.dot(G, x0 + u), B + ufl.dot(G, x0)
 
@@ -181,6 +190,7 @@ class Sheet:
         assert self.saturation is not None
 
         def fields_and_normals() -> list[tuple[Array, Array]]:
+            """Return field and normal at u, then at u = 0."""
             x0, u, n, n0 = places_and_normals()
             values = applied.polynomial.values if applied else None
             return list(
@@ -188,6 +198,7 @@ class Sheet:
             )
 
         def inputs() -> tuple[Any, ...]:
+            """Return all values on which the polynomials depend."""
             renewed = [applied.polynomial.renew()] if applied else []
             return *(f.x.array for f in followed), *(a.value for a in amplitudes), *renewed
 
@@ -224,7 +235,7 @@ class Sheet:
         return [B + x @ G.T for x in (x0 + u, x0)]
 
     def energy_per_area(self, r0: Jet, u: Jet, law: Expr, s: Expr, *given: Expr) -> Expr:
-        """Return the energy over E h per area of a shell, less its value at u = 0 in this field.
+        """Return the energy over E h per area of a shell, less that at u = 0 in the same field.
 
         `law` is the susceptibility or, of a saturating material, its polynomials at u and at u = 0.
         `s` is the scale and `given` the field, as in `fields`.
@@ -241,7 +252,8 @@ class Sheet:
         The arguments are those of `energy_per_area`.
         """
         B, _ = self.fields(r0.r, u.r, given)
-        return ufl.dot(e, self.polarisation(self._halves(law)[0], B, kin.normal(r0 + u)))
+        present, _ = self._halves(law)
+        return ufl.dot(e, self.polarisation(present, B, kin.normal(r0 + u)))
 
     def energy_in_solid(
         self, X: Expr, u: Expr, H: Expr, law: Expr, s: Expr, n0: Expr, h: Expr, *given: Expr
@@ -269,7 +281,8 @@ class Sheet:
         The arguments are those of `energy_in_solid`.
         """
         B, _ = self.fields(X, u, given)
-        return ufl.dot(e, self.polarisation(self._halves(law)[0], B, deformed_normal(H, n0)))
+        present, _ = self._halves(law)
+        return ufl.dot(e, self.polarisation(present, B, deformed_normal(H, n0)))
 
     def polarisation(self, law: Any, B: Expr, n: Expr) -> Expr:
         """Return mu0 M; of a linear material it is chi (B_t + B_n n/(1 + chi))."""

@@ -1,4 +1,12 @@
-"""A source of the applied field as a load: its place, its angle or its strength changes."""
+"""A source of the applied field as a load: its place, its angle or its strength changes.
+
+A step is an entry of the programme, the list of loads that are applied one after the other. Its
+amplitude is its load parameter, here the factor of the motion or of the change of strength; the
+conjugate, -dPi/dmu, is the quantity on which it does work. `loads.magnetic.driven` are the fields
+of sources that amplitudes drive: `motions` (translations and rotations) and `factors` (amplitude ->
+change of the field's factor). `turns` are rotations of the whole field, which belong to another
+kind of step. Pi is in E h R², lengths are over R.
+"""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any, ClassVar, Literal, Self
@@ -63,6 +71,7 @@ class SourceStep(LoadStep):
 
         Pydantic calls it after the fields are read; it raises a ValueError.
         """
+        # keys that are given
         changes = [
             key for key in ("move", "to", "turn", "strength") if getattr(self, key) is not None
         ]
@@ -82,7 +91,7 @@ class SourceStep(LoadStep):
 
     @property
     def place(self) -> Any:
-        """What distinguishes two steps of kind source: the source and its change."""
+        """What tells one step of kind source from another: the source and its change."""
         return self.source, self.move, self.to, self.turn, self.strength
 
     @property
@@ -118,14 +127,8 @@ class SourceStep(LoadStep):
             raise ValueError(
                 f"{key}.kind: source needs the field of its source: a step of kind: field before it"
             )
-        loads = (
-            step_of_other for step_of_other in context.steps if step_of_other.name != step.name
-        )
-        other_loads = [
-            step_of_other.load
-            for step_of_other in loads
-            if isinstance(step_of_other.load, SourceStep)
-        ]
+        other_steps = (other for other in context.steps if other.name != step.name)
+        other_loads = [other.load for other in other_steps if isinstance(other.load, SourceStep)]
         loads_of_same_source = (
             load for load in other_loads if load.number(sources) == self.number(sources)
         )
@@ -136,10 +139,11 @@ class SourceStep(LoadStep):
 def source_columns(loads: "Loads") -> dict[str, str]:
     """Return amplitude of a source -> column of its conjugate.
 
-    The conjugate is a force, a torque or a work. Where several have one kind, the name of the
-    amplitude is appended to the column.
+    The conjugate is a force, a torque or a work: "source_force", "source_torque" or "source_work".
+    Where several amplitudes have one kind, their names are appended to the columns.
     """
     kinds_of: dict[str, str] = {}
+    # rotations of the whole field move every source, but are no step of kind source
     turns = [motion.name for motion in loads.magnetic.turns] if loads.magnetic else []
     for field in loads.magnetic.driven if loads.magnetic else ():
         own_motions = [motion for motion in field.motions if motion.name not in turns]
@@ -226,6 +230,7 @@ class SourcesObservables(Observables):
         from magshell_fenicsx.models.shell.spatial_fields import by_patch
 
         if loads.magnetic and loads.magnetic.patches:
+            # called for its check alone
             by_patch(loads.magnetic.patches, surface.patches, len(surface.cells))
 
     def amplitudes(self, loads: "Loads") -> tuple[str, ...]:
@@ -235,7 +240,10 @@ class SourcesObservables(Observables):
         return source_columns(loads)
 
     def motions(self, loads: "Loads") -> dict[str, tuple[bool, float]]:
-        """Return motion of a source -> whether it turns, and its way at one (over R, or rad)."""
+        """Return amplitude of a motion -> whether it turns, and its way at an amplitude of one.
+
+        The way is over R or in radians.
+        """
         motions = [
             motion
             for field in (loads.magnetic.driven if loads.magnetic else ())
@@ -256,10 +264,18 @@ class SourcesObservables(Observables):
         return values_by_column
 
     def conjugate_unit(self, view: ModelView, name: str) -> float | None:
-        """Return -dPi/dmu of one unit of a source's conjugate; None for other amplitudes."""
+        """Return -dPi/dmu, in E h R², at which a source's conjugate is one unit.
+
+        None for other amplitudes. See `_unit`.
+        """
         return self._unit(view, name) if name in self.amplitudes(view.loads) else None
 
     def _unit(self, view: ModelView, name: str) -> float:
-        """Return -dPi/dmu of one unit (N, N m or J) of the conjugate of `name`, in E h R²."""
+        """Return -dPi/dmu, in E h R², at which the conjugate of `name` is 1 N, 1 N m or 1 J.
+
+        -dPi/dmu is the conjugate times the source's change at an amplitude of one. The model has
+        one of `multiplicity` equal parts of the shell.
+        """
+        # a force needs a length to be an energy, a torque or a work does not
         arm = 1.0 if source_columns(view.loads)[name].startswith("source_force") else view.length
         return source_size(view.loads, name) / (view.force * arm * view.model.multiplicity)

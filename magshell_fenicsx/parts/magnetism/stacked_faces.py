@@ -15,6 +15,13 @@ The face of the first cell that is near the other has its charges in three layer
 which they are extrapolated: the sum of such charges is that of the face up to its third moment. So
 nothing is singular where faces touch or press on each other, and energy, forces and tangent are one
 smooth sum down to a penetration of `LAYER_DEPTH`.
+
+Copies are the modelled cells and their images, which make the whole shell; cells of all copies are
+numbered copy by copy. Own cells are those of this rank. A part is a set of connected cells. The
+kind of a first cell tells which of its sides are at free edges. S layers of charges, faces first,
+go through the thickness; heights are over the thickness, other lengths over R. Inward is the
+direction away from the other cell. "Visible points" are the rule on the second cell as seen from a
+point of the first.
 """
 
 from functools import cached_property
@@ -59,6 +66,7 @@ CHARGE_ELEMENT = basix.create_element(
     basix.LagrangeVariant.gl_isaac,
     discontinuous=True,
 )
+# twelve places on the sides of the reference triangle
 BORDER = np.concatenate(
     [CORNERS[i] + np.arange(4)[:, None] / 4 * (CORNERS[j] - CORNERS[i]) for i, j in ENDS]
 )
@@ -88,10 +96,12 @@ def corner_distances(x: Array, corners: Array) -> tuple[Array, Array]:
     normal_distance
         Its part across the triangle's plane, at the nearest place.
     """
+    # sides begin at the corners, in turn
     sides = corners[:, [1, 2, 0]] - corners
     normal = unit(np.asarray(np.cross(sides[:, 0], sides[:, 1]), dtype=np.float64))
     separations = x[:, :, None] - corners[:, None]
     normal_distance = np.einsum("nmi,ni->nm", separations[:, :, 0], normal)
+    # positive on the inner side of each side
     side_heights = np.einsum("nmki,nki->nmk", separations, np.cross(normal[:, None], sides))
     square = np.sum(sides * sides, axis=-1)
     t = np.clip(np.einsum("nmki,nki->nmk", separations, sides) / square[:, None], 0.0, 1.0)
@@ -109,12 +119,14 @@ def graded_at(free_sides: FreeSides, s: float) -> tuple[Array, Array]:
     """Return a rule of the reference triangle with rows of points along its free sides.
 
     Rows are dense there on the scale s, over the side of a cell. Points are (n, 2), weights (n,).
+    The triangle is divided into one triangle for each free side, with a common tip.
     """
     sides = [side for side, is_free in zip(ENDS, free_sides, strict=True) if is_free]
     if not sides:
         X, w = basix.make_quadrature(basix.CellType.triangle, DEGREE)
         return np.array(X), np.array(w)
-    apex = CORNERS.mean(axis=0)  # tip of the triangle on each free side
+    apex = CORNERS.mean(axis=0)  # the tip
+    # with one free side the opposite corner, with two the middle of the third side
     if len(sides) == 1:
         (apex,) = (CORNERS[i] for i in range(3) if i not in sides[0])
     elif len(sides) == 2:
@@ -139,7 +151,9 @@ def find_free_sides(corners: Array, parts: Ints) -> list[FreeSides]:
     from scipy.spatial import cKDTree  # takes long to import
 
     middles = np.stack([corners[:, [i, j]].mean(axis=1) for i, j in ENDS], axis=1).reshape(-1, 3)
-    neighbours = cKDTree(middles).query(middles, 2, distance_upper_bound=SIDE_TOLERANCE)[1][:, 1]
+    # the nearest middle but the side's own; without any, the number of sides, whose part is -1
+    _, nearest_two = cKDTree(middles).query(middles, 2, distance_upper_bound=SIDE_TOLERANCE)
+    neighbours = nearest_two[:, 1]
     part_of_side = np.append(np.repeat(parts, 3), -1)
     is_free = (part_of_side[neighbours] != part_of_side[:-1]).reshape(-1, 3)
     return [(bool(first), bool(second), bool(third)) for first, second, third in is_free]
@@ -186,7 +200,9 @@ class StackedFaces:
     ) -> NDArray[np.bool_]:
         """Return a mask (own cells, cells) of pairs with stacked faces, among those of `has_rule`.
 
-        `nodes` (cells, k, 3) are present places over R of all copies.
+        Faces are stacked if cells are nearly parallel, nearer than `STACKED_DISTANCE` of their size
+        and above each other, not in one plane. `has_rule` (own cells, cells) is 1 for the pairs
+        that count. `nodes` (cells, k, 3) are present places over R of all copies.
         """
         is_stacked, h = np.zeros(has_rule.shape, dtype=bool), self._shape.h
         middle = nodes.mean(axis=1)
@@ -199,6 +215,7 @@ class StackedFaces:
         first, second = np.nonzero(has_rule)
         first_cell = first + own_cells.start
         pair_size = 2 * np.maximum(radius[first_cell], radius[second])
+        # a lower bound of the distance, to leave out most pairs
         ball_distance = (
             np.linalg.norm(middle[first_cell] - middle[second], axis=-1)
             - radius[first_cell]
@@ -218,6 +235,7 @@ class StackedFaces:
             corner_distances(border[a], nodes[b, :3])
             for a, b in ((first_cell, second), (second, first_cell))
         )
+        # from the borders of one cell or of the other, whichever is nearer
         distance, height = np.where(from_second[0] < from_first[0], from_second, from_first)
         is_stacked[first, second] = (distance - h < STACKED_DISTANCE * pair_size) & (
             height > OVERLAP_DISTANCE * h
@@ -234,7 +252,8 @@ class StackedFaces:
     ) -> float:
         """Return the energy of stacked pairs with own cells, and add derivatives.
 
-        Of a pair with one own cell it is half the energy. It is nan if two cells overlap.
+        Of a pair with one own cell it is half the energy, since two ranks count the pair. It is nan
+        if two cells overlap.
         Derivatives are added to `gradient` (cells, k, 3) and `stiffness`.
         """
         pairs, is_own_pair = self._ordered(own_cells, is_stacked)
@@ -259,8 +278,10 @@ class StackedFaces:
     ) -> None:
         """Add derivatives by nodal values of own cells to `nodal_derivatives`.
 
-        The number that is differentiated is `weights.energy` W + `weights.force` v . dW/du, see
-        `Weights`. Arguments are those of `InteractingCharges.field_derivatives` and of `add`.
+        The number that is differentiated is `weights.energy` W + `weights.force` v . dW/du, with
+        the energy W and a change v of the nodes. `nodes` (cells, k, 3) are present places of all
+        copies, `moved_nodes` the same with v times a small step as imaginary part. `is_stacked` is
+        that of `find_stacked`.
         """
         on_charges, first_row, basis = (
             np.zeros_like(self._nodal_charges),
@@ -276,9 +297,9 @@ class StackedFaces:
                 second_cell,
                 MAX_VISIBLE_POINTS,
             )
-            if rule is None:
+            if rule is None:  # overlapping cells have no energy
                 continue
-            X, w, *layer_shifts = rule
+            X, w, *layer_shifts = rule  # places, weights, inward and shift
             places, rule_sizes = (first_points, X.reshape(-1, 2)), (len(first_points), w.shape[1])
             (t, q), (t_of_second, q_of_second) = (
                 self._thickness_and_charges(cell, points)
@@ -312,6 +333,7 @@ class StackedFaces:
                 if cell not in own_cells:
                     continue
                 copy, modelled_cell = divmod(cell, len(self._shape.r0))
+                # side 0, the first cell: from charges of its layers back to those of its faces
                 by_nodal_charges, heights_of_side = (
                     by_charges[side].reshape(len(points), -1),
                     self._heights if side else heights_of_layers,
@@ -364,6 +386,7 @@ class StackedFaces:
         heights_of_layers
             (n, L) the part of the heights that grows with the thickness.
         """
+        # two layers more than the cell has: the near face's charges take its place and these
         S, n = len(self._heights), np.arange(len(t))
         # number of the face that is near the other cell: 0 outer, 1 inner
         near_face = np.where(inward * t < 0, 0, 1)
@@ -374,6 +397,7 @@ class StackedFaces:
             np.zeros((len(t), S + 2)),
         )
         for j in range(3):
+            # the first in place of the near face itself, two more after all others
             layer = np.full_like(near_face, S - 1 + j) if j else near_face
             layer_factors[n, layer, near_face], heights_of_layers[n, layer] = (
                 EXTRAPOLATION_WEIGHTS[j],
@@ -390,6 +414,7 @@ class StackedFaces:
         self, own_cells: range, is_stacked: NDArray[np.bool_]
     ) -> tuple[Ints, NDArray[np.bool_]]:
         """Return the stacked pairs (n, 2), each once, and a mask of pairs of own cells only."""
+        # rows of `is_stacked` are own cells: pairs of two own cells are there in both orders
         first, second = np.nonzero(is_stacked)
         first = first + own_cells.start
         is_own_pair = (second >= own_cells.start) & (second < own_cells.stop)
@@ -415,6 +440,7 @@ class StackedFaces:
     @cached_property
     def _rules_of_kinds(self) -> list[tuple[Array, Array]]:
         """Points (n, 2) and weights (n,) on the first cell, for each kind of free sides."""
+        # the scale of rows is over a typical side of a cell
         side_lengths = [
             np.linalg.norm(self._shape.r0[:, i] - self._shape.r0[:, j], axis=-1) for i, j in ENDS
         ]
@@ -425,7 +451,7 @@ class StackedFaces:
 
     @cached_property
     def _structs(self) -> list[object]:
-        """Structs `Cells` in C, for each kind of first cells."""
+        """Structs `Cells` in C, for each kind of first cells: they differ in the rule alone."""
         rules = [np.column_stack(gauss(n)).ravel() for n in range(1, MAX_GAUSS_POINTS + 1)]
         shared_arrays = {
             "shape": coefficients_of_nodes(self._shape.element),

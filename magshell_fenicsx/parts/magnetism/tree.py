@@ -1,4 +1,12 @@
-"""An octree of cells: which boxes act on each other by multipoles, and which cells directly."""
+"""An octree of cells: which boxes act on each other by multipoles, and which cells directly.
+
+Boxes of level k are cubes of a grid of 2^k places along each axis; level 0 is the root, the last
+level the finest. A box holds the cells whose middles are in it, of one part and one group. A part
+is a set of connected cells; a group holds copies (the modelled cells and their images) whose boxes
+are images of each other. An offset is the vector between the grid
+places of two boxes; pairs with one offset share a translation matrix G. A box's key is (part,
+group, place in the grid). Own cells are those of this rank. Lengths are over R.
+"""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -29,7 +37,7 @@ class Level:
     keys
         (boxes, 5) the part, the group, and the place in the grid.
     middle
-        (boxes, 3) centres.
+        (boxes, 3) centres over R.
     of_cell
         (cells,) the box of each cell.
     parent
@@ -99,6 +107,7 @@ class Octree:
             np.column_stack([parts, groups]),
         )
         lowest, highest = places.min(axis=0), places.max(axis=0)
+        # all cells at one place would have a box without size
         self._size = float((highest - lowest).max()) * ROOT_BOX_FACTOR or 1.0
         self._origin = (
             lowest + highest - self._size
@@ -156,13 +165,15 @@ class Octree:
             )
         offsets: dict[tuple[int, ...], int] = {}
         for k, (boxes, of_cell, middle, width) in enumerate(boxes_of_levels):
+            # pairs of other ranks are left to them
             has_own_cells = np.zeros(len(boxes), dtype=bool)
             has_own_cells[of_cell[self._own_cells.start : self._own_cells.stop]] = True
+            # radius of a ball about the box's middle that contains all of its charges
             radius = np.zeros(len(boxes))
             np.maximum.at(
                 radius, of_cell, np.linalg.norm(places - middle[of_cell], axis=-1) + radii
             )
-            if boxes_before is None:
+            if boxes_before is None:  # the root: all pairs of boxes, of different parts or groups
                 parent = np.zeros(0, dtype=np.int64)
                 pairs = np.stack(
                     np.meshgrid(*2 * [np.arange(len(boxes))], indexing="ij"), axis=-1
@@ -184,6 +195,7 @@ class Octree:
             offset_numbers = np.array(
                 [offsets.setdefault(offset, len(offsets)) for offset in vectors], dtype=np.int64
             )
+            # by offset: C then reads each translation matrix once
             order = np.argsort(offset_numbers, kind="stable")
             levels.append(
                 Level(
@@ -198,6 +210,7 @@ class Octree:
                 )
             )
             boxes_before = boxes
+        # pairs of boxes that remain at the finest level
         of_cell, count = boxes_of_levels[-1][1], len(boxes_of_levels[-1][0])
         acts_directly = np.zeros((count, count), dtype=bool)
         acts_directly[pairs[:, 0], pairs[:, 1]] = True
@@ -214,12 +227,13 @@ class Octree:
         return np.column_stack([self._kinds, grid_places])
 
     def _translation_matrices(self, offsets: list[tuple[int, ...]]) -> Array:
-        """Return the entries of translation matrices for offsets between boxes; see `Tree.G`.
+        """Return the entries of translation matrices that are not zero, one row for each offset.
 
-        Matrices are kept for later trees.
+        Boxes have the width one; see `Tree.G`. Matrices are kept for later trees.
         """
         new_offsets = [offset for offset in offsets if offset not in self._translations]
         if new_offsets:
+            # each row of a matrix begins with its entries that are not zero
             is_nonzero = np.arange(COUNT) < ends()[:, None]
             self._translations.update(
                 zip(
@@ -238,8 +252,10 @@ class Octree:
 def _children(pairs: Ints, parent: Ints, parents: int) -> Ints:
     """Return all pairs of children (m, 2) of pairs (n, 2) of boxes.
 
-    `parent` (children,) is the parent of each box, `parents` the number of parents.
+    `parent` (children,) is the parent of each box, `parents` the number of parents. A pair of
+    parents with a and b children has a b pairs of children.
     """
+    # children sorted by parent, so that each parent has one slice
     order, child_counts = np.argsort(parent, kind="stable"), np.bincount(parent, minlength=parents)
     first_of_parent = np.concatenate([[0], np.cumsum(child_counts)])
     child_counts_of_pairs = child_counts[pairs]
@@ -249,6 +265,7 @@ def _children(pairs: Ints, parent: Ints, parents: int) -> Ints:
     number_in_pair = np.arange(len(parent_pair)) - np.repeat(
         np.cumsum(children_of_pair) - children_of_pair, children_of_pair
     )
+    # the second child runs fastest
     first_child, second_child = (
         number_in_pair // child_counts_of_pairs[parent_pair, 1],
         number_in_pair % child_counts_of_pairs[parent_pair, 1],

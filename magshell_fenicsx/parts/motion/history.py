@@ -1,5 +1,12 @@
 """A load as a function of time: ramp, step, triangle, sine, a table, or a formula; and the
 viscosity of a shell.
+
+A history is a load's values over the time of a step, in one of several forms of the case file. A
+level is such a value; like a time it may be text with a unit, whose meaning depends on the load. A
+`Curve` is a history as a function (t, before) -> value: t is the time since the step began, and at
+a jump `before` chooses the value before it. An ability is what a section adds to a problem; an
+offer is a property of the case that it may take away from others, such as a material without
+viscosity.
 """
 
 import re
@@ -32,7 +39,7 @@ def measured(unit: str) -> Any:
     """
 
     def check(value: float | str) -> float | str:
-        in_units(unit)(value)
+        in_units(unit)(value)  # which refuses text without this unit
         return value
 
     return Annotated[
@@ -91,6 +98,7 @@ class WaveHistory(Section):
 def _formula(text: str) -> str:
     """Return a formula of the time t; other text is refused with a ValueError."""
     try:
+        # formulas know x, y, z as variables: t is written as x, and these are refused
         if re.search(r"\b[xyz]\b", text):
             raise ValueError(text)
         formula(re.sub(r"\bt\b", "x", text))
@@ -115,7 +123,7 @@ History: TypeAlias = Annotated[
 def _tag(data: Any) -> str | None:
     """Return the tag of a history's type for pydantic: of text, a list, or a section by its kind.
 
-    None: it is none of these.
+    It is None if the data are none of these. Data are as in the case file, or a section already.
     """
     if isinstance(data, str | list):
         return "formula" if isinstance(data, str) else "table"
@@ -138,6 +146,7 @@ def curve(history: History, time: Value, level: Value, start: float) -> Curve:
         The value before the history began.
     """
     if isinstance(history, str):
+        # formulas are of arrays of places x, y, z: t stands in place of x
         function = formula(re.sub(r"\bt\b", "x", history))
         return lambda t, before: float(function(*np.array([t, 0.0, 0.0]).reshape(3, 1))[0])
     if isinstance(history, RampHistory):
@@ -170,6 +179,7 @@ def _interpolation(times: Sequence[float], values: Sequence[float]) -> Curve:
     """
 
     def interpolated(t: float, before: bool) -> float:
+        # the row after t; at a jump with `before` the first of its two rows
         row = int(np.searchsorted(times, t, side="left" if before else "right"))
         if row in (0, len(times)):
             return values[min(row, len(values) - 1)]
@@ -193,7 +203,7 @@ def marks(history: History, time: Value, end: float) -> list[float]:
     elif isinstance(history, StepHistory):
         times = [time(history.at)]
     elif isinstance(history, WaveHistory) and history.kind == "triangle":
-        quarter = time(history.period) / 4
+        quarter = time(history.period) / 4  # corners are at odd quarters
         times = [quarter * i for i in range(1, int(end / quarter) + 1, 2)]
     elif isinstance(history, list):
         times = [time(t) for t, _ in history]
@@ -272,6 +282,7 @@ class ViscousMaterial(Ability):
         }
         if self.viscosity is not None:
             times = {"viscosity": self.viscosity, **times}
+        # text with a unit needs a case in which it can be made dimensionless
         has_units = context.time_unit is not None and context.shell.with_units
         for key, value in (times | moduli).items():
             context.needs(f"shell.{key}", "a mid-surface", "the area as drawn")

@@ -1,4 +1,11 @@
-"""A step in time: the shell moves, with inertia, under loads that are functions of time."""
+"""A step in time: the shell moves, with inertia, under loads that are functions of time.
+
+A step of a case drives one amplitude, a load parameter by name; a step in time drives those that
+have a history here, and the time. A history is a load's values over the time of the step. To hold
+an amplitude is to keep the load, or the displacement on which it does work, constant. An ability is
+what a section of the case adds to a problem; some say what their load does in a step in time. A
+context is the case around a section, an outline the undeformed shell, e3 the axis.
+"""
 
 from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self, TypeAlias
@@ -113,7 +120,7 @@ class TimeSection(Step):
         if self.search:
             raise ValueError("search: is for steps that end in equilibrium")
         for key, value in (("duration", self.duration), ("step", self.step), ("drag", self.drag)):
-            number = (
+            number = (  # a step that is not given is not checked
                 in_units("1/second" if key == "drag" else "second")(value)
                 if value is not None
                 else 1.0
@@ -126,6 +133,7 @@ class TimeSection(Step):
                 raise ValueError(
                     f"history.{name}: the times of a table must not fall, nor be negative"
                 )
+            # a jump may be at the begin, but no ramp or wave has no length; formulas have no times
             jumps, least_time = getattr(history, "kind", "") == "step", min(times, default=1.0)
             if not isinstance(history, list) and (
                 least_time < 0 or (least_time == 0 and not jumps)
@@ -171,6 +179,7 @@ class TimeSection(Step):
             for ability in context.abilities
             if (in_time := ability.in_time(context, driven_amplitudes))
         }
+        # the part that has the field says why it cannot follow a history; without it there is none
         if "field" in self.history and (
             refusal := load_in_time["field"].refused if "field" in load_in_time else NO_FIELD
         ):
@@ -181,8 +190,9 @@ class TimeSection(Step):
                     f"{key}.{time_key}: {text}: a time with a unit needs shell.density, "
                     "youngs_modulus and lengths"
                 )
-        loads = {in_time.name: in_time.load for in_time in context.steps}
+        loads = {case_step.name: case_step.load for case_step in context.steps}
         section_amplitudes = _factors_of_sections(context)
+        # the field goes by its own name; the angle and the time follow from steps of their own
         allowed = {"field", "pressure", *section_amplitudes, *loads} - {"lambda_m", "angle", "time"}
         for name, history in self.history.items():
             if name not in allowed:
@@ -190,6 +200,7 @@ class TimeSection(Step):
                     f"{key}.history.{name}: no such load; allowed: {', '.join(sorted(allowed))}"
                 )
             times = [t for t, _ in history] if isinstance(history, list) else []
+            # two rows of a table at one time are a jump
             jumps = getattr(history, "kind", "") == "step" or len(set(times)) < len(times)
             if jumps and name in loads and not loads[name].jumps:
                 raise ValueError(f"{key}.history.{name}: a support cannot jump")
@@ -226,6 +237,7 @@ class TimeSection(Step):
     def with_units(self) -> Iterator[tuple[str, str]]:
         """Yield (key below the step, text) for each time or rate that has a unit."""
         times: dict[str, Any] = {"duration": self.duration, "step": self.step, "drag": self.drag}
+        # several times of one history would have one key: a number after a space tells them apart
         for name, history in self.history.items():
             times |= {f"history.{name} {i}": t for i, t in enumerate(times_of(history))}
         yield from (
@@ -244,6 +256,7 @@ def _factors_of_sections(context: Context) -> set[str]:
         STEPS,
     )
 
+    # kinds of steps that sections of the case put before the steps of its load
     steps = [STEPS[kind] for kind in KINDS_BEFORE_LOAD]
     return {
         step_kind.amplitude
@@ -271,5 +284,6 @@ def level_in(context: Context, name: str, level: Level) -> float:
 
     if not isinstance(level, str):
         return level
+    # the class of the load's step knows its units, of the case's step or of the kind that has it
     step_kind = next((type(step.load) for step in context.steps if step.name == name), None)
     return (step_kind or step_class(name)).level(level, context)

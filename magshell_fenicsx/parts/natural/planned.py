@@ -1,4 +1,12 @@
-"""The natural shape of a case in the model's frame, and the symmetry that it preserves."""
+"""The natural shape of a case in the model's frame, and the symmetry that it preserves.
+
+The natural shape is the curvature and stretch that the shell would have without stress. It is read
+from the case's `NaturalSection` and becomes a `Natural`, whose values vary as arrays, patterns or
+fields of a program. A pattern is a function of places and normals. t1, t2 and the normal are the
+frame in which curvature and stretch have components. The model may be turned about the axis e3
+against the case. An outline has what is known of the shell before it has a mesh: its meridian, and
+samples of its surface. R is the reference length of the shell, over which models measure.
+"""
 
 from collections.abc import Callable, Mapping
 
@@ -36,7 +44,7 @@ def natural(context: Context, turn: float, patch_rims: Mapping[str, InsideRim]) 
     section = context.section_of(NaturalSection)
     if section is None:
         return None
-    Q, R = rotation(turn), context.shell.reference
+    Q, R = rotation(turn), context.shell.reference  # Q: from the case's frame to the model's
 
     def varying(
         value: object, components_of: Callable[[object], list[float | str]], factor: float
@@ -48,7 +56,7 @@ def natural(context: Context, turn: float, patch_rims: Mapping[str, InsideRim]) 
         components_of
             Makes three numbers or formulas of the value, `_curvatures` or `_stretches`.
         factor
-            Factor of the numbers.
+            Factor of the numbers, from the case's units to the model's: R of a curvature.
         """
         if value is None:
             return None
@@ -58,7 +66,7 @@ def natural(context: Context, turn: float, patch_rims: Mapping[str, InsideRim]) 
                     factor * _three_numbers(numbers, stretch=components_of is _stretches)
                 )
             )
-        if not isinstance(value, dict):
+        if not isinstance(value, dict):  # one value for the whole shell
             components_of_value = components_of(value)
             if any(isinstance(v, str) for v in components_of_value):
                 return FormulaVectors(
@@ -70,7 +78,7 @@ def natural(context: Context, turn: float, patch_rims: Mapping[str, InsideRim]) 
             for name, patch_value in value.items()
         }
         if isinstance(context.shell, MeshSurface):
-            return vectors
+            return vectors  # its mesh knows the cells of a patch; else patches are of dimples
         vector_elsewhere = vectors.get("rest", np.zeros(3))
         return WithinRims(
             tuple(
@@ -134,7 +142,7 @@ def not_axisymmetric_because(context: Context, outline: Outline) -> str | None:
     """Return why the natural shape is not axisymmetric about e3, as a phrase; None if it is.
 
     It is if nothing twists, the frame is along the meridians or not needed, and formulas do not
-    vary around e3.
+    vary around e3. The twist is the third component k12 of a curvature.
     """
     section = context.section_of(NaturalSection)
     assert section
@@ -146,6 +154,7 @@ def not_axisymmetric_because(context: Context, outline: Outline) -> str | None:
         for c in map(components, [curvature, *patch_curvatures])
     ):
         return "the natural curvature twists: k12 is not zero"
+    # the part of e3 in the surface is along the meridians too
     is_vertical = [v == 0 for v in direction] == [True, True, False]
     if is_anisotropic(context) and direction != MERIDIAN and not is_vertical:
         return "the natural shape is not along the meridians"
@@ -160,11 +169,12 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
     """Return whether a plane mirrors the natural shape onto itself.
 
     It is decided by values at samples of the surface; patches are taken to be their own images.
+    A reflection keeps k11, k22 and the stretches, and changes the sign of the twist k12.
     """
     section = context.section_of(NaturalSection)
     assert section
     if section.user_fields:
-        return False
+        return False  # a program's function is not known off its mesh
     x, R, direction = outline.sample(), context.shell.reference, first_direction(context)
 
     def is_mirrored(text: float | str, sign: float = 1.0) -> bool:
@@ -185,7 +195,7 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
             *_components_of_patches(section.curvature),
             *_components_of_patches(section.stretch),
         )
-        for v in c[:2]
+        for v in c[:2]  # of a curvature without the twist
     ]
     if not (
         all(is_mirrored(v) for v in even_components) and all(is_mirrored(v, -1.0) for v in twists)
@@ -193,12 +203,13 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
         return False
     if not is_anisotropic(context):
         return True
-    if direction == MERIDIAN:
+    if direction == MERIDIAN:  # the plane contains the axis, or is normal to it
         return mirror.through_e3 or bool(np.hypot(*mirror.normal[:2]) == 0)
     directions, directions_at_images = (
         np.stack([formula_function(v)(*(R * p).T) for v in direction], -1)
         for p in (x, mirror.image(x))
     )
+    # t1 and -t1 are the same frame, as tensors have it
     return any(
         bool(
             (
@@ -234,10 +245,10 @@ def _stretches(value: object) -> list[float | str]:
 def _three_numbers(numbers: Array, *, stretch: bool) -> Array:
     """Return values (..., 1, 2 or 3) of a program's function as three numbers (..., 3).
 
-    With `stretch` they are stretches less one as of `_stretches`, else curvatures as of
-    `_curvatures`.
+    With `stretch` they are stretches less one, along t1, t2 and of the thickness; else curvatures
+    k11, k22, k12. One number is the same in all directions, without a twist.
     """
-    if stretch and numbers.shape[-1] == 2:
+    if stretch and numbers.shape[-1] == 2:  # along t1 and t2; the thickness keeps its size
         return np.concatenate([numbers - 1, np.zeros_like(numbers[..., :1])], axis=-1)
     if stretch:
         return np.repeat(numbers - 1, 3, axis=-1)
@@ -252,6 +263,7 @@ def natural_constraints(context: Context, outline: Outline) -> list[SymmetryCons
     """Return the symmetry that the natural shape of a case preserves.
 
     Its planes must contain the first direction of the frame, if the frame matters and is constant.
+    A frame along meridians, or by formulas, gives no such vector.
     """
     direction = first_direction(context) if is_anisotropic(context) else MERIDIAN
     is_constant = not isinstance(direction, str) and all(

@@ -1,4 +1,11 @@
-"""The natural shape: the section of curvature and size without stress, and growth as a load."""
+"""The natural shape: the section of curvature and size without stress, and growth as a load.
+
+The natural shape is what the shell would have without stress. Its amplitudes "natural_curvature"
+and "natural_stretch" are load parameters, from 0 (as drawn) to 1 (as given). A step is a part of a
+case's load programme; growth is a kind of it. An ability is what a section adds to a case: checks,
+formulas, symmetry and the model's data. A user field is a function that a program gives on its
+mesh. R is the reference length of the shell.
+"""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -36,7 +43,7 @@ def per_length(value: Any) -> Any:
     """
     matched = _PER_LENGTH.fullmatch(value) if isinstance(value, str) else None
     unit = matched and (matched["below"] or matched["power"])
-    if not matched or unit in PLACE:
+    if not matched or unit in PLACE:  # 5/x is a formula of the place, no unit
         return value
     return in_units("1/metre")(f"{matched['number']} {unit}**-1")
 
@@ -51,6 +58,10 @@ def _components(
 
     Parameters
     ----------
+    numbers
+        Number of components of a list.
+    minimum, maximum
+        Bounds of each number; those of formulas are checked later, at places of the shell.
     lengths
         Whether numbers may be text per length, such as "5/m".
     """
@@ -59,7 +70,7 @@ def _components(
         """Return a value that is a number within bounds, or a formula."""
         value = per_length(value) if lengths else value
         if isinstance(value, str):
-            formula(value)
+            formula(value)  # raises if it is none
         elif (
             isinstance(value, bool)
             or not isinstance(value, int | float)
@@ -100,6 +111,7 @@ def _refuse_formulas_of_patches(value_of_patch: dict[str, Any]) -> None:
     """Check that the values of patches are numbers, with or without a unit, and no formulas."""
     for name, value in value_of_patch.items():
         values = value if isinstance(value, list) else [value]
+        # text that `per_length` returns unchanged has no unit: it is a formula
         if any(isinstance(v, str) and per_length(v) is v for v in values):
             raise ValueError(f"{name}: of a patch numbers, no formulas")
 
@@ -183,7 +195,7 @@ class NaturalSection(Section, Ability):
         return natural_constraints(context, outline)
 
     def formulas(self, context: Context) -> Iterable[Formulas]:
-        """Return the formulas of stretch and curvature, with the values that are allowed.
+        """Yield the formulas of stretch and curvature, with the least and largest allowed value.
 
         Places are in the shell's unit of length, and curvatures in one over this unit.
         """
@@ -264,7 +276,10 @@ class GrowthSection(LoadStep):
 
     @classmethod
     def steps_before_load(cls, context: Context, loading: Step | None) -> list[tuple[str, Step]]:
-        """Return steps that let stretch and curvature grow to 1 before the only load of a case."""
+        """Return steps that let stretch and curvature grow to 1 before the only load of a case.
+
+        There are none if that load is itself a growth, or the case has no natural shape.
+        """
         natural = context.section_of(NaturalSection)
         if isinstance(loading, cls) or natural is None:
             return []

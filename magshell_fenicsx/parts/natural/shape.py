@@ -15,6 +15,12 @@ numbers, at the distance z along the normal n,
     G = (1 - s z kappa) U + s n n,
 
 whose metric G^T G is that of the shell's natural forms, linear in z.
+
+A jet is a map with its first and second derivatives at a point; `Forms` are the natural metric,
+curvature and thickness at a point, in UFL. A pattern is a function of undeformed places and unit
+normals. Places are over R, the reference length; h is the thickness. A user field is a function
+that a program gives on its mesh. a0 and b0 are metric and curvature of the undeformed surface, T
+and t the stretches of surface and thickness less one, mu_s the amplitude of the stretch.
 """
 
 from collections.abc import Callable, Mapping
@@ -100,6 +106,7 @@ class Natural:
             Number of cells on this rank.
         pattern_of
             Function that makes a pattern (function of places and normals) of a field of a program.
+            Without it such fields stay as they are.
 
         Raises
         ------
@@ -139,9 +146,11 @@ class Natural:
     def in_frame(self, forces: Array, r0: Array, n0: Array) -> Array:
         """Return derivatives (..., 3) of an energy by kappa_11, kappa_22, kappa_12 in the frame.
 
-        `forces` (..., 6) are derivatives by the six numbers of kappa in the field. Places and
-        normals are (..., 3).
+        `forces` (..., 6) are derivatives by the six numbers of kappa in the field. By the chain
+        rule each is multiplied by the derivative of the field by a component in the frame: a unit
+        tensor. Places and normals are (..., 3).
         """
+        # nowhere needed: where there is no frame, its vectors and the derivatives are zero
         t1, t2 = self._frame(r0, n0, np.zeros(r0.shape[:-1], dtype=bool))
         unit_tensors = (
             _tensor(np.broadcast_to(e, r0.shape), t1, t2)[..., *FIELD] for e in np.eye(3)
@@ -152,7 +161,10 @@ class Natural:
 
     @property
     def formulas(self) -> FormulaGroup | None:
-        """The formulas of stretch and curvature in one group; None without any."""
+        """The formulas of stretch and curvature in one group; None without any.
+
+        Both groups have the same frame and length, so that the first one lends them to all.
+        """
         groups = (getattr(value, "formulas", None) for value in (self.stretch, self.curvature))
         known_groups = [value for value in groups if value]
         return (
@@ -179,8 +191,10 @@ class Natural:
             If the frame does not exist at a place where it is needed.
         """
         along = self.along(r0, n0)
+        # its part in the surface
         along = along - np.einsum("...i,...i->...", along, n0)[..., None] * n0
         length = np.linalg.norm(along, axis=-1, keepdims=True)
+        # not (length > NORMAL): also where it is no number
         if (has_no_direction := needed & ~(length[..., 0] > NORMAL)).any():
             x, y, z = r0[has_no_direction][0]
             raise MeshError(
@@ -221,6 +235,7 @@ def natural_field(natural: Natural, cells: CellGeometry, V: fem.FunctionSpace) -
         On every rank, if a number is not finite, a stretch is out of bounds, or the frame has no
         direction.
     """
+    # kept, so that all ranks raise together: one that raised alone would leave the others waiting
     message, element = None, V.element.basix_element
     r0, n0, _ = cells.evaluate(element.points)
     try:
@@ -231,10 +246,12 @@ def natural_field(natural: Natural, cells: CellGeometry, V: fem.FunctionSpace) -
     if problems := [text for text in V.mesh.comm.allgather(message) if text]:
         raise MeshError(problems[0])
     Q = fem.functionspace(V.mesh, ("DG", element.degree, (SIZE,)))
+    # the function makes the field anew for another placement r
     field = PlacementField(
         Q, "natural", lambda r: natural_field(natural, cell_geometry(r), r.function_space)
     )
     values = _numbers(T, kappa, t)
+    # only formulas vary between the nodes; all else is exact there
     if any(getattr(value, "by_formula", False) for value in (natural.stretch, natural.curvature)):
         fitted_numbers = project_formula(
             lambda x, n: _numbers(*natural.tensors_at(x, n)),
@@ -266,6 +283,7 @@ def _refuse_unfit(natural: Natural, r0: Array, n0: Array) -> None:
     MeshError
         With the first such place.
     """
+    # values of a stretch are less one
     stretch, curvature = 1 + _values(natural.stretch, r0, n0), _values(natural.curvature, r0, n0)
     is_valid = {
         f"stretch: is not within {SMALLEST:g} to {LARGEST:g}": (stretch >= SMALLEST)
@@ -342,12 +360,14 @@ class Shape:
         """
         numbers = at_quadrature(self.field, points)
         T = np.empty((*numbers.shape[:2], 3, 3))
+        # numbers 6 to 11 of the field are those of T, see `_numbers`; both halves are set
         T[..., *FIELD] = T[..., *FIELD[::-1]] = numbers[..., 6:12]
         tangents = np.moveaxis(first, 0, -2)
         # mixed components of T in the surface, whose determinant is that of the tensor
         mixed = np.linalg.solve(
             tangents @ np.swapaxes(tangents, -1, -2), tangents @ T @ np.swapaxes(tangents, -1, -2)
         )
+        # (1 + mu trace + mu^2 det) (1 + mu t), for the 2 x 2 tensor T
         t, trace, det = numbers[..., 12], np.trace(mixed, axis1=-2, axis2=-1), np.linalg.det(mixed)
         return np.array([np.ones_like(t), trace + t, det + trace * t, det * t])
 
@@ -359,7 +379,7 @@ class Shape:
         r0
             Jet of the undeformed placement: the map with its first and second derivatives.
         field, amplitudes
-            The values of `parameters` at the point.
+            The values of `parameters` at the point: of an amplitude that stays zero there is none.
         """
         remaining_amplitudes = list(amplitudes)
         curvature_factor, stretch_factor = (
@@ -385,10 +405,11 @@ def _forms(
         The numbers of the natural shape, see `_numbers`.
     """
     a0, up, n0 = kin.metric(r0), kin.inverse_metric(r0), kin.normal(r0)
+    # the field has kappa from number 0, T from 6, and t as 12
     kappa = (
         ufl.zero((2, 2)) if curvature_factor is None else curvature_factor * covariant(r0, field, 0)
     )
-    if stretch_factor is None:
+    if stretch_factor is None:  # metric and thickness are the undeformed ones
         return Forms(ufl.zero((2, 2)), kappa, a0, up, ufl.as_ufl(1), ufl.as_ufl(1))
     b12 = ufl.dot(n0, r0.r12)
     b0 = ufl.as_matrix([[ufl.dot(n0, r0.r11), b12], [b12, ufl.dot(n0, r0.r22)]])
@@ -426,7 +447,7 @@ def grown(density: Density, shape: Shape) -> Density:
         own_count = len(arguments) - len(shape.parameters)
         density_arguments, (field, *amplitudes) = arguments[:own_count], arguments[own_count:]
         r0 = density_arguments[0]
-        if isinstance(r0, Jet):
+        if isinstance(r0, Jet):  # of a point; of an edge it is a pair, one jet for each side
             return density.function(*density_arguments, natural=shape.forms(r0, field, *amplitudes))
         forms_of_sides = tuple(
             shape.forms(j, side, *amplitudes) for j, side in zip(r0, field, strict=True)
@@ -471,8 +492,8 @@ def _is_anisotropic(curvature: Array) -> NDArray[np.bool_]:
 def _tensor(components: Array, t1: Array, t2: Array) -> Array:
     """Return the tensor (..., 3, 3) with components S_11, S_22 and perhaps S_12 in a frame t1, t2.
 
-    Its normal component is S_22. Where S_11 = S_22 and S_12 = 0 it is S_22 times the unit tensor,
-    exactly.
+    Its normal component is S_22, which has no effect: only parts in the surface are used. So where
+    S_11 = S_22 and S_12 = 0 it is S_22 times the unit tensor, exactly, without t1 and t2.
     """
 
     def product(a: Array, b: Array) -> Array:
@@ -490,6 +511,9 @@ def body_shape(
 ) -> Shape:
     """Return the natural shape of a solid, with normals and heights; collective.
 
+    Its field has at each node the 13 numbers of the shell, the normal n, and the height z over R
+    above the mid-surface.
+
     Parameters
     ----------
     V
@@ -504,6 +528,7 @@ def body_shape(
     """
     natural = natural.on_cells(body.patches, len(body.layer_bounds))
     _, normals = body_positions_and_normals(V)
+    # heights of the body are parts of its thickness, from the inner face
     Z = fem.functionspace(V.mesh, ("Lagrange", V.element.basix_element.degree, (1,)))
     z = body.at_nodes(Z, (body.heights - MIDSURFACE_HEIGHT) * body.thickness)[Z.dofmap.list]
     shell_field = natural_field(natural, body_cell_geometry(V), V)
@@ -516,9 +541,11 @@ def body_shape(
 
 
 def growth_in_body(shape: Shape, field: Expr, *amplitudes: Expr) -> Expr:
-    """Return the growth tensor G (3, 3) in space at a point, as a UFL expression.
+    """Return the growth tensor G = (1 - s z kappa) U + s n n at a point, as a UFL expression.
 
-    See the module's docstring for G.
+    G (3, 3) is in space; U is the stretch in the surface, s (`thickness_stretch`) the one of the
+    thickness. `field` is that of `body_shape`. `amplitudes` are curvature and stretch, without one
+    that stays zero.
     """
     remaining_amplitudes = list(amplitudes)
     curvature_factor, stretch_factor = (
@@ -526,9 +553,9 @@ def growth_in_body(shape: Shape, field: Expr, *amplitudes: Expr) -> Expr:
         for p in (shape.curvature, shape.stretch)
     )
     n, z = ufl.as_vector([field[NORMAL_AT + i] for i in range(3)]), field[HEIGHT_AT]
-    n = n / ufl.sqrt(ufl.dot(n, n))
+    n = n / ufl.sqrt(ufl.dot(n, n))  # interpolation between nodes shortens it
     normal_projection = ufl.outer(n, n)
-    P = ufl.Identity(3) - normal_projection
+    P = ufl.Identity(3) - normal_projection  # projects onto the surface
     thickness_stretch, U = 1, P
     if stretch_factor is not None:
         thickness_stretch, U = (

@@ -5,6 +5,12 @@ edge is held or stays in a plane through that point. Else a line integral over t
 curl, p int (v x w) . dx for two motions v and w of the edge (Romano 1972, Buefler 1984,
 Schweizerhof and Ramm 1984), vanishes where the edge moves in a single direction or in its own
 plane: then the pressure has a potential, `densities.swept_volume`. Elsewhere it has none.
+
+A live pressure turns with the surface and follows its area. An edge is closed if it is held or lies
+in a plane of symmetry; a moving edge is one with a part that is not. Openings are the moving edges,
+with those of them at which the pressure has no potential. The side of a cell or shell is the face
+that is pressed: 1 outside, -1 inside, 0 none. On a meridian, the curve of a shell of revolution, an
+edge is an end.
 """
 
 from collections.abc import Callable, Hashable, Mapping, Sequence, Set
@@ -72,7 +78,8 @@ def without_potential(
         condition = conditions.get(name, "free")
         if not isinstance(condition, HeldComponents):
             return False
-        axes = list(condition.components)
+        axes = list(condition.components)  # held: with two of them it moves along the third
+        # else it moves in its own plane, if the held coordinate is the same at all its places
         return len(axes) == 2 or bool(
             np.ptp(places(name)[:, axes], axis=0).max() < PLANARITY_TOLERANCE
         )
@@ -103,10 +110,12 @@ def edge_openings(
     comm, dim = V.mesh.comm, V.mesh.topology.dim - 1
 
     def places(name: str) -> Array:
+        """Return the places (n, 3) of an edge, from all ranks."""
         dofs = fem.locate_dofs_topological(V, dim, edges[name])
         by_rank = r0.x.array.reshape(-1, 3)[dofs if nodes is None else dofs[nodes[dofs]]]
         return np.concatenate(comm.allgather(by_rank))
 
+    # a facet is an edge's side of a cell; an edge moves if it does on any rank
     by_rank = comm.allgather(
         moving_edges({name: set(map(int, facets)) for name, facets in edges.items()}, conditions)
     )
@@ -151,6 +160,7 @@ def pressed_parts(
     links = topology.connectivity(1, 2)
 
     def is_pressed(facet: int) -> bool:
+        # a facet of an edge has one cell
         return bool(sides[links.links(facet)[0]])
 
     return {
@@ -183,7 +193,8 @@ def ring_openings(
 ) -> tuple[list[str], tuple[str, ...]]:
     """Return the moving ends of a meridian, and those of them without potential.
 
-    Only ends of pressed shells count. An end is a circle about the axis, see `without_potential`.
+    Only ends of pressed shells count. An end is a circle about the axis; the pressure has a
+    potential there if it moves in a single direction or in its own plane.
 
     Parameters
     ----------
@@ -198,8 +209,10 @@ def ring_openings(
 
     def ring(name: str) -> Array:
         rho, z = ends[name]
+        # three places of the circle, in x, y, z, show in which plane it is
         return np.array([[rho, 0, z], [0, rho, z], [-rho, 0, z]])
 
+    # an end is one side, which may have the end's name as its label
     names = moving_edges({name: {name} for name in ends}, conditions)
     return names, without_potential(names, conditions, ring)
 
@@ -207,10 +220,16 @@ def ring_openings(
 def meridian_openings(
     meridian: Meridian, conditions: Mapping[str, Condition], sides: Mapping[str, float]
 ) -> tuple[list[str], tuple[str, ...]]:
-    """Return the ends of a meridian that are not held, and those of them without potential.
+    """Return the moving ends of a meridian, and those at which a pressure has no potential.
 
-    See `ring_openings`.
+    Parameters
+    ----------
+    conditions
+        Name of an end -> its support.
+    sides
+        Name of a shell -> side on which a pressure acts; empty: all from outside.
     """
+    # (rho, z) of each end: `section` takes several parameters and returns a row for each
     places = {
         name: meridian.section(np.array([meridian.parameter(name)]))[0] for name in meridian.ends
     }

@@ -1,4 +1,11 @@
-"""The step `kind: pressure`, a gas under the shell as its conjugate, and their observables."""
+"""The step `kind: pressure`, a gas under the shell as its conjugate, and their observables.
+
+A live pressure turns with the surface; p is positive from outside, and over p_c, the classical
+buckling pressure of a sphere. A step of a case drives one amplitude, a load parameter by name, here
+p. Its conjugate -dPi/dp, with the energy Pi, is the change of the enclosed volume on which it does
+work; at free edges that may move there is none. A step's course is how it goes on from its begin. A
+view is a model with the units in which it is reported. Volumes are over R^3, h is over R.
+"""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -103,11 +110,13 @@ class PressureSection(PathStep):
         Rubber that is blown up gets longer steps, since it goes far beyond p_c.
         """
         course = super().course(step_start)
+        # `open`: no change of volume is conjugate to the pressure, so none can be prescribed
         if step_start.open and "control" not in self.model_fields_set:
             course = replace(course, drive=replace(course.drive, control="arc"))
         if (
             step_start.context.shell.rubber is not None and course.drive.first < 0
         ):  # blown up far beyond p_c
+            # E h/R, the size of such pressures, is about 1/h times p_c
             finer = partial(_longer, INFLATION_STEP_FACTOR / step_start.h)
             course = replace(
                 course, drive=replace(course.drive, scale=1 / step_start.h), finer=finer
@@ -244,7 +253,7 @@ class EnclosedGas:
                 self.classical_pressure * self.shell.youngs_modulus
             )
         volume, pressure, unit = self._volume(), self.pressure, self.unit
-        change = self.conjugate / unit
+        change = self.conjugate / unit  # of the volume over R^3, since the shell was undeformed
         if volume + change <= 0:
             raise CaseError(
                 f"hold.pressure.gas.volume: {volume:.4g}: the shell has shrunk by {-change:.4g} "
@@ -259,6 +268,7 @@ class EnclosedGas:
         content = (ambient - pressure) * (volume + change)
 
         def conjugate(p: float) -> tuple[float, float]:
+            # the volume's change at p, and its derivative
             return unit * (content / (ambient - p) - volume), unit * content / (ambient - p) ** 2
 
         return conjugate
@@ -266,13 +276,16 @@ class EnclosedGas:
     def by_begin(self, p: float) -> tuple[float, float]:
         """Return derivatives of the conjugate at p/p_c by the state where the gas was closed in.
 
-        The first is by the conjugate there, the second by p/p_c there.
+        The first is by the conjugate there, the second by p/p_c there. With the pressures a of the
+        ambient and p0 at the begin, and the volumes V0 undeformed and V0 + dV at the begin, the law
+        is (a - p) V = (a - p0) (V0 + dV).
         """
         conjugate, slope = self.law()(p)
         initial_volume = self._volume()
         pressure_below_ambient = (
             (conjugate / self.unit + initial_volume) / slope * self.unit
         )  # ambient - p
+        # (a - p0)/(a - p)
         share = (pressure_below_ambient + p - self.pressure) / pressure_below_ambient
         return share, -(self.unit * initial_volume + self.conjugate) / pressure_below_ambient
 
@@ -294,8 +307,8 @@ def cap_volume(shell: ShellSection | Surface) -> float:
     if shell.geometry == "hemisphere":
         return 2 * pi / 3
     if isinstance(shell, CapSurface) and shell.geometry == "cap":
-        c = cos(radians(shell.polar))
-        return pi * (2 + c) * (1 - c) ** 2 / 3
+        c = cos(radians(shell.polar))  # of the polar angle of the edge
+        return pi * (2 + c) * (1 - c) ** 2 / 3  # of a spherical cap of radius one
     raise CaseError(
         f"hold.pressure.gas.volume: give the volume of the gas under a {shell.geometry}"
     )

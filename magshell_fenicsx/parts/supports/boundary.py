@@ -1,4 +1,11 @@
-"""Conditions on the named edges and points of a geometry."""
+"""Conditions on the named edges and points of a geometry.
+
+A condition is a support or symmetry, by the name of an edge, a point or a patch. An offer is a
+property of a case that other parts may need, such as the whole shell, and that a part may withdraw.
+A symmetry constraint says which mirror planes a part of the case allows, and why it is not
+axisymmetric about e3. R/h is the radius over the thickness. `mirror.image_of_edge` gives the name
+of the mirror image of an edge.
+"""
 
 import re
 from collections.abc import Iterable
@@ -57,7 +64,7 @@ def _condition(value: Any) -> Any:
         try:
             return HeldSection.model_validate(value)
         except ValidationError:
-            pass
+            pass  # the message below says what is allowed
     raise ValueError(
         f"must be {', '.join(get_args(EdgeCondition))}, or {{held: [x, y, z]}} with some of these"
     )
@@ -87,7 +94,7 @@ class BoundarySection(Section, Ability):
     def warning(self, context: Context, places: Array) -> str | None:
         """Return a warning if pressure blows up thick rubber beside a clamped edge; None if not.
 
-        No shell theory holds in the layer at such an edge.
+        No shell theory holds in the layer at such an edge. `places` are not used here.
         """
         clamped = [name for name, condition in self.conditions().items() if condition == "clamped"]
         blown_up = any(step.kind == "pressure" for step in context.steps)
@@ -143,12 +150,14 @@ class BoundarySection(Section, Ability):
         """Return the symmetry that the supports of a shell preserve.
 
         A loaded half does not see rigid motions across its mirror plane. So without a support
-        against all motions the whole shell is needed.
+        against all motions the whole shell is needed, but for frequencies of a shell without loads,
+        where free rigid motions are allowed.
         """
         constraints = list[SymmetryConstraint]()
         for name, condition in self.conditions().items():
             reason = None
             if isinstance(condition, HeldSection):
+                # x and y are held both, or neither, around e3
                 one_sided = len({0, 1} & set(condition.components)) == 1
                 is_off_axis = tilted(np.array(context.points.get(name, [0.0, 0.0, 1.0])))
                 asymmetry = (
@@ -178,6 +187,7 @@ class BoundarySection(Section, Ability):
             conditions.get(mirror.image_of_edge(name), "free"),
         )
         if isinstance(condition, HeldSection):
+            # the reflection must map the held directions onto themselves
             held_projection, S = (
                 np.diag([float(i in condition.components) for i in range(3)]),
                 mirror.reflection,

@@ -1,4 +1,10 @@
-"""Motions of supports: edges, points and patches that are held and move as rigid bodies."""
+"""Motions of supports: edges, points and patches that are held and move as rigid bodies.
+
+A step of the load programme moves them. Its amplitude (load parameter) is the factor of all its
+motions; the conjugate of the factor, on which it does work, is the reaction. A `RigidMotion` is a
+shift (translation), a turn (rotation vector) and a centre, a point of the axis, over R and in the
+frame of the model, which may be turned about e3. R is the reference length of the shell.
+"""
 
 from math import copysign, radians
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, Literal, Self
@@ -90,6 +96,7 @@ class EdgeSection(PathStep):
     @model_validator(mode="after")
     def _each_once(self) -> Self:
         """Check that the factor's name is free, and that no support moves twice in the step."""
+        # "motion" is the column of a motion without a name of its own
         if self.name in ({*RESERVED_NAMES, *QUANTITIES} - {"motion"}):
             raise ValueError(
                 f"name: {self.name}: is taken; choose another name for the factor of the motion"
@@ -178,7 +185,7 @@ def motion(move: MoveSection, name: str, R: float, turn: float = 0.0) -> RigidMo
     turn
         Angle of the model's frame about e3 (rad).
     """
-    Q, rotation_section, zero = rotation(turn), move.rotation, np.zeros(3)
+    Q, rotation_section, zero = rotation(turn), move.rotation, np.zeros(3)  # Q: case to model
     shift = Q @ (np.array(move.translation) / R) if move.translation else zero
     if rotation_section is None:
         return RigidMotion(name, shift, zero, zero)
@@ -216,6 +223,7 @@ def mirrored(load: EdgeSection, R: float, mirror: Mirror) -> bool:
 
     `R` is the reference length in the unit of the section's lengths.
     """
+    # the name of the amplitude is not compared
     motions = {name: motion(move, "", R) for move in load.moves for name in move.supports}
     return all(
         mirror.image_of_edge(name) in motions
@@ -227,8 +235,10 @@ def mirrored(load: EdgeSection, R: float, mirror: Mirror) -> bool:
 def _is_image(first: RigidMotion, second: RigidMotion, mirror: Mirror) -> bool:
     """Return whether the second rigid motion is the mirror image of the first.
 
-    A mirrored rotation runs the other way about the mirrored axis.
+    A mirrored rotation runs the other way about the mirrored axis. Its centre may be any point of
+    that axis.
     """
+    # unit vector of the axis; zero without a rotation
     S, axis = mirror.reflection, second.turn / (np.linalg.norm(second.turn) or 1.0)
     offset = mirror.image(first.centre) - second.centre
     size = max(np.abs([first.shift, first.turn]).max(), ROUNDING)

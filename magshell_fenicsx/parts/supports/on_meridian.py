@@ -1,4 +1,10 @@
-"""Supports of a meridian: displacements that are zero at its ends, and rigid motions they stop."""
+"""Supports of a meridian: displacements that are zero at its ends, and rigid motions they stop.
+
+U, V and W are the displacements away from the axis e3, around it and along it. An axisymmetric
+displacement has U and W. A wave m varies as cos(m theta) (U, W) and sin(m theta) (V) around the
+axis; its unknowns are U + V, V and W. rho and z are the distance from the axis and the height. A
+facet is a point of the meridian's mesh. A body is a shell, or several that are joined.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -69,11 +75,11 @@ class Supports:
         return [_zero(V, self.axis, 0), _zero(V, self.horizontal, 0), _zero(V, self.axial, 1)]
 
     def wave_conditions(self, V: fem.FunctionSpace, m: int) -> list[fem.DirichletBC]:
-        """Return the conditions of zero on the coefficients (U + V, V, W) of waves m in V.
+        """Return the conditions of zero on the coefficients (U + V, V, W) of waves m.
 
-        A wave m = 1 may move the axis across itself.
+        V is their function space. A wave m = 1 may move the axis across itself.
         """
-        # on the axis all coefficients are zero, but V of waves m = 1
+        # on the axis all are zero, but V of waves m = 1: a shift across the axis has U = -V
         at_axis = [_zero(V, self.axis, i) for i in ((0, 2) if m == 1 else (0, 1, 2))]
         return [
             *at_axis,
@@ -96,6 +102,7 @@ class Supports:
             fem.locate_dofs_topological(r0.function_space, 0, facets)
             for facets in (self.axis, self.horizontal, self.axial)
         )
+        # of m = 1 all but the coefficient 1, V, as in `wave_conditions`
         at_axis = [3 * axis + i for i in ((0, 2) if m == 1 else (0, 1, 2))]
         return np.concatenate([*at_axis, 3 * horizontal, 3 * horizontal + 1, 3 * axial + 2])
 
@@ -111,12 +118,13 @@ class Supports:
         )
         places = r0.x.array.reshape(-1, 2)
         for cells in self.meridian.bodies:
-            rho, z, ones = np.zeros((3, len(places)))
+            rho, z, ones = np.zeros((3, len(places)))  # zero on other bodies
             nodes = r0.function_space.dofmap.list[cells]
             ones[nodes], (rho[nodes], z[nodes]) = 1.0, np.moveaxis(places[nodes], -1, 0)
             zero = 0.0 * ones
             axial_motions.append(np.column_stack([zero, ones]).ravel())
             torsional_waves.append(np.column_stack([rho, rho, zero]).ravel())
+            # a shift across the axis (U = 1, V = -1), and a turn (U = z, V = -z, W = -rho)
             transverse_waves += [
                 np.column_stack(wave).ravel() for wave in ([zero, -ones, zero], [zero, -z, -rho])
             ]
@@ -133,6 +141,7 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Support
     MeshError
         If an end with a plane of symmetry does not lie in one.
     """
+    # `facets` has the same three lists
     horizontal, axial, mirror = facets = [list[Facets]() for _ in range(3)]
     named_ends: dict[str, tuple[Facets, tuple[int, ...]]] = {}
     for name, condition in conditions.items():
@@ -148,6 +157,7 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Support
             horizontal.append(end)
         if AXIAL in components:
             axial.append(end)
+        # of (U, W): U is held only where x and y both are
         held_in_plane = tuple(
             i for i, part in enumerate((HORIZONTAL, {AXIAL})) if components >= part
         )
@@ -167,6 +177,7 @@ def _refuse_slanting(meridian: Meridian, name: str) -> None:
     MeshError
         If the meridian at the end is not nearly parallel to e3.
     """
+    # the direction of the meridian at its end, from two points on it
     s, offset = (
         meridian.parameter(name),
         PLANARITY_TOLERANCE if meridian.begins(name) else -PLANARITY_TOLERANCE,

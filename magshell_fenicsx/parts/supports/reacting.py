@@ -1,4 +1,11 @@
-"""Observables of supports: reactions, and their work-conjugates to motions, in the case's units."""
+"""Observables of supports: reactions, and their work-conjugates to motions, in the case's units.
+
+An observable is what is read from a state, as columns of path.csv. mu holds the amplitudes (load
+parameters) of a state by name; Pi is the energy. The amplitude of a motion is its factor, and
+-dPi/dmu its conjugate, which is in proportion to the reaction: a force, or a moment if the supports
+only turn. E, h and R are Young's modulus, thickness and reference length; models measure forces
+over E h R and lengths over R. A model of half a shell has the multiplicity 2.
+"""
 
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
@@ -99,6 +106,7 @@ class ReactionsObservables(Observables):
         """
         values: dict[str, float] = {}
         for name, column in motion_columns(view.loads).items():
+            # the potential of an amplitude is dPi/dmu: minus its conjugate
             values |= {
                 name: state.mu[name],
                 column: view.potential(state, name) / -self._unit(view, name),
@@ -114,7 +122,11 @@ class ReactionsObservables(Observables):
         return self._unit(view, name) if name in self.amplitudes(view.loads) else None
 
     def _unit(self, view: ModelView, name: str) -> float:
-        """Return -dPi/dmu of the motion `name` for a reaction of one in the case's unit."""
+        """Return -dPi/dmu of the motion `name` for a reaction of one in the case's unit.
+
+        The reaction works along the sum of the lengths (or angles) of the motion. The reaction is
+        that of the whole shell, Pi that of the model.
+        """
         lever_arm = view.length if only_turns(view.loads, name) else 1.0
         return -motion_size(view.loads, name) / (view.force * lever_arm * view.model.multiplicity)
 
@@ -144,6 +156,7 @@ def observed_reactions(
 
     by_column: dict[str, float] = {}
     for name, reaction in reactions(model, state, mirror).items():
+        # from the model's frame to the case's
         values = np.concatenate(
             [force * reaction.force @ frame, force * length * reaction.moment @ frame]
         )

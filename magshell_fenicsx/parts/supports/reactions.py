@@ -1,4 +1,10 @@
-"""Forces and moments of supports on the shell, from the residual at the nodes that they hold."""
+"""Forces and moments of supports on the shell, from the residual at the nodes that they hold.
+
+Forces are over E h R, moments over E h R^2, places over R; E, h and R are Young's modulus,
+thickness and reference length. Unknowns have three components at a node, or two (away from the axis
+e3 and along it) on a meridian. A mirror is the plane of a half model, or both planes of a sector;
+its removed edges are those of the whole shell that the model does not have.
+"""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -71,7 +77,7 @@ def reactions(
         Mirror of a half model or a sector: the reactions are those of the whole shell.
     """
     system, comm = model.system, model.system.comm
-    R, shares = system.forces(state.u, state.mu), _shares(model)
+    R, shares = system.forces(state.u, state.mu), _shares(model)  # R: the residual
     axes = system.u.function_space.dofmap.index_map_bs
     r = vectors_in_space(
         model.r0.x.array[: system.size] + system.with_ghosts(state.u, state.mu)[: system.size], axes
@@ -87,12 +93,12 @@ def reactions(
         point = box.mean(axis=0)
         F, arm = vectors_in_space(shares[name] * R, axes), r - point
         M = np.cross(arm, F).sum(axis=0)
-        if support.edge:
+        if support.edge:  # the name of the energy that holds the edge's normal
             M = M - np.cross(
                 arm, vectors_in_space(system.forces(state.u, state.mu, support.edge), axes)
             ).sum(axis=0)
         force, moment = comm.allreduce(np.array([F.sum(axis=0), M]))
-        if axes == 2:  # around the axis
+        if axes == 2:  # a meridian: around the axis all but the force along it cancels
             force, moment, point = force * [0.0, 0.0, 1.0], 0 * moment, point * [0.0, 0.0, 1.0]
         by_support[name] = Reaction(force, moment, point)
     return _of_whole(by_support, mirror) if mirror else by_support
@@ -117,7 +123,7 @@ def weights(model: "ModelBase", name: str, direction: Array, mirror: Mirror | No
     Array
         (unknowns,) on this rank; the products must be summed over ranks.
     """
-    if mirror and name in mirror.removed_edges:
+    if mirror and name in mirror.removed_edges:  # its force is the image of the modelled edge's
         name, direction = mirror.removed_edges[name], mirror.reflection @ direction
     elif mirror and mirror.image_of_edge(name) == name:
         direction = mirror.sum_over_images(direction)
@@ -132,8 +138,8 @@ def weights(model: "ModelBase", name: str, direction: Array, mirror: Mirror | No
 def _shares(model: "ModelBase") -> dict[str, Array]:
     """Return each support's share in the force at each of this rank's unknowns.
 
-    A point has the force of its node alone, edges and patches share it equally, and a mirror plane
-    has what is left.
+    A share is between 0 and 1, in an array of this rank's unknowns. A point has the force of its
+    node alone, edges and patches share it equally, and a mirror plane has what is left.
     """
     size = model.system.size
     shares = {name: np.zeros(size) for name in model.supports}
@@ -143,7 +149,7 @@ def _shares(model: "ModelBase") -> dict[str, Array]:
         for name in names:
             dofs = model.supports[name].dofs
             shares[name][dofs[dofs < size]] = 1.0
-            shares[name] *= is_unassigned
+            shares[name] *= is_unassigned  # unknowns of an earlier kind are taken
         number_of_holders = sum((shares[name] for name in names), np.zeros(size))
         for name in names:
             shares[name] /= np.maximum(number_of_holders, 1.0)

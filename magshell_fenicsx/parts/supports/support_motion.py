@@ -1,4 +1,10 @@
-"""Supports that move: their unknowns, and the rigid bodies that the loads' motions make of them."""
+"""Supports that move: their unknowns, and the rigid bodies that the loads' motions make of them.
+
+A rigid motion is a shift and a turn in proportion to an amplitude (load parameter). A lid is a
+rigid surface that closes a moving edge, so that a live pressure, which follows the surface, acts
+on a closed volume. p_c is the unit of pressures, E h/R the one of models: Young's modulus E,
+thickness h, reference length R. `loads.moves` has all motions, each with the names of its supports.
+"""
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -145,6 +151,7 @@ def pressed_edges(
     edges_by_motion = dict[tuple[object, ...], list[str]]()
     for name in curves:
         if motions := motions_of(loads, name):
+            # arrays by their bytes: equal motions have equal keys
             motion_key = tuple(
                 (m.name, *(part.tobytes() for part in (m.shift, m.turn, m.centre))) for m in motions
             )
@@ -157,6 +164,7 @@ def pressed_edges(
     for names in edges_by_motion.values():
         curves_of_lid = [curves[name] for name in names]
         open_corners = end_corners(curves_of_lid, comm)
+        # else the edges leave a gap, and no lid closes them
         if not len(open_corners) or (
             closing is not None and np.isin(open_corners, all_corners_on_planes).all()
         ):

@@ -1,7 +1,11 @@
 """Supports of a shell or a solid: displacements that are zero, and rigid motions left free.
 
 Of a solid these are whole faces above clamped edges and in mirror planes, else the mid-surface
-alone.
+alone. A condition is what the case says of a named edge, point or patch: clamped, some components
+held, "symmetry" in the mirror plane of a half model, or "plane" in one that belongs to the shell as
+it is described. Facets are edges of cells, or faces of a solid. A piece is a connected part of the
+shell. Amplitudes are load parameters. Places are over R, the reference length; the components of a
+displacement are x, y, z at each node.
 """
 
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
@@ -62,6 +66,7 @@ def held_on(
     """
     V.mesh.topology.create_connectivity(dim, V.mesh.topology.dim)
     conditions = []
+    # dofs of a component have the numbers of V: the node times the block size, plus the component
     for space in (V.sub(i) for i in axes):
         dofs = fem.locate_dofs_topological(space, dim, entities)
         conditions.append(
@@ -85,7 +90,8 @@ def held_at_vertex(
     axes
         The components, from 0.
     cells_at_vertex
-        (cells,) whether each local cell may have the node; None for all cells.
+        (cells,) whether each local cell may have the node: shells that touch have several nodes at
+        one place. None for all cells.
     """
     nodes_at_vertex = fem.locate_dofs_geometrical(
         V, lambda y: np.linalg.norm(y.T - x, axis=1) < 1e-9
@@ -95,6 +101,7 @@ def held_at_vertex(
         if cells_at_vertex is None
         else nodes_at_vertex[np.isin(nodes_at_vertex, V.dofmap.list[cells_at_vertex])]
     )
+    # a node has three unknowns
     return [fem.dirichletbc(0.0, 3 * nodes_at_vertex + np.int32(i), V.sub(i)) for i in axes]
 
 
@@ -133,6 +140,7 @@ def refuse_unknown(
             )
 
     for name, condition in conditions.items():
+        # points can be held, but for the pole, where the program reads; patches be held or clamped
         allowed = set(edges)
         allowed |= set(points) - {"pole"} if isinstance(condition, HeldComponents) else set()
         allowed |= (
@@ -191,10 +199,10 @@ def plane_of(r0: fem.Function, facets: NDArray[np.int32], name: str) -> Mirror:
     dofs = fem.locate_dofs_topological(V, V.mesh.topology.dim - 1, facets)
     places = np.concatenate(V.mesh.comm.allgather(r0.x.array.reshape(-1, 3)[dofs]))
     centre = places.mean(axis=0)
+    # axes of the places, from the largest to the smallest extent: the last is normal to a plane
     _, spread, axes = np.linalg.svd(places - centre, full_matrices=False)
-    conormals = (
-        _conormals(r0, facets) if on_edge else axes[2:]
-    )  # the thickness stands at right angles
+    # of a solid, the face itself shows its plane, and the thickness stands at right angles
+    conormals = _conormals(r0, facets) if on_edge else axes[2:]
     if spread[1] > PLANARITY_TOLERANCE * spread[0]:
         candidates = [axes[2]]
     else:  # a straight edge lies in many planes: those of the axes, and through e3, are exact
@@ -203,6 +211,7 @@ def plane_of(r0: fem.Function, facets: NDArray[np.int32], name: str) -> Mirror:
         candidates = [*np.eye(3), *([upright] if upright.any() else []), fitted_normal]
     for normal in candidates:
         plane = Mirror.with_normal(normal, float(normal @ centre))
+        # weighted with the lengths of the edges of cells, which the conormals have
         mean_cosine = (
             np.abs(conormals @ plane.normal).sum() / np.linalg.norm(conormals, axis=1).sum()
         )
@@ -227,6 +236,7 @@ def put_in_plane(r0: fem.Function, facets: NDArray[np.int32]) -> None:
     vertices = np.concatenate(domain.comm.allgather(domain.geometry.x[ends.ravel()]))
     centre = vertices.mean(axis=0)
     _, spread, axes = np.linalg.svd(vertices - centre, full_matrices=False)
+    # vertices on a straight line, or off any plane
     if (
         spread[1] <= PLANARITY_TOLERANCE * spread[0]
         or np.ptp(vertices @ axes[2]) > PLANARITY_TOLERANCE
@@ -270,8 +280,10 @@ def _conormals(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
     for facet in facets[facets < topology.index_map(1).size_local]:
         cell = topology.connectivity(1, 2).links(facet)[0]
         side = int(np.flatnonzero(topology.connectivity(2, 1).links(cell) == facet)[0])
+        # a side of the reference triangle has the number of the opposite corner
         ends = np.delete(corners, side, axis=0)
         # tangents a (2, 3) of the surface at the middle of the side
+        # (both derivatives, one point, all shape functions, scalar)
         table = V.element.basix_element.tabulate(1, ends.mean(axis=0)[None])[1:, 0, :, 0]
         a = table @ r0.x.array.reshape(-1, 3)[V.dofmap.list[cell]]
         tangent, outward = (ends[1] - ends[0]) @ a, (ends.mean(axis=0) - corners[side]) @ a
@@ -295,6 +307,8 @@ def free_motion(system: FiniteElementSystem, r0: fem.Function, amplitudes: Ampli
         if not len(motions):
             continue
         node_count = system.comm.allreduce(int(nodes_of_piece.sum()))
+        # mean displacement of the first motion, whose length over all nodes is one; of a pure
+        # translation it would be (1/nodes)^(1/2)
         shift = system.comm.allreduce(motions[0].reshape(-1, 3).sum(axis=0)) / node_count
         is_translation = np.linalg.norm(shift) > 0.5 * np.sqrt(1 / node_count)
         centre = system.comm.allreduce(x[nodes_of_piece].sum(axis=0)) / node_count
@@ -329,6 +343,7 @@ def _nodes_of_pieces(system: FiniteElementSystem, r0: fem.Function) -> list[NDAr
 
     The nodes are those that this rank owns.
     """
+    # the first nodes of a rank are its own; each has three unknowns
     piece_of_node = component_numbers(r0.function_space)[: system.size // 3]
     return [
         piece_of_node == n
@@ -354,7 +369,7 @@ def _unresisted_motions(
     centre = system.comm.allreduce(x[nodes_of_piece].sum(axis=0)) / node_count
     motions = np.zeros((6, *x.shape))
     for i, axis in enumerate(np.eye(3)):
-        motions[i, :, i] = nodes_of_piece
+        motions[i, :, i] = nodes_of_piece  # one along the axis
         motions[3 + i] = np.cross(axis, x - centre) * nodes_of_piece[:, None]
     return unresisted(
         motions.reshape(6, -1),
@@ -387,6 +402,7 @@ def unresisted(
         (n, unknowns) combinations of length one, n at most k, the one of the lowest energy first.
     """
     # the part of each motion that supports stop; its null combinations are free
+    # its squares are summed over ranks as products, whose eigenvectors are the combinations
     stopped = rigid - np.array([zero_at_supports(motion) for motion in rigid])
     _, squares, combinations = np.linalg.svd(comm.allreduce(stopped @ stopped.T))
     free_motions = combinations[squares < FREE_MOTION_TOLERANCE * max(squares.max(), 1.0)] @ rigid
@@ -456,10 +472,12 @@ def supports(
         )
         if condition in ("free", "symmetry"):
             continue
+        # clamped is the whole thickness; else the mid-surface alone, so that the edge can turn
         nodes = None if condition == "clamped" else is_in_middle
         if condition == "plane":
             planes.append(plane := plane_of(r0, body.faces[name], name))
             constraints.append(support_along(V, 2, body.faces[name], plane.normal))
+            # all components, as of a plane along no axis each has a part of the reaction
             supports_on_planes[name] = Support.from_conditions(
                 held_on(V, 2, body.faces[name], ALL_COMPONENTS), kind="plane"
             )
@@ -467,7 +485,7 @@ def supports(
         if name in body.faces:
             conditions_of_part = held_on(V, 2, body.faces[name], components, nodes)
         elif name in body.patches:
-            conditions_of_part = held_on(
+            conditions_of_part = held_on(  # a patch has the cells (dimension 3) of a solid
                 V, 3, np.flatnonzero(body.patches[name]).astype(np.int32), components, nodes
             )
         else:
@@ -476,7 +494,7 @@ def supports(
         named_supports[name] = Support.from_conditions(
             conditions_of_part, kind="point" if name in body.points else "part"
         )
-    return constraints, planes, named_supports | supports_on_planes
+    return constraints, planes, named_supports | supports_on_planes  # planes come last
 
 
 def in_middle(body: BodyMesh, V: fem.FunctionSpace) -> NDArray[np.bool_]:

@@ -1,8 +1,12 @@
 """A mesh for the branch on which a run goes on in another model, and the error at the branch's end.
 
-The bifurcation has the mesh of the first model. The larger model has one of its own, found in the
-same rounds for the load of the branch where it ends, at the same volume or displacement; or the
-displacement there at the same load.
+The bifurcation has the mesh of the first model. The larger model, which has the mode that the first
+one excludes by its symmetry, has a mesh of its own. It is found in the same rounds (meshes that are
+tried, each with an estimated error). The result there is the load at the end of the branch if a
+volume or a displacement is prescribed, else the displacement at the prescribed load.
+
+A choice is degree and mesh; the end of a run is its result with the state there; `Solved` is a
+scene with its end.
 """
 
 from mpi4py import MPI
@@ -82,9 +86,8 @@ def branch_error(adapted: Adapted, record: Record) -> float:
     scene, coarse_end = _ended(record)
     choice = adapted.choice
     finer = Choice(choice.degree + 1, choice.refinement, choice.size)
-    return estimated(
-        coarse_end.value, _on_finer_mesh(scene.problem, finer, (scene, coarse_end))[1].value
-    )
+    _, fine_end = _on_finer_mesh(scene.problem, finer, (scene, coarse_end))
+    return estimated(coarse_end.value, fine_end.value)
 
 
 def _coarsest_branch(first: Adapted, comm: MPI.Comm) -> tuple[Choice, Solved] | None:
@@ -107,11 +110,11 @@ def _coarsest_branch(first: Adapted, comm: MPI.Comm) -> tuple[Choice, Solved] | 
         raise NoResult("of a solid nothing is carried between meshes")
     for refinement in FIRST_REFINEMENTS:
         scene, choice = first.choice.scene(first.asked, comm), Choice(PATH_DEGREE, refinement)
-        scene.remesh = choice.applied
+        scene.remesh = choice.applied  # the mesh of the larger model alone
         last_record: Record | None = None
         try:
             for record in follow(scene, search=False, remark=lambda text: None):
-                if record.branch and record.scene is scene:
+                if record.branch and record.scene is scene:  # the branch stays in the first model
                     break
                 if record.scene is not scene and record.label not in LOCATED:
                     last_record = record
@@ -136,7 +139,7 @@ def _ended(record: Record) -> tuple[Scene, Ending]:
         raise NoResult("a motion ends at no single load")
     assert record.scene
     end = at_target(record.scene, record)
-    if end.kind == "held":
+    if end.kind == "held":  # on another mesh such an end cannot be solved directly
         raise NoResult("what is held besides loads needs the path")
     return record.scene, end
 

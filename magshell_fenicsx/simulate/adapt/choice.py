@@ -1,5 +1,10 @@
 """The mesh that a tolerance chooses: its degree, refinement, sizes and layers, and what was
 estimated on the way.
+
+A round is one mesh that was tried, with its result and the estimated error. The share of a cell is
+its part of the error. A size is the length of an element's edges, a function of the place in the
+chart (coordinates of the undeformed surface). A branch leads from the first model to a larger one,
+with a mesh of its own.
 """
 
 import json
@@ -45,7 +50,7 @@ class Sampled:
     def __call__(self, x: Array) -> float:
         """Return the size at a place (2,) of the chart."""
         distance, neighbours = self._tree.query(x, NEIGHBOURS)
-        weight = 1 / (distance + 1e-12)
+        weight = 1 / (distance + 1e-12)  # also at a point itself
         return float(np.exp(weight @ np.log(self.sizes[neighbours]) / weight.sum()))
 
     @cached_property
@@ -75,10 +80,11 @@ def equidistributed(
     sizes, factor
         The size function, and the factor of the number of cells.
     """
-    # the factor of the size that gives each cell the mean share
+    # the factor of the size that gives each cell the geometric mean of the shares
     wished_change = (np.exp(np.log(shares).mean()) / shares) ** (1 / (order + 2))
     change = _smoothed(centres, np.clip(wished_change, 1 / LARGEST_CHANGE, LARGEST_CHANGE))
     expected_ratio = shares @ change**order / shares.sum()  # a cell becomes change^-2 cells
+    # a common factor gives the wanted reduction
     change *= np.clip(
         (reduction / expected_ratio) ** (1 / order), 1 / LARGEST_CHANGE, LARGEST_CHANGE
     )
@@ -177,8 +183,9 @@ class Adapted:
     def account(self, result: float | None, on_branch: float | None = None) -> dict[str, Any]:
         """Return the entry of summary.json on the tolerance.
 
-        It is without an estimate if the run ended at another result than the rounds. The chosen
-        mesh may be a cheaper one than that of the best estimate, which is there too.
+        It has no estimate if the run ended at another result than the rounds, as the estimate is
+        not about this result. The chosen mesh may be a cheaper one than that of the least error,
+        whose result is in the entry "best".
 
         Parameters
         ----------
@@ -215,7 +222,7 @@ class Adapted:
         return json.dumps(self._as_data()).encode()
 
     def _as_data(self) -> dict[str, Any]:
-        """Return all except the problem as plain data, see `to_json`."""
+        """Return all except the problem as plain data for JSON; the best round by its index."""
         size = self.choice.size
         sizes = size and {"points": size.points.tolist(), "sizes": size.sizes.tolist()}
         content = {

@@ -1,8 +1,20 @@
 """The end of a run, and the same end on another mesh without computing the path.
 
-Fields are carried between meshes of one case by the polynomials of each cell. `transfer` smooths,
-and scales between shells of different shape. Here source and target have the same chart, and to a
-higher degree on the same mesh it is exact.
+To carry a field to another mesh is to evaluate it at the new nodes, by the polynomials of each
+cell. Unlike `transfer`, which smooths, and scales between shells of different shape, this needs the
+same chart; from one degree to a higher one on the same mesh it is exact.
+
+Words and symbols:
+
+- The chart has the coordinates of the undeformed surface: one along a meridian, two of a surface.
+  Each of several shells has its own. xi are positions in the reference cell, the interval or
+  triangle with corners 0 and 1.
+- A distance in cells is one in the coordinates xi.
+- The amplitude of a run is its load parameter; its conjugate -dPi/dmu is the displacement on which
+  it does work (Pi: potential energy). A held conjugate is prescribed, so the amplitude is unknown.
+- A located record is a fold or a bifurcation. A step departs where it leaves its path at a
+  bifurcation for a branch, and hands over where this branch is in another model.
+- Cuts and penalties are the settings of contact between shells, kept as entries of `State.mu`.
 """
 
 from dataclasses import dataclass, field
@@ -62,8 +74,9 @@ def carry(source: Scene, target: Scene, u: Vector) -> Vector:
         _chart(target),
         values_of_all_cells(source, u),
     )
-    if nodes_in_chart.shape[1] > target.model.V.mesh.topology.dim:
+    if nodes_in_chart.shape[1] > target.model.V.mesh.topology.dim:  # they are positions in space
         raise NotCarried("a mesh file has no chart")
+    # farthest: distance in cells and coordinates of the node that is farthest from all cells
     transferred, farthest = np.zeros((len(nodes_in_chart), values.shape[2])), (0.0, list[float]())
     owned_cells = source.model.V.mesh.topology.index_map(
         source.model.V.mesh.topology.dim
@@ -78,6 +91,7 @@ def carry(source: Scene, target: Scene, u: Vector) -> Vector:
         cells, reference_points, distances = fields.subset(is_source_cell).places(
             nodes_in_chart[nodes_of_shell]
         )
+        # numbers of cells in the subset become numbers among all cells
         transferred[nodes_of_shell] = fields.evaluate(
             values, np.flatnonzero(is_source_cell)[cells], reference_points
         )
@@ -146,6 +160,7 @@ class CellFields:
             nodes = np.concatenate(scene.comm.allgather(own_nodes))
         else:
             chart_places = chart(scene)
+            # gathered as if it were a displacement, which may have more components
             nodes = values_of_all_cells(
                 scene,
                 np.pad(chart_places, ((0, 0), (0, V.dofmap.bs - chart_places.shape[1]))).ravel(),
@@ -173,14 +188,19 @@ class CellFields:
         Parameters
         ----------
         values
-            (cells, nodes, components), see `values_of_all_cells`.
+            (cells, nodes, components), the field's values at the nodes of each cell.
         cells, xi
-            Cell (n,) and position in its reference cell (n, 1 or 2) of each point, see `places`.
+            Cell (n,) of each point, and its position (n, 1 or 2) in the reference cell; `places`
+            finds them.
         """
         return np.asarray(np.einsum("np,npc->nc", self.table(0, xi)[0], values[cells]))
 
     def places(self, x: Array) -> tuple[NDArray[np.int64], Array, Array]:
         """Locate points of the chart in the cells.
+
+        First the cells with the nearest centres are searched. Points that are in none of these are
+        searched among `WIDER` times as many cells, until no point is too far from its cell or all
+        cells have been searched.
 
         Parameters
         ----------
@@ -219,6 +239,7 @@ class CellFields:
                 )
             if candidate_count == len(self.nodes):
                 break
+            # the wider search is for points that would be refused; on a curved edge others remain
             accepted_distance = (
                 INSIDE_TOLERANCE if candidate_count <= CANDIDATES else MAX_DISTANCE_IN_CELLS
             )
@@ -245,14 +266,14 @@ class CellFields:
             return xi, distances
         x, nodes, reference_points = x[near_cells], self.nodes[cells[near_cells]], xi[near_cells]
         for _ in range(NEWTON_STEPS):
-            table = self.table(1, reference_points)
+            table = self.table(1, reference_points)  # [0]: values, [1:]: first derivatives
             residuals = x - np.einsum("np,npd->nd", table[0], nodes)
             step = _solve(np.einsum("jnp,npd->ndj", table[1:], nodes), residuals)
             reference_points = reference_points + step
         xi[near_cells], distances[near_cells] = (
             reference_points,
             np.where(
-                np.abs(step).max(axis=1) < INSIDE_TOLERANCE,
+                np.abs(step).max(axis=1) < INSIDE_TOLERANCE,  # the last step: it has converged
                 _distance_to_cell(reference_points),
                 np.inf,
             ),
@@ -358,7 +379,7 @@ class History:
         if record.branch:
             return
         self.first, self.end = self.first or record, record
-        if self.last and record.step != self.last.step:
+        if self.last and record.step != self.last.step:  # the first record of a step
             self.begins.setdefault(record.step, self.last)
         if record.label in ("fold", "bifurcation"):
             self.located.append(record)
@@ -370,9 +391,9 @@ class History:
     def ending(self, scene: Scene, stopped: str | None) -> Ending:
         """Return the end of the run.
 
-        It is the first instability, with `until: bifurcation` the last one, and with a target the
-        last target. Of a run that goes on in another model, or along a branch, it is the
-        bifurcation where this begins.
+        It is the target of the last step, if this step ends at one. Otherwise it is the first
+        instability of the last step that has any, but with `until: bifurcation` the last one there.
+        A bifurcation where the run goes over to a branch or to another model comes before these.
 
         Parameters
         ----------
@@ -388,13 +409,14 @@ class History:
         """
         steps = scene.problem.programme
         until = steps[-1].until if steps else "target"
-        if self.handed_over:  # beyond it meshes of the first model have no state to compare
+        # beyond the hand-over meshes of the first model have no state to compare
+        if self.handed_over:
             return _instability(self._departures(scene)[0])
         if (
             until in ("target", "points", "zero")
             and not stopped
             and self.last
-            and self.last.amplitude not in ("", "time")
+            and self.last.amplitude not in ("", "time")  # "": no load; "time": a motion
         ):
             return at_target(scene, self.last)
         if self.last and self.last.amplitude == "time":
@@ -445,7 +467,7 @@ def _instability(end: Record) -> Ending:
     """
     if end.amplitude not in end.point.state.mu:
         raise NoResult("an instability of a turning field is not a single load")
-    own_fold = end.label == "fold" and not end.mode
+    own_fold = end.label == "fold" and not end.mode  # no mode: not one that the model excludes
     value = end.point.state.mu[end.amplitude]
     return Ending(
         "fold" if own_fold else "instability", end.amplitude, value, end.point.state, end.point.du
@@ -455,10 +477,12 @@ def _instability(end: Record) -> Ending:
 def by_path(scene: Scene) -> Ending:
     """Return the end of a scene, by computing its whole history; collective.
 
+    The history is computed up to its stop, or to where it goes on in another model.
+
     Raises
     ------
     NoResult
-        See `History.ending`.
+        If the history stopped before its target and not at an instability, or has no load.
     """
     history, stopped = History(), None
     try:
@@ -484,7 +508,7 @@ def from_near(scene: Scene, source: Scene, neighbour: Ending) -> Ending:
     Raises
     ------
     NoResult
-        See `History.ending`.
+        If the history stopped before its target and not at an instability, or has no load.
     """
     return near_by(scene, source, neighbour) or by_path(scene)
 
@@ -510,6 +534,7 @@ def near_by(scene: Scene, source: Scene, neighbour: Ending) -> Ending | None:
         )
     except NotCarried:
         return None
+    # cuts belong to a mesh: those of the other one are of no use here
     guess = with_cuts_here(scene, State(u, dict(neighbour.state.mu)))
     for _ in range(MOST_CHANGED):
         is_fold = neighbour.kind == "fold"
@@ -528,7 +553,7 @@ def near_by(scene: Scene, source: Scene, neighbour: Ending) -> Ending | None:
 def _fold(scene: Scene, guess: FoldGuess, name: str) -> Ending | None:
     """Return the end at the fold near a guess; None if there is none, or it is not the first.
 
-    With other unstable directions a fold is not the first instability.
+    It is not the first instability of its path if other directions are unstable there.
     """
     try:
         fold = find_fold(scene.newton, guess, name)
@@ -540,7 +565,8 @@ def _fold(scene: Scene, guess: FoldGuess, name: str) -> Ending | None:
 def _equilibrium(scene: Scene, guess: State, neighbour: Ending) -> Ending | None:
     """Return the end at an equilibrium near a guess; None if Newton's method fails.
 
-    It is at the same load, or the same conjugate displacement, as the end on another mesh.
+    The equilibrium has the load of the end on the other mesh, or its conjugate displacement where
+    this was held.
     """
     newton, system, name, held_value = (
         scene.newton,
@@ -564,13 +590,18 @@ def _equilibrium(scene: Scene, guess: State, neighbour: Ending) -> Ending | None
 
 
 def at_target(scene: Scene, record: Record) -> Ending:
-    """Return the end of a run at a target of the record's step, or at the end of a branch."""
+    """Return the end of a run at a target of the record's step, or at the end of a branch.
+
+    At the end of a branch, which has no target, the conjugate counts as held. With held conjugates
+    of other amplitudes the end is of the kind "held".
+    """
     system, state, step = (
         scene.newton.system,
         record.point.state,
         scene.problem.programme[record.step - 1].load,
     )
     target = step.target
+    # a field that turns by an angle does its work through the component across
     name = "lambda_across" if record.amplitude == "angle" else record.amplitude
     by_conjugate = target is None or target[0].quantity == "conjugate"
     held_value = (

@@ -5,8 +5,8 @@ path.
     the tolerance. (b) Compute the end with one degree more; the change of the result estimates the
     error. (c) Stop if the estimate is at most the tolerance, and on a surface at least a fifth of
     it. (d) Else make a mesh on which all cells have equal shares in the error (`indicators`) and
-    the expected error is 0.55
-        of the tolerance; compute its end by Newton's method from the end of (b); continue with (b).
+    the expected error is 0.55 of the tolerance; compute its end by Newton's method from the end of
+    (b); continue with (b).
 
 Meridians and grids, whose lines go from edge to edge, are refined uniformly. On a meridian, where
 cells cost nothing, on a grid and on a surface of few cells the error may be far below a loose
@@ -15,6 +15,16 @@ tolerance.
 A solid has degree 2, so element size and layers are chosen. Each round solves on one mesh, with
 smaller elements, and with one more layer. The two changes of the result estimate the two parts of
 the error, as if it fell with the square of the size; the part that is too large is refined.
+
+Words and symbols:
+
+- The end of a run (`Ending`) is its scalar result with the state and the path's tangent there. A
+  solution is a scene with its end. `carry` evaluates a displacement of one mesh on another one.
+- A choice is degree and mesh; `refinement` divides the default sizes of its elements.
+- A round is a mesh that was tried, with result and estimated error. Its coarse solution has the
+  degree of the choice, its fine solution one degree more.
+- h and R are thickness and reference length; energies are over E h R^2.
+- `say` prints a line of the log, `doing` sets a line of status.
 """
 
 from collections.abc import Callable
@@ -70,12 +80,12 @@ def indicators(
 ) -> tuple[Array, Array]:
     """Return the share of each cell in the error of the result, up to a common factor; collective.
 
-    The result J of a run is an amplitude on a path of stationary points, or its conjugate
-    displacement. Its first variation with the residual is therefore the path's tangent z: J - J_h =
-    a(e_u, e_z) up to higher order, with the tangent stiffness a and the errors e of u and z (dual
-    weighted residuals: R. Becker, R. Rannacher, Acta Numerica 10, 2001). In each cell this is at
-    most sqrt(|e_u|^2 |e_z|^2) in the energy norm. The errors are estimated with a solution of
-    higher degree on the same mesh.
+    The result J of a run is an amplitude on a path of equilibria, or its conjugate displacement.
+    Dual weighted residuals (R. Becker, R. Rannacher, Acta Numerica 10, 2001) give its error: the
+    adjoint solution is here the path's tangent z, and J - J_h = a(e_u, e_z) up to higher order,
+    with the tangent stiffness a and the errors e_u, e_z of u and z. In each cell this is at most
+    the product of the energy norms of e_u and e_z, which is the share. The errors are estimated
+    with a solution of higher degree on the same mesh.
 
     Parameters
     ----------
@@ -102,10 +112,11 @@ def indicators(
 
 
 class _TangentEnergy:
-    """Energy of the linearised strains of a variation, cell by cell: half the second derivative.
+    """Energy of the linearised strains of a variation v, cell by cell.
 
-    With the deformed a_i, n and a_i,j: dE_ij = sym(a_i . v,_j), dK_ij = n . (v,_ij - G^k_ij v,_k).
-    It has membrane and bending energy.
+    It is half the second derivative of membrane and bending energy, with the strains dE_ij =
+    sym(a_i . v,_j) and dK_ij = n . (v,_ij - G^k_ij v,_k). Here a_i are the deformed tangent vectors
+    r,_i, n the normal, and G^k_ij the Christoffel symbols.
 
     Parameters
     ----------
@@ -123,7 +134,7 @@ class _TangentEnergy:
         # indices of arrays: n cells, q points, p nodes; i, j, k of the reference cell, c of space
         points, self._weights = basix.make_quadrature(basix.CellType.triangle, 2 * model.degree)
         self._table = cells.table(2, points)
-        r0 = self._derivatives(model.r0.x.array[: model.system.size])
+        r0 = self._derivatives(model.r0.x.array[: model.system.size])  # first and second ones
         first_derivatives, second_derivatives = (
             undeformed_part + displacement_part
             for undeformed_part, displacement_part in zip(r0, self._derivatives(u), strict=True)
@@ -134,6 +145,7 @@ class _TangentEnergy:
         )
         normal = np.cross(first_derivatives[..., 0, :], first_derivatives[..., 1, :])
         self._normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
+        # tangent vectors, the inverse metric that raises indices, and the membrane strain
         self._a, self._raise, self._strain = (
             first_derivatives,
             np.linalg.inv(metric0),
@@ -147,6 +159,7 @@ class _TangentEnergy:
         a1, a2 = r0[0][..., 0, :], r0[0][..., 1, :]
         material_directions = None
         if (material_field := getattr(model, "cell_materials", None)) is not None:
+            # four numbers of the material of each cell
             directions_here = material_field.x.array.reshape(-1, 4)[
                 : material_field.function_space.dofmap.index_map.size_local
             ]
@@ -179,7 +192,7 @@ class _TangentEnergy:
         membrane_second_derivative = (
             work(law.stress(self._strain + 1j * STEP * E, self._raise), E).imag / STEP
         )
-        # without what is linear, of plies
+        # the mean for K and -K is without the part linear in K, which plies have
         bending_energies = (law.bending(self._strain, S, self._raise) for S in (K, -K))
         density = membrane_second_derivative / 2 + sum(bending_energies) / 2
         return np.asarray((density * self._area) @ self._weights)
@@ -190,7 +203,7 @@ class _TangentEnergy:
         Their shapes are (cells, points, i, 3) and (cells, points, i, j, 3).
         """
         by_order = np.einsum("jqp,npc->jnqc", self._table, values_of_all_cells(self._scene, v))
-        # basix orders derivatives as 0, x, y, xx, xy, yy
+        # basix orders derivatives as 0, x, y, xx, xy, yy: 3, 4, 5 are the second ones
         second = np.stack(
             [
                 np.stack([by_order[3], by_order[4]], axis=-2),
@@ -204,10 +217,13 @@ class _TangentEnergy:
 def adapted_solid(problem: Problem, comm: MPI.Comm, say: Say, doing: Say) -> Adapted:
     """Find refinement and layers of a solid for its tolerance; collective.
 
+    Each round solves on one mesh, and refines sizes or layers if their part of the error is too
+    large.
+
     Parameters
     ----------
     say, doing
-        See `adapted`.
+        Called with a line of text per round, and with words for the next activity.
 
     Raises
     ------
@@ -224,7 +240,7 @@ def adapted_solid(problem: Problem, comm: MPI.Comm, say: Say, doing: Say) -> Ada
         doing(f"a mesh for the tolerance {tolerance:g}: round {len(tried) + 1}")
         try:
             round_result, size_error, thickness_error = _round(problem, comm, refinement, layers)
-        except NoResult:
+        except NoResult:  # a first mesh may be too coarse: try the next one
             if tried or refinement == FIRST_REFINEMENTS[-1]:
                 raise
             refinement = FIRST_REFINEMENTS[FIRST_REFINEMENTS.index(refinement) + 1]
@@ -242,6 +258,7 @@ def adapted_solid(problem: Problem, comm: MPI.Comm, say: Say, doing: Say) -> Ada
         if round_result.estimate <= tolerance or refinement >= FINEST:
             break
         if size_error > ERROR_SHARE * tolerance:
+            # the error falls with the square of the size
             refinement = round(
                 refinement
                 * float(np.clip((size_error / (ERROR_SHARE * tolerance)) ** 0.5, SLOWEST, FASTEST)),
@@ -278,11 +295,10 @@ def _round(
         return by_path(scene).value, scene.cells, scene.model.system.dofs
 
     value, cells, dofs = result(refinement, layers)
-    finer, thicker = (
-        result(min(FINER * refinement, FINEST), layers)[0],
-        result(refinement, layers + 1)[0],
-    )
+    finer, *_ = result(min(FINER * refinement, FINEST), layers)
+    thicker, *_ = result(refinement, layers + 1)  # one more layer in the same thickness
     scale = max(abs(finer), np.finfo(float).tiny)
+    # a change from size s to s/q is 1 - 1/q^2 of an error in proportion to s^2
     size_error = abs(finer - value) / scale / (1 - FINER**-2)
     thickness_error = abs(thicker - value) / scale / (1 - (layers / (layers + 1)) ** 2)
     return (
@@ -299,8 +315,9 @@ def adapted(
 ) -> Adapted:
     """Find a mesh on which the relative error of the result is below `mesh.tolerance`; collective.
 
-    The result is `Ending.value`: k_d or the critical amplitude at an instability; at the last
-    target the load, or the displacement conjugate to a prescribed load. It should not be zero.
+    The result is `Ending.value`: the amplitude at an instability (of a pressure the knock-down
+    factor); at the last target the load if a displacement is prescribed, else the displacement on
+    which the load does work. It should not be zero.
 
     Parameters
     ----------
@@ -341,12 +358,13 @@ def rounds(
     transferred
         Function that computes scene and end on another mesh, from those on a mesh near by.
     say, doing
-        See `adapted`.
+        Called with a line of text per round, and with words for the next activity.
     suffix
         Words in the lines of the rounds that say which part of the run they are about.
     """
     tolerance = problem.mesh.tolerance
     assert tolerance is not None
+    # degree by degree, as Newton's method needs a near start
     for degree in range(PATH_DEGREE + 1, _degree(tolerance) + 1):
         choice = Choice(degree, choice.refinement)
         coarse_solution = transferred(problem, choice, coarse_solution)
@@ -367,14 +385,15 @@ def rounds(
             f"{round_result.dofs} unknowns: "
             f"result {round_result.result:.9g}, estimated error {round_result.estimate:.1e}"
         )
-        # what is cheap is not made worse
-        least_ratio = 0.0 if coarse_solution[0].problem.axisymmetric else MIN_REDUCTION * tolerance
-        if least_ratio <= round_result.estimate <= tolerance or len(tried_rounds) == MOST_ROUNDS:
+        # a mesh far better than the tolerance is made coarser, but a meridian is cheap anyway
+        coarse_scene, _ = coarse_solution
+        least_error = 0.0 if coarse_scene.problem.axisymmetric else MIN_REDUCTION * tolerance
+        if least_error <= round_result.estimate <= tolerance or len(tried_rounds) == MOST_ROUNDS:
             break
         next_choice = _remeshed(
             choice, coarse_solution, fine_solution, AIM * tolerance / round_result.estimate
         )
-        if next_choice is None:
+        if next_choice is None:  # there is no other mesh
             break
         doing(
             f"a mesh for the tolerance {tolerance:g}: round {len(tried_rounds) + 1}, degree "
@@ -382,6 +401,7 @@ def rounds(
         )
         choice, coarse_solution = next_choice, transferred(problem, next_choice, fine_solution)
     rounds_within = [t for t in tried_rounds if t[0].estimate <= tolerance]
+    # the fewest unknowns within the tolerance, or else the least error
     best, choice = (
         min(rounds_within, key=lambda t: t[0].dofs)
         if rounds_within
@@ -415,7 +435,7 @@ def _coarsest_path(problem: Problem, comm: MPI.Comm) -> tuple[Choice, Solved]:
         scene = choice.scene(problem, comm)
         try:
             return choice, (scene, by_path(scene))
-        except NoResult as e:
+        except NoResult as e:  # a finer mesh may have one
             failure = e
     raise failure
 
@@ -470,10 +490,10 @@ def _remeshed(
         or scene.problem.mesh_file
         or isinstance(scene.problem.shape, Grid)
     ):
-        size_factor = np.clip(reduction, 1e-3, 1e3) ** (-1 / order)
+        refinement_factor = np.clip(reduction, 1e-3, 1e3) ** (-1 / order)
         if reduction < 1 and not scene.problem.axisymmetric:
-            size_factor = max(size_factor, LINES)
-        new_refinement = np.clip(choice.refinement * size_factor, COARSEST, FINEST)
+            refinement_factor = max(refinement_factor, LINES)
+        new_refinement = np.clip(choice.refinement * refinement_factor, COARSEST, FINEST)
         refinement = round(float(new_refinement), 3)
         return Choice(degree, refinement) if refinement != choice.refinement else None
     if reduction > 1 and scene.cells <= MIN_CELLS_TO_COARSEN:
@@ -482,8 +502,9 @@ def _remeshed(
     size, expected_ratio = equidistributed(
         scene.problem.size, centres, shares, order, reduction, scene.problem.material.h
     )
-    # twice, since this is an estimate
-    if not _fits(fine_solution[0], 2 * fine_solution[0].model.system.dofs * expected_ratio):
+    # the fine solution must fit too; twice its unknowns, since the ratio is an estimate
+    fine_scene, _ = fine_solution
+    if not _fits(fine_scene, 2 * fine_scene.model.system.dofs * expected_ratio):
         return None
     return Choice(degree, round(choice.refinement * expected_ratio**0.5, 3), size)
 
@@ -494,6 +515,6 @@ def _fits(scene: Scene, unknowns: float) -> bool:
         refuse_beyond_memory(
             replace(scene.problem, unknowns=unknowns), scene.comm.size, scene.comm.size
         )
-    except CaseError:
+    except CaseError:  # the sum is the number of ranks that refuse
         return not scene.comm.allreduce(1)
     return not scene.comm.allreduce(0)

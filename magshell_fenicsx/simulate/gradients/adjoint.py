@@ -10,11 +10,21 @@ its second variation, and
 
     dmu/dp = -(Q_p + w . R_p)/(Q_mu + w . R_mu),    K w = -Q_u.
 
-The equations of vibrations and of energy barriers are contracted at several displacements:
-`AdjointState`.
-So are those of states under a conjugate q that a step holds: it is q = -Pi_mu of the state where
-the step began, which p changes too. So are loads that a step leaves and was not controlled by, as a
-force at a depth.
+Some results depend on several states, as those of vibrations and energy barriers. Then the
+multipliers w are taken at each state: its place in the adjoint, an `AdjointState`. A further place
+is the state where a step began: the step may hold a conjugate q = -Pi_mu of that state, which p
+changes too, and loads stay at values that the step before has found, as a force at a depth.
+
+Words and symbols:
+
+- Pi is the potential energy. mu holds the amplitudes of a state, by name; an amplitude is a load
+  parameter or a prescribed position. R = Pi_u, and R_mu is the load vector `system.load`.
+- The conjugate q = -Pi_mu of an amplitude is the displacement on which the amplitude does work. A
+  step that holds it makes the amplitude an unknown; the `Device` adds this unknown and its
+  equation, a row. A gas gives q as a function of its amplitude.
+- A stage is a scene with the solver of one step; `enter` and `leave` convert states of the model to
+  states of the step's system and back. Step 0 of a record is the part before all steps.
+- A wave is a displacement with m waves around a meridian, in a space of its own.
 """
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -158,8 +168,10 @@ class Adjoint:
     slope
         The observable of a part that J is, with its own derivatives by a field; None for other
         results.
-    forms, deflections
-        As of a `Functional`.
+    forms
+        Further energies in J that depend on the placement, and their factors.
+    deflections
+        Name of a point -> the factor in J of the deflection u . n0 there.
     contact_state
         State about which contact between shells is expanded into a polynomial at all places; None:
         at each place about its own state.
@@ -228,10 +240,10 @@ def adjoint_of_instability(
     fold = fold or fold_at(scene, record)
     stage = stage_of_record(scene, record)
     system = stage.newton.system
-    pull = dot(
+    phi_by_load = dot(  # phi . R_mu
         system.comm, fold.left_null_vector, system.load(fold.state.u, fold.state.mu, fold.name)
     )
-    left_null_vector = np.asarray(-fold.left_null_vector / pull)
+    left_null_vector = np.asarray(-fold.left_null_vector / phi_by_load)
     rows = stage.device.rates(left_null_vector) if stage.device else {}
     w = stage.device.displacement(left_null_vector) if stage.device else left_null_vector
     place = AdjointState(stage.leave(fold.state), np.array(w), rows)
@@ -244,8 +256,9 @@ def adjoint_of_instability(
 def _of_wave(scene: Scene, record: Record) -> Adjoint:
     """Return the adjoint of the amplitude at which waves around a meridian are neutral; collective.
 
-    With Q the second variation of the neutral wave phi, and dQ/dmu its rate along the path, phi has
-    the factor -1/(dQ/dmu), and w solves K w = -Q_u and has the same factor.
+    Q(phi) is the second variation of the neutral wave phi, and dQ/dmu = Q_mu + w . R_mu its total
+    derivative along the path, with the solution w of K w = -Q_u. In dJ/dp = -(Q_p + w . R_p) /
+    (dQ/dmu) both the energy Q and the multiplier w so have the factor -1/(dQ/dmu).
 
     Raises
     ------
@@ -266,11 +279,11 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
         model.system.with_moved_supports(record.point.state),
     )
     refuse_touching_shells(scene, state, f"instability: {record.mode}")
-    phi = nearest_to_zero(waves.factor_at(state, m))[1]
+    _, phi = nearest_to_zero(waves.factor_at(state, m))
     Q = variation(model, state, phi, m, [record.amplitude])
     w, _ = solved(scene, state, Q, {})
     rate = Q.by_mu[record.amplitude] + w @ system.load(state.u, state.mu, record.amplitude)
-    # what locating it has left, to second order
+    # one Newton step towards Q = 0, as the record is there up to the tolerance of locating it
     value = state.mu[record.amplitude] - Q.value / rate
     direction = EnergyDirection(phi, m, stiffness=float(-1 / rate))
     return Adjoint(
@@ -296,7 +309,9 @@ def variation(
     m
         Number of waves around the meridian.
     """
+    # energies of phi, which depend on the axisymmetric displacement u
     terms, system, mu = model.waves.energies_along(phi, m), model.system, state.mu
+    # amplitude -> terms with factors, whose sum is the derivative of Q_m by it
     rates = {name: by_amplitude(model, terms, name, mu) for name in names}
 
     def functional_here() -> Functional:
@@ -317,22 +332,23 @@ def variation(
 def by_amplitude(
     model: ModelBase, terms: Sequence[FormTerm], name: str, mu: Mapping[str, float]
 ) -> list[tuple[FormTerm, float]]:
-    """Return energies whose weighted sum is the derivative of a sum of energies by an amplitude.
+    """Return terms whose weighted sum is the derivative of a sum of energies by an amplitude.
 
     Parameters
     ----------
     terms
         Each stands in the sum with its own amplitude as a factor.
     name
-        The amplitude. It may multiply terms, and may enter their forms as a constant.
+        The amplitude mu_i. It may multiply a term, and may enter the form of a term as a constant.
     mu
         Values of all amplitudes.
 
     Returns
     -------
     list of (term, factor)
-        A term that the amplitude multiplies, with 1; the derivative of a form by the constant, with
-        the term's own amplitude.
+        By the product rule: each term that mu_i multiplies, with the factor 1; and for each form
+        with mu_i as a constant the derivative of this form, with the amplitude of its term as the
+        factor.
     """
     weighted_terms = [(term, 1.0) for term in terms if term.amplitude == name]
     constant = model.system.parameters[name].constant if name in model.system.parameters else None
@@ -358,8 +374,8 @@ def adjoint(
 ) -> Adjoint:
     """Return the adjoint of a result at a regular state; collective.
 
-    It takes one factorisation and one solve, and again as many where a step began on which it
-    depends.
+    It takes one factorisation and one solve, and one more of each for every begin of a step on
+    which the result depends.
 
     Parameters
     ----------
@@ -369,8 +385,8 @@ def adjoint(
         Column of path.csv, also in units; or a target shape, whose mean square distance is the
         result.
     hold
-        Amplitude -> "load" or "conjugate", what stays as p changes; None: as the record's step
-        holds.
+        Amplitude -> "load" or "conjugate": which of the two stays as p changes. None: the one that
+        the record's step holds; the derivative then includes the begins of steps.
     begins
         Number of a step -> the last record before it.
 
@@ -383,6 +399,7 @@ def adjoint(
     column, scale = in_units(scene, state, of) if isinstance(of, str) else (of, "")
     result = functional(scene, state, column)
     held_conjugates = held_at(scene, record, state, hold)
+    # a prescribed amplitude has no derivative; a sensor has by_mu too, but is no amplitude itself
     if free_amplitudes := [
         name for name in result.by_mu if name not in held_conjugates and not result.slope
     ]:
@@ -393,6 +410,7 @@ def adjoint(
     # where J is c Pi, the energy of the place gives J_p
     by_itself = None if result.energy else lambda there, at: functional(there, at, column).value
     if result.reaction is not None:
+        # the force J is e . R, so e is a multiplier of R; J_p is left from the unit of forces alone
         unit = force_unit(scene)
         by_itself = lambda there, _: result.value * force_unit(there) / unit  # noqa: E731
         w = w + result.reaction
@@ -413,17 +431,20 @@ def adjoint(
 
 
 def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
-    """Return an adjoint at a record with further places, where steps began; collective.
+    """Return an adjoint with further places, the states where steps began; collective.
 
-    The adjoint depends on the state where a step began in two ways: by a conjugate that the step
-    holds, and by a load that the step has left with a value and was not controlled by.
+    J depends on the state where a step began in two ways: the step holds a conjugate at its value
+    there; or a load keeps the value that was found there as an unknown. The loop goes back from
+    step to step and solves for multipliers at each begin on which J depends.
 
     Parameters
     ----------
     adjoint
         Adjoint with the record's state as its only place.
+    record
+        The record of this state.
     begins
-        Number of a step -> the last record before it. The loop goes back from step to step.
+        Number of a step -> the last record before it.
 
     Raises
     ------
@@ -432,10 +453,12 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
         between.
     """
     scene, places, left_loads = adjoint.scene, list(adjoint.places), set[str]()
+    # adjoint with the place at the present record alone; None: J does not depend on this record
     newest_adjoint: Adjoint | None = adjoint
-    place_number = 0  # of the place at the record
-    # dJ/dmu of loads as earlier steps have left them
-    loads, driven_amplitudes = dict[str, float](), set[str]()
+    place_number = 0  # index of this place in `places`
+    # dJ/dmu of loads that keep their value from an earlier step, which is not yet found
+    loads = dict[str, float]()
+    driven_amplitudes = set[str]()  # that the steps passed so far change
     while record.step:
         place, step, system = (
             newest_adjoint.places[0] if newest_adjoint else None,
@@ -467,6 +490,7 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
         state_before = system.with_moved_supports(begin.point.state)
         held_before = held_at(scene, begin, state_before)
         if newest_adjoint and place:
+            # loads that an earlier step has set, and no step since
             reused_amplitudes = _amplitudes_of_steps(earlier) & place.state.mu.keys()
             for name in reused_amplitudes - place.rows.keys() - driven_amplitudes:
                 loads[name] = loads.get(name, 0.0) + by_load(newest_adjoint, name)
@@ -474,8 +498,7 @@ def with_begins(adjoint: Adjoint, record: Record, begins: Begins) -> Adjoint:
             potentials_at_begin, by_mu = _terms_of_held(
                 scene, step, place.state, state_before, held_conjugates
             )
-        # a load that is unknown at the begin, as its conjugate was held there, gets its multiplier
-        # here
+        # such a load was an unknown at this begin if its conjugate was held there: J depends on it
         for name in loads.keys() & held_before.keys():
             by_mu[name] = by_mu.get(name, 0.0) + loads.pop(name)
             left_loads.add(name)
@@ -541,8 +564,8 @@ def _terms_of_held(
     Returns
     -------
     c, by_mu
-        Amplitude -> factor of dPi/dmu at the state before, and amplitude -> derivative by its value
-        there.
+        Amplitude -> factor c of dPi/dmu at the state before, and amplitude -> derivative by the
+        amplitude at that state, which only the law of a gas has.
 
     Raises
     ------
@@ -557,6 +580,7 @@ def _terms_of_held(
             potential_factor, rate_by_amplitude = gas.by_begin(state.mu[name])
             c[name], by_mu[name] = -row * potential_factor, row * rate_by_amplitude
             continue
+        # the equation is Pi_mu(state) - Pi_mu(state before) = 0, if the step holds this value
         potential = system.potential(state.u, state.mu, name)
         change = potential - system.potential(state_before.u, state_before.mu, name)
         scale = max(abs(potential), abs(scene.conjugate_unit(name)))
@@ -577,7 +601,9 @@ def _driven_amplitudes(step: ProgrammeStep, mu: Mapping[str, float]) -> set[str]
 def by_load(adjoint: Adjoint, name: str) -> float:
     """Return dJ/dmu of an amplitude that is prescribed, with one value at all places; collective.
 
-    Places where the amplitude is an unknown, or where a later step still changes it, do not count.
+    It is the sum over places of w . R_mu + c Pi_mu + sum_i c_i d2Pi/dmu_i dmu, and the derivative
+    of the energies of directions. Places where the amplitude is an unknown, or where a later step
+    still changes it, do not count.
     """
     scene, system, total = adjoint.scene, adjoint.scene.model.system, adjoint.by_mu.get(name, 0.0)
     for place in adjoint.places:
@@ -585,6 +611,7 @@ def by_load(adjoint: Adjoint, name: str) -> float:
             continue
         u, mu = place.state.u, place.state.mu
         total += dot(system.comm, place.w, system.load(u, mu, name, constrained=False))
+        # without a factor c the potential, an integral, is not computed
         total += place.energy and place.energy * system.potential(u, mu, name)
         total += sum(
             factor_in_J * system.curvature(u, mu, i, name)
@@ -622,7 +649,8 @@ def solved(
 ) -> tuple[Vector, dict[str, float]]:
     """Return the multipliers of a functional J at a state; collective.
 
-    They solve K^T x = -J_x with one factorisation, with K of the system under the loading device.
+    They solve K^T x = -J_x with one factorisation. K is that of the device's system, whose unknowns
+    are the displacement and the amplitudes with held conjugates.
 
     Parameters
     ----------
@@ -657,7 +685,7 @@ def solved(
                 for name in held_conjugates
             },
         )
-    multipliers = (
+    multipliers = (  # a symmetric K is its own transpose
         factors.solve_transposed(-by_unknowns) if factors.skewed else factors.solve(-by_unknowns)
     )
     return np.array(device.displacement(multipliers) if device else multipliers), device.rates(
@@ -666,9 +694,10 @@ def solved(
 
 
 def mixed(scene: Scene, state: State, functional: Functional, name: str) -> float:
-    """Return the derivative by an amplitude of those parts of J that contain derivatives of Pi.
+    """Return the derivative by an amplitude of those parts of J that contain Pi or derivatives.
 
-    They are potentials, sum_i c_i dPi/dmu_i; a reaction, e . R; and the energy, c Pi. Collective.
+    They are sum_i c_i dPi/dmu_i (`potentials`), e . R with unit motions e of supports (`reaction`),
+    and c Pi (`energy`). Collective.
     """
     system = scene.model.system
     derivative = sum(
@@ -696,8 +725,10 @@ def held_at(
 
     Parameters
     ----------
+    state
+        The record's state, with the displacement of moved supports.
     hold
-        Amplitude -> "load" or "conjugate"; None: as the record's step holds.
+        Amplitude -> "load" or "conjugate", what is held; None: what the record's step holds.
 
     Raises
     ------
@@ -708,6 +739,7 @@ def held_at(
     step = scene.problem.programme[record.step - 1] if record.step else None
     if hold is None and step:
         held_conjugates |= held_conjugates_of_step(scene, step, state)
+        # a step may prescribe the conjugate of its own amplitude, at least at its target
         if step.load.by_conjugate(at_target=record.label == "target"):
             held_conjugates[step.name] = -scene.model.system.potential(state.u, state.mu, step.name)
     for name, kind in (hold or {}).items():

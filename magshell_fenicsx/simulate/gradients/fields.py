@@ -4,6 +4,20 @@ Each field is a coefficient of the terms' forms, or a part of one: the remanence
 magnitude, the factor of the thickness, the natural curvature in the case's frame, and a deviation
 w0 of the drawn shape along the normal of the perfect one. For a deviation see `shape`. The mass has
 derivatives by the same fields.
+
+Words and symbols:
+
+- J is the result, with its `Adjoint`: at each of its places, which are states, there are the
+  multiplier w of the residual and factors c_i of the derivatives dPi/dmu_i of the potential by
+  amplitudes.
+- A place is also a point of the surface, where it is an array: (cells, nodes, 3) over R, with the
+  components of the axes of the model alone where a meridian is modelled.
+- `forces` are the derivatives of J by the values of a field: (own cells, nodes, components).
+- A share is a term with its weights in a gradient (`WeightedTerm`): the weight `energy` of dPi/df,
+  and the weight `work` of the derivative of the residual along w.
+- Br is the remanence, r0 the undeformed placement, h the thickness, R the reference length. A thin
+  model is a shell; the other one is a solid.
+- The slope of a result is the observable that a sensor reads, with its own derivatives.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -106,13 +120,17 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
         )
 
     def over_all_places(coefficient_or_name: str | PlacementField) -> tuple[fem.Function, Array]:
-        """Return a field and its gradient (own cells, nodes, components), summed over places."""
+        """Return a field and its gradient (own cells, nodes, components), summed over places.
+
+        The system is put at the state of each place in turn. Collective.
+        """
         fields_and_gradients = [
             model.system.at_state(place.state).evaluate(
                 partial(_field_at_place, adjoint, origin, name, number, place, coefficient_or_name)
             )
             for number, place in enumerate(adjoint.places)
         ]
+        # the field is the same at all places
         return fields_and_gradients[-1][0], np.sum(
             [
                 gradient_at_place
@@ -126,7 +144,7 @@ def by_field(adjoint: Adjoint, name: str, origin: Adjoint | None = None) -> Fiel
     places, normals = (nodal_vectors[: len(forces)] for nodal_vectors in places_of(scene, f))
     if name == "deviation":
         places, normals = _perfect(scene, places, normals)
-    if kind.project:
+    if kind.project:  # to the components of the field
         forces = kind.project(scene, f, forces, places, normals)
     if model.thin and name == "deviation":
         # dJ/df : df/dw0 for the fields f that follow from the placement
@@ -154,12 +172,15 @@ def _field_at_place(
 
     Parameters
     ----------
-    name, origin
-        See `by_field`.
+    origin
+        Adjoint in the scene that was solved; None: it is `adjoint`.
+    name
+        Name of the field, a key of `FIELDS`.
     number, place
         Index of the place in `adjoint.places`, and the place itself.
     coefficient_or_name
-        The field, or its name in the terms.
+        The coefficient of the forms, or its name. It may follow from the field, as the normals do
+        from the placement; then it is given itself.
 
     Returns
     -------
@@ -175,7 +196,7 @@ def _field_at_place(
     self_differentiating_terms = [
         term for term in model.system.terms if isinstance(term, FieldDifferentiable)
     ]
-    if origin:
+    if origin:  # contact is to be the same in the scene that has the field
         expand_shell_contact(origin.scene, scene, origin.places[number].state)
     shares, w = _shares(adjoint, number, place, name), _contracted(scene, place)
     coefficient = (
@@ -206,6 +227,7 @@ def _field_at_place(
     gradients = [gradient_at_points for _, gradient_at_points in known_gradients] + [
         summed(shares, f, model.u, w, model.kernels)
     ]
+    # J itself, as what a sensor reads, counts once: at the first place
     if slope and slope.by_field is not None and slope.field is not None and not number:
         gradients += [slope.by_field] if coefficient == slope.field.name else []
     if (
@@ -227,7 +249,7 @@ def _placement_fields(adjoint: Adjoint, name: str, normals: Array) -> Iterator[P
     Parameters
     ----------
     name
-        See `by_field`.
+        Name of the field by which J is differentiated, a key of `FIELDS`.
     normals
         (own cells, nodes, 3), directions in which places move.
     """
@@ -254,7 +276,7 @@ def _shares(adjoint: Adjoint, number: int, place: AdjointState, name: str) -> li
         Name of the field, a key of `FIELDS`.
     """
     scene, c, mu = adjoint.scene, place.conjugates, place.state.mu
-    # whether the residual counts at this place, on any rank
+    # whether the residual counts at this place, on any rank; c may add to w, see `_contracted`
     has_multipliers = scene.comm.allreduce(bool(place.w.any())) or any(c.values())
     terms_with_factors = [
         (term, factor_of(term.amplitude, mu)) for term in _terms(scene, place.state, name)
@@ -278,10 +300,10 @@ def _shares(adjoint: Adjoint, number: int, place: AdjointState, name: str) -> li
         shares += [
             WeightedTerm(term, share, 0.0) for term in scene.model.size_terms(held_amplitude)
         ]
-    if not number:
+    if not number:  # energies that J itself contains are those at its own state, the first place
         shares += [
-            WeightedTerm(term, c * factor_of(term.amplitude, mu), 0.0)
-            for term, c in (*energies_along(scene, adjoint), *adjoint.forms)
+            WeightedTerm(term, factor_in_J * factor_of(term.amplitude, mu), 0.0)
+            for term, factor_in_J in (*energies_along(scene, adjoint), *adjoint.forms)
         ]
     return shares
 
@@ -290,6 +312,8 @@ def _known_gradient(
     term: FieldDifferentiable, place: AdjointState, w: fem.Function, name: str
 ) -> tuple[fem.Function, Array] | None:
     """Return the contribution of a term that provides its own derivatives by a field; collective.
+
+    Such terms, as contact or a self-field, have no form that could be differentiated.
 
     Parameters
     ----------
@@ -311,8 +335,9 @@ def _known_gradient(
 
 
 def _transferred(adjoint: Adjoint, other: Scene) -> Adjoint:
-    """Return an adjoint with states and multipliers of another scene on its mesh; collective."""
-    mu = dict.fromkeys(other.unloaded().mu, 1.0)  # of a natural curvature of zero
+    """Return an adjoint on another scene: states and multipliers moved to its mesh; collective."""
+    # an amplitude that only the other scene has multiplies a field that is zero there
+    mu = dict.fromkeys(other.unloaded().mu, 1.0)
     places = []
     for place in adjoint.places:
         u, w = (transfer(adjoint.scene, other, vector) for vector in (place.state.u, place.w))
@@ -339,6 +364,7 @@ def _of_parameters(scene: Scene, place: AdjointState, name: str) -> list[Weighte
     system, conjugates, shares = scene.model.system, place.conjugates, list[WeightedTerm]()
     for parameter in conjugates.keys() & system.parameters.keys():
         for derivative in system.parameters[parameter].slopes:
+            # a density is known at points; its form can be differentiated
             if isinstance(derivative, ParameterDerivative) and not derivative.density.on_edges:
                 derivative = _as_form(scene, derivative)
             if not isinstance(derivative, FormTerm):
@@ -369,7 +395,8 @@ def _of_starts(
     """Return the derivative by the thickness where bodies start from the shell's face; collective.
 
     A thicker shell lifts such a body. This is the same as to lower the whole shell for this body
-    alone.
+    alone. So the derivative is that of the body's energies by a displacement of the whole shell
+    (`forces`), along the direction `contact.lift` in which the body is lifted.
 
     Parameters
     ----------
@@ -386,7 +413,7 @@ def _of_starts(
         (own cells, nodes of f, 1).
     """
     model, domain = scene.model, f.function_space.mesh
-    assert model.thin  # on which no bodies press
+    assert model.thin  # for types: a solid has no field of the thickness
     axes = model.axes
     gradient = np.zeros(
         (
@@ -395,7 +422,7 @@ def _of_starts(
         )
     )
     for contact in scene.problem.loads.contacts:
-        if contact.start is None or contact.lift is None:
+        if contact.start is None or contact.lift is None:  # it starts elsewhere
             continue
         of_body = [
             share for share in shares if share.term.name.startswith(f"contact {contact.body}")
@@ -403,8 +430,10 @@ def _of_starts(
         forces = domain.comm.allreduce(
             summed(of_body, model.u, model.u, w, model.kernels).sum(axis=(0, 1))
         )
+        # the thickness at the start is a sum of nodal values times basis functions of one cell
         if (cell_and_basis := _basis_at(model, f, contact.start[axes])) is not None:
-            gradient[cell_and_basis[0]] -= float(forces @ contact.lift[axes]) * cell_and_basis[1]
+            cell, basis = cell_and_basis
+            gradient[cell] -= float(forces @ contact.lift[axes]) * basis
     return gradient[..., None]
 
 
@@ -413,8 +442,8 @@ def _basis_at(
 ) -> tuple[int, Array] | None:
     """Return the cell nearest to a place of the surface, with its basis functions' values there.
 
-    The nearest place in a cell is on the plane of its corners. Collective: all ranks but the
-    nearest one get None.
+    Places are projected on the plane of a cell's corners; a cell is the nearer, the less they lie
+    outside of its corners and off its plane. Collective: all ranks but the nearest one get None.
 
     Parameters
     ----------
@@ -424,7 +453,7 @@ def _basis_at(
         Place (2,) or (3,) over R, undeformed.
     """
     element, nodes = f.function_space.element.basix_element, model.V.element.basix_element.points
-    corners = [
+    corners = [  # numbers of the nodes that are corners
         int(np.abs(nodes - corner).sum(axis=1).argmin())
         for corner in basix.geometry(element.cell_type)
     ]
@@ -435,7 +464,7 @@ def _basis_at(
         [corner_place - origin for corner_place in other_corners], axis=-1
     )  # (cells, components, dimension)
     barycentric = np.einsum("cdi,ci->cd", np.linalg.pinv(sides), x - origin)
-    distance_outside = np.maximum(
+    distance_outside = np.maximum(  # in cells
         0.0, np.maximum(-barycentric.min(axis=1), barycentric.sum(axis=1) - 1)
     )
     distances = distance_outside + np.linalg.norm(
@@ -451,8 +480,8 @@ def _basis_at(
 def _contracted(scene: Scene, place: AdjointState) -> fem.Function:
     """Return the vector along which residuals are taken, with the motion of supports; collective.
 
-    It is w of the place. A conjugate c_i of moving supports is a residual along the rate of their
-    motion, times c_i.
+    It is w of the place. If mu_i moves supports, c_i dPi/dmu_i is the residual along the rate of
+    their motion, times c_i: this rate is added to w.
     """
     model, system = scene.model, scene.model.system
     direction = fem.Function(model.V)
@@ -472,20 +501,20 @@ def _with_field(adjoint: Adjoint, name: str) -> Scene:
     no coefficient of the terms so far.
     """
     scene, problem = adjoint.scene, adjoint.scene.problem
-    if not scene.model.thin:
+    if not scene.model.thin:  # a solid has the remanence alone
         return scene
     if name == "thickness" and not scene.model.thickness:
         return Scene(replace(problem, thickness=Thickness()), scene.comm)
     loads, natural = problem.loads, problem.loads.natural
     if name == "curvature" and (natural is None or natural.curvature is None):
         with_curvature = Natural(
-            np.zeros(3),
+            np.zeros(3),  # the curvatures kappa_11, kappa_22, kappa_12
             natural.stretch if natural else None,
             frame(scene.problem.context, problem.azimuth),
         )
         return Scene(replace(problem, loads=replace(loads, natural=with_curvature)), scene.comm)
     magnetic = loads.magnetic
-    if (
+    if (  # without directions `_terms` takes magnetic terms with the field
         adjoint.directions
         and FIELDS[name].coefficient == "Br"
         and magnetic
@@ -499,10 +528,10 @@ def _with_field(adjoint: Adjoint, name: str) -> Scene:
 
 
 def _terms(scene: Scene, state: State, name: str) -> list[FormTerm]:
-    """Return the terms with forms, in which the field is a coefficient.
+    """Return the terms of a model that have forms; the field may be a coefficient in them.
 
-    A uniform remanence is a constant in the model's own terms. They are replaced by terms with a
-    field.
+    A uniform remanence is a constant in the model's own terms. By the remanence the magnetic terms
+    alone are returned then, with a field in place of the constant.
     """
     forms_of_terms = (
         (term.forms if isinstance(term, LinearTerm) else (term,))
@@ -530,7 +559,7 @@ def places_of(scene: Scene, f: fem.Function) -> tuple[Array, Array]:
 
 
 def _lengths(scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array) -> Array:
-    """Return the derivative by a factor of the vector at each place; a `Projection`."""
+    """Return the derivative by a factor of the remanence: forces . Br; a `Projection`."""
     Q = f.function_space
     vectors = f.x.array.reshape(-1, Q.dofmap.bs)[Q.dofmap.list[: len(forces)]]
     return np.asarray(np.sum(forces * vectors, axis=-1, keepdims=True))
@@ -541,7 +570,8 @@ def _curvatures(
 ) -> Array:
     """Return the derivative by kappa_11, kappa_22, kappa_12 of the natural shape; a `Projection`.
 
-    Components of `forces` are those by the tensor in space; the frame is that of the natural shape.
+    The first six components of `forces` are derivatives by the symmetric tensor of curvature in
+    space. They are projected on the tangent frame of the natural shape.
     """
     natural = scene.problem.loads.natural
     assert natural
@@ -549,9 +579,9 @@ def _curvatures(
 
 
 def _outwards(scene: Scene, f: fem.Function, forces: Array, places: Array, normals: Array) -> Array:
-    """Return the derivative by the deviation w0, the normal part of that by the place.
+    """Return the derivative by the deviation w0; a `Projection`.
 
-    A `Projection`.
+    It is the normal part of the derivative by the placement r0.
     """
     return np.asarray(np.sum(forces * normals[..., scene.model.axes], axis=-1, keepdims=True))
 
@@ -559,12 +589,12 @@ def _outwards(scene: Scene, f: fem.Function, forces: Array, places: Array, norma
 def _perfect(scene: Scene, places: Array, normals: Array) -> tuple[Array, Array]:
     """Return places and normals (cells, nodes, 3) of the perfect shell, from the drawn one's.
 
-    Deviations are functions of the perfect places.
+    Deviations are functions of the perfect places, at a distance w0 along the normal.
     """
     model, outward = scene.model, scene.problem.outward
     assert model.thin
     coordinates = model.meridian.embedding if model.axisymmetric else scene.problem.embedding
-    if outward:
+    if outward:  # normals of the perfect shell; nan where it has none
         normals_at_nodes = model.at_nodes(outward)[: len(normals)]
         normals = np.where(np.isfinite(normals_at_nodes), normals_at_nodes, normals)
     w0 = getattr(coordinates, "w0", None)
@@ -583,10 +613,10 @@ FIELDS = {
 
 
 def mass(scene: Scene) -> Adjoint:
-    """Return the mass over that of the same shell with the thickness h, as an adjoint; collective.
+    """Return the adjoint of the mass over the mass of the same shell with the thickness h.
 
-    It does not depend on displacements, so its only place is the undeformed state without
-    multipliers.
+    The mass does not depend on displacements, so the only place is the undeformed state without
+    multipliers. Collective.
     """
     state = scene.unloaded()
 
@@ -598,14 +628,15 @@ def mass(scene: Scene) -> Adjoint:
             scene_there.model.kernels,
             scene_there.model.u,
         )
-        if thickness_factor is None:
+        if thickness_factor is None:  # a uniform thickness is h
             return 1.0, []
         density_ratio = (
             fem.Constant(thickness_factor.function_space.mesh, 1.0)
             if scene_there.model.cell_materials is None
-            else scene_there.model.cell_materials[2]
+            else scene_there.model.cell_materials[2]  # the density of each cell
         )
         terms = (
+            # the field has one component, [0]
             FormTerm("mass", thickness_integral(density_ratio * thickness_factor[0]), u, log),
             FormTerm("area", thickness_integral(density_ratio * 1.0), u, log),
         )
@@ -625,15 +656,15 @@ def mass(scene: Scene) -> Adjoint:
 
 
 def density(scene: Scene, gradient: FieldGradient) -> Array:
-    """Return dJ per area over R^2 (per volume of a solid) at the nodes of V, from a gradient.
+    """Return the change of J per area over R^2 (per volume of a solid) at the nodes of V.
 
-    With the derivatives f by a field at the nodes of the cells and the hat functions H_v of the
-    vertices,
+    With the derivatives f of the gradient at the nodes of the cells and the hat functions H_v of
+    the vertices,
 
         g_v = sum(f H_v)/int(H_v dA)
 
-    is what J changes by where the field changes by one over a unit of area, averaged over about a
-    cell. The sum of g_v int(H_v dA) is the derivative by a field that changes alike everywhere.
+    is the change of J for a change of the field by one over a unit of area, averaged over the cells
+    at a vertex. The sum of g_v int(H_v dA) is the derivative by a uniform change of the field.
     Collective.
 
     Returns
@@ -656,6 +687,7 @@ def density(scene: Scene, gradient: FieldGradient) -> Array:
         g = fem.Function(H)
         np.add.at(g.x.array, H.dofmap.list[:count], forces_of_component)
         _added(g)
+        # J is that of the whole shell, of which the model may be one of several equal parts
         density_at_vertices.append(g.x.array / area.x.array / scene.model.multiplicity)
     in_cells = np.stack(density_at_vertices, axis=-1)[H.dofmap.list[:count]]
     hats_at_nodes = hat.tabulate(0, V.element.basix_element.points)[0, :, :, 0]

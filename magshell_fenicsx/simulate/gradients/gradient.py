@@ -1,4 +1,16 @@
-"""Gradients of a result with respect to amplitudes, numbers of the case, and fields."""
+"""Gradients of a result with respect to amplitudes, numbers of the case, and fields.
+
+Words and symbols:
+
+- J is the result, p the parameter. An `Adjoint` has J with the multipliers of its equations at
+  several places, which are states: the state of J, and states where steps began.
+- Pi is the potential energy, R = Pi_u the residual. An amplitude mu is a load parameter by name;
+  its conjugate -dPi/dmu is the displacement on which it does work. Where a step holds a conjugate
+  the amplitude is unknown, and the equation that holds it is a row with a multiplier.
+- Contracted equations are equations times their multipliers, summed.
+- A key is the path of a number in the case's file. h and R are thickness and reference length, E is
+  Young's modulus.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
@@ -47,13 +59,14 @@ Gradient: TypeAlias = float | FieldGradient
 
 
 def by_amplitude(adjoint: Adjoint, name: str) -> float:
-    """Return the derivative of a result by an amplitude that is prescribed at its places.
+    """Return the derivative of a result by an amplitude that is prescribed.
 
     Raises
     ------
     CaseError
         If the amplitude is unknown, as its conjugate is held, or is left by an earlier step.
     """
+    # at no place of the adjoint is it a load that stays up to the result
     if name in adjoint.places[0].follows or all(
         name in {*place.rows, *place.driven_amplitudes} for place in adjoint.places
     ):
@@ -68,7 +81,8 @@ def by_amplitude(adjoint: Adjoint, name: str) -> float:
 def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = None) -> float:
     """Return the derivative of a result J by a number of the case, without a solve; collective.
 
-    It is a central difference of J and of the contracted equations on the same mesh.
+    It is a difference of the sum of J and the contracted equations between two scenes on the same
+    mesh. The states stay, but for loads that the number changes.
 
     Parameters
     ----------
@@ -106,8 +120,9 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
             others[p] = perturbed_scene(scene, key, p)
         scene_at_value = scene if p == value else others[p]
         first_place, contracted_sum = adjoint.places[0], 0.0
-        for place in reversed(adjoint.places):  # the last one, whose state stays, is the first
-            own_amplitudes = {
+        # in reverse: `state` after the loop is that of the first place, the state of J
+        for place in reversed(adjoint.places):
+            own_amplitudes = {  # results and unknowns, which p does not scale
                 *place.rows,
                 *adjoint.left_loads,
                 *([adjoint.free_amplitude] if place.steps is None else []),
@@ -144,10 +159,10 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
 def _slope(f: Callable[[float], float], value: float, size: float) -> float:
     """Return df/dp at a value, by a difference between values that are allowed.
 
-    At a held displacement an energy or a pressing body is far stiffer in a number than the
-    equilibrium: by a natural stretch e the energy changes by E h R^2 of e^2, and its derivative may
-    be 1e-4 of that. A difference of second order then has the third derivative in it. Where the
-    values are not straight over a step, the difference is of fourth order.
+    At fixed displacements the values may be far more curved in p than the derivative is large: a
+    natural stretch e changes the energy by about E h R^2 e^2, and the derivative may be 1e-4 of
+    that. Then the error of a difference of second order, by the third derivative, is too large. So
+    where three values are not nearly on a line, the difference is of fourth order.
 
     Parameters
     ----------
@@ -167,14 +182,15 @@ def _slope(f: Callable[[float], float], value: float, size: float) -> float:
         """Return the difference quotient with values at multiples `nodes` of the step."""
         values = [value_at(value + node * step) for node in nodes]
         powers = np.vander(np.array(nodes, dtype=float), increasing=True).T
-        weights = np.linalg.solve(powers, np.eye(len(nodes))[1])  # exact of polynomials
+        # with sum of weights times node^k = 1 for k = 1, else 0: exact of polynomials
+        weights = np.linalg.solve(powers, np.eye(len(nodes))[1])
         return float(weights @ values) / step
 
     try:
         low, high = (value_at(value + node * step) for node in BOTH)
         if abs(low - 2 * value_at(value) + high) <= STRAIGHT * abs(high - low):
             return difference(BOTH)
-    except CaseError:
+    except CaseError:  # a value that is not allowed; one side may be
         pass
     for nodes in (FOUR, *ONE_SIDE):
         try:
@@ -229,7 +245,9 @@ def _residual_at(scene: Scene, other: Scene, place: AdjointState, state: State) 
         ratio_of_units = (
             other.conjugate_unit(name) / scene.conjugate_unit(name) * targets.get(name, 1.0)
         )
+        # a value that follows from the begin of the step changes with that place
         unit_ratio = 1.0 if name in place.follows else ratio_of_units
+        # the row: Pi_mu + q = 0
         contracted_sum += multiplier * (
             system.potential(state.u, state.mu, name) + unit_ratio * held_value
         )
@@ -237,7 +255,7 @@ def _residual_at(scene: Scene, other: Scene, place: AdjointState, state: State) 
 
 
 def _own_value(other: Scene, place: AdjointState, state: State) -> float:
-    """Return the part of J that a place contains through potentials and energy; collective.
+    """Return the part of J that a place contains: sum_i c_i dPi/dmu_i + c Pi; collective.
 
     Parameters
     ----------
@@ -250,6 +268,7 @@ def _own_value(other: Scene, place: AdjointState, state: State) -> float:
         for name, potential_factor in place.potentials.items()
     )
     if place.energy:
+        # Pi is that of the modelled part, `energies` those of the whole shell
         value += place.energy / other.model.multiplicity * sum(other.energies(state).values())
     return float(value)
 
@@ -305,7 +324,7 @@ def gradient(
         raise CaseError(
             f"{of}: the record is of {record.amplitude or 'the start'}, not of {FOLDS[of]}"
         )
-    begins = {record.step: begin} if begin else {}
+    begins = {record.step: begin} if begin else {}  # of this step alone
     if of == "instability" or (isinstance(of, str) and of in FOLDS):
         adjoint = as_asked(adjoint_of_instability(scene, record, fold, begins), of)
     else:
@@ -316,12 +335,14 @@ def gradient(
 def derivative(adjoint: Adjoint, by: str, others: dict[float, Scene] | None = None) -> Gradient:
     """Return the derivative of a result by one parameter, in the unit of the result; collective.
 
+    A number of the case changes the unit of the result too, which adds a second part.
+
     Parameters
     ----------
     by
         Amplitude, key of a number in the case, or field; see `gradient`.
     others
-        See `by_number`.
+        Value of the number -> scene with this value; filled, for further results of the same scene.
     """
     unit_size = adjoint.size
     with contact_expanded_about(adjoint.scene, adjoint.contact_state):

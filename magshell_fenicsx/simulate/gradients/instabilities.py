@@ -1,4 +1,10 @@
-"""The lowest instabilities of a path as results that have gradients."""
+"""The lowest instabilities of a path as results that have gradients.
+
+In: the records of a path. Out: adjoints, from which derivatives by any parameter follow. The result
+is the load at a fold, or at a bifurcation into waves around a meridian. An amplitude is a load
+parameter by name, as "pressure" or "lambda_m", the strength of the magnetic field. A path may go
+over to a branch at a bifurcation; the records of this branch do not count.
+"""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -35,8 +41,8 @@ class LostResult(RuntimeError):
 def located(records: Sequence[Record], amplitude: str) -> list[Record]:
     """Return the records at which the path loses its stability as an amplitude grows.
 
-    They are folds, and bifurcations before which no direction is unstable; those of branches do not
-    count.
+    Such a record is a fold, or a bifurcation before which no direction is unstable; records of
+    branches do not count.
     """
     records_in_amplitude = [
         record for record in records if record.amplitude == amplitude and not record.branch
@@ -73,6 +79,7 @@ def refuse_unitless(scene: Scene, result: str) -> None:
         If the result has a unit, and the case does not have this unit.
     """
     sizes = scene.sizes
+    # a field in T is no result in mT
     if result in SCALES and (
         SCALES[result] not in sizes.by_unit or (result.endswith("_mT") and sizes.field != "mT")
     ):
@@ -95,6 +102,7 @@ def refuse_moving(scene: Scene, end: Record, result: str | Target) -> None:
     LostResult
         If the path ends at an instability, and the result is not its amplitude.
     """
+    # a target shape has no column
     column = in_units(scene, end.point.state, result)[0] if isinstance(result, str) else ""
     is_load = end.amplitude in FOLDS.values() and column in (
         end.amplitude,
@@ -169,9 +177,10 @@ def instabilities(
             by_name.append(
                 (name, as_asked(adjoint_of_instability(scene, record, begins=begins), result))
             )
-        except CaseError as e:
+        except CaseError as e:  # a higher one without a gradient is left out
             if not by_name:
                 raise LostResult(str(e)) from None
     if not by_name:
         raise LostResult(f"the path has no instability in {amplitude}")
+    # again: the adjoint has the exact value, the record that of its point
     return sorted(by_name, key=lambda each: abs(each[1].value))

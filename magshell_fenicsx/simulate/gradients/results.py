@@ -2,6 +2,17 @@
 of a history.
 
 Before anything is built names alone say what a problem will have.
+
+Words and symbols:
+
+- J is a result; its `Adjoint` has what derivatives by any parameter p need: at several places,
+  which are states, multipliers w of the residual R, factors of dPi/dmu_i and of Pi.
+- Pi is the potential energy of the modelled part; the whole shell has `multiplicity` such parts.
+- An amplitude mu is a load parameter by name, its conjugate q = -dPi/dmu the displacement on which
+  it does work. A step may hold conjugates at their values where it begins.
+- A history has the records of a run on which its end depends. `begins` has for each step the last
+  record before it.
+- The barrier is the work that a probing force does in a step at whose end it is zero again.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -62,12 +73,13 @@ def adjoint_of_barrier(
 ) -> Adjoint:
     """Return the adjoint of the energy barrier between begin and end of the last step; collective.
 
-    Both states are in equilibrium without the probing force, so that the energy changes by p alone,
+    Both states are in equilibrium without the probing force, so that the first variation of Pi is
+    zero, and p changes the energy explicitly alone:
 
         dJ/dp = Pi_p(end) - Pi_p(begin) + sum_i (mu_i(end) - mu_i(begin)) dq_i/dp,
 
-    with the conjugates q_i that the step holds. They are those of its begin, where one solve gives
-    their multipliers.
+    with the conjugates q_i that the step holds. As q_i are functions of the state at the begin, one
+    solve there gives their derivatives.
 
     Parameters
     ----------
@@ -119,14 +131,15 @@ def adjoint_of_barrier(
         state_before, w, rows, -multiplicity, potential_factors, steps=begin.step
     )
     adjoint_of_conjugates = with_begins(Adjoint(scene, [at_begin]), begin, begins)
+    # with rows of factor zero: the amplitudes are unknown there
     zero_vector, zero_rows = 0.0 * state_after.u, dict.fromkeys(held_conjugates, 0.0)
     places_at_ends = [
         AdjointState(state_after, zero_vector, zero_rows, multiplicity),
         AdjointState(state_before, zero_vector, zero_rows, -multiplicity),
     ]
-    # loads as earlier steps have left them
+    # loads that keep values which earlier steps have found
     adjoint_with_begins = with_begins(Adjoint(scene, places_at_ends), end, begins)
-    # the places of `ends` come first, then those where earlier steps began
+    # its first two places are the ends; `at_begin`, in `adjoint_of_conjugates`, replaces the second
     places = [places_at_ends[0], *adjoint_of_conjugates.places, *adjoint_with_begins.places[2:]]
     value, left_loads = (
         barrier(scene, step, state_before, state_after),
@@ -175,7 +188,7 @@ def adjoint_at_end(
 ) -> tuple[str, Adjoint]:
     """Return the kind of a result at the end of a history, and its adjoint; collective.
 
-    The kind is "" but for vibrations, see `Vibration.kind`.
+    The kind of a vibration is the name of its mode in words; that of other results is "".
 
     Parameters
     ----------
@@ -197,14 +210,16 @@ def adjoint_at_end(
     if result == BARRIER:
         return "", adjoint_of_barrier(scene, history.begin, history.end, history.begins)
     if isinstance(result, str) and NAMES.fullmatch(result):
+        # the first of them is the vibration of this name
         return adjoints_of_vibrations(scene, history.end, result, hold, begins=history.begins)[0]
     return "", adjoint(scene, history.end, result, hold, history.begins)
 
 
 def vibration_at_end(scene: Scene, history: History, result: str) -> float | None:
-    """Return the frequency of a name at the end of a history; collective.
+    """Return a result such as "omega2_1" or "hertz_1" at the end of a history; collective.
 
-    None if the name is not one of a vibration, such as "omega2_1".
+    None if the name is not one of a vibration. Bodies that touch the shell are taken so stiff that
+    their stiffness does not matter.
 
     Raises
     ------
@@ -228,6 +243,7 @@ class NamesOnlyScene(Scene):
         """Put names alone in place of a model: a value of 1 says that a name exists."""
         loads = problem.loads
         unit_load_sizes = {name: 1.0 for name, several in loads.dead.items() if forces(several)}
+        # a mesh from a file has a pole of its own; other shapes have it among their points
         highest_point = ["pole"] if isinstance(problem.context.shell, MeshSurface) else []
         model = SimpleNamespace(
             loads=loads,

@@ -9,6 +9,15 @@ cells, and by each field f that follows from r0,
 
 where df/dw0 are differences: f in a cell follows from the nodes of this cell alone, so that a node
 of all cells is moved at once. Cells are as wide as the flat triangles between their vertices x.
+
+Words and symbols:
+
+- J is a result; w0 the deviation, a motion of the undeformed surface along its normal n; r0 the
+  placement, the undeformed place as a function on the mesh; Pi the potential energy.
+- A share is a term Pi_k with its weights in a gradient of J: `energy`, the factor of its own
+  derivative, and `work`, the factor of the derivative of its residual along w.
+- `over` of a term is the form of the integral (area, length, volume) by which its load is divided.
+- A measure is such an integral. Own cells are the cells of this rank without ghosts.
 """
 
 from collections.abc import Iterator, Sequence
@@ -37,7 +46,8 @@ def of_measures(
 ) -> list[WeightedTerm]:
     """Return further terms for loads that are divided by an integral, such as an area; collective.
 
-    They are the derivatives of this integral, which changes with the field as well.
+    A load L/A with A = int dA has the derivative L'/A - (L/A) A'/A. The first part is that of the
+    term itself; here the second one is added, as a term A with the weight -(L/A)/A.
 
     Parameters
     ----------
@@ -50,6 +60,7 @@ def of_measures(
     for share in shares:
         if share.term.over is None:
             continue
+        # dead loads are linear in u, so both weights are taken along one vector
         direction.x.array[:] = share.energy * model.u.x.array + share.work * w.x.array
         numerator = model.kernels.compile(
             f"{share.term.name} along", ufl.replace(share.term.form, {model.u: direction})
@@ -68,8 +79,9 @@ def of_widths(
 ) -> Array | None:
     """Return derivatives (cells, vertices, 3) by the vertices of flat cells; collective.
 
-    The widths of flat cells are in the penalty energies on edges. So the forms are replaced by ones
-    with vertices that move. None of a meridian, or where no form has a width.
+    The penalty energies on edges contain the widths of flat cells (area over length of the edge),
+    which UFL takes from the mesh. So these are replaced by functions of a field of vertices, by
+    which the forms are differentiated. None of a meridian, or where no form has a width.
 
     Parameters
     ----------
@@ -78,13 +90,13 @@ def of_widths(
     w
         The vector along which residuals are taken.
     """
-    if model.axisymmetric:  # where the placement says how wide they are
+    if model.axisymmetric:  # widths of its cells are functions of the placement
         return None
     domain = model.V.mesh
     vertices = fem.Function(fem.functionspace(domain, ("Lagrange", 1, (3,))), name="x")
     vertices.interpolate(lambda places: places)
     jet, (volume, side) = kin.jet(vertices, domain), (ufl.CellVolume(domain), ufl.FacetArea(domain))
-    length = kin.conormal(jet, kin.facet_covector(domain))[2]
+    *_, length = kin.conormal(jet, kin.facet_covector(domain))  # ratio of lengths of an edge
     moved_measures = {volume: volume * kin.area_ratio(jet), side: side * length}
     widened_terms = list[WeightedTerm]()
     for share in shares:
@@ -104,8 +116,8 @@ def of_widths(
 def of_normals(adjoint: Adjoint, place: AdjointState, *, first: bool) -> Array | float:
     """Return derivatives (own cells, nodes, 3) by the placement, from normals at points.
 
-    Point forces act along such a normal, and J may contain the deflection along one. 0.0 of a model
-    without a mid-surface, where the normals stay. Collective.
+    Point forces act along the normal at their point, and J may contain a deflection along a normal.
+    0.0 of a model without a mid-surface, where the normals stay. Collective.
 
     Parameters
     ----------
@@ -117,6 +129,7 @@ def of_normals(adjoint: Adjoint, place: AdjointState, *, first: bool) -> Array |
     model, mu, conjugates = adjoint.scene.model, place.state.mu, place.conjugates
     if not model.midsurface:  # on the axis of a meridian they stay
         return 0.0
+    # point, and the weights of the deflections of u and of w there
     deflected_points = (
         [(point, factor, 0.0) for point, factor in adjoint.deflections.items()] if first else []
     )
@@ -126,7 +139,6 @@ def of_normals(adjoint: Adjoint, place: AdjointState, *, first: bool) -> Array |
             (force.point, model.force_unit * energy, model.force_unit * mu[name])
         )
     gradient: Array | float = 0.0
-    # weights of the deflections of u and of w at the point
     for point, weight_of_u, weight_of_w in deflected_points:
         displacement = weight_of_u * model.displacement(
             place.state.u, point
@@ -166,8 +178,8 @@ def rates(
         (own cells, nodes, 3) at the nodes of the model.
     """
     V, step = model.V, STEP * model.material.h
-    placement = fem.Function(broken_space(V))
-    nodes = placement.x.array.reshape(-1, V.dofmap.bs)
+    placement = fem.Function(broken_space(V))  # each cell has nodes of its own
+    nodes = placement.x.array.reshape(-1, V.dofmap.bs)  # a view
     coordinates = model.r0.x.array.reshape(-1, V.dofmap.bs)[V.dofmap.list]
     node_dofs, dofs = (
         placement.function_space.dofmap.list,
@@ -185,4 +197,5 @@ def rates(
             values.append(
                 field.rebuild(placement).x.array.reshape(-1, field.function_space.dofmap.bs)[dofs]
             )
-        yield np.asarray((values[0] - values[1]) / (2 * step))
+        forward, backward = values
+        yield np.asarray((forward - backward) / (2 * step))

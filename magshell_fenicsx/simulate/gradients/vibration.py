@@ -12,6 +12,18 @@ residual's between u + e phi and u - e phi, which needs no third derivative of t
 here of fourth order, and those by u are differences of K phi. Membrane forces are cubic in u:
 without bending they are exact. Of waves around a meridian the second variation is a form of its
 own.
+
+Words and symbols:
+
+- K is the tangent matrix, M the mass matrix, phi a mode, lambda = omega^2 in the unit E/(rho R^2)
+  with Young's modulus E, density rho and reference length R. h is the thickness.
+- J is the result: lambda ("omega2_1", with the number of the mode), or the frequency in hertz.
+- The label of a mode is "" if it has the symmetry of the model; otherwise it names waves ("m = 3"),
+  torsion, or another symmetry.
+- A place of an `Adjoint` is a state with the multiplier w of its residual. Here each mode adds
+  places at u + e phi.
+- The conjugate of an amplitude (a load parameter) is the displacement on which it does work; where
+  it is held the amplitude is unknown.
 """
 
 import math
@@ -121,12 +133,12 @@ def vibrations(
 ) -> list[Vibration]:
     """Return the vibration of a name such as "omega2_1" and the next higher ones; collective.
 
-    The model's tangent is overwritten.
+    Modes with equal frequencies are one vibration. The model's tangent is overwritten.
 
     Parameters
     ----------
     max_ratio
-        Largest eigenvalue of a next one, over that of the first.
+        Largest eigenvalue of a next one, over that of the first; 1: the first one alone.
     max_count
         Largest number of vibrations.
 
@@ -141,7 +153,7 @@ def vibrations(
         )
     number = int(result.partition("_")[2])
     count = number + max_count
-    while True:
+    while True:  # with more and more modes, until the last group has none beyond them
         count += 1
         try:
             modes = ShellModes(scene.model).vibrations(
@@ -157,13 +169,13 @@ def vibrations(
             for group in groups
             if group.value <= max(max_ratio, 1 + DEGENERACY_TOLERANCE) * groups[0].value
         ][:max_count]
-        # the last group is complete
+        # the last group is complete: a higher mode is not in it, or the model has no more modes
         if groups_near_lowest[-1].numbers[-1] < len(modes) or len(modes) < count:
             return groups_near_lowest
 
 
 def _groups(modes: Sequence[ShellMode]) -> list[Vibration]:
-    """Return modes of one label whose frequencies are equal as one vibration; ascending.
+    """Return vibrations, each of all modes with one label and equal frequencies; ascending.
 
     Parameters
     ----------
@@ -172,6 +184,7 @@ def _groups(modes: Sequence[ShellMode]) -> list[Vibration]:
     """
     groups = list[list[int]]()
     for i, mode in enumerate(modes):
+        # compared with the lowest mode of each group, the nearest group last
         matching_groups = [group for group in groups if _is_degenerate(modes[group[0]], mode)]
         if matching_groups:
             matching_groups[-1].append(i)
@@ -230,10 +243,11 @@ def adjoints_of_vibrations(
     result
         Name such as "omega2_1".
     hold
-        Amplitude -> "load" or "conjugate", what stays as parameters change; None: as the record's
-        step holds.
+        Amplitude -> "load" or "conjugate", what stays as parameters change; None: what the record's
+        step holds, and then the begins of steps count too.
     max_ratio, max_count
-        See `vibrations`.
+        Largest eigenvalue of a higher vibration, over that of the first; and largest number of
+        vibrations.
     begins
         Number of a step -> the last record before it.
 
@@ -278,8 +292,9 @@ def _adjoint(
 ) -> Adjoint:
     """Return the adjoint of one vibration; collective.
 
-    Each mode adds displaced states u + e phi, as places whose residuals are contracted with phi:
-    their differences are the derivatives of phi . K phi.
+    Each mode adds displaced states u + e phi, as places with multipliers along phi. The sum of
+    their residuals times multipliers is the difference quotient of phi . K phi, so that its
+    derivative by p follows as from any other place.
 
     Parameters
     ----------
@@ -287,9 +302,11 @@ def _adjoint(
         Amplitude that is unknown -> its conjugate.
     """
     value = frequency(scene.problem, result, vibration.value)
+    # dJ/dlambda; hertz go as its square root
     rate = 1.0 if result.startswith("omega2") else value / (2 * vibration.value)
-    # factor of the eigenvalue of each mode in J
+    # factor of the eigenvalue of each mode in J, which has their mean
     factor = rate / len(vibration.modes)
+    # where shells touch, differences need fixed places in contact: an expansion about the state
     contact_state = state if any(deep > 0 for _, deep in shell_penetrations(scene, state)) else None
     if contact_state and _wave(vibration.modes[0]) is not None:
         refuse_touching_shells(scene, state, f"{result}: {vibration.modes[0].label}")
@@ -301,7 +318,7 @@ def _adjoint(
         ]
     by_u = np.sum([slope.by_u for slope in slopes], axis=0) * factor
     by_mu = {name: factor * sum(slope.by_mu[name] for slope in slopes) for name in held_conjugates}
-    # nothing displaces a shell that nothing loads, whatever changes
+    # without loads, as where rigid motions are allowed, p does not displace the shell: w is zero
     w, rows = (
         (0.0 * by_u, {})
         if scene.allows_rigid_motion
@@ -309,7 +326,7 @@ def _adjoint(
     )
     places, directions = [AdjointState(state, w, rows)], list[EnergyDirection]()
     for mode in vibration.modes:
-        if (m := _wave(mode)) is not None:
+        if (m := _wave(mode)) is not None:  # its energies are forms of their own
             directions.append(
                 EnergyDirection(mode.vector, m, stiffness=factor, inertia=-factor * mode.eigenvalue)
             )
@@ -323,6 +340,7 @@ def _adjoint(
                 )
             )
         directions.append(EnergyDirection(mode.vector, None, inertia=-factor * mode.eigenvalue))
+    # at a fixed eigenvalue J depends on the case by the unit of time alone
     by_itself = lambda there, _: frequency(there.problem, result, vibration.value)  # noqa: E731
     gas = with_gas(held_conjugates)
     return Adjoint(
@@ -348,12 +366,19 @@ def _slopes(
 ) -> Functional:
     """Return phi . K phi of a mode, with derivatives by u and by unknown amplitudes; collective.
 
+    They are differences of K phi and of the load vectors between states u + e phi.
+
     Parameters
     ----------
     held_names
         Amplitudes that are unknown.
     largest_step
         Largest displacement e phi of a difference, over h.
+
+    Raises
+    ------
+    CaseError
+        If the mode does not have the model's symmetry, and is no wave.
     """
     system, phi = scene.model.system, mode.vector
     if (m := _wave(mode)) is not None:

@@ -1,4 +1,8 @@
-"""Currents in thin wires."""
+"""Currents in thin wires: the section of a coil, and its field in its own axes, from magpylib.
+
+Lengths are in m, currents in A, fields in T. A source's field is known by values; `Harmonic` takes
+derivatives from them, at distances in proportion to the distance from the wire.
+"""
 
 from typing import Annotated, Literal, Self
 
@@ -18,7 +22,7 @@ from magshell_fenicsx.parts.magnetism.sources.source import (
 from magshell_fenicsx.shape.reference_shell import circle_line
 
 Array = NDArray[np.float64]
-NOWHERE = "on the wire of"
+NOWHERE = "on the wire of"  # words for places without a field
 
 
 class CoilSection(SourceSection):
@@ -47,7 +51,10 @@ class CoilSection(SourceSection):
         return self
 
     def field(self, key: str, R: float) -> FieldOfSource:
-        """Return the field of the wire in its own axes, see `SourceSection`."""
+        """Return the field of the wire in its own axes.
+
+        `key` is its key in the case file, for messages. R, the unit of formulas, is not used.
+        """
         current, currents = self.turns * self.current, magpylib(key).current
         if self.vertices is not None:
             corners = np.array(self.vertices)
@@ -60,6 +67,7 @@ class CoilSection(SourceSection):
         loop = currents.Circle(current=current, diameter=2 * r)
 
         def distance(x: Array) -> Array:
+            """Return the distance (n,) of places x (n, 3) from the circle."""
             return np.hypot(np.hypot(x[:, 0], x[:, 1]) - r, x[:, 2])
 
         return FieldOfSource(Harmonic(loop.getB, distance), [circle_line(r)], NOWHERE)

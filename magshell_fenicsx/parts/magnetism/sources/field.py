@@ -1,7 +1,13 @@
 """The whole applied field where it is known by its values: formulas, sources, and a uniform part.
 
-Fields are `FieldInSpace`: functions of places over R that return B over |B^a| with its first and
-second derivatives.
+Fields are `FieldInSpace`: functions of places over R that return B over |B^a|, the applied field's
+reference, with its first and second derivatives.
+
+A context holds the sections and steps of a case. A field at rest is one without amplitudes; a
+moving field has amplitudes (factors, by name) that shift, turn or multiply it, and is at rest where
+they are zero. Each step that moves a source has one amplitude, which is one at the end of the full
+motion; so has each step that turns the whole field. The frame of a model is that of the case,
+turned by an azimuth about e3.
 """
 
 from collections.abc import Callable, Sequence
@@ -66,6 +72,7 @@ def placed_sources(context: Context, turn: float = 0.0) -> list[PlacedSource]:
     applied = _applied(context)
     if applied is None or not applied.sources:
         return []
+    # unit: |B^a| in T
     R, unit, Q = context.shell.reference, applied.reference, rotation(turn)
     assert unit
     sources = list[PlacedSource]()
@@ -96,6 +103,7 @@ def turns(context: Context, turn: float = 0.0) -> tuple[RigidMotion, ...]:
     applied = _applied(context)
     if applied is None or not (applied.components or applied.sources or applied.gradient):
         return ()
+    # each step turns the field's axis from where the last one left it, by the shortest way
     rotations, start, zero = list[RigidMotion](), applied.vector(turn), np.zeros(3)
     for step in context.steps:
         if isinstance(step.load, RotationSection):
@@ -137,6 +145,7 @@ def in_space(
     if not applied.sources and not rotations:
         return by_formula, ()
     fields_at_rest = list[FieldInSpace]()
+    # formulas, or a uniform field with its gradient
     if applied.has_field_beside_sources:
         G = Q @ np.array(applied.gradient or np.zeros((3, 3))) @ Q.T
         fields_at_rest.append(by_formula or Linear(applied.uniform * applied.vector(turn), G))
@@ -147,6 +156,7 @@ def in_space(
             moving_fields.append(moving_field)
         else:
             fields_at_rest.append(source)
+    # rotations of the whole field move all that rests, too
     if rotations:
         moving_fields += [MovingField(field_at_rest, rotations) for field_at_rest in fields_at_rest]
         fields_at_rest = []
@@ -163,10 +173,14 @@ def _moving_source(
 ) -> MovingField:
     """Return a source as a field with the amplitudes of all steps that move it.
 
-    Rotations about its own position come before all other motions.
+    Motions are carried out one after the other: first all rotations about the source's own position
+    at rest (`spins`), then shifts and rotations of the whole field (`moves`) in the order of the
+    steps.
 
     Parameters
     ----------
+    applied
+        Section of the applied field, with the list of sources.
     steps
         Steps of the programme.
     number
@@ -192,7 +206,7 @@ def _moving_source(
             moves.append(rotation_of[turn_name(step)])
         if step.name not in steps_of_source:
             continue
-        steps_of_source.remove(step.name)
+        steps_of_source.remove(step.name)  # later steps of one amplitude go on with the same motion
         load, name = loads[step.name], step.name
         if load.turn:
             axis = np.array(load.turn.axis) / np.linalg.norm(load.turn.axis)
@@ -200,7 +214,7 @@ def _moving_source(
                 RigidMotion(name, zero, radians(load.turn.angle) * (Q @ axis), source.position)
             )
         elif load.strength is not None:
-            factors[name] = load.strength - 1
+            factors[name] = load.strength - 1  # the change of the factor, from one
         else:
             end = np.array(load.move or load.to) / source.length
             # where all motions before this step have taken the source

@@ -1,4 +1,4 @@
-"""A field by formulas, in tesla."""
+"""A field by formulas of x, y, z over the reference length R, in tesla."""
 
 from typing import Annotated, Literal
 
@@ -24,12 +24,17 @@ class FormulaSource(SourceSection):
         return f"formulas ({', '.join(self.components)})"
 
     def field(self, key: str, R: float) -> FieldOfSource:
-        """Return the field of the formulas in the source's own axes, see `SourceSection`."""
+        """Return the field of the formulas in the source's own axes, places in m.
+
+        `key` is not used. The field has no outline, and nowhere where a formula is not finite.
+        """
         formulas = FormulasInSpace(
             [formula_with_derivatives(text) for text in self.components], np.eye(3)
         )
 
         def values(x: Array) -> tuple[Array, Array, Array]:
+            """Return B at places x (n, 3) in m, with its first and second derivatives."""
+            # derivatives are by lengths over R
             B, G, H = formulas(np.asarray(x / R))
             return self.flux_density * B, self.flux_density / R * G, self.flux_density / R**2 * H
 

@@ -1,4 +1,9 @@
-"""A field that is known on a rectilinear grid, as a C2 cubic spline."""
+"""A field that is known on a rectilinear grid, as a C2 cubic spline.
+
+In goes a file with places and flux densities; out come B and its first and second derivatives at
+any place within the grid. An axis is the sorted list of the coordinates of the grid along x, y or
+z. Places are in m, B in T.
+"""
 
 from itertools import combinations_with_replacement
 from math import prod
@@ -19,7 +24,7 @@ if TYPE_CHECKING:
     import scipy
 
 PLACES, FIELD = ("x", "y", "z"), ("Bx", "By", "Bz")
-VTK, DEGREE = (".vtk", ".vti", ".vtr", ".vts"), 3
+VTK, DEGREE = (".vtk", ".vti", ".vtr", ".vts"), 3  # endings of VTK files; degree of the spline
 PLACE_TOLERANCE = 1e-6  # over the distance between places: rounding of a table
 _grids: dict[tuple[Path, str], tuple[list[Array], Array]] = {}  # a run plans its case several times
 
@@ -42,7 +47,10 @@ class GridSection(FileKeys, SourceSection):
         return f"grid of {self.file}"
 
     def field(self, key: str, R: float) -> FieldOfSource:
-        """Return the field of the spline in the source's own axes, see `SourceSection`.
+        """Return the field of the spline in the source's own axes, places in m.
+
+        `key` is the source's key in the case file, for messages. R, the unit of formulas, is not
+        used.
 
         Raises
         ------
@@ -56,7 +64,10 @@ class GridSection(FileKeys, SourceSection):
         spline = _spline(axes, B_on_grid)
 
         def values(x: Array) -> tuple[Array, Array, Array]:
+            """Return B at places x (n, 3) with its first and second derivatives."""
+
             def derivative(*axes_of_derivative: int) -> Array:
+                """Return B (n, 3), differentiated once for each number of an axis given."""
                 return np.asarray(
                     spline(x, nu=np.bincount(axes_of_derivative, minlength=3))
                     if axes_of_derivative
@@ -65,11 +76,13 @@ class GridSection(FileKeys, SourceSection):
 
             B, G = derivative(), np.stack([derivative(j) for j in range(3)], axis=-1)
             H = np.empty((len(x), 3, 3, 3))
+            # second derivatives are symmetric in the last two axes
             for j, k in combinations_with_replacement(range(3), 2):
                 H[:, :, j, k] = H[:, :, k, j] = derivative(j, k)
             return B, G, H
 
         low, high = (np.array([axis[end] for axis in axes]) for end in (0, -1))
+        # beyond the grid the spline is nan
         return FieldOfSource(values, box_lines(low, high), "beyond the grid of")
 
 
@@ -97,7 +110,7 @@ def read(file: Path, digest: str | None, files: Files) -> tuple[list[Array], Arr
         If the file cannot be read, or is no rectilinear grid.
     """
     if digest is None or (file, digest) not in _grids:
-        if len(_grids) > 3:
+        if len(_grids) > 3:  # a few grids may fill the memory
             _grids.clear()
         rows = _vtk_rows(file, files) if file.suffix in VTK else _table_rows(file, files)
         _grids[file, digest or ""] = _gridded(*rows)
@@ -121,6 +134,7 @@ def _gridded(x: Array, B: Array) -> tuple[list[Array], Array]:
             f"has {' x '.join(map(str, shape))} places: a cubic spline needs four along each axis"
         )
     values_on_grid = np.full((len(x), 3), np.nan)
+    # rows without a node of their own leave nan at others
     if len(x) == prod(shape):  # scattered places have far more places along the axes than rows
         grid_numbers = tuple(_nearest(axis, x[:, i]) for i, axis in enumerate(axes))
         # each row goes to the node of the grid nearest to its place
@@ -148,7 +162,7 @@ def _table_rows(file: Path, files: Files) -> tuple[Array, Array]:
         )
     axes = [columns[name] for name in PLACES]
     on_axes = file.suffix == ".npz" and columns["Bx"].ndim == 3 and {a.ndim for a in axes} == {1}
-    # arrays hold the places along each axis
+    # .npz arrays may hold the places along each axis alone, and B on the whole grid
     if on_axes and columns["Bx"].size == prod(a.size for a in axes):
         columns |= dict(zip(PLACES, np.meshgrid(*axes, indexing="ij"), strict=True))
     rows = [columns[name].ravel() * _size(units[name], name) for name in (*PLACES, *FIELD)]

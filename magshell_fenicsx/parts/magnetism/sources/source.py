@@ -1,4 +1,12 @@
-"""Base of all sources of the applied field: their sections, and their fields at their places."""
+"""Base of all sources of the applied field: their sections, and their fields at their places.
+
+A source is a magnet, a coil, a grid or formulas. It has axes of its own, in which places are in m
+and B in T; `FieldOfSource` is its field there. `PlacedSource` is the field in the model's frame,
+with places over R and B over |B^a|, the applied field's reference. A field (`FieldInSpace`) is a
+function of places that returns B with its first and second derivatives. `Values` are functions of
+places (n, 3) to arrays. A solid is a body as it is drawn; `magpylib` is the package that computes
+fields.
+"""
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -78,7 +86,7 @@ class SourceSection(Section):
             (np.sin(t), np.cos(t))
             for t in np.radians([self.axis.polar, self.axis.azimuth, self.spin])
         )
-        # rotations by azimuth about z, polar about y, and spin about z
+        # rotations by spin about z, then by polar about y, then by azimuth about z
         about_z = np.array([[ca, -sa, 0.0], [sa, ca, 0.0], [0.0, 0.0, 1.0]])
         about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
         return np.asarray(
@@ -142,7 +150,10 @@ class MagnetSection(SourceSection):
         """Return the faces for pictures, in m."""
 
     def field(self, key: str, R: float) -> FieldOfSource:
-        """Return the field of the magnet in its own axes, see `SourceSection`."""
+        """Return the field of the magnet in its own axes.
+
+        `key` is its key in the case file, for messages. R, the unit of formulas, is not used.
+        """
         values = Harmonic(self.values(magpylib(key).magnet), self.distance)
         solid = self.solid().magnetised(
             self.strength * self.vector, self.name or f"{self.kind} magnet"
@@ -191,6 +202,7 @@ class PlacedSource:
 
     def __call__(self, x: Array) -> tuple[Array, Array, Array]:
         """Return B (n, 3) over |B^a| at places x (n, 3) over R, with both derivatives."""
+        # to the source's own axes, in m; a derivative by lengths over R has the factor R
         Q, R = self.axes, self.length
         B, G, H = self.own.values(R * (x - self.position) @ Q)
         return (
@@ -204,6 +216,7 @@ class PlacedSource:
 
         It is negative inside, and infinite if there is no body.
         """
+        # grids and formulas have no body
         distance_to_source = getattr(self.own.values, "distance", None)
         return (
             np.full(len(x), np.inf)
@@ -276,6 +289,7 @@ class Harmonic:
 
         All are nan inside a magnet and where the distance is not finite.
         """
+        # points of the stencil around each place, at 0.005 of its distance
         d = self.distance(x)
         outside = np.isfinite(d) & (d > 0)
         B, G, H = (np.full((len(x), *shape), np.nan) for shape in ((3,), (3, 3), (3, 3, 3)))
@@ -295,8 +309,9 @@ class Harmonic:
 def stencil() -> tuple[Array, Array, Array]:
     """Return the points of `Harmonic` and the weights that give derivatives of values there.
 
-    The gradients of the powers (a . x)^l of null vectors a are those of all harmonic polynomials of
-    degree l.
+    Values of B at the points and its derivatives at 0 are known for gradients of harmonic
+    polynomials. All of these of degree l are sums of the powers (a . x)^l of null vectors a. So the
+    weights are those that are right for these powers up to `DEGREE`, of least squares.
 
     Returns
     -------
@@ -315,6 +330,7 @@ def stencil() -> tuple[Array, Array, Array]:
         for t in 2 * np.pi * np.arange(2 * degree + 1) / (2 * degree + 1):
             # null vector: a . a = 0, so that powers of a . x are harmonic
             a = np.array([np.cos(t), np.sin(t), 1j])
+            # the gradient is l (a . x)^(l - 1) a; points with a . x = 0 make 0^0 a case of its own
             power = np.ones(len(points)) if degree == 1 else (points @ a) ** (degree - 1)
             # derivatives at 0 of the gradient of (a . x)^l
             by_x = 2.0 * (degree == 2) * np.outer(a, a).ravel()
