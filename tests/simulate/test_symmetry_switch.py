@@ -259,7 +259,7 @@ def test_the_branch_of_a_tube_has_the_curvature_of_koiters_theory(
     critical, b = koiter(h, length, 0.3, 4)
     seen = list[tuple[float, float]]()
     for size in (0.15, 0.3):  # of the first step along the mode, in thicknesses
-        monkeypatch.setattr(bifurcation, "SIZES", (size,))
+        monkeypatch.setattr(bifurcation, "FIRST_STEP_SIZES", (size,))
         records = follow(Scene(problem_of(TUBE)), remark=lambda said: None)
         buckled, first = islice(
             (r for r in records if r.scene and isinstance(r.scene.problem.mirror, Sector)), 2

@@ -125,7 +125,12 @@ def test_a_resumed_run_looks_at_no_known_contact_again(
     """
     case, whole, killed = tmp_path / "case.yaml", tmp_path / "whole", tmp_path / "killed"
     case.write_text(json.dumps(pressed_caps(0.03, 3, **mesh) | {"symmetry": symmetry}))
-    looks, at_end, record, following = list[str](), list[int](), Checkpoint.record, Checkpoint._next
+    looks, at_end, record, following = (
+        list[str](),
+        list[int](),
+        Checkpoint.record,
+        Checkpoint._next_content,
+    )
 
     def recorded(journal: Checkpoint, result: Point | str) -> None:
         record(journal, result)
@@ -149,7 +154,7 @@ def test_a_resumed_run_looks_at_no_known_contact_again(
     before, looked = read_path(killed), at_end[-1]
     assert any(float(row["contact_force"]) > 0 for row in before)
     looks.clear(), at_end.clear()
-    monkeypatch.setattr(Checkpoint, "_next", next_known)
+    monkeypatch.setattr(Checkpoint, "_next_content", next_known)
     assert magshell("run", case, "--out", killed, "--resume").returncode == 0
     assert at_end[0] <= FEW < looked / 2, looks[: at_end[0]]
     rows = [[{**row, "wall_s": ""} for row in read_path(out)] for out in (killed, whole)]
