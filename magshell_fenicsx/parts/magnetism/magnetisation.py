@@ -15,8 +15,8 @@ leaves to a model.
   to a model.
 """
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from math import sqrt
 from typing import Any
@@ -70,6 +70,7 @@ from magshell_fenicsx.shape.symmetry_constraint import (
 )
 
 Array = NDArray[np.float64]
+MIRROR_TOLERANCE = 1e-10  # difference of a uniform vector from its mirror image: rounding
 EQUALITY_TOLERANCE = 1e-9  # part of a direction outside a plane: rounding
 
 
@@ -253,125 +254,173 @@ def _remanence(
     return section.vector(turn)
 
 
+@dataclass(frozen=True)
+class _MagneticVectors:
+    """Remanence and applied field of a case, as a symmetry must preserve them.
+
+    A plane is a mirror if it maps both to themselves, or both to their opposites: the energy is a
+    product of both.
+
+    Attributes
+    ----------
+    vectors
+        Uniform remanences and the uniform applied field, (3,) each.
+    turned_directions
+        Directions (3,) to which the programme turns the uniform field.
+    fields
+        Remanences and applied fields that vary: places (n, 3) -> vectors (n, 3).
+    sources
+        Fields of sources, functions like `fields`; they are smooth.
+    patterns
+        Patch -> its remanence, if that is a pattern in the frame of the patch.
+    kind
+        Kind of the section `remanent`: "radial", "tangential" or another.
+    is_beside_surface
+        Whether the applied field is a formula of the deformed place, which lies off the surface.
+    """
+
+    vectors: Sequence[Array]
+    turned_directions: Sequence[Array]
+    fields: Sequence[Callable[[Array], Array]]
+    sources: Sequence[Callable[[Array], Array]]
+    patterns: Mapping[str, PosedPattern]
+    kind: str
+    is_beside_surface: bool
+
+    def has_mirror(self, mirror: Mirror, outline: Outline) -> bool:
+        """Return whether a plane maps remanence and field to themselves or both to opposites."""
+        x = outline.sample() if self.fields or self.sources else np.zeros((0, 3))
+        if self.is_beside_surface:
+            x = with_nearby_places(x)
+        return self._has_images(mirror, x, 1.0) or self._has_images(mirror, x, -1.0)
+
+    def _has_images(self, mirror: Mirror, x: Array, sign: float) -> bool:
+        """Return whether mirror images are `sign` times the vectors, at places x (n, 3)."""
+        S = mirror.reflection
+        some_places = x[:: len(x) // 50 + 1]  # enough for smooth fields
+        places_of_fields = [
+            *((field, x) for field in self.fields),
+            *((field, some_places) for field in self.sources),
+        ]
+        uniform = all(
+            np.abs(S @ v - sign * v).max() <= MIRROR_TOLERANCE
+            for v in (*self.vectors, *self.turned_directions)
+        )
+        varying = all(
+            equal_to_rounding(
+                sign * np.einsum("ni,ij->nj", field(places), S), field(mirror.image(places))
+            )
+            for field, places in places_of_fields
+        )
+        return uniform and varying and self._patterns_have_images(S, sign)
+
+    def _patterns_have_images(self, S: Array, sign: float) -> bool:
+        """Return whether radial and tangential remanences are mapped to `sign` times themselves.
+
+        A radial remanence is its own mirror image. A tangential one is so for planes through its
+        axis, and its opposite for planes normal to that. S is the reflection (3, 3).
+        """
+        sign_of_kind = {"radial": 1.0, "tangential": float(S[2, 2])}
+        for pattern in self.patterns.values():
+            axis = pattern.place.Q[:, 2]
+            if pattern.pattern is radial and sign != 1.0:
+                return False
+            is_mapped = np.abs(S @ axis - sign * axis).max() <= EQUALITY_TOLERANCE
+            if pattern.pattern is tangential and not is_mapped:
+                return False
+        return sign_of_kind.get(self.kind, sign) == sign
+
+
 def remanence_constraints(context: Context, outline: Outline) -> list[SymmetryConstraint]:
     """Return the symmetry that the magnetisation preserves, as one constraint in a list.
 
-    A plane is a mirror if it maps remanence and applied field to themselves, or both to their
-    opposites: the energy is a product of both. The constraint also has the reason, if any, why the
-    problem is not axisymmetric about e3.
+    The constraint also has the reason, if any, why the problem is not axisymmetric about e3.
     """
     magnetic = context.section_of(MagneticSection)
     assert magnetic
-    # what is compared: uniform `vectors`, and `fields` that are functions of the place
-    formulas = magnetic.applied.components if magnetic.applied.has_field_beside_sources else None
-    without_uniform_field = (
-        formulas or not magnetic.applied.has_field_beside_sources or not strength(context)
-    )
-    directions = magnetic.remanent.directions() if magnetic.remanent else []
-    remanences = [_on_patch(d, context, 0.0) for d in directions]
-    vectors = [v for v in remanences if not callable(v)] + (
-        [] if without_uniform_field else [magnetic.applied.vector()]
-    )
-    rotates_as_whole = turns(context)  # then the rotation is a part of the field at each place
-    turned_directions = (
-        [] if rotates_as_whole else [step.to.vector() for step in _rotations(context)]
-    )
-    remanent = magnetic.remanent or RemanentSection.model_construct()
-    G = np.array(magnetic.applied.gradient or np.zeros((3, 3)))
-    if isinstance(remanent.components, UserField):
+    if magnetic.remanent and isinstance(magnetic.remanent.components, UserField):
         return [SymmetryConstraint("the remanence is a function on a mesh", mirrors=no_plane)]
-    fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
-    fields += [vector_function(texts) for texts in (remanent.components, formulas) if texts]
-    reasons = ["a field is not along e3"] if any(tilted(v) for v in vectors) else []
-    if remanent.file:
-        by_place = by_points(remanent)
-        fields.append(lambda x: by_place(x, x))
-        reasons += (
-            []
-            if by_place.controls.is_axisymmetric
-            else ["the remanence is given at points in space"]
+    vectors = _magnetic_vectors(magnetic, context)
+
+    def mirrors(mirror: Mirror) -> bool:
+        return soft_mirrored(magnetic.susceptibility, outline, mirror) and vectors.has_mirror(
+            mirror, outline
         )
+
+    reasons = _reasons_not_axisymmetric(magnetic, vectors, outline)
+    axes_of_sources = _vectors_of_sources(magnetic.applied.sources or [], context.shell.reference)
+    in_plane = [*vectors.vectors, *axes_of_sources]
+    return [SymmetryConstraint(next(reasons, None), in_plane, mirrors)]
+
+
+def _magnetic_vectors(magnetic: MagneticSection, context: Context) -> _MagneticVectors:
+    """Return remanence and applied field of a case, as its symmetry is judged by them."""
+    applied, remanent = magnetic.applied, magnetic.remanent
+    formulas = applied.components if applied.has_field_beside_sources else None
+    directions = remanent.directions() if remanent else []
+    remanences = [_on_patch(direction, context, 0.0) for direction in directions]
+    vectors = [remanence for remanence in remanences if not callable(remanence)]
+    if applied.has_field_beside_sources and not formulas and strength(context):
+        vectors.append(applied.vector())
+    remanent = remanent or RemanentSection.model_construct()
     patterns = {
         name: remanence
         for name, remanence in zip(remanent.patches or {}, remanences, strict=False)
         if isinstance(remanence, PosedPattern)
     }
-    for name, pattern in patterns.items():
-        if pattern.pattern in (radial, tangential):
-            continue
-        fields.append(partial(_at_places, pattern))
-        meridians = tuple(
-            meridian
-            for meridian in (outline.meridian.shell_meridians if outline.meridian else ())
-            if name.startswith(meridian.name)
-        )
-        meridian_of_patch = outline.meridian and replace(
-            outline.meridian, shell_meridians=meridians
-        )
-        if not (
-            meridian_of_patch and field_is_axisymmetric(fields[-1], meridian_of_patch, smooth=False)
-        ):
-            reasons.append(f"the remanence of {name} differs around e3")
-    sources = values(context) if magnetic.applied.sources or rotates_as_whole else []
-    reasons += [
-        f"{field_in_words} differs around e3"
-        for field_in_words, is_axisymmetric in _axisymmetry_of_formulas(
-            magnetic, outline, sources
-        ).items()
-        if not is_axisymmetric
-    ]
+    G = np.array(applied.gradient or np.zeros((3, 3)))
+    fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
+    fields += [vector_function(texts) for texts in (remanent.components, formulas) if texts]
+    if remanent.file:
+        by_place = by_points(remanent)
+        fields.append(lambda x: by_place(x, x))
+    fields += [partial(_at_places, pattern) for pattern in _varying_patterns(patterns).values()]
+    rotates_as_whole = turns(context)  # then the rotation is a part of the field at each place
+    rotations = [] if rotates_as_whole else _rotations(context)
+    return _MagneticVectors(
+        vectors=vectors,
+        turned_directions=[step.to.vector() for step in rotations],
+        fields=fields,
+        sources=values(context) if applied.sources or rotates_as_whole else [],
+        patterns=patterns,
+        kind=remanent.kind,
+        is_beside_surface=bool(formulas),
+    )
+
+
+def _varying_patterns(patterns: Mapping[str, PosedPattern]) -> dict[str, PosedPattern]:
+    """Return the patterns that are neither radial nor tangential, by patch."""
+    return {
+        name: pattern
+        for name, pattern in patterns.items()
+        if pattern.pattern not in (radial, tangential)
+    }
+
+
+def _reasons_not_axisymmetric(
+    magnetic: MagneticSection, vectors: _MagneticVectors, outline: Outline
+) -> Iterator[str]:
+    """Yield why remanence and field are not axisymmetric about e3, in words for the user."""
+    if any(tilted(v) for v in vectors.vectors):
+        yield "a field is not along e3"
+    remanent = magnetic.remanent
+    if remanent and remanent.file and not by_points(remanent).controls.is_axisymmetric:
+        yield "the remanence is given at points in space"
+    for name, pattern in _varying_patterns(vectors.patterns).items():
+        meridian = outline.meridian
+        if meridian:
+            meridians = [m for m in meridian.shell_meridians if name.startswith(m.name)]
+            meridian = replace(meridian, shell_meridians=tuple(meridians))
+        field = partial(_at_places, pattern)
+        if not (meridian and field_is_axisymmetric(field, meridian, smooth=False)):
+            yield f"the remanence of {name} differs around e3"
+    is_axisymmetric = _axisymmetry_of_formulas(magnetic, outline, vectors.sources)
+    for field_in_words, is_around_e3 in is_axisymmetric.items():
+        if not is_around_e3:
+            yield f"{field_in_words} differs around e3"
+    G = np.array(magnetic.applied.gradient or np.zeros((3, 3)))
     if np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() > PARALLEL:
-        reasons.append("the gradient of the applied field is not diag(a, a, b)")
-
-    def mirrors(mirror: Mirror) -> bool:
-        """Return whether a plane maps remanence and field to themselves or both to opposites."""
-        S, x = mirror.reflection, outline.sample() if fields or sources else np.zeros((0, 3))
-        # the applied formula is one of the deformed place, which is beside the surface
-        x = with_nearby_places(x) if formulas else x
-
-        def images(sign: float) -> bool:
-            """Return whether mirror images are `sign` times the remanence and the field."""
-            uniform = all(
-                np.abs(S @ v - sign * v).max() <= 1e-10 for v in (*vectors, *turned_directions)
-            )
-            some_places = x[:: len(x) // 50 + 1]  # the field of a source is smooth
-            varying = all(
-                equal_to_rounding(
-                    sign * np.einsum("ni,ij->nj", field(places), S), field(mirror.image(places))
-                )
-                for field, places in (
-                    *((field, x) for field in fields),
-                    *((field, some_places) for field in sources),
-                )
-            )
-            # a radial remanence is its own mirror image; a tangential one is so for planes through
-            # e3, and its opposite for planes normal to e3
-            kinds = {"radial": 1.0, "tangential": float(S[2, 2])}
-            shell_patterns = [
-                (pattern_of_shell.pattern, pattern_of_shell.place.Q[:, 2])
-                for pattern_of_shell in patterns.values()
-            ]
-            is_symmetric = all(p is not radial or sign == 1.0 for p, _ in shell_patterns)
-            is_symmetric &= all(
-                p is not tangential or np.abs(S @ e3 - sign * e3).max() <= EQUALITY_TOLERANCE
-                for p, e3 in shell_patterns
-            )
-            return uniform and varying and is_symmetric and kinds.get(remanent.kind, sign) == sign
-
-        return soft_mirrored(magnetic.susceptibility, outline, mirror) and (
-            images(1.0) or images(-1.0)
-        )
-
-    return [
-        SymmetryConstraint(
-            next(iter(reasons), None),
-            [
-                *vectors,
-                *_vectors_of_sources(magnetic.applied.sources or [], context.shell.reference),
-            ],
-            mirrors,
-        )
-    ]
+        yield "the gradient of the applied field is not diag(a, a, b)"
 
 
 def _axisymmetry_of_formulas(
