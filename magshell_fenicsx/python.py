@@ -433,7 +433,7 @@ def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys
         If it is no vector of three numbers or formulas.
     """
 
-    def of_size(tesla: float) -> Keys:
+    def magnitude_key(tesla: float) -> Keys:
         """Return the key of a magnitude in tesla; no key in a dimensionless problem."""
         return {} if dimensionless else {"flux_density": f"{tesla!r} T"}
 
@@ -450,14 +450,16 @@ def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys
         return {
             **expression_kind,
             "components": field.mapped(lambda B: np.asarray(B / magnitude)),
-            **of_size(magnitude),
+            **magnitude_key(magnitude),
         }
     components = shell.plain_value(value, key)
     if not isinstance(components, list) or len(components) != 3:
         raise CaseError(f"{NAME}: {key}: {components}: a vector has three components")
-    has_direction = any(components) or not dimensionless  # zero has a size, and no direction
-    if not has_direction or any(isinstance(item, str) for item in components):
-        return {**expression_kind, "components": list(map(str, components)), **of_size(1.0)}
+    # formulas stay components; so does a zero vector in a dimensionless problem, where no magnitude
+    # could say that it is zero
+    is_dimensionless_zero = dimensionless and not any(components)
+    if is_dimensionless_zero or any(isinstance(item, str) for item in components):
+        return {**expression_kind, "components": list(map(str, components)), **magnitude_key(1.0)}
     try:
         x, y, z = map(float, components)
     except (TypeError, ValueError):
@@ -465,7 +467,7 @@ def _flux(value: Vector, shell: Shell, key: str, *, dimensionless: bool) -> Keys
             f"{NAME}: {key}: {components}: its components are numbers or formulas"
         ) from None
     direction = {"polar": degrees(atan2(hypot(x, y), z)), "azimuth": degrees(atan2(y, x))}
-    return {**direction, **of_size(hypot(x, y, z))}
+    return {**direction, **magnitude_key(hypot(x, y, z))}
 
 
 def Problem(

@@ -154,15 +154,16 @@ def interior_edges(
     topology = V.mesh.topology
     topology.create_connectivity(1, 2)
     cells_of_edges = topology.connectivity(1, 2)
-    facets = np.flatnonzero(
-        # edges with two cells
-        np.diff(cells_of_edges.offsets[: topology.index_map(1).size_local + 1]) == 2
-    ).astype(np.int32)
+    # own edges with two cells
+    cell_counts = np.diff(cells_of_edges.offsets[: topology.index_map(1).size_local + 1])
+    facets = np.flatnonzero(cell_counts == 2).astype(np.int32)
     # the two cells of a facet follow one another in the flat array
-    cells = cells_of_edges.array[cells_of_edges.offsets[facets][:, None] + np.arange(2)]
+    first_positions = cells_of_edges.offsets[facets]
+    cells = cells_of_edges.array[first_positions[:, None] + np.arange(2)]
     edges = np.column_stack([_local_edges(V, facets, cells[:, side]) for side in range(2)])
-    starts = [_corner(V, cells[:, side], edges[:, side]) for side in range(2)]
-    return cells, edges, starts[0] != starts[1]
+    # two cells run in opposite directions if they start at different vertices
+    first_starts, second_starts = (_corner(V, cells[:, side], edges[:, side]) for side in range(2))
+    return cells, edges, first_starts != second_starts
 
 
 def boundary_edges(
@@ -205,23 +206,41 @@ def _edge_batches(
     """
     sides = cells.shape[1]
     for kind in np.unique(kinds, axis=0):
-        # the points on the second side run backwards where its cell runs in opposite direction
-        reversed_sides = (False, bool(kind[-1]))[:sides]
-        rules = [
-            edge_rule(degree, int(edge), is_reversed)
-            for edge, is_reversed in zip(kind[:sides], reversed_sides, strict=True)
-        ]
-        # all sides have the same weights
-        points_of_sides, weights = tuple(points for points, _ in rules), rules[0][1]
-        tables = tuple(ShapeTable.tabulate(V.element.basix_element, x) for x in points_of_sides)
-        rule = EntityRule(points_of_sides, tables, weights)
-        covectors = np.concatenate([edge_covector(int(edge)) for edge in kind[:sides]])
+        # what all edges of this kind share
+        edge_numbers = [int(edge) for edge in kind[:sides]]
+        rule = _edge_quadrature(V, degree, edge_numbers, opposite=bool(kind[-1]))
+        covectors = np.concatenate([edge_covector(number) for number in edge_numbers])
         edges = np.flatnonzero((kinds == kind).all(axis=1)).astype(np.int32)
-        for chunk in _chunks(edges, len(weights)):
+        for chunk in _chunks(edges, len(rule.weights)):
             cells_of_sides = tuple(np.ascontiguousarray(side) for side in cells[chunk].T)
+            # by the edge's number in the cell on side 0
             width = edge_width(V, cells_of_sides, np.full(len(chunk), kind[0]))
             geometry = np.column_stack([np.tile(covectors, (len(chunk), 1)), width])
             yield EntityBatch(cells_of_sides, rule, geometry)
+
+
+def _edge_quadrature(
+    V: fem.FunctionSpace, degree: int, edge_numbers: list[int], *, opposite: bool
+) -> EntityRule:
+    """Return a quadrature over an edge, with the shape functions of the cell on each side.
+
+    Parameters
+    ----------
+    edge_numbers
+        Local number of the edge in the cell of each side.
+    opposite
+        Whether the two cells run along the edge in opposite directions; ignored with one side. Then
+        the points on the second side run backwards, and are the same points in space.
+    """
+    reversed_sides = (False, opposite)[: len(edge_numbers)]
+    points_and_weights = [
+        edge_rule(degree, number, is_reversed)
+        for number, is_reversed in zip(edge_numbers, reversed_sides, strict=True)
+    ]
+    points_of_sides = tuple(points for points, _ in points_and_weights)
+    _, weights = points_and_weights[0]  # all sides have the same ones
+    tables = tuple(ShapeTable.tabulate(V.element.basix_element, x) for x in points_of_sides)
+    return EntityRule(points_of_sides, tables, weights)
 
 
 def _chunks(entities: NDArray[np.int32], points: int) -> list[NDArray[np.int32]]:
@@ -273,14 +292,23 @@ def edge_width(
     edges
         (n,): local numbers of the edge in the cell on side 0.
     """
+    # for each side the places (n, 3, 3) of the corners of its cells
     corners = [V.mesh.geometry.x[compat.geometry_dofs(V.mesh)[side]] for side in cells]
-    areas = [
-        np.linalg.norm(np.cross(places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]), axis=1)
-        / 2
-        for places in corners
-    ]
-    start, end = (corners[0][np.arange(len(edges)), ends] for ends in np.array(EDGES)[edges].T)
-    return np.asarray(sum(areas) / len(areas) / np.linalg.norm(end - start, axis=1))
+    areas = [_triangle_areas(places) for places in corners]
+    mean_area = sum(areas) / len(areas)
+    # both ends of each edge, as corners of the cell on side 0
+    first_corners, last_corners = np.array(EDGES)[edges].T
+    start, end = (
+        corners[0][np.arange(len(edges)), numbers] for numbers in (first_corners, last_corners)
+    )
+    length = np.linalg.norm(end - start, axis=1)
+    return np.asarray(mean_area / length)
+
+
+def _triangle_areas(places: Array) -> Array:
+    """Return the areas (n,) of triangles, from the places (n, 3, 3) of their corners."""
+    first_edge, second_edge = places[:, 1] - places[:, 0], places[:, 2] - places[:, 0]
+    return np.asarray(np.linalg.norm(np.cross(first_edge, second_edge), axis=1) / 2)
 
 
 class Contraction:
@@ -288,7 +316,8 @@ class Contraction:
 
     D_i are the shape functions' derivatives, H the Hessians at points; a and b count functions, c
     and d components. Products of two D are the same for all entities of a rule. For a symmetric
-    (skew) block they are symmetric (skew) in a, b, so only a <= b is computed.
+    (skew) block they are symmetric (skew) in a, b, so only a <= b is computed. The private fields
+    `_symmetric` and `_skew` have these products for each side, and `_cross` between the sides.
 
     Parameters
     ----------
@@ -300,7 +329,6 @@ class Contraction:
 
     def __init__(self, rule: EntityRule, pairs: BlockPairs) -> None:
         w, tables = rule.weights, rule.tables
-        # products of shape functions, for each side and between the sides
         self._symmetric = [table.symmetric(w, pairs.within_side) for table in tables]
         self._skew = [table.skew(w, pairs.skew) for table in tables] if pairs.skew else []
         self._cross = tables[0].cross(w, tables[1], pairs.cross) if pairs.cross else None
@@ -339,7 +367,7 @@ class HessianBlocks:
     Parameters
     ----------
     pairs
-        The pairs of vectors whose blocks the terms have, all together.
+        The pairs of vectors whose blocks the terms have, all together; kept as `_pairs`.
 
     Attributes
     ----------
@@ -441,18 +469,31 @@ def add_cell_products(y: Array, K: Array, nodes: Ints, x: Array) -> None:
         (cells, functions): local nodes of each cell.
     """
     a, b = np.triu_indices(nodes.shape[1])
-    # (cells, pairs a <= b, 3, 3): symmetric plus skew parts
-    blocks = np.empty((len(K), len(a), 3, 3))
+    blocks = _full_blocks(K)
+    # rows of a by columns of b; e counts cells, p pairs, c and d components
+    products = np.einsum("epcd,epd->epc", blocks, x[nodes[:, b]])
+    np.add.at(y, nodes[:, a], products)
+    # blocks below the diagonal, rows of b by columns of a, are transposes of those above
+    upper = a < b
+    transposed_products = np.einsum("epdc,epd->epc", blocks[:, upper], x[nodes[:, a[upper]]])
+    np.add.at(y, nodes[:, b[upper]], transposed_products)
+
+
+def _full_blocks(K: Array) -> Array:
+    """Return blocks (cells, pairs, 3, 3), each the sum of its symmetric and its skew part.
+
+    Parameters
+    ----------
+    K
+        (cells, 9, pairs): six symmetric components, then three skew ones.
+    """
+    blocks = np.empty((len(K), K.shape[2], 3, 3))
     for number, (c, d) in enumerate(COMPONENTS):
         blocks[:, :, c, d] = blocks[:, :, d, c] = K[:, number]
     for number, (c, d) in enumerate(SKEW, len(COMPONENTS)):
         blocks[:, :, c, d] += K[:, number]
         blocks[:, :, d, c] -= K[:, number]
-    np.add.at(y, nodes[:, a], np.einsum("epcd,epd->epc", blocks, x[nodes[:, b]]))
-    # Blocks below the diagonal are transposes of those above.
-    upper = a < b
-    transposed = np.einsum("epdc,epd->epc", blocks[:, upper], x[nodes[:, a[upper]]])
-    np.add.at(y, nodes[:, b[upper]], transposed)
+    return blocks
 
 
 def add_coupling_products(y: Array, K: Array, rows: Ints, columns: Ints, x: Array) -> None:
@@ -471,6 +512,7 @@ def add_coupling_products(y: Array, K: Array, rows: Ints, columns: Ints, x: Arra
         (pairs of cells, functions): nodes of the first and the second cell.
     """
     n = rows.shape[1]
+    # e counts pairs of cells, c and d components, a and b functions on the first and second cell
     blocks = K.reshape(len(K), 3, 3, n, n)
     np.add.at(y, rows, np.einsum("ecdab,ebd->eac", blocks, x[columns]))
     np.add.at(y, columns, np.einsum("ecdab,eac->ebd", blocks, x[rows]))

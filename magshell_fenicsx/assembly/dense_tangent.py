@@ -128,9 +128,11 @@ class SinglePrecisionBlocks:
             starts = np.asarray(A.indptr, dtype=np.int32)
             columns = np.asarray(A.indices, dtype=np.int32)
             return cls(starts, columns, A.data.astype(np.float32), upper)
-        is_upper = np.repeat(np.arange(len(A.indptr) - 1), np.diff(A.indptr)) <= A.indices
-        # the number of upper blocks before the first block of each row
-        starts = np.append(0, np.cumsum(is_upper, dtype=np.int32))[A.indptr].astype(np.int32)
+        row_of_each_block = np.repeat(np.arange(len(A.indptr) - 1), np.diff(A.indptr))
+        is_upper = row_of_each_block <= A.indices
+        # the number of upper blocks before each block, and so before the first one of each row
+        upper_before = np.append(0, np.cumsum(is_upper, dtype=np.int32))
+        starts = upper_before[A.indptr].astype(np.int32)
         columns = A.indices[is_upper].astype(np.int32)
         return cls(starts, columns, A.data[is_upper].astype(np.float32), upper)
 
@@ -158,9 +160,10 @@ class BlockProducts:
             columns = np.asarray(A.indices, dtype=np.int32)
             values = pointer("double[]", np.ascontiguousarray(A.data))
             multiply, x = lib.multiply_doubles, _three_times(v)
-        product = np.empty(3 * (len(starts) - 1))
+        row_count = len(starts) - 1
+        product = np.empty(3 * row_count)
         multiply(
-            len(starts) - 1,
+            row_count,
             pointer("int32_t[]", starts),
             pointer("int32_t[]", columns),
             values,
@@ -248,6 +251,11 @@ class DenseTangent:
 
     Clamped unknowns are treated as in `scatter.BlockMatrix`. The constructor is collective.
 
+    Private fields: `_owned` and `_ghosts` are numbers of local nodes, `_count` that of all nodes,
+    `_first` the global number of the first own node. `_dense` is what `_create_dense` returned.
+    `_blocks_of_terms` has for each term its latest Hessian, with its near blocks in double and
+    single precision. `_latest_common` has near blocks, and their entries in the latest pattern.
+
     Parameters
     ----------
     V
@@ -292,21 +300,16 @@ class DenseTangent:
         """
         n, first_column, column_count = 3 * self._owned, 3 * self._first, 3 * self._count
         kind = PETSc.IntType
-        # PETSc stores a matrix as two, in compressed rows with all columns; a rank may have no rows
+        # PETSc stores a matrix as two, each by starts of rows, columns and values
         inner, outer = np.zeros((n, n)), np.zeros((n, column_count - n))
-        inner_starts = np.arange(0, n * n + 1, n or 1, dtype=kind)[: n + 1]
-        if column_count > n:
-            outer_starts = np.arange(0, n * (column_count - n) + 1, column_count - n, dtype=kind)[
-                : n + 1
-            ]
-        else:
-            outer_starts = np.zeros(n + 1, dtype=kind)
-        arrays = [(inner_starts, np.tile(np.arange(n, dtype=kind), n), inner.reshape(-1))]
+        inner_columns = np.arange(n, dtype=kind)
+        arrays = [(_row_starts(n, n), np.tile(inner_columns, n), inner.reshape(-1))]
         if self.comm.size > 1:
-            others = np.delete(
+            outer_columns = np.delete(
                 np.arange(column_count, dtype=kind), np.s_[first_column : first_column + n]
             )
-            arrays.append((outer_starts, np.tile(others, n), outer.reshape(-1)))
+            outer_starts = _row_starts(n, column_count - n)
+            arrays.append((outer_starts, np.tile(outer_columns, n), outer.reshape(-1)))
         size = ((n, None), (n, None))
         K = PETSc.Mat().createAIJWithArrays(
             size, arrays[0] if len(arrays) == 1 else tuple(arrays), comm=self.comm
@@ -360,11 +363,14 @@ class DenseTangent:
         starts, columns
             The pattern in compressed sparse rows, of own unknowns.
         """
-        # contact changes the pattern from state to state
-        latest = self._latest_common
-        if latest is not None and latest[0] is part.near_blocks:
-            common = latest[1]
-            if np.array_equal(common.indices, columns) and np.array_equal(common.indptr, starts):
+        # the latest ones serve for the same blocks and the same pattern, which contact changes
+        if self._latest_common is not None:
+            latest_blocks, common = self._latest_common
+            if (
+                latest_blocks is part.near_blocks
+                and np.array_equal(common.indices, columns)
+                and np.array_equal(common.indptr, starts)
+            ):
                 return common
         rows = np.repeat(np.arange(len(starts) - 1), np.diff(starts))  # of each entry
         own_fixed, all_fixed = self.fixed
@@ -389,7 +395,9 @@ class DenseTangent:
         rows[own_fixed], rows[:, all_fixed] = 0.0, 0.0
         # the sparse matrix is added last: at supports it has the identity
         starts, columns, values = K.getValuesCSR()
-        rows[np.repeat(np.arange(n), np.diff(starts)), columns] += values
+        row_of_each_entry = np.repeat(np.arange(n), np.diff(starts))
+        rows[row_of_each_entry, columns] += values
+        # on several ranks the rows are copied into both parts of the matrix of PETSc
         if self.comm.size > 1:
             inner[:] = rows[:, first_column : first_column + n]
             outer[:] = np.delete(rows, np.s_[first_column : first_column + n], axis=1)
@@ -474,9 +482,8 @@ class DenseTangent:
             # the unit vectors of `count` columns from the first one on
             unit_vectors = np.eye(3 * self._count, count, -first_column)
             far = part.hessian.times_far(unit_vectors).reshape(-1, 3, count)
-            rows[:, first_column : first_column + PRODUCT_COLUMNS] += self._sum_rows(far).reshape(
-                len(rows), -1
-            )
+            far_columns = self._sum_rows(far).reshape(len(rows), -1)
+            rows[:, first_column : first_column + PRODUCT_COLUMNS] += far_columns
         return np.asarray(rows)
 
     def _sum_rows(self, rows: Array) -> Array:
@@ -489,10 +496,11 @@ class DenseTangent:
         """
         if self.comm.size == 1:
             return rows
-        own_rows, ghosts = rows[: self._owned].copy(), rows[self._owned :]
-        sent = [(self._ghost_numbers[i], ghosts[i]) for i in self._ghosts_of_ranks]
-        for numbers, received in self.comm.alltoall(sent):
-            np.add.at(own_rows, numbers - self._first, received)
+        own_rows, ghost_rows = rows[: self._owned].copy(), rows[self._owned :]
+        # to each rank the global numbers and the rows of the ghosts that it owns
+        sent = [(self._ghost_numbers[i], ghost_rows[i]) for i in self._ghosts_of_ranks]
+        for numbers, received_rows in self.comm.alltoall(sent):
+            np.add.at(own_rows, numbers - self._first, received_rows)
         return own_rows
 
     def _sum_blocks(self, rows: bsr_array) -> bsr_array:
@@ -506,17 +514,17 @@ class DenseTangent:
         if self.comm.size == 1:
             return rows
         n = 3 * self._owned
-        own_rows, ghosts = rows.tocsr()[:n], rows.tocsr()[n:].tocoo()
+        own_rows, ghost_entries = rows.tocsr()[:n], rows.tocsr()[n:].tocoo()
+        # rows are counted from the first ghost: three of each node
+        nodes, components = ghost_entries.row // 3, ghost_entries.row % 3
         sent = list[tuple[NDArray[np.generic], ...]]()
-        for nodes in self._ghosts_of_ranks:
-            mask = np.isin(ghosts.row // 3, nodes)
-            # global rows of the entries that the rank owns
-            row = 3 * self._ghost_numbers[ghosts.row[mask] // 3] + ghosts.row[mask] % 3
-            sent.append((row, ghosts.col[mask], ghosts.data[mask]))
-        for row, column, values in self.comm.alltoall(sent):
-            own_rows = own_rows + csr_array(
-                (values, (row - 3 * self._first, column)), own_rows.shape
-            )
+        for ghosts_of_rank in self._ghosts_of_ranks:
+            mask = np.isin(nodes, ghosts_of_rank)
+            global_rows = 3 * self._ghost_numbers[nodes[mask]] + components[mask]
+            sent.append((global_rows, ghost_entries.col[mask], ghost_entries.data[mask]))
+        for global_rows, columns, values in self.comm.alltoall(sent):
+            positions = global_rows - 3 * self._first, columns
+            own_rows = own_rows + csr_array((values, positions), own_rows.shape)
         blocks = own_rows.tobsr((3, 3))
         blocks.sort_indices()
         return blocks
@@ -525,6 +533,13 @@ class DenseTangent:
     def _ghosts_of_ranks(self) -> list[NDArray[np.intp]]:
         """For each rank the ghosts that it owns, counted from the first ghost."""
         return [np.flatnonzero(self._ghost_owners == rank) for rank in range(self.comm.size)]
+
+
+def _row_starts(rows: int, width: int) -> NDArray[np.generic]:
+    """Return the starts (rows + 1,) of rows with `width` entries each; both may be zero."""
+    if width == 0:
+        return np.zeros(rows + 1, dtype=PETSc.IntType)
+    return np.arange(0, rows * width + 1, width, dtype=PETSc.IntType)
 
 
 def _entries(blocks: bsr_array, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> Array:

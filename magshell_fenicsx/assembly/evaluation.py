@@ -147,17 +147,29 @@ class Evaluation:
             if not system._finite(residual.sum()):
                 system.nan_terms = self._nan_terms(factors)
         else:
-            dofmap = system.u.function_space.dofmap
-            # each term has noise of its own, so that it is of the size of rounding in large terms
-            first_unknown = dofmap.index_map.local_range[0] * dofmap.index_map_bs
-            gradients = [
-                system._summed(system._gradient({name: factor})) for name, factor in factors.items()
-            ]
-            noisy = [system.noise.on_vector(gradient, first_unknown) for gradient in gradients]
-            residual = np.asarray(np.sum(noisy, axis=0))
+            residual = self._noisy_residual(system.noise, factors)
         if system.projection is None:
             return residual
         return residual + system.projection.constrained_part(self._u)
+
+    def _noisy_residual(self, noise: "Noise", factors: Mapping[str, float]) -> Vector:
+        """Return the residual as a sum of terms, each with noise of its own. Collective.
+
+        So the noise is of the size of rounding in large terms, even where these cancel.
+
+        Parameters
+        ----------
+        factors
+            Term name -> its factor.
+        """
+        system = self._system
+        dofmap = system.u.function_space.dofmap
+        first_unknown = dofmap.index_map.local_range[0] * dofmap.index_map_bs
+        gradients = [
+            system._summed(system._gradient({name: factor})) for name, factor in factors.items()
+        ]
+        noisy_gradients = [noise.on_vector(gradient, first_unknown) for gradient in gradients]
+        return np.asarray(np.sum(noisy_gradients, axis=0))
 
     def _nan_terms(self, factors: Mapping[str, float]) -> list[str]:
         """Return the names of the terms whose energy or gradient is not a number. Collective.
@@ -171,9 +183,10 @@ class Evaluation:
         """
         system = self._system
         used = [t for t in system.terms if factors[t.name]]
-        sizes = {t.name: t.energy() + system._gradient({t.name: 1.0}).sum() for t in used}
+        # not a number if the energy or an entry of the gradient is none
+        sums = {t.name: t.energy() + system._gradient({t.name: 1.0}).sum() for t in used}
         reasons = {t.name: getattr(t, "no_number", "") for t in used}
-        names = [name + reasons[name] for name, size in sizes.items() if not system._finite(size)]
+        names = [name + reasons[name] for name, total in sums.items() if not system._finite(total)]
         return names or ["the sum of all terms"]
 
     def forces(self, name: str = "") -> Vector:
@@ -234,7 +247,8 @@ class Evaluation:
         moving = system.moving
         if moving and name in moving.names:
             local = float(system._gradient(system._factors(mu)) @ moving.rate(mu, name))
-            # the normal of a clamped edge turns too; `edge` is the name of the edge's term
+            # the normal of a clamped edge turns too: the work of its forces along the spin A r;
+            # `edge` is the name of the edge's term
             for edge, A in moving.turning(mu, name):
                 spin = moving.spin_displacement(A, system.u.x.array)
                 local += float(system._gradient({edge: 1.0}) @ spin)
@@ -289,12 +303,12 @@ class Evaluation:
         """
         system = self._system
         with system.assembly:
-            stress_of = [(weight, system.with_ghosts(v, self._mu)) for weight, v in stress]
+            local_stress = [(weight, system.with_ghosts(v, self._mu)) for weight, v in stress]
             system._put(self._u, self._mu)
             factors = system._factors(self._mu)
-            for name, size in (times or {}).items():
-                factors[name] *= size
-            return system._tangent(factors, stress_of, inexact=inexact)
+            for name, further_factor in (times or {}).items():
+                factors[name] *= further_factor
+            return system._tangent(factors, local_stress, inexact=inexact)
 
     @property
     def _system_at_state(self) -> "FiniteElementSystem":
@@ -313,6 +327,8 @@ class Noise:
         Relative size of the noise.
     seed
         Runs with the same seed draw the same factors.
+
+    The private field `_calls` counts the calls, each of which draws other factors.
     """
 
     level: float

@@ -135,6 +135,7 @@ def derivatives_by_field(
         for order, factor in enumerate((weighted.energy, weighted.work)):
             if not domain.comm.allreduce(abs(factor)):  # zero on all ranks: no kernel is needed
                 continue
+            # the energy, or the work dPi/du[w] of its forces
             functional = ufl.derivative(energy, u, w) if order else energy
             weight = fem.Constant(domain, float(factor))
             name = f"{weighted.term.name} by {f.name} {order}"
@@ -142,8 +143,9 @@ def derivatives_by_field(
             weighted.term.renew()
             fem.assemble_vector(derivatives.x.array, form)
     derivatives.x.scatter_reverse(InsertMode.add)
-    cells = domain.topology.index_map(domain.topology.dim).size_local
-    return np.asarray(derivatives.x.array.reshape(-1, Q.dofmap.bs)[Q.dofmap.list[:cells]])
+    own_cells = domain.topology.index_map(domain.topology.dim).size_local
+    by_node = derivatives.x.array.reshape(-1, Q.dofmap.bs)
+    return np.asarray(by_node[Q.dofmap.list[:own_cells]])
 
 
 def broken_space(V: fem.FunctionSpace) -> fem.FunctionSpace:

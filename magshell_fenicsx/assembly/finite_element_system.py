@@ -31,7 +31,7 @@ from petsc4py import PETSc
 from magshell_fenicsx.assembly.dense_tangent import DenseTerm
 from magshell_fenicsx.assembly.evaluation import Evaluation, Noise
 from magshell_fenicsx.assembly.free_parameters import Derivative, FreeParameter, SettableNumber
-from magshell_fenicsx.assembly.nonlocal_terms import added_tangents, dense_terms
+from magshell_fenicsx.assembly.nonlocal_terms import DenseTerms, added_tangents, dense_terms
 from magshell_fenicsx.assembly.oblique_supports import Constraint, ObliqueSupport, Projection
 from magshell_fenicsx.assembly.prescribed_motion import PrescribedMotion
 from magshell_fenicsx.assembly.terms import (
@@ -115,6 +115,10 @@ class FiniteElementSystem:
         Names of the terms that were not numbers at the latest residual that was none.
     coordinates
         Names of the amplitudes that move supports or are free parameters.
+
+    Private fields: `_fixed` are the own clamped unknowns, `_settings` the numbers in the forms with
+    their values in a state that has none. `_b` is a field for exchange between ranks. `_K` and
+    `_K_free` are the matrices of the forms with and without supports, `_N` that of the skew part.
     """
 
     def __init__(
@@ -130,17 +134,19 @@ class FiniteElementSystem:
     ) -> None:
         """Request the kernels of all terms, and create the matrices. Collective.
 
-        The terms' own forms give the tangent only without `assembler`; then `_K` has supports, and
-        `_K_free`, for motions of supports, does not.
+        The terms' own forms give the tangent only without `assembler`; only then `_K` exists, and
+        `_K_free` for motions of supports.
         """
         variables = variables or SystemVariables()
         moving = variables.moving
         V = u.function_space
+        # unknowns and supports
         self.u, self.terms, self.length = u, terms, length
         self.comm = V.mesh.comm
         self.size = V.dofmap.index_map.size_local * V.dofmap.index_map_bs
         self.dofs = V.dofmap.index_map.size_global * V.dofmap.index_map_bs
         self._set_supports(V, supports)
+        # what varies besides u
         self.parameters = variables.parameters
         self.moving, self.edge_pressure = moving, moving.edge_pressure if moving else None
         self._angle_terms = [t for t in terms if isinstance(t, AngleTerm)]
@@ -153,11 +159,13 @@ class FiniteElementSystem:
         self.coordinates = frozenset(self.parameters) | (moving.names if moving else frozenset())
         self.nan_terms: list[str] = []
         self.assembly, self.noise = Stopwatch(), Noise.from_environment()
+        # terms outside the sparsity pattern
         self.added_tangents = added_tangents(V, terms, self.clamped)
         self.dense_terms = dense_terms(V, terms, self.clamped)
         self._b = fem.Function(V)
         self._assembler, self.gradients = assembler, gradients
         self._N: PETSc.Mat | None = None
+        # terms whose own forms give the residual, then the tangent
         self._terms_with_residual = [
             t for t in terms if gradients is None or t.name not in gradients.names
         ]
@@ -316,8 +324,8 @@ class FiniteElementSystem:
         Parameters
         ----------
         stress
-            Weighted displacements whose stress replaces that of u, which small errors of a guess
-            spoil.
+            Weighted displacements. The sum of their stresses replaces the stress of u, which small
+            errors of a guess u change much.
         times
             Term name -> further factor of its tangent; None: no further factors.
         inexact
@@ -396,24 +404,25 @@ class FiniteElementSystem:
         other, name
             The two amplitudes; `name` moves supports, `other` may do so.
         """
-        # by the displacement E(mu) of the moving nodes, whose rate is dE/dmu
+        # `name` moves nodes with the rate dE/dmu; d2Pi/du dmu of `other` is the change of forces
         curvature = moving.rate(mu, name) @ self._column(mu, other)
         if other not in moving.names:
             return float(curvature)
-        # both move supports: the other order of node and normal, and the curvature of E
+        # both move supports: `other` moves nodes while `name` turns normals, and the curvature of E
         residual, u = self._gradient(self._factors(mu)), self.u.x.array
         curvature += (
             moving.rate(mu, other) @ self._turning_column(mu, name)
             + moving.bend(mu, name, other) @ residual
         )
-        # by the normals of clamped edges that both motions turn
-        other_spins = dict(moving.turning(mu, other))
+        # both turn the normal of an edge: the change of its forces by one spin, times the other
+        spins_by_other = dict(moving.turning(mu, other))
         for edge, A in moving.turning(mu, name):
-            if edge in other_spins:
+            if edge in spins_by_other:
                 spin = moving.spin_displacement(A, u)
-                curvature += spin @ self._turned_column(edge, other_spins[edge])
-        for edge, B in moving.turning_twice(mu, (name, other)):
-            curvature += moving.spin_displacement(B, u) @ self._gradient({edge: 1.0})
+                curvature += spin @ self._turned_column(edge, spins_by_other[edge])
+        # and the derivative of one spin by the other amplitude, times the forces
+        for edge, A_slope in moving.turning_twice(mu, (name, other)):
+            curvature += moving.spin_displacement(A_slope, u) @ self._gradient({edge: 1.0})
         return float(curvature)
 
     def _column(self, mu: Amplitudes, name: str) -> NDArray[np.float64]:
@@ -520,14 +529,7 @@ class FiniteElementSystem:
             K = nonlocal_tangent.sum(K, factors)
         N = self._skew(factors)
         if self.dense_terms:
-            K = self.dense_terms.corrected(K, factors, inexact=inexact)
-            if isinstance(K, CorrectedTangent) and inexact:
-                dense_factors = {t.name: factors[t.name] for t in self.dense_terms.terms}
-                K = replace(
-                    K,
-                    present_product=self._dense_product(dense_factors, inexact=False),
-                    extrapolated_product=self._dense_product(dense_factors, inexact=True),
-                )
+            K = self._corrected(K, self.dense_terms, factors, inexact=inexact)
             if N or self.projection or self.noise:  # these need all entries of K + D
                 K = symmetric_part(K)
         if self.projection:
@@ -536,12 +538,43 @@ class FiniteElementSystem:
             self.noise.on_matrix(K)
         return SkewedTangent(K, N) if N else K
 
+    def _corrected(
+        self,
+        K: PETSc.Mat,
+        dense_terms: DenseTerms,
+        factors: Mapping[str, float],
+        *,
+        inexact: bool,
+    ) -> PETSc.Mat | CorrectedTangent:
+        """Return the sparse tangent K corrected by the dense terms. Collective.
+
+        If the correction may belong to an earlier state, it also gets the products that show how
+        far it is from the present one.
+
+        Parameters
+        ----------
+        factors
+            Term name -> factor of its tangent.
+        inexact
+            Whether the dense terms may have the tangent of an earlier state.
+        """
+        corrected = dense_terms.corrected(K, factors, inexact=inexact)
+        if not (isinstance(corrected, CorrectedTangent) and inexact):
+            return corrected
+        dense_factors = {t.name: factors[t.name] for t in dense_terms.terms}
+        return replace(
+            corrected,
+            present_product=self._dense_product(dense_factors, inexact=False),
+            extrapolated_product=self._dense_product(dense_factors, inexact=True),
+        )
+
     def _dense_product(
         self, factors: Mapping[str, float], *, inexact: bool
     ) -> Callable[[Vector], Vector]:
-        """Return a function: the dense terms' tangent at the present u times a vector.
+        """Return a function that multiplies a vector by the dense terms' tangent at the present u.
 
-        It takes differences of forces and is collective.
+        The function takes differences of forces and is collective. It may be called later, when the
+        system is at another state.
 
         Parameters
         ----------
@@ -550,18 +583,18 @@ class FiniteElementSystem:
         inexact
             Whether the forces are extrapolated.
         """
-        u = np.array(self.u.x.array)
+        u_of_tangent = np.array(self.u.x.array)
 
         def times(v: Vector) -> Vector:
             """Return the product with v, zero at supports, by a central difference."""
-            # the system's u is changed, and restored at the end
             step, direction = self.step_along(v, DENSE_DIFFERENCE_STEP), self.with_ghosts(v)
-            present, product = np.array(self.u.x.array), np.zeros(self.size)
+            # the system's u at this call is restored at the end
+            u_at_call, product = np.array(self.u.x.array), np.zeros(self.size)
             for sign in (1.0, -1.0):
-                self.u.x.array[:] = u + sign * step * direction
+                self.u.x.array[:] = u_of_tangent + sign * step * direction
                 gradient = self._gradient(factors, inexact=inexact)
                 product += sign / (2 * step) * self._summed(gradient)
-            self.u.x.array[:] = present
+            self.u.x.array[:] = u_at_call
             return product
 
         return times

@@ -74,6 +74,8 @@ class FreeParameter:
         Called with another constant q in the terms, or with p itself. It returns the derivatives of
         the slopes by it. Where q is a `PlacementAmplitude`, its method `second_derivatives` is
         called instead, since forms cannot be differentiated by it.
+
+    The private field `_second_derivatives` keeps the result for each q.
     """
 
     constant: SettableNumber
@@ -322,13 +324,16 @@ class _PlacementDerivative:
 
     def add_residual(self, b: Array, factor: float) -> None:
         """Add factor times the gradient of the derivative to the local vector b."""
-        # terms without a name are derivatives, which have a residual of their own
+        # names of the terms whose residual `gradients` computes; a derivative has no name
         assembled = self.gradients.names if self.gradients else frozenset[str]()
         names = [name for term in self.terms if (name := getattr(term, "name", "")) in assembled]
         others = [term for term in self.terms if getattr(term, "name", "") not in assembled]
 
         def add(weight: float) -> float:
-            """Add the weighted gradients at the present placement to b; return 0 as the value."""
+            """Add the weighted gradients at the present placement to b.
+
+            The sum in b is the result; the value 0 only serves `differentiate`.
+            """
             if self.gradients:
                 self.gradients.add(b, dict.fromkeys(names, weight * factor))
             for term in others:

@@ -110,15 +110,17 @@ def component_numbers(V: fem.FunctionSpace) -> NDArray[np.int32]:
     counts = comm.allgather(count)
     # labels of different ranks differ
     labels = local_labels + sum(counts[: comm.rank])
-    # Where two ranks share a node, their components are one: the owner's label tells which.
-    owner_labels = fem.Function(V)
-    nodal = owner_labels.x.array.reshape(-1, V.dofmap.bs)
+    # where two ranks share a node, their components are one: the owner's label tells which
+    owner_field = fem.Function(V)
+    nodal = owner_field.x.array.reshape(-1, V.dofmap.bs)
     nodal[:] = labels[:, None]
-    owner_labels.x.scatter_forward()
+    owner_field.x.scatter_forward()
+    owner_labels = nodal[:, 0].astype(np.int64)
     # edges of a graph whose nodes are the labels of all ranks
-    links = np.unique(np.column_stack([labels, nodal[:, 0].astype(np.int64)]), axis=0)
+    links = np.unique(np.column_stack([labels, owner_labels]), axis=0)
     all_links = np.concatenate(comm.allgather(links))
-    _, merged_labels = _graph_components(all_links[:, 0], all_links[:, 1], sum(counts))
+    link_starts, link_ends = all_links.T
+    _, merged_labels = _graph_components(link_starts, link_ends, sum(counts))
     return np.asarray(merged_labels[labels], dtype=np.int32)
 
 

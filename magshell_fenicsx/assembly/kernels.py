@@ -315,6 +315,8 @@ class KernelLog:
         Names of all requested kernels.
     seconds
         Time spent on compiling or loading them.
+
+    The private field `_requested` has the libraries to compile next, by the name of their file.
     """
 
     names: list[str] = field(default_factory=list)

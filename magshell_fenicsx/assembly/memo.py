@@ -34,6 +34,8 @@ class Memo(Generic[Value]):
         The value that was computed last.
     version
         How often the value was computed.
+
+    The private field `_latest_inputs` has copies of its inputs; None: none was computed yet.
     """
 
     def __init__(
@@ -79,6 +81,9 @@ class PointField(fem.Function):  # type: ignore[misc]  # dolfinx has no types
         (q, dimension): the quadrature points on the reference cell.
     values
         (local cells, q, size), as they were last renewed.
+
+    The private field `_dofs` (local cells, q) numbers the points of each cell, `_memo` computes the
+    values.
     """
 
     def __init__(self, domain: mesh.Mesh, degree: int, size: int) -> None:

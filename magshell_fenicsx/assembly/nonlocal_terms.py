@@ -183,6 +183,10 @@ class NonlocalEntries:
 
     It is an `AddedTangent`. The constructor is collective.
 
+    Private fields: `_ranges` has the first unknown of each rank and the number of all, `_own` is
+    the slice of own unknowns, `_fixed` tells of all unknowns whether they are clamped. `_sum` is
+    the latest matrix with room for expected entries, which belong to `_pattern_keys`.
+
     Parameters
     ----------
     V
@@ -222,24 +226,29 @@ class NonlocalEntries:
         factors
             Term name -> factor of its tangent.
         """
-        entries = self._entries(factors)
-        if not entries:
+        weighted_entries = self._entries(factors)
+        if not weighted_entries:
             return K
-        rows = np.concatenate([term_rows for _, (term_rows, _, _) in entries])
-        columns = np.concatenate([term_columns for _, (_, term_columns, _) in entries])
-        values = np.concatenate([factor * term_values for factor, (_, _, term_values) in entries])
-        added = _owned_rows(self._comm, self._ranges, self._fixed, (rows, columns, values))
+        all_entries = _weighted_sum(weighted_entries)
+        added = _owned_rows(self._comm, self._ranges, self._fixed, all_entries)
         if not self._comm.allreduce(added.nnz):
             return K
-        # the room is made anew where the terms expect other entries, or K is another object
+        matrix_sum = self._sum_with_room(K, factors)
+        if self._comm.allreduce(matrix_sum.has_room_for(added), MPI.MIN):
+            return matrix_sum.update(added)
+        # an unexpected entry: a matrix for this state alone
+        return _MatrixSum(K, _pattern_of(added), self._own.start).update(added)
+
+    def _sum_with_room(self, K: PETSc.Mat, factors: Factors) -> "_MatrixSum":
+        """Return the sum of K with room for all expected entries. Collective.
+
+        It is made anew where the terms expect other entries, or K is another object.
+        """
         keys = tuple((t.name, t.pattern_key) for t in self._terms if factors.get(t.name, 0.0))
         if self._sum is None or self._pattern_keys != keys or self._sum.sparse.handle != K.handle:
             self._sum = _MatrixSum(K, self._expected_pattern(factors), self._own.start)
             self._pattern_keys = keys
-        if self._comm.allreduce(self._sum.has_room_for(added), MPI.MIN):
-            return self._sum.update(added)
-        # an unexpected entry: a matrix for this state alone
-        return _MatrixSum(K, _pattern_of(added), self._own.start).update(added)
+        return self._sum
 
     def times(self, v: Array, factors: Factors) -> Array:
         """Return the terms' product with v, see `AddedTangent`. Collective."""
@@ -256,13 +265,15 @@ class NonlocalEntries:
     def _expected_pattern(self, factors: Factors) -> csr_array:
         """Return the pattern (own unknowns, all) of expected entries of the terms. Collective."""
         pairs = [t.coupled_pairs() for t in self._terms if factors.get(t.name, 0.0)]
-        rows, columns = (np.concatenate(nodes) for nodes in zip(*pairs, strict=True))
-        count = len(self._fixed) // self._block_size
-        # each pair of nodes once, as the number row * count + column
-        rows, columns = np.divmod(np.unique(rows * count + columns), count)
+        row_nodes, column_nodes = (np.concatenate(nodes) for nodes in zip(*pairs, strict=True))
+        node_count = len(self._fixed) // self._block_size
+        # each pair of nodes once, as the number row * node_count + column
+        pair_numbers = np.unique(row_nodes * node_count + column_nodes)
+        row_nodes, column_nodes = np.divmod(pair_numbers, node_count)
+        # the unknowns of these nodes, (pairs, 1, 3)
         i, j = (
             self._block_size * nodes[:, None, None] + np.arange(self._block_size)
-            for nodes in (rows, columns)
+            for nodes in (row_nodes, column_nodes)
         )
         # all components of the first node with all of the second, (pairs, 3, 3)
         i, j = np.broadcast_arrays(i.transpose(0, 2, 1), j)
@@ -272,6 +283,10 @@ class NonlocalEntries:
 
 class _MatrixSum:
     """A sparse matrix plus changing entries, in a fixed pattern; the constructor is collective.
+
+    The fixed pattern is the union of the sparse matrix's pattern and of the room; `_values` are its
+    values, row by row. `_at_sparse` and `_at_room` are the places of both patterns' entries in
+    them. `_room_keys` are the keys of the room's entries, see `_entry_keys`.
 
     Parameters
     ----------
@@ -390,10 +405,24 @@ def _owned_rows(
         sent = [tuple(array[owner == rank] for array in selected) for rank in range(comm.size)]
         received = comm.alltoall(sent)
         selected = tuple(np.concatenate(arrays) for arrays in zip(*received, strict=True))
+    own_rows, own_columns, own_values = selected
     first_row, end_row = ranges[comm.rank : comm.rank + 2]
-    return coo_array(
-        (selected[2], (selected[0] - first_row, selected[1])), (end_row - first_row, len(fixed))
-    ).tocsr()
+    shape = end_row - first_row, len(fixed)
+    return coo_array((own_values, (own_rows - first_row, own_columns)), shape).tocsr()
+
+
+def _weighted_sum(weighted_entries: list[tuple[float, Entries]]) -> Entries:
+    """Return the entries of all terms in one list, with the values times the terms' factors.
+
+    Parameters
+    ----------
+    weighted_entries
+        Pairs of a factor and a term's entries.
+    """
+    rows = np.concatenate([rows for _, (rows, _, _) in weighted_entries])
+    columns = np.concatenate([columns for _, (_, columns, _) in weighted_entries])
+    values = np.concatenate([factor * values for factor, (_, _, values) in weighted_entries])
+    return rows, columns, values
 
 
 def times(entries: list[tuple[float, Entries]], v: Array) -> Array:
@@ -454,6 +483,8 @@ def _selected_columns(
     -------
     Starts of the rows, columns, and zeros as values.
     """
-    starts = np.concatenate([[0], np.cumsum(mask)])[matrix.indptr]
+    # the number of selected entries before each entry, and so before the first one of each row
+    selected_before = np.concatenate([[0], np.cumsum(mask)])
+    starts = selected_before[matrix.indptr]
     columns = matrix.indices[mask] - first
     return starts.astype(PETSc.IntType), columns.astype(PETSc.IntType), np.zeros(len(columns))

@@ -75,6 +75,10 @@ class Projection:
         Supports along any direction.
     clamped
         Conditions on components, possibly at the same nodes.
+
+    Private fields: `_nodes` are the supported local nodes, ascending, and `_P` (nodes, 3, 3) their
+    projectors. `_P_matrix` and `_complement` are P and I - P as matrices, made at first use.
+    `_unprojected` is the latest K, and `_projected` its product.
     """
 
     def __init__(

@@ -289,7 +289,8 @@ def point_gradient(
         for (W,), z in zip(nodes[::2], nodes[1::2], strict=True):
             slopes, _ = graph.derivatives(W, z, second=False)
             sum_nodes = [
-                graph.add(t, slopes.get(i, graph.zero)) for t, i in zip(sum_nodes, z, strict=True)
+                graph.add(total, slopes.get(component, graph.zero))
+                for total, component in zip(sum_nodes, z, strict=True)
             ]
         return sum_nodes
 
@@ -369,7 +370,10 @@ def point_hessian(
     sides = z.ufl_shape[0] // (3 * vectors)  # 1 or 2
 
     def hessian(graph: ScalarGraph, nodes: list[list[int]]) -> list[int]:
-        """Return the nodes of the kernel's results, in their order."""
+        """Return the nodes of the kernel's results, in their order.
+
+        `inputs` are the components of z: three of each vector, one side after the other.
+        """
         (density,), inputs = nodes
         _, second = graph.derivatives(density, inputs, second=True)
 
@@ -396,6 +400,7 @@ def point_hessian(
                 for c, d in SKEW
                 for i, j in skew
             ]
+        # blocks between the sides: vectors of the second one follow those of the first
         outputs += [
             entry(i, vectors + j, c, d) for c in range(3) for d in range(3) for i, j in pairs.cross
         ]
@@ -473,6 +478,7 @@ def point_code(graph: ScalarGraph, outputs: Sequence[int]) -> str:
     outputs
         The nodes of the results, in order; a node may occur several times.
     """
+    # node -> its name in C, and helper function -> number of its arguments
     names, helpers = dict[int, str](), dict[str, int]()
     lines = [f"four A[{len(outputs)}];"]
     result_positions = dict[int, list[int]]()

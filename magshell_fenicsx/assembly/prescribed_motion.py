@@ -37,6 +37,8 @@ Amplitudes = Mapping[str, float]
 # First and last place in the reference cell, and the numbers of the corners there.
 CellSide = tuple[Array, Array, tuple[int, int]]
 
+AffineMap = tuple[Array, Array]  # (G, s) of G y + s: a matrix (3, 3) and a vector (3,)
+
 # Points in (0, 1) of the two-point Gauss rule, whose weights are equal; exact for cubics.
 GAUSS_POINTS = (0.5 - np.sqrt(1 / 12), 0.5 + np.sqrt(1 / 12))
 
@@ -91,16 +93,11 @@ class EdgeCurve:
         # exact for the product of a place, a place and a slope
         rule = basix.make_quadrature(basix.CellType.interval, 3 * element.degree)
         points, weights = (np.asarray(array) for array in rule)
-        values, slopes = {}, {}  # for each side of the reference cell
-        for number, (first_place, last_place, _) in sides.items():
-            # [0] the shape functions, [1:] their derivatives by reference coordinates
-            tabulated = element.tabulate(1, first_place + points * (last_place - first_place))[
-                ..., 0
-            ]
-            values[number] = tabulated[0]
-            slopes[number] = weights[:, None] * np.tensordot(
-                last_place - first_place, tabulated[1:], 1
-            )
+        # shape functions and weighted slopes (points, functions), by number of the side
+        tables = {
+            number: _tabulate_side(element, side, points, weights) for number, side in sides.items()
+        }
+        # the cell of each facet, the facet's number in the cell, and the corners at its ends
         cells = [int(topology.connectivity(dim - 1, dim).links(facet)[0]) for facet in facets]
         facets_of_cells = topology.connectivity(dim, dim - 1)
         numbers = [
@@ -108,18 +105,21 @@ class EdgeCurve:
             for cell, facet in zip(cells, facets, strict=True)
         ]
         vertices_of_cells = topology.connectivity(dim, 0)
-        # [2] are the numbers of both corners in the cell
+        corners_of_sides = {number: list(corners) for number, (_, _, corners) in sides.items()}
         corners = [
-            vertices_of_cells.links(cell)[list(sides[number][2])]
+            vertices_of_cells.links(cell)[corners_of_sides[number]]
             for cell, number in zip(cells, numbers, strict=True)
         ]
         flat_corners = np.array(corners, dtype=np.int32).ravel()
+        # the tables of each facet; the sign turns curves whose surface is on the right
         shape = len(cells), len(weights), element.dim
+        values = np.reshape([tables[number][0] for number in numbers], shape)
+        slopes = np.reshape([tables[number][1] for number in numbers], shape)
         signs = np.ones(len(cells)) if pressure_signs is None else pressure_signs[cells]
         return cls(
             V.dofmap.list[cells],
-            np.reshape([values[number] for number in numbers], shape),
-            signs[:, None, None] * np.reshape([slopes[number] for number in numbers], shape),
+            values,
+            signs[:, None, None] * slopes,
             topology.index_map(0).local_to_global(flat_corners).reshape(-1, 2),
         )
 
@@ -133,6 +133,26 @@ class EdgeCurve:
         The shape is (sides, points, 3).
         """
         return np.asarray(self.slopes @ x[self.nodes])
+
+
+def _tabulate_side(
+    element: basix.finite_element.FiniteElement, side: CellSide, points: Array, weights: Array
+) -> tuple[Array, Array]:
+    """Return shape functions on a side of the reference cell, and their slopes along the side.
+
+    Both are (points, functions); the slopes are multiplied by the weights.
+
+    Parameters
+    ----------
+    points, weights
+        (points, 1) and (points,): a quadrature on the interval from 0 to 1, which runs along the
+        side.
+    """
+    first_place, last_place, _ = side
+    # [0] the shape functions, [1:] their derivatives by reference coordinates
+    tabulated = element.tabulate(1, first_place + points * (last_place - first_place))[..., 0]
+    slopes = np.tensordot(last_place - first_place, tabulated[1:], 1)
+    return np.asarray(tabulated[0]), np.asarray(weights[:, None] * slopes)
 
 
 def triangle_sides() -> dict[int, CellSide]:
@@ -249,18 +269,16 @@ class Lid:
         """
         turn = total_rotation(self.motions, mu)
         place = apply_motions(self.motions, mu, self.origin[None])
-        # The displacement is u = G y + s; (G, s) here and of each derivative.
-        # Rows of `turn` and `place` are images, so matrices are transposed.
+        # (G, s) of the displacement u = G y + s, then of its derivatives. Rows of `turn` and
+        # `place` are images, so matrices are transposed.
         displacement = turn.x.T - np.eye(3), place.x[0] - self.origin
         rates = {name: (turn.slopes[name].T, place.slopes[name][0]) for name in turn.slopes}
         second_rates = {
             pair: (turn.curvatures[pair].T, place.curvatures[pair][0]) for pair in turn.curvatures
         }
-        volume, slopes, curvatures = (
-            0.0,
-            dict.fromkeys(rates, 0.0),
-            dict.fromkeys(second_rates, 0.0),
-        )
+        volume = 0.0
+        slopes = dict.fromkeys(rates, 0.0)
+        curvatures = dict.fromkeys(second_rates, 0.0)
         # cof F is quadratic in tau: two Gauss points, of weight 1/2 each, integrate exactly. The
         # product rule gives the derivatives; the slope of cof F is 2 cof(F, dF), bilinear.
         for tau in GAUSS_POINTS:
@@ -268,18 +286,45 @@ class Lid:
             flux = self._flux(*displacement)
             volume += float((_cofactor(F, F) * flux).sum()) / 2
             for a, (G, s) in rates.items():
-                stretched = 2 * tau * _cofactor(F, G) * flux
-                slopes[a] += float((stretched + _cofactor(F, F) * self._flux(G, s)).sum()) / 2
-            for (a, b), (G, s) in second_rates.items():
-                second = 2 * tau**2 * _cofactor(rates[a][0], rates[b][0])
-                stretched = (second + 2 * tau * _cofactor(F, G)) * flux
-                mixed = [
-                    2 * tau * _cofactor(F, rates[i][0]) * self._flux(*rates[j])
-                    for i, j in ((a, b), (b, a))
-                ]
-                integrand = stretched + sum(mixed) + _cofactor(F, F) * self._flux(G, s)
+                by_F = 2 * tau * _cofactor(F, G) * flux
+                slopes[a] += float((by_F + _cofactor(F, F) * self._flux(G, s)).sum()) / 2
+            for (a, b), second_rate in second_rates.items():
+                integrand = self._second_integrand(tau, F, flux, (rates[a], rates[b]), second_rate)
                 curvatures[a, b] += float(integrand.sum()) / 2
         return volume, slopes, curvatures
+
+    def _second_integrand(
+        self,
+        tau: float,
+        F: Array,
+        flux: Array,
+        rates: tuple[AffineMap, AffineMap],
+        second_rate: AffineMap,
+    ) -> Array:
+        """Return the second derivative (3, 3) of cof F * flux by two amplitudes a and b.
+
+        The sum of its entries is the derivative of u . cof(F) n, integrated over the lid.
+
+        Parameters
+        ----------
+        tau
+            Time of the motion, from 0 to 1.
+        F, flux
+            1 + tau G, and the integral of u n^T over the lid.
+        rates, second_rate
+            (G, s) of the derivatives of u by a and by b, and of the mixed one.
+        """
+        rate_a, rate_b = rates
+        (G_a, _), (G_b, _), (G, s) = rate_a, rate_b, second_rate
+        # cof F alone is differentiated, once by each amplitude or through the mixed derivative
+        by_both = 2 * tau**2 * _cofactor(G_a, G_b)
+        by_F = (by_both + 2 * tau * _cofactor(F, G)) * flux
+        # cof F by one amplitude, the flux by the other
+        mixed = [
+            2 * tau * _cofactor(F, G_a) * self._flux(*rate_b),
+            2 * tau * _cofactor(F, G_b) * self._flux(*rate_a),
+        ]
+        return np.asarray(by_F + sum(mixed) + _cofactor(F, F) * self._flux(G, s))
 
     def _flux(self, G: Array, s: Array) -> Array:
         """Return the integral (3, 3) of u n^T over the lid for u = G y + s."""
@@ -408,12 +453,13 @@ class PrescribedMotion:
         """Find the places of the prescribed components, and the cells with nodes that move.
 
         A degree of freedom is numbered by node, then component: two in a meridian, three in space.
+        `_axes` are the axes of the components, `_places` for each body the places (dofs, 3) of the
+        nodes of its prescribed components.
         """
         self.edge_pressure = edge_pressure
         self._axes = list(AXES_OF_COMPONENTS[r0.function_space.dofmap.index_map_bs])
         self._r0, self._bodies = r0, bodies
         places = vectors_in_space(r0.x.array, len(self._axes))
-        # the place of the node of each prescribed component
         self._places = [places[body.dofs // len(self._axes)] for body in bodies]
         self.names = frozenset(name for body in bodies for name in body.names)
         V = r0.function_space

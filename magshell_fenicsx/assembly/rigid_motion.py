@@ -96,15 +96,18 @@ def apply_motions(motions: Sequence[RigidMotion], mu: Mapping[str, float], x: Ar
     slopes: dict[str, Array] = {}
     curvatures: dict[AmplitudePair, Array] = {}
     for motion in motions:
-        # the transposed rotation and its derivatives by this amplitude
+        # the transposed rotation and its first two derivatives by this amplitude
         Q, Q1, Q2 = (matrix.T for matrix in motion.rotation(mu[motion.name]))
         name, arm = motion.name, x - motion.centre
-        # this motion turns all derivatives by earlier amplitudes; then come those by its own
+        # second derivatives: by two earlier amplitudes, and by an earlier one and this one
         curvatures = {pair: derivative @ Q for pair, derivative in curvatures.items()}
         for earlier_name, derivative in slopes.items():
             curvatures[earlier_name, name] = curvatures[name, earlier_name] = derivative @ Q1
+        # first derivatives by earlier amplitudes
         slopes = {earlier_name: derivative @ Q for earlier_name, derivative in slopes.items()}
-        slopes[name], curvatures[name, name] = arm @ Q1 + motion.shift, arm @ Q2
+        # derivatives by this amplitude alone
+        slopes[name] = arm @ Q1 + motion.shift
+        curvatures[name, name] = arm @ Q2
         x = arm @ Q + motion.centre + mu[name] * motion.shift
     return MovedPoints(x, slopes, curvatures)
 

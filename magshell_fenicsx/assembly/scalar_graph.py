@@ -51,6 +51,10 @@ class ScalarGraph:
         and "pick" (condition, value if it holds, other value). Without operands are "number"
         (value), "field" (position among the fields, component) and "constant" (position among the
         values of all constants).
+    zero, one
+        The nodes of these numbers.
+
+    The private field `_nodes` has the node of each operation.
     """
 
     def __init__(self) -> None:
@@ -265,19 +269,12 @@ class ScalarGraph:
         if isinstance(e, classes.Indexed):
             return _indexed(operands[0], e)
         if isinstance(e, classes.ComponentTensor):
-            a, labels = e.ufl_operands
-            # free indices that become axes of the shape move to the front
-            axes = [len(a.ufl_shape) + a.ufl_free_indices.index(i.count()) for i in labels]
-            return np.asarray(np.moveaxis(operands[0], axes, range(len(axes))))
+            return _component_tensor(operands[0], e)
         if isinstance(e, classes.ListTensor):
             return np.stack(operands)
         if isinstance(e, classes.IndexSum):
-            a, label = e.ufl_operands
-            axis = len(a.ufl_shape) + a.ufl_free_indices.index(label[0].count())
-            # the summed index becomes the last axis
-            summands = np.moveaxis(operands[0], axis, -1)
-            sums = [self.sum(flat(row)) for row in summands.reshape(-1, summands.shape[-1])]
-            return np.array(sums).reshape(summands.shape[:-1])
+            return self._index_sum(operands[0], e)
+        # any other expression is an operation on numbers, component by component
         operation = self._scalar_operation(e)
         pairs = zip(operands, e.ufl_operands, strict=True)
         aligned = [_aligned(nodes, operand, e) for nodes, operand in pairs if nodes is not None]
@@ -285,6 +282,23 @@ class ScalarGraph:
         # a row of operands for each component of the result
         rows = np.stack([nodes.ravel() for nodes in arrays], axis=1).tolist()
         return np.array([operation(*row) for row in rows]).reshape(arrays[0].shape)
+
+    def _index_sum(self, value: Nodes, e: Expr) -> Nodes:
+        """Return the nodes of a sum over a free index of A.
+
+        Parameters
+        ----------
+        value
+            Nodes (*shape, *free indices) of A.
+        e
+            The sum.
+        """
+        tensor, (index,) = e.ufl_operands
+        axis = len(tensor.ufl_shape) + tensor.ufl_free_indices.index(index.count())
+        # the summed index becomes the last axis
+        summands = np.moveaxis(value, axis, -1)
+        sums = [self.sum(flat(row)) for row in summands.reshape(-1, summands.shape[-1])]
+        return np.array(sums).reshape(summands.shape[:-1])
 
     def _scalar_operation(self, e: Expr) -> Callable[..., int]:
         """Return the function from operand nodes to a node that an expression applies by component.
@@ -345,12 +359,8 @@ class ScalarGraph:
         Input -> first derivative, and pair of inputs, the smaller one first -> second derivative.
         """
         ends = set(inputs)
-        # active nodes depend on an input
         ascending = sorted(self.dependencies([f]))
-        active = set(ends)
-        for node in ascending:
-            if any(operand in active for operand in self.operands(node)):
-                active.add(node)
+        active = self._nodes_that_depend_on(ends, ascending)
         # derivatives of f by a node, and by two nodes (in both orders)
         adjoints, pairs = {f: self.one}, dict[int, dict[int, int]]()
 
@@ -363,11 +373,13 @@ class ScalarGraph:
         for node in reversed(ascending):
             if node in ends or node not in active:
                 continue
+            # the node is eliminated: derivatives by it, by it and another one, and by it twice
             adjoint = adjoints.pop(node, self.zero)
             mixed = pairs.pop(node, {})
             squared = mixed.pop(node, self.zero)
             if adjoint == self.zero and squared == self.zero and not mixed:
                 continue
+            # derivatives of the node's operation by its operands
             slopes, curvatures = self._local_derivatives(node, active, ends, second=second)
             # second derivatives by the node and another one move to the operands: chain rule
             for other_node, value in mixed.items():
@@ -382,10 +394,25 @@ class ScalarGraph:
                 curvature_part = self.times(adjoint, curvature)
                 slope_part = self.times(slopes[j], self.times(slopes[k], squared))
                 couple(j, k, self.add(slope_part, curvature_part))
-            for j, slope in slopes.items():
+            for j, slope in slopes.items():  # first derivatives move to the operands
                 adjoints[j] = self.add(adjoints.get(j, self.zero), self.times(adjoint, slope))
+        # of both orders of a pair one
         upper = {(j, k): value for j, row in pairs.items() for k, value in row.items() if j <= k}
         return {node: value for node, value in adjoints.items() if node in ends}, upper
+
+    def _nodes_that_depend_on(self, inputs: set[int], nodes: Iterable[int]) -> set[int]:
+        """Return the inputs, and those of some nodes that depend on one.
+
+        Parameters
+        ----------
+        nodes
+            Nodes in an order in which operands come first.
+        """
+        dependent = set(inputs)
+        for node in nodes:
+            if any(operand in dependent for operand in self.operands(node)):
+                dependent.add(node)
+        return dependent
 
     def _local_derivatives(
         self, node: int, active: set[int], ends: set[int], *, second: bool
@@ -407,6 +434,7 @@ class ScalarGraph:
         name, *operands = self.operations[node]
         if name == "pick":
             condition, *sides = operands
+            # f where the condition holds, g elsewhere: first and second derivatives of both
             (f1, f2), (g1, g2) = (
                 self.derivatives(side, list(ends), second=second) for side in sides
             )
@@ -415,6 +443,7 @@ class ScalarGraph:
                 {i: self.pick(condition, f1.get(i, zero), g1.get(i, zero)) for i in f1 | g1},
                 {i: self.pick(condition, f2.get(i, zero), g2.get(i, zero)) for i in f2 | g2},
             )
+        # the rules are by positions of operands; an operand that occurs twice gets the sum
         rule_slopes, rule_curvatures = self._rules(node, name, operands)
         slopes: FirstDerivatives = {}
         curvatures: SecondDerivatives = {}
@@ -422,10 +451,10 @@ class ScalarGraph:
             if operand not in active:
                 continue
             slopes[operand] = self.add(slopes.get(operand, self.zero), rule_slopes[i])
-            # each pair once, the smaller node first; an operand may occur twice
-            for k in range(len(operands) if second else 0):
-                if operands[k] >= operand and operands[k] in active:
-                    pair = operand, operands[k]
+            # each pair of nodes once, the smaller node first
+            for k, other_operand in enumerate(operands if second else []):
+                if other_operand >= operand and other_operand in active:
+                    pair = operand, other_operand
                     curvature = curvatures.get(pair, self.zero)
                     curvatures[pair] = self.add(curvature, rule_curvatures[i][k])
         return slopes, curvatures
@@ -456,6 +485,7 @@ class ScalarGraph:
         if name == "*":
             return [b, a], [[zero, one], [one, zero]]
         if name == "/":
+            # 1/b and -(a/b)/b; by both -1/b^2, by b twice 2 (a/b)/b^2
             inverse, slope = divide(one, b), self.minus(divide(node, b))
             mixed = self.minus(times(inverse, inverse))
             return [inverse, slope], [
@@ -463,6 +493,7 @@ class ScalarGraph:
                 [mixed, times(number(-2.0), times(slope, inverse))],
             ]
         if name == "pow":
+            # a^(b-1) and a^(b-2); where b is a number, derivatives by it are not needed
             lower = self.power(a, self.add(b, number(-1.0)))
             lowest = self.power(a, self.add(b, number(-2.0)))
             slope, bend = times(b, lower), times(times(b, self.add(b, number(-1.0))), lowest)
@@ -472,6 +503,7 @@ class ScalarGraph:
             mixed = times(lower, self.add(one, times(b, log)))
             return [slope, times(node, log)], [[bend, mixed], [mixed, times(node, times(log, log))]]
         if name == "atan2":
+            # of atan(a/b): x = b/(a^2 + b^2) and -y, with y = a/(a^2 + b^2)
             inverse = divide(one, self.add(times(a, a), times(b, b)))
             x, y = times(b, inverse), times(a, inverse)
             bend = times(number(-2.0), times(x, y))
@@ -589,6 +621,24 @@ def terminals_of(expressions: Iterable[Expr], *kinds: type) -> tuple[list[Any], 
     )
 
 
+def _component_tensor(value: Nodes, e: Expr) -> Nodes:
+    """Return the nodes of the tensor whose components are A, from those of A.
+
+    Free indices of A that count the components become axes of the shape, and move to the front.
+
+    Parameters
+    ----------
+    value
+        Nodes (*shape, *free indices) of A.
+    e
+        The tensor.
+    """
+    tensor, indices = e.ufl_operands
+    dimension = len(tensor.ufl_shape)
+    axes = [dimension + tensor.ufl_free_indices.index(index.count()) for index in indices]
+    return np.asarray(np.moveaxis(value, axes, range(len(axes))))
+
+
 def _indexed(value: Nodes, e: Expr) -> Nodes:
     """Return the nodes of A[i, 0, ...] from those of A.
 
@@ -602,6 +652,7 @@ def _indexed(value: Nodes, e: Expr) -> Nodes:
         The indexed expression.
     """
     tensor, indices = e.ufl_operands
+    # A with its fixed indices, and the label of each axis that is left
     fixed, labels = list[int | slice](), list[int]()
     for index in indices:
         is_fixed = isinstance(index, classes.FixedIndex)
@@ -612,6 +663,7 @@ def _indexed(value: Nodes, e: Expr) -> Nodes:
     numbers = {label: i for i, label in enumerate(dict.fromkeys(labels))}
     axes = [numbers[label] for label in labels]
     free_axes = [numbers[label] for label in e.ufl_free_indices]
+    # einsum orders the axes, and takes the diagonal of two with one label
     return np.asarray(np.einsum(value[tuple(fixed)], axes, free_axes))
 
 

@@ -51,6 +51,11 @@ class SparsityPattern:
         (blocks,): an own node, or n + the position of another in `others`.
     others
         Global numbers, ascending, of nodes of other ranks.
+
+    Private fields: `_columns_of_nodes` has the column of each local node, `_width` is the number of
+    columns. `_keys` has row * width + column of each block, ascending. `_sent_entries` and
+    `_received_entries` tell where the values stand that `add_ghosts` sends and adds; the numbers of
+    their blocks for each rank are `_sent_counts` and `_received_counts`.
     """
 
     def __init__(
@@ -63,25 +68,25 @@ class SparsityPattern:
         numbers = nodes.local_to_global(np.arange(n + ghosts, dtype=np.int32))
         pairs = zip((own_nodes, own_nodes), *coupled, strict=True)
         i, j = (np.concatenate(nodes_of_pairs) for nodes_of_pairs in pairs)
-        # Blocks in the rows of ghosts are sent to the ranks that own these, in the order of ranks.
-        in_ghost_rows = _unique_positions(i[i >= n] - n, j[i >= n], (ghosts, n + ghosts)).tocoo()
-        ranks = nodes.owners[in_ghost_rows.row] if ghosts else in_ghost_rows.row
-        order = np.argsort(ranks, kind="stable")
-        sent = in_ghost_rows.row[order] + n, in_ghost_rows.col[order]
-        self._sent_counts = np.bincount(ranks, minlength=comm.size)
+        # blocks in the rows of ghosts go to the owners of these, as local rows and columns
+        sent = self._blocks_to_send(nodes, i, j)
         self._received_counts = np.array(comm.alltoall(list(self._sent_counts)))
-        # global rows and columns of the blocks that others send
-        received = tuple(self._exchange(numbers[local], size=1) for local in sent)
-        is_foreign = (received[1] < first_node) | (received[1] >= first_node + n)
+        received_rows, received_nodes = (
+            self._exchange(numbers[local_nodes], size=1) for local_nodes in sent
+        )
         # all nodes of other ranks in own columns; columns are numbered by their position here
-        self.others = np.unique(np.concatenate([numbers[n:], received[1][is_foreign]]))
+        is_foreign = (received_nodes < first_node) | (received_nodes >= first_node + n)
+        self.others = np.unique(np.concatenate([numbers[n:], received_nodes[is_foreign]]))
         received_columns = np.where(
-            is_foreign, n + np.searchsorted(self.others, received[1]), received[1] - first_node
+            is_foreign,
+            n + np.searchsorted(self.others, received_nodes),
+            received_nodes - first_node,
         )
         ghost_columns = n + np.searchsorted(self.others, numbers[n:])
         self._columns_of_nodes = np.concatenate([own_nodes, ghost_columns]).astype(np.int32)
         self._width = n + len(self.others)
-        received_blocks = self._row(received[0] - first_node, received_columns), received_columns
+        # the blocks of this rank's cells and those that others send, each once
+        received_blocks = self._row(received_rows - first_node, received_columns), received_columns
         all_positions = zip(self._position(i, j), received_blocks, strict=True)
         rows, columns = (np.concatenate(arrays, dtype=np.int32) for arrays in all_positions)
         del i, j  # large
@@ -92,6 +97,27 @@ class SparsityPattern:
         self._keys = block_rows * self._width + self.columns
         self._sent_entries = self._entries(*self._position(*sent)).ravel()
         self._received_entries = self._entries(*received_blocks).ravel()
+
+    def _blocks_to_send(self, nodes: IndexMap, i: Ints, j: Ints) -> tuple[Ints, Ints]:
+        """Return the blocks in the rows of ghosts, in the order of the ranks that own these.
+
+        Their number for each rank is set as `_sent_counts`.
+
+        Parameters
+        ----------
+        i, j
+            Local nodes of the rows and columns of all blocks.
+
+        Returns
+        -------
+        Local nodes of the rows and columns, each block once.
+        """
+        n, ghosts = nodes.size_local, nodes.num_ghosts
+        in_ghost_rows = _unique_positions(i[i >= n] - n, j[i >= n], (ghosts, n + ghosts)).tocoo()
+        owners = nodes.owners[in_ghost_rows.row] if ghosts else in_ghost_rows.row
+        order = np.argsort(owners, kind="stable")
+        self._sent_counts = np.bincount(owners, minlength=self._comm.size)
+        return in_ghost_rows.row[order] + n, in_ghost_rows.col[order]
 
     def blocks(self, i: Ints, j: Ints) -> Ints:
         """Return the numbers of the blocks of pairs of local nodes; -1 for a missing block."""
@@ -148,8 +174,9 @@ class SparsityPattern:
 
     def _find(self, rows: Any, columns: Any) -> Ints:
         """Return the numbers of the blocks at rows and columns; -1 for a missing block."""
-        # a key beyond all others is compared with the last one
         keys = rows * np.int64(self._width) + columns
+        # where each key would be inserted: at the same key if its block exists; a key beyond all
+        # others is compared with the last one
         positions = np.minimum(np.searchsorted(self._keys, keys), len(self._keys) - 1)
         return np.where(self._keys[positions] == keys, positions, -1).astype(np.int32)
 
@@ -161,12 +188,11 @@ class SparsityPattern:
         # 9 values for each block before the row, then 3 for each earlier block of its first scalar
         # row: 9 start + 3 (block - start)
         row_start = self.starts[rows].astype(np.int64)
-        width = 3 * (self.starts[rows + 1] - self.starts[rows])
-        components = np.arange(3)
         first_entry = 6 * row_start + 3 * self._find(rows, columns)
-        return np.asarray(
-            first_entry[:, None, None] + components[:, None] * width[:, None, None] + components
-        )
+        scalar_row_length = 3 * (self.starts[rows + 1] - self.starts[rows])
+        # the components of row and column of a value within its block
+        c, d = np.arange(3)[:, None], np.arange(3)
+        return np.asarray(first_entry[:, None, None] + c * scalar_row_length[:, None, None] + d)
 
     def _exchange(self, values: NDArray[Any], size: int) -> NDArray[Any]:
         """Send values of blocks in the rows of ghosts to the owners of the rows. Collective.
@@ -219,6 +245,10 @@ class BlockMatrix:
     PETSc shares the array of its values, so assembly copies and sorts nothing. The constructor is
     collective.
 
+    Private fields: `_cells` has the nodes of each cell, `_coupled` those of the two cells of each
+    pair, by batch. `_blocks` and `_coupling_blocks` are the numbers of their blocks. `_values` are
+    all values; `_zeros` and `_ones` tell where clamped unknowns have 0 and 1.
+
     Parameters
     ----------
     V
@@ -247,8 +277,8 @@ class BlockMatrix:
             is_clamped.ravel()[bc.dof_indices()[0]] = True
         self._fully_clamped = np.array(is_clamped.all(axis=1))
         self._pattern = pattern = SparsityPattern(nodes, self._free_pairs(), comm)
-        # numbers of the blocks of each cell, and of each pair of coupled cells in both orders
         self._blocks = pattern.blocks(*_pairs(self._cells, self._cells))
+        # of each pair of coupled cells in both orders
         self._coupling_blocks = [
             np.stack(
                 [pattern.blocks(*_pairs(rows, columns)), pattern.blocks(*_pairs(columns, rows))],
@@ -263,16 +293,18 @@ class BlockMatrix:
     def _create_matrix(self, comm: MPI.Comm) -> PETSc.Mat:
         """Return a matrix of PETSc that shares the array of values. Collective."""
         n = self._pattern.owned
+        # the columns of own unknowns: rows of blocks 0 to n
         starts, columns = self._pattern.csr(0, n)
         arrays = [(starts, columns, self._values[: len(columns)])]
+        # those of other ranks: rows of blocks n to 2 n
         if comm.size > 1:
             value_start = len(columns)
             starts, columns = self._pattern.csr(n, 2 * n)
             # columns of other ranks' nodes are stored by their position in `others`
             columns -= 3 * n
-            numbers = 3 * self._pattern.others[columns // 3] + columns % 3
+            global_columns = 3 * self._pattern.others[columns // 3] + columns % 3
             values = self._values[value_start : value_start + len(columns)]
-            arrays.append((starts, numbers.astype(PETSc.IntType), values))
+            arrays.append((starts, global_columns.astype(PETSc.IntType), values))
         size = ((3 * n, None), (3 * n, None))
         K = PETSc.Mat().createAIJWithArrays(
             size, arrays[0] if comm.size == 1 else tuple(arrays), comm=comm
@@ -369,17 +401,20 @@ class BlockMatrix:
         Indices of all entries in clamped rows and columns, and of the own diagonal ones of these.
         """
         count, owned = len(is_clamped), self._pattern.owned
-        partly, own_nodes = np.array(is_clamped.any(axis=1)), np.arange(owned, dtype=np.int32)
+        has_clamped, own_nodes = np.array(is_clamped.any(axis=1)), np.arange(owned, dtype=np.int32)
         # a pair i, j of nodes as the number i * count + j; first the diagonal blocks of own nodes
-        keys = [own_nodes[partly[own_nodes]] * (count + np.int64(1))]
+        keys = [own_nodes[has_clamped[own_nodes]] * (count + np.int64(1))]
         for i, j in self._free_pairs():
-            has_clamped = partly[i] | partly[j]
-            keys.append(np.unique(i[has_clamped] * np.int64(count) + j[has_clamped]))
-        i, j = (x.astype(np.int32) for x in np.divmod(np.unique(np.concatenate(keys)), count))
+            is_affected = has_clamped[i] | has_clamped[j]
+            keys.append(np.unique(i[is_affected] * np.int64(count) + j[is_affected]))
+        # each pair of nodes once
+        pair_numbers = np.unique(np.concatenate(keys))
+        i, j = (x.astype(np.int32) for x in np.divmod(pair_numbers, count))
+        # which of the nine values of each block are in a clamped row, or in a clamped column
         entries = self._pattern.entries(i, j)
-        rows, columns = is_clamped[i][:, :, None], is_clamped[j][:, None, :]
+        in_row, in_column = is_clamped[i][:, :, None], is_clamped[j][:, None, :]
         is_own_diagonal = ((i == j) & (i < owned))[:, None, None] & np.eye(3, dtype=bool)
-        return entries[rows | columns], entries[rows & is_own_diagonal]
+        return entries[in_row | in_column], entries[in_row & is_own_diagonal]
 
 
 def _pairs(rows: Ints, columns: Ints) -> tuple[Ints, Ints]:

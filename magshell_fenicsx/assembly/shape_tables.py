@@ -73,7 +73,7 @@ class ShapeTable:
         w
             (points,): weights.
         pairs
-            The pairs i <= j of derivatives, by their numbers in the table.
+            The pairs i <= j of derivatives, by their numbers in the table, 0 to 5.
 
         Returns
         -------
@@ -198,7 +198,8 @@ class PointSampling:
     """Sampling of vector fields and their derivatives at points of every cell, and its transpose.
 
     Values are in the order (cell; point, derivative, component). The table of shape functions is
-    expanded to vectors. This triples the arithmetic but avoids sorting.
+    expanded to vectors. This triples the arithmetic but avoids sorting. The private fields
+    `_to_points` and `_to_nodes` are the matrices of both maps.
 
     Parameters
     ----------

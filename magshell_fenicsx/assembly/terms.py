@@ -99,6 +99,9 @@ class FormTerm:
         Compiled on first use, on all ranks; None for the tangent of a linear energy.
     skew_form
         The skew part that the symmetric tangent lacks; None for a potential.
+
+    The private field `_factor` is a constant in all forms but that of the energy; it is set before
+    each assembly.
     """
 
     def __init__(

@@ -167,8 +167,10 @@ def _remade_case(case: Case, key: str, value: Any) -> Case:
 def _data_with_value(case: Case, data: Mapping[str, Any], key: str, value: Any) -> dict[str, Any]:
     """Return plain data with another value at a key path, in the unit of the previous value.
 
-    `value` is in the size of the validated case, such as SI units.
+    `value` is a number as the validated case has it, such as 0.002 for a length in metres. If the
+    data have "1 mm", the result has "2.0 mm".
     """
+    # the section that has the last key, which is a number in a list
     new_data = deepcopy(dict(data))
     *path, last_key = key.split(".")
     section: Any = new_data
@@ -182,8 +184,8 @@ def _data_with_value(case: Case, data: Mapping[str, Any], key: str, value: Any) 
         section[index] = value
         return new_data
     size_of_unit, current = si_size(unit), _number_at(case, key)
-    # the validated number may be over h or a width: the unit's size is found from the current
-    # value, or where that is zero from a trial with the value 1
+    # validation may divide a number by h or by a width. So the size of the unit in the validated
+    # case is found from the current value; if that is zero, from a trial with the value 1
     if current and float(number):
         size_of_unit = current / float(number)
     elif current is not None:

@@ -53,7 +53,7 @@ def _description(case: Case, problem: Problem) -> str:
     memory_warning = None if case.mesh.tolerance else refuse_beyond_memory(problem)
     _refuse_unsupported(problem)
     lines = _number_lines(case, problem)
-    patch = None
+    patch = None  # the triangulation, if it is made here
     if case.mesh.tolerance is None:
         patch = None if problem.axisymmetric else problem.triangulated()
         lines += _mesh_lines(problem, patch)
@@ -62,6 +62,7 @@ def _description(case: Case, problem: Problem) -> str:
             "mesh: found by the run, for a relative error of its result below "
             f"{case.mesh.tolerance:g}"
         )
+    # what the model lacks, and what other commands alone do
     left_out = list(problem.left_out)
     edges = _edges_without_potential(problem, patch) if problem.loads.pressure else ()
     if edges:
@@ -215,13 +216,17 @@ def _count(problem: Problem, patch: PatchMesh | None) -> tuple[int, int]:
         count = len(meridian_vertices(problem)) - piece_count
         # two components, at the nodes of cells and one more for each piece
         return count, 2 * (degree * count + piece_count)
-    cells, corners = patch.corners, len(np.unique(patch.corners))
-    sides = len(np.unique(np.sort(cells[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1), axis=0))
+    cell_count, corner_count = len(patch.corners), len(np.unique(patch.corners))
+    # the two corners of each side, smaller number first: a side of two cells counts once
+    sides = np.sort(patch.corners[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    side_count = len(np.unique(sides, axis=0))
     if problem.body:  # three hexahedra a layer above each triangle
-        count = len(problem.body.layer_bounds) - 1
-        # three components; nodes of degree two: of a triangle in three quadrilaterals there are
-        # three within each side and seven inside, in two planes for each layer and one more
-        return 3 * len(cells) * count, 3 * (2 * count + 1) * (corners + 3 * sides + 7 * len(cells))
+        layers = len(problem.body.layer_bounds) - 1
+        # nodes of degree two: of a triangle in three quadrilaterals there are three within each
+        # side and seven inside, in two planes for each layer and one more; three components
+        nodes_in_plane = corner_count + 3 * side_count + 7 * cell_count
+        return 3 * cell_count * layers, 3 * (2 * layers + 1) * nodes_in_plane
     # three components at corners, within sides and within cells
-    inner_nodes = (degree - 1) * (degree - 2) // 2
-    return len(cells), 3 * (corners + (degree - 1) * sides + inner_nodes * len(cells))
+    nodes_in_cell = (degree - 1) * (degree - 2) // 2
+    nodes = corner_count + (degree - 1) * side_count + nodes_in_cell * cell_count
+    return cell_count, 3 * nodes

@@ -223,37 +223,19 @@ def meridians(several: "SeveralShells") -> MeridianChart | str:
         return "contact: shells that are joined to each other are modelled with their circumference"
     shells = list[CoaxialShell]()
     for member in several.parts:
-        place, outline = several.place(member), reference_shell_of(member.case.shell).perfect
-        key = member.refused("place")
-        # distance of the origin from e3, and slope of the shell's own axis
-        if max(np.hypot(*place.position[:2]), np.hypot(*place.Q[:2, 2])) > ROUNDING:
-            return f"{key}: its axis is not e3 through the origin"
-        problem = _problem_of(member)
-        if isinstance(problem, str):
-            return member.refused(problem)
-        assert problem.meridian
-        # each begins at 0 until its place in the common parameter is known
-        meridian = problem.meridian
-        shells.append(
-            CoaxialShell(
-                member.name,
-                start=0.0,
-                problem=problem,
-                chart=meridian,
-                place=place,
-                outline=outline,
-            )
-        )
+        shell = _coaxial_shell(member, several)
+        if isinstance(shell, str):
+            return shell
+        shells.append(shell)
+    # the order of the shells along the common parameter
     successors = _successors(shells, several.joints)
     if isinstance(successors, str):
         return successors
+    # vertices at T-junctions: there the second name of a joint is that of a shell, not of an edge
     places = dict(name_and_place for shell in shells for name_and_place in shell.places)
     with_feet = []
     for shell in shells:
-        # T-junctions: edges of other shells that stand on this one
-        feet = [
-            places[edge] for edge, name_of_other in several.joints if name_of_other == shell.name
-        ]
+        feet = [places[edge] for edge, name in several.joints if name == shell.name]
         with_feet.append(_with_feet(shell, feet))
     ordered_shells = _in_chains(with_feet, successors)
     if len(ordered_shells) < len(shells):
@@ -261,32 +243,60 @@ def meridians(several: "SeveralShells") -> MeridianChart | str:
     return _joined_chart(ordered_shells, several)
 
 
+def _coaxial_shell(member: "MemberCase", several: "SeveralShells") -> CoaxialShell | str:
+    """Return one of several shells, with its own meridian, or the reason why it has none.
+
+    It begins at 0 until its place in the common parameter is known.
+    """
+    place, outline = several.place(member), reference_shell_of(member.case.shell).perfect
+    key = member.refused("place")
+    distance_from_axis = np.hypot(*place.position[:2])
+    slope_of_own_axis = np.hypot(*place.Q[:2, 2])
+    if max(distance_from_axis, slope_of_own_axis) > ROUNDING:
+        return f"{key}: its axis is not e3 through the origin"
+    problem = _problem_of(member)
+    if isinstance(problem, str):
+        return member.refused(problem)
+    assert problem.meridian
+    return CoaxialShell(
+        member.name,
+        start=0.0,
+        problem=problem,
+        chart=problem.meridian,
+        place=place,
+        outline=outline,
+    )
+
+
 def _successors(
     shells: Sequence[CoaxialShell], joints: Sequence[tuple[str, str]]
 ) -> dict[str, str] | str:
-    """Return name -> name of the shell that is joined to its end and goes on along the parameter.
+    """Return the order of joined shells: name of a shell -> name of the one that follows it.
 
-    The result is a reason in words if two shells cannot be joined end to beginning.
+    The next shell begins where this one ends, and is joined to it there. The result is a reason in
+    words if two shells cannot be joined end to beginning.
     """
-    # name of an end -> 0 for the first or 1 for the last one, its place, its shell
-    ends = {
-        name: (end, place, shell)
+    # name of an edge -> (side, its place, its shell); the side is 0 at the beginning of the shell
+    # along the common parameter, 1 at its end
+    edges = {
+        name: (side, place, shell)
         for shell in shells
-        for end, (name, place) in enumerate(shell.places)
+        for side, (name, place) in enumerate(shell.places)
     }
     samples = [shell.places_at(shell.end * np.arange(101.0) / 100) for shell in shells]
     extent = np.ptp(np.vstack(samples), axis=0).max()
     successors = dict[str, str]()
     for number, names in enumerate(joints):
         key, edge_words = f"joints.{number}.edges", " and ".join(names)
-        if names[0] in ends and names[1] in {shell.name for shell in shells}:
+        if names[0] in edges and names[1] in {shell.name for shell in shells}:
             continue  # of a T-junction
-        if any(name not in ends for name in names):
+        if any(name not in edges for name in names):
             return f"{key}: there is no such edge"
-        (begin, begin_place, next_shell), (end, end_place, previous_shell) = sorted(
-            (ends[name] for name in names), key=lambda end: end[0]
-        )
-        if (begin, end) != (0, 1):  # two beginnings, or two ends
+        # the beginning of one shell first, the end of the other last
+        first_edge, last_edge = sorted((edges[name] for name in names), key=lambda edge: edge[0])
+        begin_side, begin_place, next_shell = first_edge
+        end_side, end_place, previous_shell = last_edge
+        if (begin_side, end_side) != (0, 1):  # two beginnings, or two ends
             return f"{key}: the normals of {edge_words} point to opposite sides"
         if np.linalg.norm(begin_place - end_place) > MEETING_TOLERANCE * extent:
             return f"{key}: {edge_words} do not meet"
@@ -320,17 +330,17 @@ def _in_chains(shells: Sequence[CoaxialShell], successors: Mapping[str, str]) ->
     successors
         Name of a shell -> name of the shell that follows it.
     """
-    by_name, ordered_shells, end = (
-        {shell.name: shell for shell in shells},
-        list[CoaxialShell](),
-        -PARAMETER_GAP,
-    )
+    by_name, ordered_shells = {shell.name: shell for shell in shells}, list[CoaxialShell]()
     # a chain begins with a shell that follows none
-    for name in (shell.name for shell in shells if shell.name not in successors.values()):
-        end, next_name = end + PARAMETER_GAP, name or None
+    first_names = [shell.name for shell in shells if shell.name not in successors.values()]
+    end = -PARAMETER_GAP  # the first chain begins at zero
+    for name in first_names:
+        end += PARAMETER_GAP
+        next_name = name or None
         while next_name:
             ordered_shells.append(replace(by_name[next_name], start=end))
-            end, next_name = ordered_shells[-1].end, successors.get(next_name)
+            end = ordered_shells[-1].end
+            next_name = successors.get(next_name)
     return ordered_shells
 
 
@@ -365,6 +375,7 @@ def _joined_chart(shells: Sequence[CoaxialShell], several: "SeveralShells") -> M
     by_name = {shell.name: shell for shell in shells}
     # of joints end to end; at a T-junction the second name is that of a shell
     joined_ends = {name for joint in joints if joint[1] not in by_name for name in joint}
+    # where the parameters that count as those of a shell begin, see `CoaxialEmbedding`
     begins = []
     for shell in shells:
         is_joined = shell.names[0] in joined_ends

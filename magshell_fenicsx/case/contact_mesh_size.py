@@ -85,43 +85,27 @@ def contact_places(
     for a, b in all_pairs if all_may_touch else pairs:
         if a == b or a not in places or b not in places:
             continue
-        gaps_between = {
-            first: _gaps(
-                places[first], places[second], half_thickness[first], half_thickness[second]
-            )
-            for first, second in ((a, b), (b, a))
-        }
-        gaps, nearest_numbers = gaps_between[a]
-        nearest = int(np.argmin(gaps))
-        nearest_places, with_one_place = (
-            {a: places[a][nearest], b: places[b][nearest_numbers[nearest]]},
-            list[str](),
-        )
+        gaps_a, nearest_in_b = _gaps(places[a], places[b], half_thickness[a], half_thickness[b])
+        gaps_b, _ = _gaps(places[b], places[a], half_thickness[b], half_thickness[a])
+        # the pair of places with the least gap of all
+        nearest = int(np.argmin(gaps_a))
+        nearest_places = {a: places[a][nearest], b: places[b][nearest_in_b[nearest]]}
         mean_thickness = {name: 2 * float(half_thickness[name].mean()) for name in (a, b)}
-        for name in (a, b):
-            # places whose gap is nearly the least
-            similar_places = places[name][
-                gaps_between[name][0] < gaps.min() + GAP_TOLERANCE * mean_thickness[name]
-            ]
-            # all of them count as one place
-            if (
-                np.linalg.norm(similar_places - nearest_places[name], axis=1).max()
-                < one_place_distance[name]
-            ):
+        # shells of which all places with nearly the least gap are close together
+        with_one_place = []
+        for name, gaps in ((a, gaps_a), (b, gaps_b)):
+            is_similar = gaps < gaps_a.min() + GAP_TOLERANCE * mean_thickness[name]
+            offsets = places[name][is_similar] - nearest_places[name]
+            if np.linalg.norm(offsets, axis=1).max() < one_place_distance[name]:
                 with_one_place.append(name)
         if with_one_place and a in charted and b in charted:
-            nearest_places = dict(
-                zip(
-                    (a, b),
-                    _nearest(nearest_places[a], nearest_places[b], charted[a], charted[b]),
-                    strict=True,
-                )
+            exact_a, exact_b = _nearest(
+                nearest_places[a], nearest_places[b], charted[a], charted[b]
             )
+            nearest_places = {a: exact_a, b: exact_b}
+        distance = np.linalg.norm(nearest_places[a] - nearest_places[b])
         for name in with_one_place:
-            if (
-                np.linalg.norm(nearest_places[a] - nearest_places[b])
-                < MAX_GAP * mean_thickness[name]
-            ):
+            if distance < MAX_GAP * mean_thickness[name]:
                 places_of_contact[name].append(nearest_places[name])
     return places_of_contact
 
@@ -143,12 +127,13 @@ def _gaps(x: Array, y: Array, half_x: Array, half_y: Array) -> tuple[Array, NDAr
     numbers
         (n,) of the places y with these nearest faces.
     """
-    # of a uniform thickness the nearest mid-surface has the nearest face
+    # where the thickness is uniform, the nearest mid-surface has the nearest face
     candidate_count = min(FACE_CANDIDATES if np.ptp(half_y) else 1, len(y))
+    # (n, candidates): for each x the nearest places y, by their mid-surfaces
     distances, candidates = scipy.spatial.KDTree(y).query(x, k=range(1, 1 + candidate_count))
     gaps = distances - half_y[candidates] - half_x[:, None]
-    nearest = np.arange(len(x)), gaps.argmin(axis=1)  # index of the least gap in each row
-    return gaps[nearest], candidates[nearest]
+    least_in_row = np.arange(len(x)), gaps.argmin(axis=1)  # rows and columns of these entries
+    return gaps[least_in_row], candidates[least_in_row]
 
 
 @dataclass(frozen=True)
@@ -204,9 +189,11 @@ def _nearest(x: Array, y: Array, of_x: ChartedShell, of_y: ChartedShell) -> tupl
 
     def gap(charts: Array) -> float:
         """Return the gap between the faces at two charts (4,), up to uniform thicknesses."""
-        ends = of_x.place_of(charts[:2]), of_y.place_of(charts[2:])
-        return float(np.linalg.norm(ends[0] - ends[1])) - of_x.depth(ends[0]) - of_y.depth(ends[1])
+        place_x, place_y = of_x.place_of(charts[:2]), of_y.place_of(charts[2:])
+        distance = float(np.linalg.norm(place_x - place_y))
+        return distance - of_x.depth(place_x) - of_y.depth(place_y)
 
+    # both charts are sought together, as one vector (4,)
     start = np.concatenate([of_x.chart(x), of_y.chart(y)])
     # a varying thickness enters the gap; otherwise the distance alone is a least-squares problem
     if of_x.half or of_y.half:

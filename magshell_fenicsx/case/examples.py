@@ -76,7 +76,8 @@ def _contents(source: Path, target: Path) -> dict[Path, bytes]:
         Path of the case to be written; other files are beside it.
     """
     text, case_data = _text(source), read_source(source).data
-    mesh, data_file = (case_data.get("shell") or {}).get("file"), source.with_suffix(".csv")
+    mesh = (case_data.get("shell") or {}).get("file")  # name of a mesh file, or None
+    data_file = source.with_suffix(".csv")
     # only an example of `identify` has data: a table with its own name
     if data_file.exists():
         predicted = (case_data.get("identify") or {}).get("predict") or {}

@@ -62,7 +62,8 @@ def programme(loading: Step | Sequence[Step] | None, context: Context) -> tuple[
             for pair in STEPS[kind].steps_before_load(context, loading)
         ]
     keyed_loads = [*implied_steps, *loads_by_key(loading).items()]
-    loads, places_of_amplitude = [load for _, load in keyed_loads], dict[str, list[Any]]()
+    loads = [load for _, load in keyed_loads]
+    places_of_amplitude = dict[str, list[Any]]()  # different places, in the order of the steps
     steps = []
     for number, (key, load) in enumerate(keyed_loads, 1):
         name = load.name_in(context, loads)
@@ -116,9 +117,11 @@ def _refuse_unfit_hold(step: ProgrammeStep, steps: Sequence[ProgrammeStep]) -> N
         holdable_loads.pop(step.name)
     to_limit = step.until == "limit"
     # a step that ends at an instability may hold the conjugate of its own amplitude
-    names = sorted(set(holdable_loads) - (set() if to_limit else {step.name}))
+    refused_names = set() if to_limit else {step.name}
+    names = sorted(set(holdable_loads) - refused_names)
     allowed = ", ".join(names) or "none"
     for name, manner in step.load.hold.items():
+        # whether the step may hold this amplitude at all, then whether it may hold its conjugate
         key = f"{step.key}.hold.{name}"
         holds_conjugate = manner == "conjugate"
         if name == step.name and not (to_limit and holds_conjugate):

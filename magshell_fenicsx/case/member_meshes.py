@@ -45,6 +45,7 @@ class MemberMeshes:
     """
 
     def __init__(self, several: "SeveralShells") -> None:
+        """Keep the shells of the case, each with a case of its own and its pose."""
         self._several = several
 
     def whole_shells(self) -> list[MemberShell]:
@@ -95,10 +96,12 @@ class MemberMeshes:
                 is_known = any(side.is_plane_of(known_plane) for known_plane in mirrors)
                 if is_known or not all(own_mirrors):
                     continue
-                # names in the common mesh: those of a shell after its own name
+                # edges that the half loses, by their names in the common mesh: those of a shell
+                # after its own name
                 removed_edges = dict[str, str]()
                 for member, mirror in zip(members, own_mirrors, strict=True):
-                    for a, b in mirror.removed_edges.items() if mirror else ():
+                    own_edges = mirror.removed_edges if mirror else {}
+                    for a, b in own_edges.items():
                         removed_edges[f"{member.name}_{a}"] = f"{member.name}_{b}"
                 mirrors.append(replace(side, removed_edges=removed_edges))
         return mirrors
@@ -147,22 +150,19 @@ class MemberMeshes:
         )
         is_round = reference_shell_of(part.case.shell).perfect.round
         is_closed = is_round or isinstance(part.case.shell, MeshSurface)
-        # the order in which the shell's own sector begins and ends at them
-        for begin, end in ((first_plane, second_plane), (second_plane, first_plane)):
-            own_sector = Sector.from_azimuth(begin.azimuth, sector.waves)
-            has_planes = own_sector.is_plane_of(begin) and own_sector.second_plane.is_plane_of(end)
-            if is_closed and begin.through_e3 and has_planes:
-                break
-        else:
+        # the shell's own sector, in the same order of planes and in the other one
+        same_order = _sector_between(first_plane, second_plane, sector.waves)
+        other_order = _sector_between(second_plane, first_plane, sector.waves)
+        if is_closed and same_order is not None:
+            return self._member(part, same_order)
+        if not is_closed or other_order is None:
             raise CaseError(
                 part.refused(
                     f"place: symmetry: {sector.waves} needs shells that are closed around e3"
                 )
             )
-        member = self._member(part, own_sector)
-        if begin is first_plane:
-            return member
-        # in the other order: the edges at the two planes exchange their names
+        member = self._member(part, other_order)
+        # in the other order the edges at the two planes exchange their names
         other_edge = {SYMMETRY_EDGE: SECOND_SYMMETRY_EDGE, SECOND_SYMMETRY_EDGE: SYMMETRY_EDGE}
         edges = {other_edge.get(name, name): pairs for name, pairs in member.patch.edges.items()}
         return replace(member, patch=replace(member.patch, edges=edges))
@@ -204,28 +204,27 @@ class MemberMeshes:
         """
         places = [self._several.place(member) for member in self._several.parts]
         shells_at_places = zip(places, self._reference_shells, strict=True)
+        # place and direction of each axis of revolution
         axes = [
             (place.position, place.Q[:, 2])
             for place, reference_shell in shells_at_places
             if reference_shell.perfect.round
         ]
         for point, axis in axes:
-            distances = [other_point - point for other_point, _ in axes]
+            to_other_axes = [other_point - point for other_point, _ in axes]
             # planes through the axis and another axis, a given vector or a coordinate direction
-            for direction in (*vectors, *distances, *np.eye(3)):
+            for direction in (*vectors, *to_other_axes, *np.eye(3)):
                 normal = np.cross(axis, direction)
                 if np.linalg.norm(normal) > ROUNDING:
                     unit = Mirror.with_normal(normal).normal
                     yield Mirror(unit, _rounded(float(unit @ point)))
+        # planes of each shell, from its own frame to that of all shells
         for place, reference_shell in zip(places, self._reference_shells, strict=True):
-            for own_mirror in reference_shell.perfect.mirrors(
-                [place.Q.T @ vector for vector in vectors], loosely
-            ):
+            own_vectors = [place.Q.T @ vector for vector in vectors]
+            for own_mirror in reference_shell.perfect.mirrors(own_vectors, loosely):
                 normal = Mirror.with_normal(place.Q @ own_mirror.normal).normal
-                yield Mirror(
-                    normal,
-                    _rounded(place.scale * own_mirror.offset + float(normal @ place.position)),
-                )
+                offset = place.scale * own_mirror.offset + float(normal @ place.position)
+                yield Mirror(normal, _rounded(offset))
 
     @cached_property
     def _reference_shells(self) -> Sequence[ReferenceShell]:
@@ -251,10 +250,8 @@ class MemberMeshes:
                 return np.asarray(scale * reference_shell.half_thickness(x))
 
             varies = half if reference_shell.thickness_factor else None  # None: it is uniform
-            places[member.name], one_place_distance[member.name] = (
-                place(sample),
-                ONE_PLACE_DISTANCE * sqrt(h) * scale,
-            )
+            places[member.name] = place(sample)
+            one_place_distance[member.name] = ONE_PLACE_DISTANCE * sqrt(h) * scale
             thickness[member.name] = 2 * varies(sample) if varies else h * scale
             if reference_shell.perfect.chart_samples() is not None:  # a mesh file has no chart
                 charted[member.name] = ChartedShell(
@@ -280,14 +277,23 @@ class MemberMeshes:
         pairs = [
             tuple(self._several.shell_of(name) for name in edges) for edges in self._several.joints
         ]
-        # as often as there are joints: a chain of shells passes it on
+        # repeated as often as there are joints, so that it reaches the end of a chain of shells
         for _ in pairs:
             for first_name, second_name in pairs:
                 if first_name in is_held and second_name in is_held:
-                    is_held[first_name] = is_held[second_name] = (
-                        is_held[first_name] or is_held[second_name]
-                    )
+                    is_one_held = is_held[first_name] or is_held[second_name]
+                    is_held[first_name] = is_held[second_name] = is_one_held
         return all(is_held.values())
+
+
+def _sector_between(begin: Mirror, end: Mirror, waves: int) -> Sector | None:
+    """Return the sector of 180/`waves` degrees that begins and ends at two planes through e3.
+
+    None if they are no such planes.
+    """
+    sector = Sector.from_azimuth(begin.azimuth, waves)
+    has_planes = sector.is_plane_of(begin) and sector.second_plane.is_plane_of(end)
+    return sector if begin.through_e3 and has_planes else None
 
 
 def _rounded(offset: float) -> float:

@@ -149,11 +149,9 @@ def own_mirror(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | 
     """
     reference_shell = reference_shell_of(case.shell)
     perfect = reference_shell.perfect
-    # if patches have names, each imperfection must be its own image, no other's
-    imperfections, one_by_one = (
-        imperfection_geometries(case.imperfections, reference_shell),
-        bool(case.patches),
-    )
+    imperfections = imperfection_geometries(case.imperfections, reference_shell)
+    # if patches have names, each imperfection must be its own image, not that of another
+    one_by_one = bool(case.patches)
     constraints = [
         shape_constraint(case.shell, perfect),
         *imperfection_constraints(imperfections, perfect, one_by_one=one_by_one),
@@ -165,7 +163,7 @@ def own_mirror(case: Case, plane: Mirror, *, loosely: bool = False) -> Mirror | 
         candidates: Sequence[Mirror] = [plane]
     else:
         candidates = perfect.mirrors(plane.in_plane_vectors, loosely)
-    for candidate in candidates:  # a mirror plane holds all directions of the constraints
+    for candidate in candidates:  # directions of the constraints must lie in a mirror plane
         has_vectors = all(abs(candidate.normal @ v) < ROUNDING for v in vectors)
         if not candidate.is_plane_of(plane) or not has_vectors:
             continue
@@ -217,6 +215,7 @@ def _symmetry(
     The plane is None for a meridian and for a full model. Raises CaseError if the symmetry that the
     case asks for is not there; the message says why.
     """
+    # the meridian, a sector of so many waves, all of the shell, or else a half
     reason = why_not_axisymmetric(constraints)  # None if all constraints are axisymmetric
     if reason and case.symmetry == "axisymmetric":
         raise CaseError(f"symmetry: axisymmetric: {reason}")

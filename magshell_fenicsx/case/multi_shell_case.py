@@ -64,26 +64,27 @@ def merge_shells(
     """
     if not isinstance(data, dict) or data.get("shells") is None:
         return data, None
+    # keys of the merged shell, which are made here
     for key in REPLACED_KEYS:
         if data.get(key) is not None:
             raise ValueError(f"shells: each has its own {key}: leave out {key}, or shells")
-    # a copy without what pydantic adds while it validates the whole case
+    # the shells, each with a case of its own; each validation gets a copy of the context, which
+    # lacks what pydantic adds while it validates the whole case, and which it may change
     context_keys = (
         {key: context[key] for key in ("folder", "files") if key in context} if context else {}
     )
-    # each validation gets a copy of the context, which it may change
     sections = _ShellsAlone.model_validate(
         {"shells": data["shells"]}, context={**context_keys}
     ).shells
     for name in sections:
         _refuse_name(name, sections)
-    # in the order of the file
     member_shells = [
         MemberCase(name, section, _case(name, section, data, {**context_keys}, case))
         for name, section in sections.items()
     ]
     joined_edges = _joined_edges(_with_mesh_names(data.get("joints"), sections))
     several = SeveralShells(member_shells, joined_edges, _pairs(data.get("contact")))
+    # the data of one shell that stands for all of them
     common_keys = _common_shell(member_shells)
     merged_data = {
         key: _with_mesh_names(value, sections) if key in SECTIONS_WITH_NAMES else value
@@ -163,11 +164,7 @@ def _case(name: str, section: OneOfShells, data: Keys, context: Keys, case: "typ
         "boundary": shell_data.get("boundary") or {},
         "points": shell_data.get("points") or {},
     }
-    mesh = data.get("mesh") or {}
-    mesh_data = {key: mesh[key] for key in ("degree", "size", "refinement") if key in mesh}
-    for key, value in (shell_data.get("mesh") or {}).items():
-        # a shell's refinement comes on top of the common one, other keys replace it
-        mesh_data[key] = value * mesh_data.get(key, 1.0) if key == "refinement" else value
+    mesh_data = _mesh_data(data.get("mesh") or {}, shell_data.get("mesh") or {})
     # loads that mesh sizes follow
     points = own_data["points"] if isinstance(own_data["points"], dict) else {}
     loads = [load for load in _forces_on(name, data) if load["at"]["point"] in points]
@@ -183,6 +180,7 @@ def _case(name: str, section: OneOfShells, data: Keys, context: Keys, case: "typ
         error = e.errors()[0]  # the first one is told
         message, key = error["msg"].removeprefix("Value error, "), ".".join(map(str, error["loc"]))
         raise ValueError(f"shells.{name}.{f'{key}: ' if key else ''}{message}") from None
+    # a position with a unit needs a shell with units
     keys_with_units = [*numbers_with_units(section.place, shell_data.get("place"), "place")]
     if keys_with_units and not shell_case.shell.with_units:
         raise ValueError(
@@ -190,6 +188,18 @@ def _case(name: str, section: OneOfShells, data: Keys, context: Keys, case: "typ
             "none"
         )
     return shell_case
+
+
+def _mesh_data(common: Keys, own: Keys) -> Keys:
+    """Return the section `mesh` of one shell's own case.
+
+    `common` is the section of the whole case, `own` that of the shell. The shell's refinement comes
+    on top of the common one; its other keys replace those.
+    """
+    mesh_data = {key: common[key] for key in ("degree", "size", "refinement") if key in common}
+    for key, value in own.items():
+        mesh_data[key] = value * mesh_data.get(key, 1.0) if key == "refinement" else value
+    return mesh_data
 
 
 def _forces_on(name: str, data: Keys) -> list[Keys]:
@@ -262,11 +272,11 @@ def _refuse_unfit_shell(part: MemberCase, first: MemberCase) -> None:
     """Raise ValueError for a shell that cannot be in one mesh with the first one."""
     first_shell, shell = first.case.shell, part.case.shell
     if shell.with_units != first_shell.with_units:
-        names = (first.name, part.name) if first_shell.with_units else (part.name, first.name)
+        part_with, part_without = (first, part) if first_shell.with_units else (part, first)
         raise ValueError(
             part.refused(
-                f"shell: lengths of {names[0]} have units and those of {names[1]} none: "
-                "give all of them one, or none"
+                f"shell: lengths of {part_with.name} have units and those of {part_without.name} "
+                "none: give all of them one, or none"
             )
         )
     if isinstance(shell.thickness_factor, UserField):
@@ -334,11 +344,13 @@ def _with_remanences(magnetic: Any, several: SeveralShells) -> Any:
         raise ValueError(
             "magnetic.remanent: shells have a remanence of their own: give it here, or there"
         )
+    # name of a magnetised shell -> its flux density (T), or None
     flux_densities = {
         member.name: member.section.remanent.flux_density
         for member in several.parts
         if member.section.remanent
     }
+    # either all of them have one, or none; the first one is the unit of all remanences
     if len({flux_density is None for flux_density in flux_densities.values()}) > 1:
         without = next(
             name for name, flux_density in flux_densities.items() if flux_density is None
@@ -361,12 +373,14 @@ def _with_remanences(magnetic: Any, several: SeveralShells) -> Any:
     return {**section, "remanent": {"kind": "patches", "patches": ordered, **density_key}}
 
 
-def _remanences_of(part: MemberCase, several: SeveralShells, size: float | None) -> dict[str, Any]:
+def _remanences_of(
+    part: MemberCase, several: SeveralShells, common_density: float | None
+) -> dict[str, Any]:
     """Return patch -> remanence of one shell, over a common flux density.
 
     Parameters
     ----------
-    size
+    common_density
         Flux density (T) of the first remanence of all shells; None if they have none.
     """
     remanent = part.section.remanent
@@ -377,8 +391,8 @@ def _remanences_of(part: MemberCase, several: SeveralShells, size: float | None)
             part.refused("remanent.patches: of several shells those of a mesh file alone")
         )
     factor = 1.0
-    if size is not None and remanent.flux_density is not None:
-        factor = remanent.flux_density / size
+    if common_density is not None and remanent.flux_density is not None:
+        factor = remanent.flux_density / common_density
     patches: dict[str, Any] = {}
     # a remanence without patches is that of the whole shell, here of the name ""
     for name, remanence in (remanent.patches or {"": remanent}).items():

@@ -218,6 +218,7 @@ def _problem(
     meridian = outline.meridian if part.axisymmetric else None
     if meridian:  # its ends are the only edges and points
         refuse_unfit_ends([name for name in meridian.names if name], mesh.points, conditions, loads)
+    # what the model contains and leaves out, in words
     included, left_out = describe_model(
         context, loads, part.name(case.model), part.plane, mesh.rim_count
     )
@@ -295,50 +296,65 @@ def _pending_modes(case: Case) -> PendingModes | None:
     several = case.several
     member_shells = list(several.parts) if several else []
     shell_cases = [member.case for member in member_shells] or [case]
+    # (number of the shell, key of the imperfection, its section)
     pending_sections = [
         (i, key, section)
         for i, shell_case in enumerate(shell_cases)
         for key, section in shell_case.imperfections.items()
         if isinstance(section, ModesSection) and section.pending_modes
     ]
-    if not pending_sections:
-        return None
-
-    def with_modes(modes: tuple[Mode, ...]) -> Problem:
-        """Put the modes into the imperfection sections, and return the problem with them.
-
-        Raises CaseError if no mode with an amplitude moves one of several shells.
-        """
-        for i, key, section in pending_sections:
-            # one of several shells takes its own part of the modes
-            name_and_place = (
-                (member_shells[i].name, several.place(member_shells[i])) if several else ()
-            )
-            try:
-                section.become(modes, *name_and_place)
-            except ValueError as e:
-                raise CaseError(member_shells[i].refused(f"shell.{key}.{e}")) from None
-        problem = make_problem(case.with_shells(several.parts) if several else case)
-
-        def remade(values: Mapping[str, Any]) -> Problem:
-            """Return the problem with other values of keys, and with the same modes.
-
-            The modes are put in again if the change makes imperfections wait for them.
-            """
-            changed_problem = problem.with_values(values)
-            return (
-                changed_problem.pending_modes.with_modes(modes)
-                if changed_problem.pending_modes
-                else changed_problem
-            )
-
-        return replace(problem, remade=remade)
-
-    count = max(len(section.amplitudes) for _, _, section in pending_sections)
-    # the sections ask for no mode at all
+    # zero without such sections, or if none of them asks for a mode
+    count = max((len(section.amplitudes) for _, _, section in pending_sections), default=0)
     if not count:
         return None
-    return PendingModes(count, lambda: make_problem(perfect_case(case)), with_modes)
+    return PendingModes(
+        count,
+        lambda: make_problem(perfect_case(case)),
+        lambda modes: _problem_with_modes(case, pending_sections, modes),
+    )
+
+
+def _problem_with_modes(
+    case: Case,
+    pending_sections: Sequence[tuple[int, str, ModesSection]],
+    modes: tuple[Mode, ...],
+) -> Problem:
+    """Put the modes into the imperfection sections of a case, and return the problem with them.
+
+    Parameters
+    ----------
+    pending_sections
+        Number of the shell, key of the imperfection, and its section, which waits for modes.
+    modes
+        Buckling modes of the perfect shell, or of all perfect shells together.
+
+    Raises
+    ------
+    CaseError
+        If no mode with an amplitude moves one of several shells.
+    """
+    several = case.several
+    member_shells = list(several.parts) if several else []
+    for i, key, section in pending_sections:
+        # one of several shells takes its own part of the modes, by its name and its place
+        name_and_place = (member_shells[i].name, several.place(member_shells[i])) if several else ()
+        try:
+            section.become(modes, *name_and_place)
+        except ValueError as e:
+            raise CaseError(member_shells[i].refused(f"shell.{key}.{e}")) from None
+    problem = make_problem(case.with_shells(several.parts) if several else case)
+
+    def remade(values: Mapping[str, Any]) -> Problem:
+        """Return the problem with other values of keys, and with the same modes.
+
+        The modes are put in again if the change makes imperfections wait for them.
+        """
+        changed_problem = problem.with_values(values)
+        if changed_problem.pending_modes:
+            return changed_problem.pending_modes.with_modes(modes)
+        return changed_problem
+
+    return replace(problem, remade=remade)
 
 
 @dataclass(frozen=True)
@@ -731,10 +747,10 @@ def _shape(
         for chart in points:
             place = outline.embedding(chart[None])[0]
             images.append(outline.inverse(part.mirror.image(place)))
-        x_lines, y_lines = (
-            (*shape.movable_lines[i], *(float(image[i]) for image in images)) for i in range(2)
-        )
-        shape = replace(shape, movable_lines=(x_lines, y_lines))
+        x_lines, y_lines = shape.movable_lines
+        x_of_images, y_of_images = ([float(image[i]) for image in images] for i in range(2))
+        movable_lines = ((*x_lines, *x_of_images), (*y_lines, *y_of_images))
+        shape = replace(shape, movable_lines=movable_lines)
     return shape, size
 
 
@@ -802,9 +818,12 @@ def _cells(shape: Chart | RimmedGrid, size: Grading, plane: Mirror | None) -> fl
     `plane` is the symmetry plane of the part, in the frame of the case; None for a whole shell.
     """
     if isinstance(shape, MeshFile):
-        halved = isinstance(shape.in_memory, MultiShellMesh)  # it has the cells of its half
-        return cell_count(shape) / (plane.copies if plane and not halved else 1)
-    return shape.cells * (0.5 if plane else 1.0) if isinstance(shape, Grid) else size.cells(shape)
+        # a mesh of several shells has the cells of the half alone, others those of the whole shell
+        is_halved = isinstance(shape.in_memory, MultiShellMesh)
+        return cell_count(shape) / (plane.copies if plane and not is_halved else 1)
+    if isinstance(shape, Grid):
+        return shape.cells * (0.5 if plane else 1.0)
+    return size.cells(shape)  # such a shape is that of the modelled part
 
 
 def _loads(case: Case, modelled: Modelled) -> Loads:
@@ -824,17 +843,18 @@ def _loads(case: Case, modelled: Modelled) -> Loads:
     ]
     additions += [step.load.adds(step, context, modelled) for step in last_steps.values()]
     additions += [section.adds(context, modelled) for section in context.abilities]
-    fields: dict[str, Any] = {}
+    # each addition maps names of attributes of `Loads` to values
+    sums: dict[str, Any] = {}
     for addition in additions:
         for name, value in addition.items():
-            earlier_value = fields.get(name)
+            earlier_value = sums.get(name)
             if isinstance(value, dict):
-                fields[name] = {**(earlier_value or {}), **value}
+                sums[name] = {**(earlier_value or {}), **value}
             elif isinstance(value, tuple):
-                fields[name] = (*(earlier_value or ()), *value)
+                sums[name] = (*(earlier_value or ()), *value)
             else:
-                fields[name] = earlier_value or value
-    return Loads(**fields)
+                sums[name] = earlier_value or value
+    return Loads(**sums)
 
 
 def _thickness(case: Case, turn: float) -> Thickness | None:

@@ -304,18 +304,19 @@ def _common_keys(
     -------
     The text, empty if no key is shared; and what the list says of each key.
     """
+    # what is said of a key -> the kinds of section of which that is said
     kinds_of_text = defaultdict[KeyText, list[str]](list)
+    # the same without the default -> the number of sections: a shared key may differ in it
     counts = Counter[KeyText]()
     for section in sections:
         for text in _key_texts(section, titles):
             kinds_of_text[text] += _tags(section)
-            # a key counts as shared if all but its default is alike
             counts[replace(text, default="")] += 1
     items, common = list[str](), set[KeyText]()
     all_kinds = [kind for section in sections for kind in _tags(section)]
-    # texts of one shared key: the default of most kinds comes first, without naming them
     for without_default in (text for text, count in counts.items() if count > 1):
         texts = [text for text in kinds_of_text if replace(text, default="") == without_default]
+        # the default of most kinds comes first, alone; others have their kinds in brackets
         texts.sort(key=lambda text: -len(kinds_of_text[text]))
         default = "; ".join(
             text.default + (f" ({', '.join(kinds_of_text[text])})" if i else "")
@@ -468,6 +469,7 @@ def _allowed(part: Schema, titles: dict[str, str]) -> str:
 
     `titles` maps the name of each section to its title, for links.
     """
+    # a section, alternatives, fixed values, or else a value by its type
     if "$ref" in part:
         title = titles[part["$ref"].rsplit("/", 1)[-1]]
         # a title with a tag is "loading, kind: field": the link says the tag's value alone
@@ -491,17 +493,24 @@ def _allowed(part: Schema, titles: dict[str, str]) -> str:
         return f"text such as `{part['examples'][0]}`" if "examples" in part else "text"
     if kind == "boolean":
         return "`true`, `false`"
-    if kind == "array" and "prefixItems" in part:
-        return (
-            f"[{', '.join(_allowed(alternative, titles) for alternative in part['prefixItems'])}]"
-        )
     if kind == "array":
-        min_items, max_items = part.get("minItems"), part.get("maxItems")
-        count = f"{min_items} × " if min_items == max_items and min_items else ""
-        return f"list of {count}{_allowed(part['items'], titles)}"
+        return _allowed_list(part, titles)
     if kind == "object":
         return f"name: {_allowed(part['additionalProperties'], titles)}"
     return _bounded(part, {"number": "number", "integer": "whole number"}[kind])
+
+
+def _allowed_list(part: Schema, titles: dict[str, str]) -> str:
+    """Return words for a list, such as "[text, number]" or "list of 3 × number".
+
+    `titles` is as of `_allowed`.
+    """
+    if "prefixItems" in part:
+        items = (_allowed(item, titles) for item in part["prefixItems"])
+        return f"[{', '.join(items)}]"
+    min_items, max_items = part.get("minItems"), part.get("maxItems")
+    count = f"{min_items} × " if min_items == max_items and min_items else ""
+    return f"list of {count}{_allowed(part['items'], titles)}"
 
 
 def _bounded(part: Schema, kind: str) -> str:

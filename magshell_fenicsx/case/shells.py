@@ -130,14 +130,15 @@ def in_words_of_shells(message: str, data: Any) -> str:
         return message
     texts = {*_texts(data)}  # all keys and values of the case file
     for name in map(str, shells):
+        # names of the shell's edges and points: those after "name." anywhere in the case, those in
+        # the shell's own section, and the edges of all geometries; as alternatives of a pattern
         names_in_text = {
             text.removeprefix(f"{name}.")
             for text in texts
             if re.fullmatch(rf"{re.escape(name)}\.\w+", text)
         }
-        known_names = "|".join(
-            sorted({*EDGE_NAMES, *names_in_text, *filter(str.isidentifier, _texts(shells[name]))})
-        )
+        own_names = filter(str.isidentifier, _texts(shells[name]))
+        known_names = "|".join(sorted({*EDGE_NAMES, *names_in_text, *own_names}))
         shell = re.escape(name)
         # first keys: boundary.a_rim is shells.a.boundary.rim in the file; then single names, if
         # they are no part of a path, a file name or a column such as a_tip_uz
@@ -258,6 +259,8 @@ class SeveralShells:
             for member in self.parts
         }
         members = MemberMeshes(self)
+        # in the order of the fields of `MultiShellMesh`: planes of symmetry, meridians, normal at a
+        # place, and the mesh of all halves
         functions_of_members = (
             members.mirrors,
             partial(meridians, self),
@@ -291,14 +294,13 @@ class SeveralShells:
             # a shell's own factor: a formula in its own frame, or numbers by its own patches
             if own_thickness and own_thickness.of_position:
                 factors[member.name] = PlacedFactor(own_thickness, self.place(member), ratio)
-            for name, factor in ((own_thickness and own_thickness.patches) or {}).items():
+            own_patches = (own_thickness and own_thickness.patches) or {}
+            for name, factor in own_patches.items():
                 assert isinstance(factor, float)  # a shell of its own has no shells in it
                 factors[f"{member.name}_{name}"] = ratio * factor
-        return (
-            None
-            if all(factor == 1.0 for factor in factors.values())
-            else Thickness(patches=factors)
-        )
+        if all(factor == 1.0 for factor in factors.values()):
+            return None
+        return Thickness(patches=factors)
 
     @cached_property
     def materials(self) -> "dict[str, ShellMaterial] | None":
@@ -367,13 +369,11 @@ class SeveralShells:
 
     def ratio(self, part: MemberCase) -> float:
         """Return the thickness of a shell over that of the first shell."""
+        if part is self.parts[0]:
+            return 1.0
         first_shell, shell = self.parts[0].case.shell, part.case.shell
         thickness = shell.reference / shell.R_over_h
-        return (
-            1.0
-            if part is self.parts[0]
-            else thickness / (first_shell.reference / first_shell.R_over_h)
-        )
+        return thickness / (first_shell.reference / first_shell.R_over_h)
 
     @property
     def readers(self) -> dict[str, FileKeys]:

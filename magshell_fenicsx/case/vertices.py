@@ -111,7 +111,8 @@ def on_features(chart: Array, outline: Outline, points: Mapping[str, Array]) -> 
             return point
     if outline.disc and is_at(np.zeros(CHART)):  # the pole is the origin of a disc's chart
         return np.zeros(CHART)
-    for edge in edges_near(chart, outline):  # one after the other: of two that meet at a corner too
+    # one edge after the other: at a corner the chart is moved onto both edges that meet there
+    for edge in edges_near(chart, outline):
         on_edge = edges_near(chart, outline)[edge]
         chart = on_edge if is_at(on_edge) else chart
     return chart
@@ -135,9 +136,11 @@ def edges_near(chart: Array, outline: Outline) -> dict[str, Array]:
         assert isinstance(shape, Grid)
         lowest, highest = np.array(shape.low), np.array(shape.high)
         names, glued = shape.sides, shape.glued
+    # of both axes x and y: whether the upper edge is nearer than the lower one
     is_high = chart - lowest >= highest - chart
     nearest = np.where(is_high, highest, lowest)
-    # names are those of low and high x, then of low and high y
+    # names are those of low and high x, then of low and high y; on an edge one coordinate is its
+    # own and the other that of the chart
     return {
         names[2 * axis + is_high[axis]]: np.where(np.arange(CHART) == axis, nearest, chart)
         for axis in range(CHART)
@@ -201,22 +204,23 @@ class Vertices:
             return  # vertices of a file stay where they are
         for name in self.points:
             self._refuse_beside_edges(name, shape, plane)
-        places = list(self.points.values())
-        vertices = shape.vertices_of(places) if isinstance(shape, Grid) else None
+        charts = list(self.points.values())
+        vertices = shape.vertices_of(charts) if isinstance(shape, Grid) else None
+        # every two points; points at one place share a vertex and are allowed
         for (i, name), (j, other_name) in combinations(enumerate(self.points), 2):
             if vertices is not None:  # in a grid: both take the same vertex
                 is_near = (vertices[i] == vertices[j]).all()
             else:
-                distance = float(np.hypot(*(places[i] - places[j])))
-                size = self._size_of_elements(places[i], shape)
+                distance = float(np.hypot(*(charts[i] - charts[j])))
+                size = self._size_of_elements(charts[i], shape)
                 is_near = distance < MIN_VERTEX_DISTANCE * size
-            if is_near and not np.array_equal(places[i], places[j]):
+            if is_near and not np.array_equal(charts[i], charts[j]):
                 self._refuse(
                     name,
-                    self._place(places[j]),
-                    f"{self._key(other_name)}: [{{}}]",
-                    "give one of them",
-                    MIN_VERTEX_DISTANCE,
+                    other_place=self._place(charts[j]),
+                    what=f"{self._key(other_name)}: [{{}}]",
+                    hint="give one of them",
+                    factor=MIN_VERTEX_DISTANCE,
                 )
 
     def _refuse_beside_edges(
@@ -263,6 +267,7 @@ class Vertices:
         """
         chart, unit = self.points[name], self.unit
         place = self._place(chart)
+        # coordinates of both places, each with its unit
         text, other_text = (
             ", ".join(f"{coordinate}{unit}" for coordinate in coordinates.split(", "))
             for coordinates in distinguishable_texts(place, other_place)

@@ -116,11 +116,13 @@ def advance(
     while end - motion.t > END_TOLERANCE * (end - begin):
         before_step()
         remaining = end - motion.t
-        # after the time `fastest` only the error limits a step
+        # dt is the length to which the step adapts; after the time `fastest` only the error limits
+        # it
         longest = steps.longest if motion.t < steps.fastest else dt
         dt = min(dt, steps.fixed or dt, longest)
         # steps of equal length up to the end, none of them tiny; rounding must not add one
-        length = remaining / np.ceil(remaining / dt * (1 - 1e-9))
+        step_count = np.ceil(remaining / dt * (1 - 1e-9))
+        length = remaining / step_count
         trial = integrator.step(motion, length)
         if isinstance(trial, str):  # the reason why Newton's method fails
             dt, failed = length / 2, True
@@ -133,7 +135,7 @@ def advance(
             if trial.error > steps.tolerance and length > smallest:
                 dt = max(0.3, length_ratio) * length
                 continue
-            # nan where the balance is not checked
+            # over the allowed leak; nan, which is not larger, where the balance is not checked
             leak = abs(trial.imbalance - motion.imbalance) / steps.allowed_leak(trial)
             if leak > 1 and abs(trial.imbalance) > abs(motion.imbalance):
                 if length <= smallest:

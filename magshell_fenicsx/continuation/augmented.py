@@ -18,6 +18,7 @@ from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magshell_fenicsx.continuation.bifurcation import DIFFERENCE_STEP as RELATIVE_DIFFERENCE_STEP
 from magshell_fenicsx.continuation.bifurcation import mixed_third_derivative
@@ -208,6 +209,13 @@ class AugmentedRows:
         Number of unstable directions other than v.
     bend, pull
         v . Pi'''(v, v) and v . R_mu.
+    w_R, w_mu, w_p, t_R, t_mu, t_p
+        Responses w and remainders t of R, R_mu and R_p.
+    cubic, K_mu_v, K_p_v
+        The vectors Pi'''(v, v, .) and (dK/dmu) v, (dK/dp) v at fixed u.
+
+    Private fields: `_R` is the residual. `_mixed_size` is the size of the terms that may cancel in
+    the row v . R_mu, for its rounding.
     """
 
     def __init__(
@@ -221,7 +229,6 @@ class AugmentedRows:
         scales: tuple[float, float],
     ) -> None:
         """Solve for the responses w with the tangent's factors, and differentiate g. Collective."""
-        # `_mixed_size`: size of the terms that may cancel in the row v . R_mu, for its rounding
         self._kind, self._scales, self._mixed_size = kind, scales, 0.0
         self._system, self._state, self._name, self._tangent = system, state, name, tangent
         self._difference = difference
@@ -316,26 +323,34 @@ class AugmentedRows:
             kind_row = self._row_without_work(coefficients, pull)
         c = coefficients(row.du) if row.du is not None else [0.0] * 4
         # for the tangent the row changes by 1 along it
-        place_row = [
-            c[0] + row.dmu,
-            c[1] + row.dp,
-            c[2],
-            c[3] + value if value is not None else -1.0,
-        ]
-        rows = np.array([singular_row, kind_row, place_row])
-        # units of dmu, dp and alpha: alpha v then moves the system by one length
-        columns = np.array([*self._scales, self._system.length / max_abs(comm, v)])
-        rows[:, :3] *= columns
-        row_sizes = np.abs(rows[:, :3]).max(axis=1)
-        if kind == "bifurcation":  # a coefficient that is zero by symmetry counts as rounding
-            row_sizes[1] = max(row_sizes[1], self._mixed_size * columns[2])
-        rows /= np.where(row_sizes, row_sizes, 1.0)[:, None]
-        # where bifurcations meet by symmetry the rows are dependent: the least step is taken
-        rank_tolerance = SYMMETRY_TOLERANCE if kind != "fold" else None
-        solution = np.linalg.lstsq(rows[:, :3], -rows[:, 3], rank_tolerance)[0]
-        dmu, dp, alpha = columns * solution
+        constant = c[3] + value if value is not None else -1.0
+        place_row = [c[0] + row.dmu, c[1] + row.dp, c[2], constant]
+        dmu, dp, alpha = self._solve_rows(np.array([singular_row, kind_row, place_row]))
         du = alpha * v - w_R - dmu * self.w_mu - dp * self.w_p
         return CurveVector(du, float(dmu), float(dp))
+
+    def _solve_rows(self, rows: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return dmu, dp and alpha from three linear equations. Collective.
+
+        Parameters
+        ----------
+        rows
+            (3, 4): the coefficients of dmu, dp and alpha, and the constant. It is overwritten.
+        """
+        # units of dmu, dp and alpha: alpha v then moves the system by one length
+        units = np.array(
+            [*self._scales, self._system.length / max_abs(self._system.comm, self._tangent.v)]
+        )
+        rows[:, :3] *= units
+        # every row is scaled to order one
+        row_sizes = np.abs(rows[:, :3]).max(axis=1)
+        if self._kind == "bifurcation":  # a coefficient that is zero by symmetry is only rounding
+            row_sizes[1] = max(row_sizes[1], self._mixed_size * units[2])
+        rows /= np.where(row_sizes, row_sizes, 1.0)[:, None]
+        # where bifurcations meet by symmetry the rows are dependent: the least step is taken
+        rank_tolerance = SYMMETRY_TOLERANCE if self._kind != "fold" else None
+        solution = np.linalg.lstsq(rows[:, :3], -rows[:, 3], rank_tolerance)[0]
+        return np.asarray(units * solution)
 
     def _row_without_work(
         self, coefficients: Callable[[Vector], list[float]], pull: float
@@ -362,10 +377,9 @@ class AugmentedRows:
             system.load(state.u, {**state.mu, name: mu + step}, name)
             for step in (mu_step, -mu_step)
         )
-        # its partial derivatives by mu and p, at fixed u
-        by_mu = dot(comm, v, np.asarray((forward - backward) / (2 * mu_step))) - dot(
-            comm, w_mu, self.K_mu_v
-        )
+        # the derivatives of v . R_mu by mu and p at fixed u: of the load, and of the null vector
+        load_mu = np.asarray((forward - backward) / (2 * mu_step))
+        by_mu = dot(comm, v, load_mu) - dot(comm, w_mu, self.K_mu_v)
         loads = [
             neighbour.weight * neighbour.system.load(state.u, neighbour.mu, name)
             for neighbour in self._difference

@@ -13,8 +13,8 @@ Pi(u; mu) is the potential, R = dPi/du, K = dR/du; mu is the load parameter (amp
 R_mu its load vector. A dot is the inner product over all ranks; Pi'''(v, w, .) is a third
 derivative as a vector. phi is the null vector of K. w_R and w_mu solve K w + t b = R and R_mu with
 b . w = 0. The system's length (a thickness) is the unit of displacements. `stress` is a list of
-weighted displacements: K takes the sum of their stresses in place of the stress of u, which small
-errors of a guess spoil.
+weighted displacements: K takes the sum of their stresses in place of the stress of u, since small
+errors of a guess u change its own stress much.
 """
 
 from collections.abc import Callable, Sequence
@@ -162,7 +162,7 @@ def _find_from_equilibrium(
             raise BifurcationLost
         last_u, state = state.u, state.with_(state.u + du, name, state.mu[name] + dmu)
         if sizes[-1] > EQUILIBRIUM_STEP:
-            # off equilibrium, a wrong membrane stress spoils the tangent
+            # off equilibrium the membrane stress is wrong, and with it the tangent
             state, _ = _equilibrate(newton, state, tangent.v, extrapolated_stress(last_u, du))
     state, error = _equilibrate(newton, state, tangent.v)
     return Bifurcation(
@@ -338,17 +338,23 @@ def switch_branch(
     while sizes:
         size = sizes.pop(0)
         points = (_step_off(path, state, mode, signed) for signed in (size, -size))
-        starts = [point if point and not refused(bifurcation, point) else None for point in points]
-        if starts[0] is None or starts[1] is None:
+        start, opposite_start = (
+            point if point and not refused(bifurcation, point) else None for point in points
+        )
+        if start is None or opposite_start is None:
             if branch_switch:  # the points at the last distance serve
                 break
             sizes = [smaller for smaller in SMALLER_STEP_SIZES if smaller < size]
             continue
-        rises = [point.state.mu[name] - state.mu[name] for point in starts if point]
-        symmetric = abs(rises[0] - rises[1]) <= ASYMMETRY_TOLERANCE * abs(rises[0] + rises[1])
-        branch_switch = BranchSwitch(symmetric, (starts[0], starts[1]))
-        # otherwise the symmetry is judged by rounding, and a larger distance is tried
-        changes_load = max(map(abs, rises)) > LOAD_CHANGE_TOLERANCE * abs(state.mu[name])
+        # the changes of the amplitude in both directions
+        rise, opposite_rise = (
+            point.state.mu[name] - state.mu[name] for point in (start, opposite_start)
+        )
+        symmetric = abs(rise - opposite_rise) <= ASYMMETRY_TOLERANCE * abs(rise + opposite_rise)
+        branch_switch = BranchSwitch(symmetric, (start, opposite_start))
+        # a smaller change is rounding, which would decide on the symmetry: a larger distance then
+        largest_rise = max(abs(rise), abs(opposite_rise))
+        changes_load = largest_rise > LOAD_CHANGE_TOLERANCE * abs(state.mu[name])
         if size < FIRST_STEP_SIZES[0] or changes_load:
             break
     return branch_switch

@@ -104,6 +104,10 @@ class Boundary:
         itself.
     watched
         Whether symmetry-breaking modes are counted along a boundary of the model itself.
+
+    Private fields: `_counts_families` tells whether symmetry-breaking modes are counted at points.
+    `_weight` is the factor of du . du in the metric, `_length` the system's length; `start` sets
+    both. `_solved_at` are the values of p of all solved points.
     """
 
     def __init__(
@@ -121,8 +125,8 @@ class Boundary:
         self.family, self.name, self.kind, self.scales, self.m = family, name, kind, scales, m
         self._counts_families = watched or m > 0
         self._recorded = recorded
-        self._weight = 0.0  # of du . du in the metric
-        self._solved_at = list[float]()  # values of p
+        self._weight = 0.0
+        self._solved_at = list[float]()
 
     def inner(self, a: CurveVector, b: CurveVector) -> float:
         """Return the inner product <a, b> of the arc length. Collective.
@@ -197,16 +201,19 @@ class Boundary:
         length = first_length
         for _ in range(MAX_POINTS):
             guess = self._predict(previous, current, length)
-            if not ends[0] < guess.dp < ends[1]:
+            guess_is_inside = ends[0] < guess.dp < ends[1]
+            if not guess_is_inside:
                 end = self._point_at_end(previous, current, length, ends)
                 if end:
-                    yield from self._events_between(current, *end)
-                    yield "end", end[0]
+                    end_point, distance = end
+                    yield from self._events_between(current, end_point, distance)
+                    yield "end", end_point
                     return
             # a point, or the reason why there is none
             point: BoundaryPoint | str = "the end of the range is not reached at once"
-            if ends[0] < guess.dp < ends[1]:
+            if guess_is_inside:
                 point = self._correct(current, guess, length)
+            # another trial with half the length
             if isinstance(point, str):
                 length /= 2
                 if length < MIN_STEP_RATIO * first_length:
@@ -227,9 +234,9 @@ class Boundary:
                 length = 1.5 * length
             elif point.factorisations > 2 * EASY_ITERATIONS:
                 length = 0.7 * length
-            length = min(
-                length, 1.2 * max_dp / max(abs(current.way.dp), 1e-300), 3 * first_length, 2 * step
-            )
+            # the next step changes p by little more than `max_dp`
+            max_length = 1.2 * max_dp / max(abs(current.way.dp), 1e-300)
+            length = min(length, max_length, 3 * first_length, 2 * step)
         raise BoundaryLost(f"{MAX_POINTS} points have not reached the end of the range")
 
     def _events_between(
@@ -250,29 +257,35 @@ class Boundary:
             turn = self._locate_turn(low, high, length)
             is_cusp = self.kind == "fold" and low.cubic * high.cubic < 0
             yield "cusp" if is_cusp else "turn", turn
-        if not self._counts_families:
-            if low.unstable != high.unstable:
-                point = self._locate_meeting(low, high, length, lambda point: point.unstable)
-                if point:
-                    yield "meeting", point
-            return
+        if self._counts_families:
+            yield from self._crossings_between(low, high, length)
+        elif low.unstable != high.unstable:
+            point = self._locate_meeting(low, high, length, lambda point: point.unstable)
+            if point:
+                yield "meeting", point
+
+    def _crossings_between(
+        self, low: BoundaryPoint, high: BoundaryPoint, length: float
+    ) -> Iterator[tuple[Label, BoundaryPoint]]:
+        """Yield meetings and crossings between two points at which modes are counted by family.
+
+        Parameters
+        ----------
+        length
+            Distance of the points along the tangent of the first.
+        """
         families = range(max(len(low.counts), len(high.counts)))
-        changed = [i for i in families if low.unstable_of(i) != high.unstable_of(i)]
-        meetings = {
+        changed_families = [i for i in families if low.unstable_of(i) != high.unstable_of(i)]
+        located = {
             i: self._locate_meeting(
                 low, high, length, partial(BoundaryPoint.unstable_of, family=i), i
             )
-            for i in changed
+            for i in changed_families
         }
-
-        def distance(item: tuple[int, BoundaryPoint | None]) -> float:
-            """Return how far an entry's point is from the first point in p; 0 if none was found."""
-            return abs(item[1].p - low.p) if item[1] else 0.0
-
+        found = [(i, point) for i, point in located.items() if point]
+        # in the order of p, with the counts just before each point
         counts = [low.unstable_of(i) for i in families]
-        for i, point in sorted(meetings.items(), key=distance):
-            if point is None:
-                continue
+        for i, point in sorted(found, key=lambda entry: abs(entry[1].p - low.p)):
             if i == self.m == 0:  # a mode of the model, on a boundary of the model
                 yield "meeting", replace(point, met=i)
             else:
@@ -316,17 +329,20 @@ class Boundary:
         t
             The place in units of the step: 0 at the first point, 1 at the second.
         """
+        name = self.name
         # the second tangent has length one too: per unit of the first it is longer
         faster = 1 / self.inner(low.way, high.way)
-        (h00, h10), (h01, h11) = hermite(t, (0.0, 1.0))
-        a, b, name = step * h10, step * faster * h11, self.name  # weights of both tangents
+        # weights of the values and of the slopes in units of the step, then of both tangents
+        (low_weight, low_slope_weight), (high_weight, high_slope_weight) = hermite(t, (0.0, 1.0))
+        a, b = step * low_slope_weight, step * faster * high_slope_weight
 
         def cubic(x0: float, d0: float, x1: float, d1: float) -> float:
             """Return the value for the values x0, x1 and slopes d0, d1 at both points."""
-            return h00 * x0 + a * d0 + h01 * x1 + b * d1
+            return low_weight * x0 + a * d0 + high_weight * x1 + b * d1
 
+        u = low_weight * low.state.u + a * low.way.du + high_weight * high.state.u + b * high.way.du
         return CurveVector(
-            h00 * low.state.u + a * low.way.du + h01 * high.state.u + b * high.way.du,
+            u,
             cubic(low.state.mu[name], low.way.dmu, high.state.mu[name], high.way.dmu),
             cubic(low.p, low.way.dp, high.p, high.way.dp),
         )
@@ -457,7 +473,7 @@ class Boundary:
         )
         if isinstance(point, str):
             return point
-        # the guess is a point (u, mu, p)
+        # the fields of the guess are those of a point: u, mu, p
         correction = CurveVector(
             point.state.u - guess.du, point.state.mu[name] - guess.dmu, point.p - guess.dp
         )
@@ -491,12 +507,13 @@ class Boundary:
         -------
         The point and its distance; None if the boundary does not reach the end in this step.
         """
-        low, high = 0.0, length
-        for _ in range(END_BISECTIONS):  # where the prediction leaves the range
-            middle = (low + high) / 2
+        # the distance at which the prediction leaves the range
+        inside, outside = 0.0, length
+        for _ in range(END_BISECTIONS):
+            middle = (inside + outside) / 2
             is_inside = ends[0] < self._predict(previous, current, middle).dp < ends[1]
-            low, high = (middle, high) if is_inside else (low, middle)
-        guess = self._predict(previous, current, high)
+            inside, outside = (middle, outside) if is_inside else (inside, middle)
+        guess = self._predict(previous, current, outside)
         end = float(min(ends, key=lambda end: abs(end - guess.dp)))
         point = self._solve(
             end,
@@ -514,9 +531,9 @@ class Boundary:
         correction = CurveVector(
             point.state.u - guess.du, point.state.mu[self.name] - guess.dmu, 0.0
         )
-        if np.sqrt(self.inner(correction, correction)) > MAX_CORRECTION * high:
+        if np.sqrt(self.inner(correction, correction)) > MAX_CORRECTION * outside:
             return None
-        return replace(point, p=end), high
+        return replace(point, p=end), outside
 
     def _locate_turn(self, low: BoundaryPoint, high: BoundaryPoint, length: float) -> BoundaryPoint:
         """Return the point between two others where p turns.
@@ -529,15 +546,15 @@ class Boundary:
         length
             Distance of the points along the tangent of the first.
         """
-        base, a, b = low, 0.0, length  # distances along the tangent of the base
+        base, a, b = low, 0.0, length  # a, b: distances of both along the tangent of the base
         best = min(low, high, key=lambda point: abs(point.way.dp))
         for _ in range(MAX_TRIALS):
             # slopes of p by the distance along the tangent of the base
             d0, d1 = (point.way.dp / self.inner(base.way, point.way) for point in (low, high))
             s = a + (b - a) * stationary((high.p - low.p) / (b - a), d0, d1)
-            guess = self._hermite(
-                low, high, (b - a) / self.inner(base.way, low.way), (s - a) / (b - a)
-            )
+            # the step and the place in it, as `_hermite` measures them: from `low`
+            step, t = (b - a) / self.inner(base.way, low.way), (s - a) / (b - a)
+            guess = self._hermite(low, high, step, t)
             middle = self._correct_at_distance(base, guess, s)
             if isinstance(middle, str):  # rounding: the cubic is as good
                 state = best.state.with_(guess.du, self.name, float(guess.dmu))
@@ -548,9 +565,14 @@ class Boundary:
             curvature = abs(opposite_end.way.dp - middle.way.dp) / distance_to_end
             # near the turn p is a parabola in the arc length
             error = middle.way.dp**2 / (2 * curvature) if curvature else 0.0
-            if error <= TURN_TOLERANCE * self.scales[1] or min(s - a, b - s) < MIN_BRACKET * length:
+            is_accurate = error <= TURN_TOLERANCE * self.scales[1]
+            if is_accurate or min(s - a, b - s) < MIN_BRACKET * length:
                 break
-            low, high, a, b = (middle, high, s, b) if is_before else (low, middle, a, s)
+            # the solved point replaces the end on its side of the turn
+            if is_before:
+                low, a = middle, s
+            else:
+                high, b = middle, s
         return best
 
     def _locate_meeting(
@@ -583,51 +605,53 @@ class Boundary:
         """
         coupled = family in (0, self.m)
         tolerance = MEETING_TOLERANCE if coupled else MEETING_TOLERANCE**2
-        # places, second eigenvalues and points, those with the smallest eigenvalues first; a and b
-        # are the places between which the number of unstable directions changes
-        solved, a, b = list[tuple[float, float, BoundaryPoint]](), 0.0, length
-        s = length / 2
+        # distances from `low` with their solved points, those with the smallest eigenvalues first
+        solved = list[tuple[float, BoundaryPoint]]()
+        # the distances between which the number of unstable directions changes, and the next trial
+        a, b, s = 0.0, length, length / 2
         for _ in range(MAX_MEETING_POINTS):
             guess = self._hermite(low, high, length, s / length)
             point = self._correct_with_eigenvalue(low, guess, s, family)
             if isinstance(point, str):
                 break
-            if any(s == place or point.second == second for place, second, _ in solved):
+            if any(s == other_s or point.second == other.second for other_s, other in solved):
                 break  # nothing more to interpolate
-            solved = sorted([*solved, (s, point.second, point)], key=lambda entry: abs(entry[1]))
+            solved = sorted([*solved, (s, point)], key=lambda entry: abs(entry[1].second))
             solved = solved[:INTERPOLATED_POINTS]
             a, b = (s, b) if count(point) == count(low) else (a, s)
             s = (a + b) / 2
             if len(solved) > 1:
-                places, seconds = [entry[0] for entry in solved], [entry[1] for entry in solved]
-                zero = interpolated(seconds, places, 0.0)
-                distance = abs(zero - solved[0][0])
-                outside_by_rounding = not a < zero < b and distance < MEETING_TOLERANCE * length
-                if outside_by_rounding or distance < tolerance * length:
+                distances = [distance for distance, _ in solved]
+                # inverse interpolation: the distance at which the eigenvalue is zero
+                zero = interpolated([point.second for _, point in solved], distances, 0.0)
+                change = abs(zero - distances[0])
+                outside_by_rounding = not a < zero < b and change < MEETING_TOLERANCE * length
+                if outside_by_rounding or change < tolerance * length:
                     s = zero
                     break
                 s = zero if a < zero < b else s
         if len(solved) < 2:  # too few to interpolate
-            return solved[0][2] if solved else None
+            return solved[0][1] if solved else None
         return self._interpolated_point(solved, s)
 
     def _interpolated_point(
-        self, solved: Sequence[tuple[float, float, BoundaryPoint]], s: float
+        self, solved: Sequence[tuple[float, BoundaryPoint]], s: float
     ) -> BoundaryPoint:
         """Return the nearest solved point, with p and amplitude interpolated at the distance `s`.
 
-        Its load error grows by the change of the amplitude when one point less is interpolated.
+        The amplitude is also interpolated without the last of the solved points. The difference is
+        added to the load error.
 
         Parameters
         ----------
         solved
-            Distances, second eigenvalues and points; the one nearest to a zero eigenvalue first.
+            Pairs of a distance and its point, those with the smallest second eigenvalues first.
         """
-        places, nearest = [entry[0] for entry in solved], solved[0][2]
-        loads = [point.state.mu[self.name] for _, _, point in solved]
-        p = interpolated(places, [point.p for _, _, point in solved], s)
-        load = interpolated(places, loads, s)
-        load_change = abs(load - interpolated(places[:-1], loads[:-1], s))
+        distances, (_, nearest) = [distance for distance, _ in solved], solved[0]
+        loads = [point.state.mu[self.name] for _, point in solved]
+        p = interpolated(distances, [point.p for _, point in solved], s)
+        load = interpolated(distances, loads, s)
+        load_change = abs(load - interpolated(distances[:-1], loads[:-1], s))
         return replace(
             nearest,
             p=p,
@@ -728,7 +752,10 @@ class Boundary:
         """
 
         def solve() -> BoundaryPoint | str:
-            """Run Newton's method; its result has `habit`, so that a resumed run rounds alike."""
+            """Run Newton's method.
+
+            Its result has the `habit` of the factorisation, with which a resumed run rounds alike.
+            """
             try:
                 point = self._iterate(
                     float(p),
@@ -746,7 +773,7 @@ class Boundary:
             return replace(point, habit=self.family.solver_at(point.p).factorisation.habit)
 
         point = self._recorded(solve)
-        # a stored result also renews what its solve would have left behind
+        # a stored result has not run `solve`: what that leaves behind is set here
         if isinstance(point, BoundaryPoint):
             self._solved_at.append(point.p)
             if not self.family.costly:
@@ -767,14 +794,14 @@ class Boundary:
         Pairs of a weight and its p.
         """
         # p itself and the last solved values, not too close to one another
-        places = [p]
+        values = [p]
         min_distance = MIN_SLOPE_DISTANCE * self.scales[1]
         for q in reversed(self._solved_at):
-            is_apart = min(abs(q - place) for place in places) > min_distance
-            if is_apart and len(places) <= SLOPE_POINTS:
-                places.append(q)
-        if low_order and len(places) > SLOPE_POINTS:
-            return slope_weights(places)
+            is_apart = min(abs(q - value) for value in values) > min_distance
+            if is_apart and len(values) <= SLOPE_POINTS:
+                values.append(q)
+        if low_order and len(values) > SLOPE_POINTS:
+            return slope_weights(values)
         return self.family.difference_weights(p, low_order=low_order)
 
     def _iterate(
@@ -879,8 +906,9 @@ class Boundary:
     def _has_converged(self, sizes: Sequence[float], load_changes: Sequence[float]) -> bool:
         """Return whether the remaining errors of u and of the load are small.
 
-        If all further steps shrink by the last ratio or by one half, they sum up to the last step
-        times ratio/(1 - ratio). Sizes that shrink slowly below the tolerance are rounding.
+        Further steps are expected to shrink by the last ratio, or by one half if that is less. Then
+        they sum up to the last step times ratio/(1 - ratio). Steps below the tolerance that shrink
+        slowly are rounding.
 
         Parameters
         ----------
@@ -893,13 +921,11 @@ class Boundary:
         if len(sizes) > 1:
             ratio = min(sizes[-1] / sizes[-2], 0.5) if sizes[-2] else 0.5
             shrinks_slowly = sizes[-1] > sizes[-2] / 2
-        remaining = ratio / (1 - ratio)
-        u_has_converged = sizes[-1] * remaining <= TOLERANCE or (
-            shrinks_slowly and sizes[-1] <= TOLERANCE
-        )
-        return u_has_converged and (
-            shrinks_slowly or load_changes[-1] * remaining <= LOAD_TOLERANCE * self.scales[0]
-        )
+        remaining = ratio / (1 - ratio)  # the sum of all further steps over the last one
+        is_rounding = shrinks_slowly and sizes[-1] <= TOLERANCE
+        u_has_converged = sizes[-1] * remaining <= TOLERANCE or is_rounding
+        load_error = load_changes[-1] * remaining
+        return u_has_converged and (shrinks_slowly or load_error <= LOAD_TOLERANCE * self.scales[0])
 
 
 def _row_at(p: float) -> CurveRow:

@@ -488,16 +488,13 @@ class _InstabilityLocator:
 
         Illinois' regula falsi is of order 1.44: if two successive guesses agree to tolerance^(3/4),
         the error of the second is below the tolerance. While the eigenvalue shows a larger error,
-        the search goes on as long as the error is halved: close to zero it is only rounding.
+        the search goes on as long as the error is halved: close to zero it is only rounding. The
+        `load_error` of the point is valid even if the tolerance is not reached.
 
         Parameters
         ----------
         stability
             The tangent whose eigenvalue changes sign; it may differ from the tangent of the path.
-
-        Returns
-        -------
-        The point with its `load_error`, which is valid even if the tolerance is not reached.
 
         Raises
         ------
@@ -505,10 +502,12 @@ class _InstabilityLocator:
             If the eigenpair nearest to zero is not found at a point.
         """
         # last_side: which end the last point replaced, 1 for high, -1 for low, 0 for none yet
-        name, last_side, last_s, best = self.path.name, 0, np.inf, None
+        name, last_side, last_s = self.path.name, 0, np.inf
+        best: Point | None = None  # the last guess that agreed with the one before
         low_mode = critical_mode(stability, low.state)
+        # a, b: the eigenvalues at both ends, which are halved below; `ends` keeps them with loads
         a, b = low_mode.eigenvalue, critical_mode(stability, high.state).eigenvalue
-        ends = (low.state.mu[name], a), (high.state.mu[name], b)  # loads and eigenvalues
+        ends = (low.state.mu[name], a), (high.state.mu[name], b)
         for _ in range(MAX_TRIALS):
             # the eigenvalue nearest to zero need not be the one that changes sign
             t = a / (a - b) if a * b < 0 else 0.5
@@ -519,6 +518,7 @@ class _InstabilityLocator:
             mu = point.state.mu[name]
             load_change = abs(point.s - last_s) * abs(point.dmu)
             width = abs(high.s - low.s) * abs(point.dmu)
+            # two successive guesses agree
             if load_change <= self.tolerance**0.75 * abs(mu) and a * b < 0:
                 load_error = self.distance_to_zero(point, stability, _slope(*ends), width)
                 zero = replace(point, load_error=load_error)
@@ -526,6 +526,7 @@ class _InstabilityLocator:
                 if stalled or load_error <= self.tolerance * abs(mu):
                     return min(best or zero, zero, key=lambda point: point.load_error)
                 best = zero  # the next guess, from the other side, may be nearer
+            # the bracket is small enough without such guesses
             if width <= self.tolerance * abs(mu) and not best:
                 load_error = self.distance_to_zero(point, stability, _slope(*ends), width)
                 return replace(point, load_error=max(width, load_error))
@@ -666,6 +667,8 @@ class ContinuationRun:
         Pairs of the last point before and the first point behind instabilities that were not
         separated. Such a cluster counts as one instability, at the first of both points; its width
         is the error of the amplitude.
+
+    The private field `_folds` has the located folds, `_budget` the work on the next instability.
     """
 
     def __init__(
@@ -696,15 +699,19 @@ class ContinuationRun:
             If the path is lost, returns to a fold that it has passed, or needs more steps than
             allowed.
         """
-        options, shorter_step, reason = self.path.options, None, ""
+        options = self.path.options
+        # the length of the next step where the last one is rejected, and the reason for that
+        shorter_step, reason = None, ""
         while True:
             for point, is_target in self._steps():
                 low, shorter_step = self.path.base_before(self.points[-1], point), None
+                # other amplitudes at the begin of the step, or a step that is too long
                 renewal = self._renewed_step(low, point)
                 if renewal:
                     shorter_step, new_reason = renewal
                     reason = new_reason or reason
                     break
+                # instabilities and targets in the step
                 events, refusal = self._accepted_events(low, point)
                 if refusal:  # approach in shorter steps
                     shorter_step, reason = abs(point.s - low.s) / 4, refusal
@@ -716,6 +723,7 @@ class ContinuationRun:
                     if self.done:
                         self.points.append(event)
                         return
+                # the end of the step itself
                 self.points.append(point)
                 has_all_points = self.goal.until == "points" and len(self.points) > self.goal.steps
                 self.done = not self._remaining_targets() or has_all_points
@@ -867,24 +875,33 @@ class ContinuationRun:
         For each event its label, its point, and whether it ends the run.
         """
         events: list[tuple[Label, Point, bool]] = []
-        for event in self._located(low, high):
-            ends_run = self.goal.until in ("limit", event.kind)
-            events.append((event.kind, event.point, ends_run))
+        for instability in self._located(low, high):
+            ends_run = self.goal.until in ("limit", instability.kind)
+            events.append((instability.kind, instability.point, ends_run))
             if ends_run:
                 break
         if self._by_arc and self.goal.targets:
-            last_ends_run, targets = self.goal.until in ("target", "limit"), self.goal.targets
-            # the last point is `low`, perhaps with another base direction
-            predictors = [*self.points[-2:-1], low]
-            folds = (point for label, point, _ in events if label == "fold" and point.s != low.s)
-            for end in (*(self.path.as_base(fold) for fold in folds), high):
-                # a target just below a fold is passed on both sides of it
-                predictors = [*predictors[-2:], end]
-                for target, point in targets_between(
-                    self.path, self.goal.quantity, targets, self.goal.sense, predictors
-                ):
-                    events.append(("target", point, last_ends_run and target == targets[-1]))
+            folds = [point for label, point, _ in events if label == "fold" and point.s != low.s]
+            ends_run = self.goal.until in ("target", "limit")
+            for target, point in self._targets_around(low, folds, high):
+                events.append(("target", point, ends_run and target == self.goal.targets[-1]))
         return sorted(events, key=lambda event: abs(event[1].s - low.s))
+
+    def _targets_around(
+        self, low: Point, folds: Sequence[Point], high: Point
+    ) -> Iterator[tuple[float, Point]]:
+        """Yield the targets between two points, each with its value and its point.
+
+        The folds between the points divide the path: a target just below a fold is passed on both
+        sides of it.
+        """
+        # the last point is `low`, perhaps with another base direction
+        predictors = [*self.points[-2:-1], low]
+        for end in (*(self.path.as_base(fold) for fold in folds), high):
+            predictors = [*predictors[-2:], end]
+            yield from targets_between(
+                self.path, self.goal.quantity, self.goal.targets, self.goal.sense, predictors
+            )
 
     def _located(self, low: Point, high: Point) -> Iterator[Instability]:
         """Yield the instabilities between two successive points, in the order of the path.

@@ -144,19 +144,10 @@ def nearest_combination(metric: Metric, a: Direction, span: Sequence[Direction])
         [metric.inner(direction, other_direction) for other_direction in span] for direction in span
     ]
     coefficients = np.linalg.solve(gram, [metric.inner(direction, a) for direction in span])
-    du = np.sum(
-        [
-            coefficient * direction[0]
-            for coefficient, direction in zip(coefficients, span, strict=True)
-        ],
-        axis=0,
-    )
-    return du, float(
-        sum(
-            coefficient * direction[1]
-            for coefficient, direction in zip(coefficients, span, strict=True)
-        )
-    )
+    weighted = list(zip(coefficients, span, strict=True))
+    du = np.sum([coefficient * du for coefficient, (du, _) in weighted], axis=0)
+    dmu = sum(coefficient * dmu for coefficient, (_, dmu) in weighted)
+    return du, float(dmu)
 
 
 @dataclass(frozen=True)
@@ -216,6 +207,10 @@ class BorderedMatrix:
     ----------
     column
         R_mu.
+
+    Private fields: `_load_response` is K^-1 R_mu, `_schur` the Schur complement d - c . K^-1 R_mu.
+    `_weight` is the factor of dmu dmu in `inner`, by which dmu counts as the displacement that it
+    causes. `_gradient` is (c, d), `_mu` the amplitude.
     """
 
     def __init__(
@@ -233,10 +228,8 @@ class BorderedMatrix:
         self._comm, self._factors, self._length = system.comm, factors, system.length
         self._gradient = row.gradient(state)
         self.column = system.load(state.u, state.mu, name)
-        # K^-1 R_mu, and the Schur complement of K
         self._load_response = factors.solve(self.column, low_accuracy=lagged)
         self._schur = derivative_along(self._comm, self._gradient, (-self._load_response, 1.0))
-        # of dmu dmu in `inner`: dmu counts as the displacement that it causes
         self._weight = dot(self._comm, self._load_response, self._load_response)
 
     def size(self, step: Direction) -> float:
@@ -441,23 +434,28 @@ class _TangentRefinement:
             return self.matrix.solve(force, row_value, low_accuracy=self.matrix.lagged)
 
         z = add_scaled((0.0 * t[0], 0.0), -1.0, preconditioned_product(t, 1.0))
-        directions = list[tuple[Direction, Direction, float]]()
+        # earlier directions p with their images q and q . q
+        earlier = list[tuple[Direction, Direction, float]]()
         for _ in range(MAX_REFINEMENTS):
+            # the correction z is small compared with the tangent t, in du and in dmu
             size = max_abs(comm, t[0])
             du_converged = max_abs(comm, z[0]) <= DU_TOLERANCE * size
             if du_converged and abs(z[1]) <= DMU_TOLERANCE * abs(t[1]):
                 # a smaller correction is only the error of the differences
                 is_significant = max_abs(comm, z[0]) > DIFFERENCE_ACCURACY * size
                 return add_scaled(t, 1.0, z) if is_significant else t
+            # a new direction, whose image is orthogonal to the earlier ones
             p, q = z, preconditioned_product(z)
-            for direction, image, square in directions:
-                component = self.matrix.inner(image, q) / square
-                p = add_scaled(p, -component, direction)
-                q = add_scaled(q, -component, image)
+            for earlier_p, earlier_q, earlier_square in earlier:
+                component = self.matrix.inner(earlier_q, q) / earlier_square
+                p = add_scaled(p, -component, earlier_p)
+                q = add_scaled(q, -component, earlier_q)
             square = self.matrix.inner(q, q)
-            directions.append((p, q, square))
+            earlier.append((p, q, square))
+            # the step along it that leaves the least of z
             component = self.matrix.inner(z, q) / square
-            t, z = add_scaled(t, component, p), add_scaled(z, -component, q)
+            t = add_scaled(t, component, p)
+            z = add_scaled(z, -component, q)
         return None
 
     def stiffness(self, residual: Residual, du: Vector, R: Vector) -> Vector:

@@ -104,8 +104,8 @@ def first_mode(
     """Return the boundary to which an instability belongs, and its point on that boundary.
 
     A path with two modes at nearly one load may have named the second: if another mode becomes
-    critical just before, its boundary is returned. Where others become critical long before, the
-    start is an instability beyond the first, and stays. Collective.
+    critical just before, its boundary is returned. If others become critical long before, the path
+    has passed the first instability; then the given boundary and point are returned. Collective.
 
     Parameters
     ----------
@@ -166,9 +166,9 @@ class _FirstModeSearch:
     def mode_beyond(self, mode: Boundary, crossing: BoundaryPoint, sense: float) -> _Successor:
         """Return the boundary beyond a crossing, of the mode that becomes critical there.
 
-        It may belong to a third mode that becomes critical there too. Where the equations of both
-        modes do not couple, it begins at the crossing itself; else they are singular there, and it
-        is taken up at a p beside the crossing.
+        It may belong to a third mode that becomes critical there too. If the equations of both
+        modes do not couple, it begins at the crossing itself. If they do, they are singular there,
+        and the boundary begins at a p beside the crossing.
 
         Parameters
         ----------
@@ -184,7 +184,7 @@ class _FirstModeSearch:
         """
 
         def starts_of(family: int) -> Iterator[_Successor]:
-            """Yield where a family's boundary may be taken up: at the crossing, or beyond."""
+            """Yield where a family's boundary may begin: at the crossing, or beyond it."""
             boundary, phi = self._boundary_of(family, crossing, mode.m)
             if mode.m and family not in (0, mode.m):  # the two equations do not couple
                 start = boundary.start(crossing.p, crossing.state, phi)
@@ -232,14 +232,17 @@ class _FirstModeSearch:
         mode: Boundary,
         point: BoundaryPoint,
     ) -> _Successor:
-        """Return where the boundary of a family may be taken up with no other mode unstable.
+        """Return a first point at which the mode of one of some families is the first.
 
-        Families that prove to be unstable at a place join the candidates.
+        This is so if no other mode is unstable there. Families of other modes that are unstable at
+        such a point become candidates, too.
 
         Parameters
         ----------
+        families
+            The first candidates.
         starts_of
-            Called with a family. It yields the places where its boundary may be taken up.
+            Called with a family. It yields its boundary with the points at which that may begin.
         mode, point
             The boundary that ends, and its last point, for the message.
 
@@ -285,7 +288,7 @@ def _point_beyond(
     Parameters
     ----------
     mode
-        The boundary that the crossing begins.
+        The boundary that begins at the crossing.
     phi
         A vector near its null vector.
     sense

@@ -108,18 +108,18 @@ def find_deflated(
     for _ in range(MAX_ITERATIONS):
         matrix = BorderedMatrix(system, newton.factor_at(state), state, name, row)
         newton_step = matrix.solve(-residual[0], -residual[1])
-        tau, size, M = (
-            deflation.factor(state.u, newton_step[0]),
-            matrix.size(newton_step),
-            deflation.value(state.u),
-        )
+        tau = deflation.factor(state.u, newton_step[0])
+        size = matrix.size(newton_step)
+        M = deflation.value(state.u)
         if not np.isfinite(size) or not np.isfinite(tau) or tau == 0.0:
             return None
         if size <= FINAL_STEP and 1 / MAX_DEFLATION_FACTOR < tau < MAX_DEFLATION_FACTOR:
             return state.with_(state.u + newton_step[0], name, state.mu[name] + newton_step[1])
+        # the step is shortened until the linear model explains enough of its residual
         fraction, nonlinearity = min(1.0, 4 * fraction), np.inf
         while not nonlinearity <= MAX_NONLINEARITY:
-            leaps += (leap := fraction < MIN_STEP_FRACTION)
+            leap = fraction < MIN_STEP_FRACTION
+            leaps += leap
             if leaps > MAX_LEAPS:
                 return None
             if leap:

@@ -65,6 +65,9 @@ class Device:
     ----------
     names
         The amplitudes that are unknown.
+
+    Private fields, both in the order of `names`: `_conjugates` are functions or names of further
+    amplitudes, `_units` the amplitudes per unit of y.
     """
 
     def __init__(
@@ -80,7 +83,6 @@ class Device:
             conjugate if callable(conjugate) or isinstance(conjugate, str) else constant(conjugate)
             for conjugate in held_conjugates_of_step.values()
         ]
-        # of the amplitudes per unit of y
         self._units = np.array([scale[name] / system.length for name in held_conjugates_of_step])
         # the further unknowns are on the last rank
         self.size = system.size + len(held_conjugates_of_step) * (
@@ -313,12 +315,14 @@ class ParametrisedSystem:
     def curvature(self, u: Vector, mu: Amplitudes, name: str, other: str) -> float:
         """Return a second derivative of Pi by t and other amplitudes, by the chain rule."""
         amplitudes, t = self._expanded(mu), mu[self._name]
-        first_rates, second_rates = self._rates(mu, name), self._rates(mu, other)
+        # amplitude of the inner system -> its derivative by `name`, and by `other`
+        rates, other_rates = self._rates(mu, name), self._rates(mu, other)
         mixed = (
-            a * b * self._system.curvature(u, amplitudes, i, j)
-            for i, a in first_rates.items()
-            for j, b in second_rates.items()
+            rate * other_rate * self._system.curvature(u, amplitudes, i, j)
+            for i, rate in rates.items()
+            for j, other_rate in other_rates.items()
         )
+        # d2mu_i/dt2, by t alone
         second_derivatives = dict[str, float]()
         if name == other == self._name:
             second_derivatives = {i: f(t)[2] for i, f in self._curves.items()}

@@ -89,7 +89,8 @@ class Factorisation:
         """Begin without factors; CHOLMOD is tried first where it can be used.
 
         Of `_cholmod` and `_mumps` one is in use, as `_pc`. `_border`, `_correction` and
-        `_correction_solver` belong to the latest tangent, if it is bordered or corrected.
+        `_correction_solver` belong to the latest tangent, if it is bordered or corrected;
+        `_products` are the stored products with its D.
         """
         self.count, self.negative_pivots = 0, 0
         self.stopwatch, self.solving = Stopwatch(), Stopwatch()
@@ -279,11 +280,11 @@ class Factorisation:
         After some matrices without a negative pivot, CHOLMOD is tried again.
         """
         entries = _entry_count(K)
-        # [1] is the matrix that was factored
-        if self._mumps is None or (self._mumps.getOperators()[1].handle, self._entries) != (
-            K.handle,
-            entries,
-        ):
+        serves = False  # whether the symbolic work does
+        if self._mumps is not None:
+            _, factored_matrix = self._mumps.getOperators()
+            serves = factored_matrix.handle == K.handle and self._entries == entries
+        if self._mumps is None or not serves:
             # of another pattern PETSc makes new factors itself, without the options below
             self._mumps, self._entries = _new_pc(K, "mumps"), entries
             self._mumps.setFactorSetUpSolverType()

@@ -13,9 +13,9 @@ takes one factorisation and three back-solves.
 R = dPi/du, K = dR/du; mu is the one amplitude (load parameter) that varies, R_mu its load vector. A
 dot is the inner product over all ranks; Pi'''(v, v, .) is a third derivative of the potential as a
 vector. phi is the null vector. Lengths are displacements in units of the system's length. `stress`
-are weighted displacements: K takes the sum of their stresses in place of the stress of u, which
-small errors of a guess spoil. A holding force along b, of unknown size, keeps the component of u
-along b.
+are weighted displacements: K takes the sum of their stresses in place of the stress of u, since
+small errors of a guess u change its own stress much. A holding force along b, of unknown size,
+keeps the component of u along b.
 """
 
 from collections.abc import Callable, Sequence
@@ -83,15 +83,16 @@ def _add_spring(tangent: Tangent, mode: Vector, comm: MPI.Comm) -> _Spring:
     the tangent there.
     """
     K = symmetric_part(tangent)
-    sizes = np.abs(mode[: K.getLocalSize()[0]])  # without the entries of a border
+    magnitudes = np.abs(mode[: K.getLocalSize()[0]])  # without the entries of a border
     first_row = K.getOwnershipRange()[0]
-    _, owner = comm.allreduce((float(sizes.max(initial=0.0)), comm.rank), MPI.MAXLOC)
+    # the rank that owns the largest entry, and there the row of that; elsewhere no row
+    _, owner = comm.allreduce((float(magnitudes.max(initial=0.0)), comm.rank), MPI.MAXLOC)
     e = np.zeros_like(mode)
     if comm.rank == owner:
-        e[int(np.argmax(sizes))] = 1.0
+        e[int(np.argmax(magnitudes))] = 1.0
     rows = [first_row + int(i) for i in np.flatnonzero(e)]
     diagonal = comm.allreduce(sum(K.getValue(i, i) for i in rows))
-    # the sum of both is positive
+    # the sum of spring and diagonal entry is positive; where the entry is zero, K gives the scale
     stiffness = 2 * abs(diagonal) - diagonal or K.norm(PETSc.NormType.INFINITY) or 1.0
     for i in rows:
         K.setValue(i, i, stiffness, addv=True)
@@ -120,6 +121,9 @@ class AugmentedTangent:
         Solution of K v + g b = 0, b . v = 1: v is the null vector where g = 0.
     unstable
         Number of unstable directions other than v.
+
+    Private fields: `_b` is b with length one, `_e` the spring's e. `_p` and `_q` are (K + s e e)^-1
+    times e and b, `_border` is the 2 x 2 Schur complement of K + s e e.
     """
 
     def __init__(
@@ -242,13 +246,16 @@ def _held_by_full_steps(
         is_rounding = is_own and CONTRACTION * last_size < size <= ROUNDING_STEP
         if size <= TOLERANCE or is_rounding:
             return State(u - du, guess.mu), size
-        if not is_own and size > CONTRACTION * last_size:  # the step is repeated
+        # an old tangent shortens the step too little: the step is repeated with a new one
+        if not is_own and size > CONTRACTION * last_size:
             tangent = AugmentedTangent(newton, State(u, guess.mu), b, stress)
             tangent_count, is_own = tangent_count + 1, True
             continue
         if tangent_count > MAX_TANGENTS or not np.isfinite(size):
             return None
-        u, last_size, is_own, stress = u - du, size, False, extrapolated_stress(u, -du)
+        # the next iterate, with the stress for a tangent there
+        stress = extrapolated_stress(u, -du)
+        u, last_size, is_own = u - du, size, False
 
 
 def third_derivative(

@@ -63,7 +63,7 @@ def stationary(rise: float, d0: float, d1: float) -> float:
 def flat_beyond(rise: float, d0: float, d1: float) -> float:
     """Return the first place beyond 1 where a cubic is stationary; infinite if there is none.
 
-    The cubic has the value change `rise` from 0 to 1, and the slopes d0 and d1 there.
+    The cubic rises by `rise` from 0 to 1, and has the slopes d0 at 0 and d1 at 1.
     """
     return min((t for t in _stationary_places(rise, d0, d1) if t > 1), default=np.inf)
 
@@ -87,8 +87,7 @@ def hermite(s: float, nodes: Sequence[float]) -> list[tuple[float, float]]:
     weights = []
     for i, a in enumerate(nodes):
         others = [*nodes[:i], *nodes[i + 1 :]]
-        # the square of the Lagrange polynomial of node a, and the logarithmic derivative of it
-        # there
+        # the square of the Lagrange polynomial of node a at s, and its slope at a, where it is 1
         square = prod((s - b) / (a - b) for b in others) ** 2
         derivative = 2 * sum(1 / (a - b) for b in others)
         weights.append((square * (1 - derivative * (s - a)), square * (s - a)))

@@ -175,7 +175,9 @@ class Iterates:
             # with more unstable directions than before it is past an instability, which a shorter
             # step of the path meets too; then the step must shrink, not only stay bounded
             is_past = step.pivots > earlier[0].pivots
-            return step.size > (QUADRATIC_RATIO if is_past else DIVERGENCE_RATIO) * earlier[0].size
+            allowed_ratio = QUADRATIC_RATIO if is_past else DIVERGENCE_RATIO
+            return step.size > allowed_ratio * earlier[0].size
+        # after some matrices the step must be half as long
         if len(earlier) < MAX_MATRICES_TO_HALVE:
             return False
         return step.size > QUADRATIC_RATIO * earlier[-MAX_MATRICES_TO_HALVE].size

@@ -148,7 +148,7 @@ class CorrectionSolver:
     ) -> None:
         """Orthonormalise the earlier products, with which each solution begins. Collective."""
         self._solve_sparse, self._products, self._comm = solve_sparse, products, comm
-        # columns u, and c = (I + A) u, orthonormal; the first `_count` are in use
+        # columns u of U, and c = (I + A) u of C, which are orthonormal; `_count` are in use
         shape = (size, MAX_STORED_PRODUCTS + MAX_PRODUCTS)
         self._U, self._C = (np.empty(shape, order="F") for _ in range(2))
         self._count = 0
@@ -176,29 +176,26 @@ class CorrectionSolver:
         -------
         The solution; NaN if neither the tolerance nor the level of rounding is reached.
         """
-        size = np.sqrt(dot(self._comm, b, b))
-        if not 0.0 < size < np.inf:
+        norm_of_b = np.sqrt(dot(self._comm, b, b))
+        if not 0.0 < norm_of_b < np.inf:
             return b
         # the best combination of earlier vectors, and what it leaves of b
         x, remainder = self._project_out(np.zeros_like(b), np.array(b), -1.0)
-        residual, column_count = np.sqrt(dot(self._comm, remainder, remainder)) / size, self._count
+        residual = np.sqrt(dot(self._comm, remainder, remainder)) / norm_of_b
+        column_count = self._count
         while residual > tolerance and column_count < MAX_STORED_PRODUCTS + MAX_PRODUCTS:
-            # a new direction r and its image (I + A) r, orthogonal to all earlier images
-            u, c = self._project_out(
-                remainder,
-                remainder + self._solve_sparse(self._products.times(remainder)),
-                1.0,
-                column_count,
-            )
+            # the remainder as new direction, and its image by I + A: both become new columns, with
+            # the image orthogonal to all earlier ones
+            image = remainder + self._solve_sparse(self._products.times(remainder))
+            u, c = self._project_out(remainder, image, 1.0, column_count)
             norm = np.sqrt(dot(self._comm, c, c))
-            self._U[:, column_count], self._C[:, column_count] = u / norm, c / norm
-            component = dot(self._comm, self._C[:, column_count], remainder)
-            x, remainder = (
-                x + component * self._U[:, column_count],
-                remainder - component * self._C[:, column_count],
-            )
+            new_u, new_c = self._U[:, column_count], self._C[:, column_count]
+            new_u[:], new_c[:] = u / norm, c / norm
+            component = dot(self._comm, new_c, remainder)
+            x = x + component * new_u
+            remainder = remainder - component * new_c
             column_count, previous = column_count + 1, residual
-            residual = np.sqrt(dot(self._comm, remainder, remainder)) / size
+            residual = np.sqrt(dot(self._comm, remainder, remainder)) / norm_of_b
             # rounding prevents more
             if previous < ACCEPTED_TOLERANCE and residual > previous / 2:
                 break
@@ -224,12 +221,11 @@ class CorrectionSolver:
             Number of columns; None: all in use.
         """
         column_count = self._count if count is None else count
+        U, C = self._U[:, :column_count], self._C[:, :column_count]
         for _ in range(2):  # the second time for what rounding has left
-            components = self._comm.allreduce(self._C[:, :column_count].T @ c)
-            u, c = (
-                u - sign * (self._U[:, :column_count] @ components),
-                c - self._C[:, :column_count] @ components,
-            )
+            components = self._comm.allreduce(C.T @ c)
+            u = u - sign * (U @ components)
+            c = c - C @ components
         return u, c
 
 
@@ -359,14 +355,17 @@ def count_crossings(
         if not len(large_indices):
             return EigenvalueCrossings(added, uncertainty, found_vectors)
         for i in large_indices[values[large_indices].imag >= 0]:  # of a conjugate pair one
+            # one real vector, or real and imaginary part of a complex one
             coefficients = [vectors[:, i].real]
             if values[i].imag > 0:
                 coefficients.append(vectors[:, i].imag)
             vectors_of_value = [krylov.combination(c) for c in coefficients]
-            if values[i].imag == 0 and values[i].real < -1:
+            is_below_minus_one = values[i].imag == 0 and values[i].real < -1
+            if is_below_minus_one:
                 x = vectors_of_value[0]
                 # on the way from K0 to K0 + D the matrix is singular once along x
                 added += 1 if dot(comm, x, D(x)) < 0 else -1
+            # the next runs leave these vectors out
             for x in vectors_of_value:
                 x = orthogonal_to_found(x)
                 found_vectors.append(x / np.sqrt(dot(comm, x, x)))
@@ -388,10 +387,10 @@ def _converged_eigenpairs(krylov: ArnoldiBasis) -> tuple[Array, Array] | None:
         # the residual of each pair: the part of A x outside the space
         errors = abs(krylov.H[size, size - 1] * vectors[-1])
         large_indices = np.flatnonzero(np.abs(values) > SMALL_EIGENVALUE)
+        # of each large eigenvalue from -1 or from 0, the nearer one
         distances = np.minimum(abs(1 + values[large_indices]), abs(values[large_indices]))
-        if size >= MIN_PRODUCTS and np.all(
-            errors[large_indices] < EIGENVALUE_TOLERANCE * distances
-        ):
+        are_accurate = errors[large_indices] < EIGENVALUE_TOLERANCE * distances
+        if size >= MIN_PRODUCTS and np.all(are_accurate):
             return values, vectors
         if size == MAX_PRODUCTS:
             break

@@ -103,6 +103,9 @@ class _InverseKrylovSpace:
         Number of solves so far.
     norm
         Largest sum of magnitudes in a row of K.
+
+    Private fields: `_V` and `_W` have V and W in their first `_count` rows; `_size` is the number
+    of all unknowns. `_next` is the vector by which the space grows next.
     """
 
     def __init__(self, factors: Factorisation) -> None:
@@ -130,11 +133,13 @@ class _InverseKrylovSpace:
             If a solution is not finite.
         """
         v, k = self._next, self._count
+        # the next vector, orthogonal to all others, and its image
         for _ in range(2):  # a second time against rounding
             v = v - self._sums(self._V[:k] @ v) @ self._V[:k]
             v = v / np.sqrt(dot(self._comm, v, v))
         self._V[k], self._W[k] = v, self._factors.solve(v)
         self._count, self.solves = k + 1, self.solves + 1
+        # K^-1 in the space, and its eigenvalues theta in ascending order
         V, W = self._V[: k + 1], self._W[: k + 1]
         inverse = self._sums(V @ W.T)
         if not np.isfinite(inverse).all():
@@ -142,11 +147,11 @@ class _InverseKrylovSpace:
         if self._factors.skewed:
             theta, Y = _real_pairs(inverse)
         else:
-            theta, Y = np.linalg.eigh((inverse + inverse.T) / 2)  # ascending, of K^-1
-        # the largest of either sign, nearest to zero in lambda, is at an end of the ascending list
+            theta, Y = np.linalg.eigh((inverse + inverse.T) / 2)
+        # the largest theta of either sign, nearest to zero in lambda, is at an end of the list
         pairs = [self._pair(theta[i], Y[:, i]) for i in {0, len(theta) - 1}]
         pair = self._nearest(pairs)
-        if self._count == MAX_VECTORS:  # restart
+        if self._count == MAX_VECTORS:  # restart with the vectors of the largest theta
             largest = np.argsort(-np.abs(theta))[:VECTORS_AFTER_RESTART]
             Y = np.linalg.qr(Y[:, largest])[0] if self._factors.skewed else Y[:, largest]
             self._count = Y.shape[1]
@@ -184,14 +189,16 @@ class _InverseKrylovSpace:
         (theta, vector, residual), *rivals = sorted(pairs, key=lambda pair: -abs(pair[0]))
         residual_size = np.sqrt(dot(self._comm, residual, residual))
         self._next, error = residual, residual_size / abs(theta)
-        for rival, rival_w, rival_residual in rivals:
+        for rival_theta, rival_vector, rival_residual in rivals:
             # the rival's eigenvalue is uncertain by its residual
-            rival_size = np.sqrt(dot(self._comm, rival_residual, rival_residual))
-            if rival * theta < 0 and abs(rival) + rival_size >= (1 - TIE_TOLERANCE) * abs(theta):
-                error = max(error, rival_size / abs(theta))
-                self._next = residual if residual_size > rival_size else rival_residual
-                if rival < 0 and abs(rival) >= (1 - TIE_TOLERANCE) * abs(theta):
-                    theta, vector = rival, rival_w
+            uncertainty = np.sqrt(dot(self._comm, rival_residual, rival_residual))
+            least_size = (1 - TIE_TOLERANCE) * abs(theta)
+            if rival_theta * theta < 0 and abs(rival_theta) + uncertainty >= least_size:
+                error = max(error, uncertainty / abs(theta))
+                self._next = residual if residual_size > uncertainty else rival_residual
+                # equally near, and the negative one
+                if rival_theta < 0 and abs(rival_theta) >= least_size:
+                    theta, vector = rival_theta, rival_vector
         return _RitzPair(1 / theta, vector, error)
 
     def _sums(self, local_products: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -299,9 +306,8 @@ def lowest_modes(K: PETSc.Mat, M: PETSc.Mat, count: int, kernel: int = 0) -> lis
         modes = slices.nearest_to(shift, computed, LANCZOS_TOLERANCE)
         last_eigenvalue = modes[requested - 1].eigenvalue
         upper_bound = last_eigenvalue + MULTIPLE_TOLERANCE * (last_eigenvalue - shift)
-        missed = slices.count_below(upper_bound) - sum(
-            mode.eigenvalue < upper_bound for mode in modes
-        )
+        found = sum(mode.eigenvalue < upper_bound for mode in modes)
+        missed = slices.count_below(upper_bound) - found
         if missed <= 0:
             kernel_modes = [Eigenpair(0.0, mode.vector) for mode in modes[:kernel]]
             return kernel_modes + modes[kernel:requested]

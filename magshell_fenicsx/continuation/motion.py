@@ -231,12 +231,13 @@ def consistent_state(
         # amplitudes with a spring are unknowns themselves; the others constrain u along X
         S = np.where(is_spring, D, [[dot(comm, c, x) for x in X] for c in C])
         correction = np.linalg.solve(S, device.rows(u, amplitudes))
-        # u changes by the constraints, y by the springs
-        step = _combination(np.where(is_spring, 0.0, correction), X)
-        y, u = y - np.where(is_spring, correction, 0.0), u - step
-        size = max_abs(comm, step) / system.length
-        spring_size = np.abs(correction[is_spring]).max(initial=0.0)
-        if size <= ROUNDING and spring_size <= ROUNDING * (1 + np.abs(y).max()):
+        # y changes by the springs, u by the constraints
+        y = y - np.where(is_spring, correction, 0.0)
+        du = _combination(np.where(is_spring, 0.0, correction), X)
+        u = u - du
+        u_size = max_abs(comm, du) / system.length
+        y_size = np.abs(correction[is_spring]).max(initial=0.0)
+        if u_size <= ROUNDING and y_size <= ROUNDING * (1 + np.abs(y).max()):
             break
     # the component of v along each constraint, which is removed
     normal_velocity = np.where(is_spring, 0.0, [dot(comm, c, v) for c in C])
@@ -269,7 +270,8 @@ def constrained_acceleration(
     """
     C, D = device.border(motion.u, motion.mu)
     is_constraint, speed = np.diag(D) == 0, max_abs(system.comm, motion.v)
-    forward, backward, dt = C, C, 1.0  # at rest C does not change
+    # C a little later and earlier along the velocity; at rest it does not change
+    forward, backward, dt = C, C, 1.0
     if speed:
         dt = DIFFERENCE_STEP * system.length / speed
         forward, backward = (

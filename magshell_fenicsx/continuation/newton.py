@@ -9,9 +9,9 @@ the corrector of a path, and computes the path's tangent at a solution.
 mu is the one amplitude (load parameter) that varies; the others are fixed. A row is the scalar
 equation g = 0: a prescribed load, conjugate displacement (on which mu does work) or arc length.
 `stress` are weighted displacements: K takes the sum of their stresses in place of the stress of u,
-which small errors of a guess spoil. Lengths are displacements in units of the system's length.
-Negative pivots of K count unstable directions. Forces of terms that couple all unknowns are
-extrapolated from earlier states where they are small.
+since small errors of a guess u change its own stress much. Lengths are displacements in units of
+the system's length. Negative pivots of K count unstable directions. Forces of terms that couple all
+unknowns are extrapolated from earlier states where they are small.
 """
 
 from collections.abc import Sequence
@@ -108,6 +108,10 @@ class BorderedNewton:
     ----------
     factorisation
         Factors of the latest tangent.
+
+    Private fields: `_full_steps` and `_line_search` are two SNES, the second only where forces
+    begin within a step. `_callbacks` are what both call, `_x` is their vector (u, mu), `_tangent`
+    the latest tangent with its state.
     """
 
     def __init__(
@@ -205,17 +209,15 @@ class BorderedNewton:
         The result with the final stiffnesses; None if a solve on the way fails.
         """
         state, iterations = guess, 0
+        options = SolveOptions(relative_tolerance=SOFT_FACES_TOLERANCE)
         for fraction in STIFFNESS_FRACTIONS:
+            # a fraction of the final stiffnesses: of those of the guess, or the default ones
             softer = {
-                key: fraction * guess.mu.get(key, k) for key, k in self.options.stiffnesses.items()
+                stiffness: fraction * guess.mu.get(stiffness, default)
+                for stiffness, default in self.options.stiffnesses.items()
             }
-            result = self._run_snes(
-                self._full_steps,
-                State(state.u, {**state.mu, **softer}),
-                name,
-                row,
-                SolveOptions(relative_tolerance=SOFT_FACES_TOLERANCE),
-            )
+            soft_guess = State(state.u, {**state.mu, **softer})
+            result = self._run_snes(self._full_steps, soft_guess, name, row, options)
             state, iterations = result.state, iterations + result.iterations
             if not result.converged:
                 return None
@@ -244,18 +246,21 @@ class BorderedNewton:
             The way this one solve runs.
         """
         callbacks = self._callbacks
-        # [2] is SNES's tolerance of steps, which an option may have replaced
-        callbacks.begin(guess, name, row, snes.getTolerances()[2], options)
+        # the tolerance of steps, which an option of PETSc may have replaced
+        _, _, step_tolerance, _ = snes.getTolerances()
+        callbacks.begin(guess, name, row, step_tolerance, options)
         callbacks.join((guess.u, guess.mu[name]), self._x)
         snes.solve(None, self._x)
         code, iterations = snes.getConvergedReason(), snes.getIterationNumber()
+        converged = code > 0
         u, mu = callbacks.split(self._x)
-        # positive codes mean convergence
-        if code > 0 and (step := callbacks.step_at(self._x)):  # the last step is known already
+        # the test of convergence has computed one more step, which is taken as well
+        if converged and (step := callbacks.step_at(self._x)):
             u, mu = add_scaled((u, mu), -1.0, step)
         self._work.iterations += iterations
-        reason = "converged" if code > 0 else REASON_MESSAGES.get(code, f"SNES reason {code}")
-        return NewtonResult(guess.with_(u, name, mu), code > 0, iterations, reason, callbacks.error)
+        reason = "converged" if converged else REASON_MESSAGES.get(code, f"SNES reason {code}")
+        state = guess.with_(u, name, mu)
+        return NewtonResult(state, converged, iterations, reason, callbacks.error)
 
     def ensure_factors_near(self, state: State, distance: float = np.inf) -> None:
         """Factor the tangent at a state unless factors of a near state are known. Collective.

@@ -12,8 +12,9 @@ d(u, mu)/ds. Arc length is measured from a base point along its tangent, or alon
 `across` where the path turns sharply. Inertia is the number of unstable directions, from negative
 pivots. Predictors are the points that a polynomial through them and their tangents extrapolates.
 Lengths are displacements in units of the system's length. `stress` are weighted displacements: the
-tangent matrix takes the sum of their stresses in place of the stress of u, which small errors of a
-guess spoil. Results pass through a journal, from which an interrupted run resumes.
+tangent matrix takes the sum of their stresses in place of the stress of u, since small errors of a
+guess u change its own stress much. Results pass through a journal, from which an interrupted run
+resumes.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -117,6 +118,10 @@ class Path:
     step_event
         Called with the state of a point and a predicted state. It returns the onset and loss of
         forces on the straight segment between them; None: forces never begin within a step.
+
+    The private field `_hard_solves` counts solves that failed or took many factorisations,
+    `_successive_failures` solves that failed one after the other. They decide how later solves are
+    tried.
     """
 
     def __init__(
@@ -130,15 +135,11 @@ class Path:
         progress: Progress | None = None,
         step_event: Callable[[State, State], StepEvent] | None = None,
     ) -> None:
-        """Begin with no failures; their numbers decide how later solves are tried.
-
-        `_hard_solves` counts solves that failed or took many factorisations, `_successive_failures`
-        solves that failed one after the other.
-        """
+        """Begin with no failures."""
         self.newton, self.name, self.control, self.options = newton, name, control, options
         self.system = newton.system
         self.metric = Metric(newton.system, scale)
-        self._hard_solves = 0  # solves that failed or took many factorisations
+        self._hard_solves = 0
         self._successive_failures = 0
         self._journal, self.progress = journal or NoJournal(), progress or NoProgress()
         self._step_event = step_event
@@ -363,11 +364,11 @@ class Path:
             if isinstance(recorded_result, Point):
                 factors.habit = recorded_result.habit
             return recorded_result
-        habit, result = factors.habit, solve()
+        habit_before, result = factors.habit, solve()
         if isinstance(result, Point):
             result = replace(result, habit=factors.habit)
         else:
-            factors.habit = habit  # of a failure only the reason is stored
+            factors.habit = habit_before  # of a failure only the reason is stored
         self._journal.record(result)
         return result
 
@@ -381,7 +382,7 @@ class Path:
         The event is recorded in the journal, as it costs as much as a solve.
         """
         step_event = self._step_event
-        if step_event is None:
+        if step_event is None:  # no forces begin
             return StepEvent()
         recorded = self.recorded_values(lambda: RecordedValues(asdict(step_event(current, guess))))
         return StepEvent(**recorded.values)
@@ -513,6 +514,7 @@ class Path:
                 if isinstance(result, str):
                     controller.reject_step(plan, result, self._smallest_step(result))
                     continue
+                # the step is accepted; a point that was rejected earlier may follow at once
                 straight = self._cosine(current, result) > self.options.growth_cosine
                 kink = passes_kinks or self._has_kink(current, result)
                 controller.accept_step(result, plan, self.options, straight=straight, kink=kink)
@@ -536,15 +538,13 @@ class Path:
         step_end
             Returns the s at which the step ends, from the planned s and the predictors.
         """
-        points, current, distance = (
-            controller.points,
-            controller.current,
-            target - controller.current.s,
-        )
+        points, current = controller.points, controller.current
+        distance = target - current.s
         length = controller.length(distance)
         length = min(length, self._length_past_fold(points, length))
+        # the polynomial that predicted the last point better predicts the next: `smooth` is whether
+        # that is the quintic through three points, not the cubic through two
         cubic_error, quintic_error = self._prediction_errors(points)
-        # of both polynomials the one that predicted the last point better predicts the next
         smooth = quintic_error < cubic_error
         # with three points the quintic has no error yet, but shows that of the cubic
         is_third_point = len(points) == PREDICTOR_POINTS - 1
@@ -552,12 +552,13 @@ class Path:
             end = current.s + np.copysign(length, distance)
             length *= self._predictable_fraction(points, end, cubic_error)
         s = target if length == abs(distance) else current.s + np.copysign(length, distance)
-        predictors, event = points[-3:] if smooth else points[-2:], StepEvent()
+        predictors = points[-3:] if smooth else points[-2:]
         s = step_end(s, predictors)
-        # behind that onset no solution was found: the step ignores it
+        # the onset of forces on the way, unless no solution was found behind it before
+        event = StepEvent()
         if current is not controller.onset_without_solution:
             event = self._event(current.state, self.predicted_state(s, predictors))
-        if event.loses_forces:  # the tangent alone may predict other onsets
+        if event.loses_forces:  # then only the tangent predicts, perhaps other onsets
             predictors = points[-1:]
             event = self._event(current.state, self.predicted_state(s, predictors))
         if event.fraction < 1:
@@ -572,7 +573,7 @@ class Path:
         The next point, a rejected point that is too far away, or the reason why there is none.
         """
         result, event = self._try_step(plan.s, plan.predictors), plan.event
-        if event.fraction < 1 and not event.ends_behind:  # just before an onset of forces
+        if event.fraction < 1 and not event.ends_behind:  # it ends just before an onset of forces
             return self._checked_before_onset(current, result)
         # behind an onset the load may turn back: arc length along the displacement still grows
         if event.ends_behind and self.control == "arc" and not isinstance(result, Point):
@@ -593,9 +594,10 @@ class Path:
         -------
         Whether the point was accepted.
         """
+        rejected.retries += 1
         current = controller.current
         point = self.measured_from(current, rejected.point)
-        length, rejected.retries = (point.s - current.s) * sense, rejected.retries + 1
+        length = (point.s - current.s) * sense  # negative if the point lies behind
         # the inertia of a nearby matrix serves where it shows no instability
         has_inertia = rejected.exact or not point.has_instability_since(current)
         if length > 0 and has_inertia:
@@ -620,15 +622,12 @@ class Path:
         if len(points) < 2 or self.control == "load":
             return np.inf
         previous, current = points[-2:]
-        # the cubic in units of the last step: 0 is the previous point, 1 the current one
         step, current_per_s = current.s - previous.s, self.relative_to(previous, current)
-        slope = (current.state.mu[self.name] - previous.state.mu[self.name]) / step
-        to_fold = (
-            MAX_STEP_PAST_FOLD
-            * (flat_beyond(slope, previous.dmu, current_per_s.dmu) - 1)
-            * abs(step)
-        )
-        return max(to_fold, MIN_FRACTION_BEFORE_FOLD * length)
+        mean_slope = (current.state.mu[self.name] - previous.state.mu[self.name]) / step
+        # where the cubic is stationary, in units of the last step: 1 is the current point
+        fold_place = flat_beyond(mean_slope, previous.dmu, current_per_s.dmu)
+        length_past_fold = MAX_STEP_PAST_FOLD * (fold_place - 1) * abs(step)
+        return max(length_past_fold, MIN_FRACTION_BEFORE_FOLD * length)
 
     def _prediction_errors(self, points: Sequence[Point]) -> list[float]:
         """Return the errors of the cubic and of the quintic at the last point.
@@ -673,17 +672,16 @@ class Path:
         points
             Points in the order of the path. Those before a reversal of s do not count.
         """
-        last_point = points[-1]
+        *earlier_points, last_point = points
+        # one and the same s for all
         predictors = [
-            *(
-                self.relative_to(last_point, self.measured_from(last_point, point))
-                for point in points[:-1]
-            ),
-            last_point,
+            self.relative_to(last_point, self.measured_from(last_point, point))
+            for point in earlier_points
         ]
+        predictors.append(last_point)
+        # s must change in one sense from each point to the next
         while len(predictors) > 1:
             steps = np.diff([point.s for point in predictors])
-            # s changes in one sense from each point to the next
             if not min(steps) * max(steps) <= 0:
                 break
             predictors.pop(0)
@@ -723,19 +721,23 @@ class Path:
         current = predictors[-1]
         self.progress.trying(current, s - current.s)
         guess = self.predicted_state(s, predictors)
+        # a solve with long steps is given up, but not where forces begin within a step: there the
+        # steps of a solve may grow before they shrink
         max_step = np.inf
-        # where forces begin steps may grow; given up there, they end beside the path
         if not self.newton.options.has_onsets:
             distance = max_abs(self.system.comm, guess.u - current.state.u) / self.system.length
             max_step = max(MAX_CORRECTION * distance, MIN_CORRECTION_LIMIT)
         point = self.correct(s, guess, current, max_step=max_step)
         if isinstance(point, str):
             return point
+        # an instability is only believed with the inertia of the point's own tangent
         exact = point.has_instability_since(current)
         if exact:
             point = self.with_own_inertia(point, current)
-        reason = self._jump(current, point)
-        return RejectedPoint(point, reason, exact) if reason else self.as_base(point)
+        reason_of_jump = self._jump(current, point)
+        if reason_of_jump:
+            return RejectedPoint(point, reason_of_jump, exact)
+        return self.as_base(point)
 
     def _jump(self, current: Point, next_point: Point) -> str | None:
         """Return why the ends of a step do not lie on one smooth arc; None if they do.

@@ -80,6 +80,7 @@ def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]
     # a multiple of b that is as large as the residual: the amplitude of the force is of order one
     scale = np.sqrt(dot(system.comm, residual, residual) / square) or 1.0
     b = np.asarray(b * scale)
+    # the equilibrium with the force, which begins as the least squares fit of the residual
     holder = newton.for_system(HoldingForceSystem(system, b))
     force = -dot(system.comm, b, residual) / dot(system.comm, b, b)
     # the component of u along b stays; without known solutions, steps are only shortened
@@ -94,8 +95,10 @@ def released(newton: BorderedNewton, guess: State, b: Vector) -> Iterator[State]
         smallest=MIN_STEP_RATIO * FIRST_STEP,
     )
     path = Path(holder, FORCE, "arc", options, scale=FORCE_SCALE)
-    max_force = MAX_FORCE_RATIO * abs(result.state.mu[FORCE])
-    last_point = path.start(result.state, -float(np.copysign(1.0, result.state.mu[FORCE])))
+    first_force = result.state.mu[FORCE]
+    max_force = MAX_FORCE_RATIO * abs(first_force)
+    last_point = path.start(result.state, -float(np.copysign(1.0, first_force)))
+    # the path of the force, to where it is zero
     try:
         for count, (point, _) in enumerate(path.continue_to(last_point, [np.inf]), 1):
             force_before, force_after = (
@@ -171,15 +174,12 @@ class Settling:
         """
         system, u, shift, factorisations = self.system, guess.u, 1.0, 0
         residual = system.residual(u, guess.mu)
+        # outer loop: one tangent for each accepted step; inner loop: trials of the step
         while factorisations < MAX_SETTLING_FACTORISATIONS:
             K = symmetric_part(system.tangent(u, guess.mu)).copy()
             while factorisations < MAX_SETTLING_FACTORISATIONS:
                 factorisations += 1
-                shifted = K.copy()
-                # K has entries of contacts too
-                structure = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
-                shifted.axpy(shift, self._K0, structure)
-                self._factors.factor(shifted)
+                self._factor_shifted(K, shift)
                 # not positive definite: a shorter step in time
                 if self._factors.negative_pivots:
                     shift *= 2
@@ -189,19 +189,29 @@ class Settling:
                 # the residual that a linear system would not leave
                 unexplained_force = next_residual + shift * self._K0_factors.times(du)
                 unexplained = self._size(unexplained_force) / self._size(residual)
-                if unexplained <= MAX_UNEXPLAINED and not self.passes(
+                is_accepted = unexplained <= MAX_UNEXPLAINED and not self.passes(
                     State(u, guess.mu), State(u + du, guess.mu)
-                ):
-                    u, residual = u + du, next_residual
-                    is_at_rest = (
-                        shift < REST_SHIFT and max_abs(system.comm, du) <= REST_STEP * system.length
-                    )
-                    shift /= 4 if unexplained < EASY_UNEXPLAINED else 1
-                    if is_at_rest:
-                        return State(u, guess.mu)
-                    break
-                shift *= 3  # the step is refused: a shorter one in time
+                )
+                if not is_accepted:  # a shorter step in time
+                    shift *= 3
+                    continue
+                u, residual = u + du, next_residual
+                is_at_rest = (
+                    shift < REST_SHIFT and max_abs(system.comm, du) <= REST_STEP * system.length
+                )
+                shift /= 4 if unexplained < EASY_UNEXPLAINED else 1
+                if is_at_rest:
+                    return State(u, guess.mu)
+                break
         return State(u, guess.mu)
+
+    def _factor_shifted(self, K: PETSc.Mat, shift: float) -> None:
+        """Factor K + shift K0, whose factors are then in `_factors`. Collective."""
+        shifted = K.copy()
+        # K has entries of contacts too
+        structure = PETSc.Mat.Structure.DIFFERENT_NONZERO_PATTERN
+        shifted.axpy(shift, self._K0, structure)
+        self._factors.factor(shifted)
 
     def _size(self, residual: Vector) -> float:
         """Return the square root of R . K0^-1 R: the norm by K0 of the displacement K0^-1 R."""
@@ -414,6 +424,7 @@ class _SolutionSearch:
         do. It must be new. From one known solution, or from the guess if a path leads there, the
         straight way to it must not lead shells through each other.
         """
+        # `else`: the loop has ended without a point that keeps its stiffnesses and cuts
         for _ in range(MAX_PARAMETER_CHANGES):
             if (state := self._rules.with_own_parameters(point.state)) is None:
                 break
@@ -457,15 +468,16 @@ class _SolutionSearch:
             result: Point | str = "no solution is near"
             if start:
                 result = self._solver.solve(self._row, self._value, start)
-            if isinstance(result, str):
+            if isinstance(result, str):  # the descent goes on
                 reason = result
-            elif self._is_known(result.state):
+                continue
+            if self._is_known(result.state):
                 return "the solution is a known one"
-            else:
-                point = self._solver.with_own_inertia(result, result)
-                if not point.negative_pivots:
-                    return point
-                state = _SoftestMode(self._path, point.state).displaced_state(DESCENT_SIZE)
+            point = self._solver.with_own_inertia(result, result)
+            if not point.negative_pivots:
+                return point
+            # beside an unstable solution the descent goes on
+            state = _SoftestMode(self._path, point.state).displaced_state(DESCENT_SIZE)
         return reason
 
     def by_release(self, guess: SearchGuess) -> Point | str:

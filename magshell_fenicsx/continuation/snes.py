@@ -12,7 +12,8 @@ mu. A direction is a pair (du, dmu). A kept matrix gets Broyden's updates (`Chor
 iterate's own if it was computed there. Dense terms couple all unknowns: their part of K may lag,
 that is belong to an earlier state, and their forces may be extrapolated from earlier states while
 steps are long. `stress` are weighted displacements whose stress replaces that of u in K, since
-small errors of a guess spoil its own. Lengths are displacements in units of the system's length.
+small errors of a guess u change its own stress much. Lengths are displacements in units of the
+system's length.
 """
 
 from collections.abc import Mapping, Sequence
@@ -139,13 +140,15 @@ class LatestTangent:
     ----------
     lagged
         Whether a small part of the tangent, of dense terms, belongs to an earlier state.
+
+    Private fields: `_factored` has the state that was factored last and the number of its
+    factorisation; `_has_other_stress` tells whether the stress was not that of the state.
     """
 
     def __init__(self, system: System, factorisation: Factorisation) -> None:
         self.system, self._factorisation = system, factorisation
-        # the state that was factored last, and the number of its factorisation
         self._factored: tuple[State | None, int] = None, 0
-        self._has_other_stress = False  # whether the stress was not that of the state
+        self._has_other_stress = False
         self.lagged = False
 
     @property
@@ -312,6 +315,12 @@ class SnesCallbacks:
         The bordered matrix of the present solve, or of the last one; None before the first.
     extrapolating
         Whether the solve may extrapolate forces of dense terms.
+
+    Private fields: `_state` is the present iterate and `_next` the next step there, to be
+    subtracted. `_x_counter`, `_f_counter` and `_f_handle` identify PETSc's vectors x and f to which
+    that step belongs. `_chord` applies the matrix with Broyden's updates. `_is_extrapolated` tells
+    whether the present residual has extrapolated forces, `_largest_step` is the size of the largest
+    step since forces were computed, and `_computed_steps` are sizes of steps with computed forces.
     """
 
     def __init__(self, tangent: LatestTangent, options: NewtonOptions) -> None:
@@ -340,8 +349,6 @@ class SnesCallbacks:
         options
             The way this one solve runs.
         """
-        # the extrapolation: whether the present residual uses it, the largest step since forces
-        # were computed, and the steps with computed forces
         self.extrapolating, self._is_extrapolated = options.extrapolating, False
         self._largest_step, self._computed_steps = 0.0, list[float]()
         self._tolerance, self._reuse_distance = tolerance, options.reuse_distance
@@ -358,8 +365,7 @@ class SnesCallbacks:
             relative_tolerance=options.relative_tolerance,
         )
         self.matrix = self._chord = self._state = self._next = None
-        # PETSc's state counters of the vectors x and f to which `_next` belongs
-        self._x_counter = self._f_counter = -1
+        self._x_counter = self._f_counter = -1  # PETSc counts from 0
 
     @property
     def error(self) -> float:
@@ -448,12 +454,12 @@ class SnesCallbacks:
         if self._state is not None and x.stateGet() == self._x_counter:
             return self._state
         state, previous = self._state_of(x), self._state
-        # PETSc's counters tell for which x and f the step is known
         if previous is not None:
             self._go_on(previous, state)
         self._x_counter, self._state = x.stateGet(), state
         self._next = self._next_step(state, self.split(f))
         size = self._iterates.steps[-1].size
+        # too small for extrapolated forces: the same step again with computed ones
         if self._is_extrapolated and not size > self._extrapolated_size(state):
             self._is_extrapolated = False
             self._compute(state, f)
@@ -462,6 +468,7 @@ class SnesCallbacks:
             self._computed_steps.append(size)
             self._largest_step = size  # extrapolation begins anew
         self._largest_step = max(self._largest_step, size)
+        # f as it is now is the residual whose step is known
         self._f_handle, self._f_counter = f.handle, f.stateGet()
         return state
 
@@ -537,16 +544,18 @@ class SnesCallbacks:
             if self._matrix_serves(size):
                 steps.append(NewtonStep(size, is_own=False))
                 return step
-        # factors of a near state may begin the solve
+        # a new matrix of this iterate; at the first one factors of a near state may serve
         is_own = bool(steps) or not self._tangent.is_near(state, self._reuse_distance)
         # after some matrices with a lagged part one without, since the lag may slow the solve
-        renews = sum(step.is_own for step in steps) == MATRICES_WITH_LAG and not self.extrapolating
+        own_count = sum(step.is_own for step in steps)
+        renews = own_count == MATRICES_WITH_LAG and not self.extrapolating
         factors = self._tangent.latest
         if is_own:
             factors = self._tangent.factor_at(
                 state, self._stress, may_lag=not renews, needs_inertia=False
             )
         matrix, step = self._matrix_and_step(factors, state, f)
+        # once more without a lagged part, if that is the reason why steps do not shrink
         if is_own and self._lag_slows(matrix, step):
             factors = self._tangent.factor_at(state, self._stress, needs_inertia=False)
             matrix, step = self._matrix_and_step(factors, state, f)
@@ -665,15 +674,14 @@ def make_snes(
     snes.setTolerances(stol=options.tolerance, max_it=options.max_iterations)
     snes.getKSP().setType("preonly")
     petsc_options = PETSc.Options(PREFIX)
-    # an option of the user has priority
+    # an option of the user has priority; PETSc's default does not take full steps
     sets_line_search = not petsc_options.hasName("snes_linesearch_type")
-    if (
-        sets_line_search
-    ):  # full steps are not PETSc's default; if they fail, the path takes a smaller step
+    if sets_line_search:
         petsc_options["snes_linesearch_type"] = line_search
     for prefix in (PREFIX, ""):  # options with our prefix, then those without
         snes.setOptionsPrefix(prefix)
         snes.setFromOptions()
+    # the options are global: ours would count for other solvers too
     if sets_line_search:
         petsc_options.delValue("snes_linesearch_type")
     pc = snes.getKSP().getPC()

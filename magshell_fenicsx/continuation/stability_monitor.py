@@ -125,7 +125,8 @@ class PathSegment:
         if count_before == count_after:
             return
         # several crossings are separated at a point between them; for one no new point is solved
-        middle = self._middle(low, high, solve=abs(count_after - count_before) > 1 and halvings > 0)
+        are_several = abs(count_after - count_before) > 1
+        middle = self._middle(low, high, solve=are_several and halvings > 0)
         if middle is None:
             base = self._path.as_base(low)
             crossing = locate_bifurcation(
@@ -301,17 +302,23 @@ class StabilityMonitor:
     unlocated
         The reason why a change could not be located, for the first such change; "" if there is
         none.
+
+    Private fields: `_last_point` has the displacement `_u` and the distance `_distance` along the
+    path. `_last_evaluation` and `_previous_evaluation` are the last two ones, `_softening_rate` is
+    the change of the softest eigenvalue per distance between them. `_skipped` has the points since
+    then that were not evaluated, with their distances; `_may_skip` is how many in a row may be.
+    `_counts_before_path` are the counts at the end of the previous path.
     """
 
     def __init__(self, excluded: SymmetryBreakingModes | None) -> None:
-        """Begin before any path; the last two evaluations and the skipped points are kept."""
+        """Begin before any path."""
         self._excluded = excluded
         self._families = excluded.families if excluded else []
         self._last_evaluation: _InertiaEvaluation | None = None
         self._previous_evaluation: _InertiaEvaluation | None = None
         self._counts_before_path: tuple[int, ...] = ()
-        self._u: Vector | None = None  # displacement at the last point
-        self._skipped: list[tuple[Point, float]] = []  # points with their distances
+        self._u: Vector | None = None
+        self._skipped: list[tuple[Point, float]] = []
         self.unlocated = ""
 
     @property
@@ -348,17 +355,18 @@ class StabilityMonitor:
         # the same object: the last evaluation is that of this point
         is_last_point = start.state.u is self._u and not self._skipped
         known_evaluation = last_evaluation if is_last_point else None
+        # begin anew at the first point, where nothing is known of softening
         self._path, self._expand = path, expand
         self._last_point, self._u, self._distance = start, start.state.u, 0.0
         self._softening_rate: float | None = None
-        # how many points in a row may be skipped; at first none
         self._may_skip, self._skipped, self._previous_evaluation = 0, [], None
-        self._last_evaluation = (
-            replace(known_evaluation, point=start, distance=0.0) if known_evaluation else None
-        )
-        if evaluate and not known_evaluation:
+        # the evaluation of the first point: a known one, a new one, or none yet
+        self._last_evaluation = None
+        if known_evaluation:
+            self._last_evaluation = replace(known_evaluation, point=start, distance=0.0)
+        elif evaluate:
             self._last_evaluation = self._evaluate(start, 0.0)
-        elif not known_evaluation:  # evaluated later, if it proves to be needed
+        else:  # evaluated later, if it proves to be needed
             self._skipped.append((start, 0.0))
 
     def pass_to(self, point: Point, *, evaluate: bool = False) -> list[Crossing]:
@@ -430,6 +438,7 @@ class StabilityMonitor:
         changed = (
             new_evaluation.counts != previous.counts if previous else any(new_evaluation.counts)
         )
+        # all evaluations from the previous to the last point, in the order of the path
         evaluations = [new_evaluation]
         self._may_skip = min(max(1, 2 * len(self._skipped)), MAX_SKIPPED)
         if self._skipped and (softened or changed):
@@ -437,9 +446,11 @@ class StabilityMonitor:
             self._may_skip = 0
         if previous:
             evaluations = self._with_recoveries([previous, *evaluations])
+        # the last two ones are kept for the next call
         self._last_evaluation, self._skipped = new_evaluation, []
         self._previous_evaluation = evaluations[-2] if len(evaluations) > 1 else None
         self._softening_rate = _softening_rate(*evaluations[-2:]) if len(evaluations) > 1 else None
+        # crossings between each two of them
         crossings = [] if previous else list(self._crossings_at_start(evaluations[0]))
         for low, high in pairwise(evaluations):
             if low.counts != high.counts:
@@ -451,10 +462,10 @@ class StabilityMonitor:
 
         A mode recovers if it becomes unstable and stable again within a step.
         """
-        refined, earlier = evaluations[:1], self._previous_evaluation
+        refined, before_low = evaluations[:1], self._previous_evaluation
         for low, high in pairwise(evaluations):
-            refined += [*self._recoveries(earlier, low, high, MAX_RECOVERY_HALVINGS), high]
-            earlier = refined[-2]
+            refined += [*self._recoveries(before_low, low, high, MAX_RECOVERY_HALVINGS), high]
+            before_low = refined[-2]  # before `high`, the first one of the next pair
         return refined
 
     def _recoveries(
@@ -478,16 +489,15 @@ class StabilityMonitor:
         if not halvings or low.point.s == high.point.s or not self._may_recover(other, low, high):
             return
         segment = PathSegment(self._path, low.point, high.point)
-        # an estimated point costs no solve; it counts if both halves with it are certain
+        # an estimated point costs no solve; it counts if in both halves no mode may recover
         estimate = self._evaluate_between(low, high, segment.estimated_middle())
         if estimate and estimate.counts == low.counts == high.counts:
-            evaluations_by_half = (other or high, low, estimate), (low, estimate, high)
-            if not any(
-                self._may_recover(*parabola_evaluations)
-                for parabola_evaluations in evaluations_by_half
-            ):
+            # arguments for both halves: a third evaluation, then the ends of the half
+            arguments_of_halves = (other or high, low, estimate), (low, estimate, high)
+            if not any(self._may_recover(*arguments) for arguments in arguments_of_halves):
                 yield estimate
                 return
+        # otherwise the point half way is solved, and both halves are examined
         middle = self._evaluate_between(low, high, segment.middle())
         if middle is None:
             return
@@ -570,6 +580,7 @@ class StabilityMonitor:
         If a crossing cannot be located, the reason is kept in `unlocated`.
         """
         segment = PathSegment(self._path, low.point, high.point)
+        # (distance from `low`, label of the family, point, change of its number) of each crossing
         located = list[tuple[float, str, Point, int]]()
         # only the first families of the counts are located
         for family, count_before, count_after in zip(
@@ -673,11 +684,11 @@ def _inner_bernstein_coefficient(distances: Sequence[float], numbers: Sequence[V
     numbers
         The values at these places.
     """
-    (third, low, high), (at_other, at_low, at_high) = distances, numbers
+    (third, low, high), (at_third, at_low, at_high) = distances, numbers
     step = high - low
-    slopes = (at_high - at_low) / step, (at_low - at_other) / (low - third)
-    # the second divided difference of the parabola
-    half_curvature = (slopes[0] - slopes[1]) / (high - third)
+    # divided differences: of the interval and beside it, then of second order
+    slope, other_slope = (at_high - at_low) / step, (at_low - at_third) / (low - third)
+    half_curvature = (slope - other_slope) / (high - third)
     return np.asarray((at_low + at_high) / 2 - step**2 / 2 * half_curvature)
 
 

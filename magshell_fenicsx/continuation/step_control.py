@@ -175,24 +175,27 @@ class StepController:
             Whether the path has a kink in the step: then no earlier point predicts the next one.
         """
         length = plan.length
+        # the length of the next step
         easy = (
             point.factorisations <= options.easy_factorisations
             or point.iterations <= options.easy_iterations
         )
         if straight and easy:
             longer = min(self.step + length / 2, 2 * length)
-            self.step = min(max(self.step, longer), options.largest)  # a target may have cut it
+            # not less than before: this step may have been short only to end at a target
+            self.step = min(max(self.step, longer), options.largest)
         # a step to an onset says nothing about the length
         elif point.factorisations >= options.hard_factorisations and plan.event.fraction == 1:
             self.step = 0.6 * length
-        # the last points before this one that a polynomial may go through
+        # at most three points before this one, and none before an onset or a kink
         smooth = plan.event.fraction == 1 and not kink
         earlier_points = self.points[1 - PREDICTOR_POINTS :] if smooth else []
         self.points, self.leaps = [*earlier_points, point], 0
 
     def accept_rejected(self, point: Point, length: float) -> None:
         """Append a solution that was rejected before, a step of a length from the last point."""
-        self.points, self.step = [*self.points[1 - PREDICTOR_POINTS :], point], length
+        earlier_points = self.points[1 - PREDICTOR_POINTS :]  # at most three
+        self.points, self.step = [*earlier_points, point], length
         self.rejected = None
 
     def keep_rejected(self, rejected: RejectedPoint, length: float) -> None:

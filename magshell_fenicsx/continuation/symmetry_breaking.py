@@ -72,6 +72,10 @@ class SymmetryBreakingRows:
         Null vector and residual of K_m v + g b = 0.
     pull, bend
         `BoundaryPoint.pull` and `cubic`; both are zero, since v does no work on the model.
+
+    Private fields: `_factors` are those of the model's tangent K. `_g_mu` and `_g_p` are the total
+    derivatives of g by mu and p, in which u follows them. `_other_unstable` counts the unstable
+    directions of the family without v.
     """
 
     def __init__(
@@ -100,12 +104,13 @@ class SymmetryBreakingRows:
         self.g = -1 / compliance
         # where b . K_m^-1 b < 0, v itself counts among the negative pivots
         self._other_unstable = family_factors.negative_pivots - (compliance < 0)
-        R_p, K_p = 0.0 * u, 0.0
         # derivatives by p at fixed u: R_p, and K_p = v . dK_m/dp v
+        R_p, K_p = 0.0 * u, 0.0
         for weight, other_p in difference:
             state_at_other_p = State(u, {**family.amplitudes(other_p), name: value})
             R_p = R_p + weight * family.solver_at(other_p).system.residual(u, state_at_other_p.mu)
             K_p += weight * family.quadratic_form(other_p, state_at_other_p, m, self.v)
+        # responses of u to mu and p
         self._w_mu = self._factors.solve(system.load(u, mu, name))
         self._w_p = self._factors.solve(R_p)
         mu_step = DIFFERENCE_STEP * (abs(value) or 1.0)
@@ -123,7 +128,7 @@ class SymmetryBreakingRows:
 
         Collective.
         """
-        # families from 1, padded up to m, whose own count leaves v out
+        # the families from 1, at least up to m; the count of m leaves v out
         m, counts = self._m, list(self._family.counts(self._p, self._state))
         counts += [0] * (m - len(counts))
         counts[m - 1] = self._other_unstable
@@ -197,7 +202,7 @@ def nearest_eigenvalue(factors: Factorisation, comm: MPI.Comm, b: Vector | None 
     x, value = np.sin(1.0 + np.arange(factors.matrix.getLocalSize()[0]) + comm.rank), np.inf
     for _ in range(MAX_INVERSE_ITERATIONS):
         y = factors.solve(x)
-        # with the border the tangent is regular, and y is orthogonal to b
+        # a multiple of K^-1 b makes y orthogonal to b, as the border does
         if b is not None and solution_for_b is not None:
             y = y - dot(comm, b, y) / dot(comm, b, solution_for_b) * solution_for_b
         previous_value, value = value, float(dot(comm, x, x) / dot(comm, x, y))

@@ -163,7 +163,7 @@ class System(Protocol):
         stress
             Displacements with weights. A system may use the weighted sum of their stresses in place
             of the stress of u. That sum is linear along the path, while small errors of a guess u
-            spoil its own stress.
+            change its own stress much.
         """
 
 

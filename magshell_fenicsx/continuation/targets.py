@@ -75,9 +75,8 @@ def targets_between(
     """
     low, high = points[-2:]
     low_value, high_value = path.value(quantity, low.state), path.value(quantity, high.state)
-    if (
-        low_value in targets and (high_value - low_value) * sense < 0
-    ):  # a shorter step sees the load rise first
+    # from a target the path turns back at once; a shorter step sees the load rise first
+    if low_value in targets and (high_value - low_value) * sense < 0:
         raise PathStopped(f"{path.name} falls from the start", low)
     # no polynomial continues behind a kink
     smooth_points = points[-2:] if path.newton.options.has_onsets else points
@@ -89,6 +88,7 @@ def targets_between(
     ]
     for target in sorted(crossed_targets, key=lambda target: abs(target - low_value)):
         point = path.measured_from(low, _solve(path, quantity, target, predictors))
+        # it predicts the next target, as the last point before `high`
         predictors.insert(-1, path.relative_to(low, point))
         yield target, point
 
@@ -103,8 +103,10 @@ def _solve(path: Path, quantity: Quantity, target: float, points: Sequence[Point
     TargetMissed
         If the solve fails.
     """
-    low, high = predictors = list(points[-2:])
-    for earlier in reversed(points[:-2]):  # too close ones would multiply rounding
+    low, high = points[-2:]
+    # both, and earlier ones that are not too close: these would multiply rounding
+    predictors = [low, high]
+    for earlier in reversed(points[:-2]):
         distance = abs(predictors[0].s - earlier.s)
         is_far = distance > MIN_PREDICTOR_DISTANCE * abs(high.s - low.s)
         if len(predictors) < MAX_PREDICTORS and is_far:
@@ -141,11 +143,12 @@ def _zero(f: Callable[[float], float], low: float, high: float) -> float:
         is_same = abs(place - previous) <= ZERO_TOLERANCE * abs(high - low)
         if is_same or not (value := f(place)):
             break
-        # Illinois: the value at an end that stays twice in turn is halved
+        # the place replaces one end; Illinois: the value at an end that stays twice in turn is
+        # halved
         if value * b < 0:
-            low, a, b = place, value, b / 2 if side < 0 else b
-            side = -1
+            b = b / 2 if side < 0 else b
+            low, a, side = place, value, -1
         else:
-            high, b, a = place, value, a / 2 if side > 0 else a
-            side = 1
+            a = a / 2 if side > 0 else a
+            high, b, side = place, value, 1
     return place

@@ -194,7 +194,8 @@ class Integrator:
         """Begin without factors.
 
         `_free` are the amplitudes that the device makes unknown, `_driven` all positions that move.
-        `_total_energy` is the energy at the begin, from which an imbalance is counted.
+        `_total_energy` is the energy at the begin, from which an imbalance is counted. `_K` is the
+        matrix of a step, with the pattern of the tangent `_tangent`.
         """
         surroundings = surroundings or Surroundings()
         device = surroundings.device
@@ -207,7 +208,7 @@ class Integrator:
         self._driven = frozenset({*surroundings.moving_amplitudes, *self._free})
         self.factorisation = Factorisation(system.comm)
         self.steps = self.iterations = 0
-        # the matrix of a step, with the pattern of the tangent, which contact of shells changes
+        # contact of shells may give another tangent with another pattern
         self._K: PETSc.Mat | None = None
         self._tangent: PETSc.Mat | None = None
         self.factored_state: FactoredState | None = None
@@ -235,9 +236,10 @@ class Integrator:
         if earlier:
             mu |= {name: earlier.mu[name] for name in self._free} | self._contact_settings(earlier)
         inverse_mass = self._inverse_mass()
-        # a jump of the supports' velocity is an impulse, whose work is the change of the kinetic
-        # energy
+        # displacement, velocity and amplitudes, as supports and device demand
         if self.supports:
+            # a jump of the supports' velocity is an impulse, whose work is the change of the
+            # kinetic energy
             work -= self._kinetic_energy(v, t, before_jump=True)
             jump = self.supports.velocity(t, False) - self.supports.velocity(t, True)
             v = v - inverse_mass(self._mass_times_supports(jump))
@@ -248,16 +250,8 @@ class Integrator:
         if self.viscous:
             self.viscous.memory = earlier.memory if earlier else self.viscous.memory
             self.viscous.begin()
-        residual = self.system.residual(u, mu) + self.drag * self._times(v)
-        if self.supports:
-            acceleration, velocity = (
-                self.supports.acceleration(t, False),
-                self.supports.velocity(t, False),
-            )
-            residual = residual + self._mass_times_supports(acceleration + self.drag * velocity)
-        if self.viscous:
-            residual = residual + self.viscous.force(u, u, v, 1.0, 0.0)
-        a = -inverse_mass(residual)
+        # the acceleration that all forces give
+        a = -inverse_mass(self._forces_at_begin(t, u, v, mu))
         if self.device:
             motion = Motion(t, u, v, a, mu)
             a, mu = constrained_acceleration(self.system, self.device, inverse_mass, motion)
@@ -268,6 +262,20 @@ class Integrator:
             self._total_energy = self.kinetic(motion) + self.contact.stored_energy(u, mu)
         potentials = self._potentials(motion, before_jump=False)
         return self.with_imbalance(replace(motion, potentials=potentials))
+
+    def _forces_at_begin(self, t: float, u: Vector, v: Vector, mu: Amplitudes) -> Vector:
+        """Return the residual at the begin of a motion without its inertia: M a is minus this.
+
+        Inertia and drag by moving supports are part of it. At a jump the values after it count.
+        """
+        residual = self.system.residual(u, mu) + self.drag * self._times(v)
+        if self.supports:
+            acceleration = self.supports.acceleration(t, False)
+            velocity = self.supports.velocity(t, False)
+            residual = residual + self._mass_times_supports(acceleration + self.drag * velocity)
+        if self.viscous:
+            residual = residual + self.viscous.force(u, u, v, 1.0, 0.0)
+        return residual
 
     def begins_anew(self, t: float) -> bool:
         """Return whether a motion begins anew at a kink or jump of the loads at time t.
@@ -379,10 +387,14 @@ class Integrator:
             u = u + dt**2 / 2 * motion.a
         y = self.device.unknowns(motion.mu) if self.device else np.empty(0)
         support_forces = self._support_forces(motion, dt)
-        last_size, first_size, has_new_factors, growths = np.inf, np.inf, False, 0
-        if self.factored_state is None or abs(dt - self.factored_state.dt) > MAX_STEP_CHANGE * dt:
+        # sizes of the last and the first step; `growths`: successive steps that have grown
+        last_size, first_size, growths = np.inf, np.inf, 0
+        # factors of an earlier time step serve if it was about as long
+        has_new_factors = (
+            self.factored_state is None or abs(dt - self.factored_state.dt) > MAX_STEP_CHANGE * dt
+        )
+        if has_new_factors:
             self._factor_step(motion, u, y, dt)
-            has_new_factors = True
         chord = self._chord()
         for _ in range(MAX_ITERATIONS):
             a, v = self._rates(motion, u, dt)
@@ -394,6 +406,7 @@ class Integrator:
             step_size = max_abs(comm, du) / length
             if not np.isfinite(step_size):
                 return "the step is not a number"
+            # the displacement as a multiple of the one from which the tolerance is relative to it
             displacement = LENGTH_PER_DISPLACEMENT * max_abs(comm, u) / length
             # small steps that new factors do not shrink may be rounding
             stalled = (
@@ -402,15 +415,8 @@ class Integrator:
             if step_size <= TOLERANCE * max(1.0, displacement) or (
                 stalled and step_size <= ROUNDING_FACTOR * self._rounding_error(motion, u, y, dt)
             ):
-                end = State(u, self._amplitudes(motion, y, 1.0, dt))
-                if self.contact:
-                    message = self.contact.penetration_message(State(motion.u, motion.mu), end)
-                    if message:
-                        return message
-                self.steps += 1
-                return self._accept(motion, u, y, dt)
+                return self._end_of_step(motion, u, y, dt)
             if step_size > REFACTOR_RATIO * last_size:
-                # successive steps with new factors that have grown
                 growths = growths + 1 if has_new_factors and step_size > last_size else 0
                 diverges = has_new_factors and step_size > max(MAX_STEP, first_size)
                 if growths > (CONTACT_PATIENCE if self.contact else 0) or diverges:
@@ -420,6 +426,19 @@ class Integrator:
             last_size, first_size = step_size, step_size if first_size == np.inf else first_size
         self.factored_state = None
         return "Newton's method does not converge"
+
+    def _end_of_step(self, motion: Motion, u: Vector, y: Array, dt: float) -> Motion | str:
+        """Return the motion at the end of a step that has converged, if no surfaces pass through.
+
+        Otherwise return the message about them.
+        """
+        end = State(u, self._amplitudes(motion, y, 1.0, dt))
+        if self.contact:
+            message = self.contact.penetration_message(State(motion.u, motion.mu), end)
+            if message:
+                return message
+        self.steps += 1
+        return self._accept(motion, u, y, dt)
 
     def _chord(self) -> Chord[Vector]:
         """Return Broyden's chord method for a residual (u, y), with the latest factors."""
@@ -503,21 +522,17 @@ class Integrator:
         The forces, followed by the device's rows on the last rank.
         """
         alpha_m, alpha_f = self.parameters.alpha_m, self.parameters.alpha_f
+        mean_velocity = (1 - alpha_f) * v + alpha_f * motion.v
         # the system's residual has the contact forces of the whole step from here on
         self._average_contact(motion, u, y, dt)
-        residual = self._times(
-            (1 - alpha_m) * a
-            + alpha_m * motion.a
-            + self.drag * ((1 - alpha_f) * v + alpha_f * motion.v)
-        )
+        # inertia and drag, then the forces within the step
+        residual = self._times((1 - alpha_m) * a + alpha_m * motion.a + self.drag * mean_velocity)
         for fraction, weight in self.parameters.forces:
-            residual = residual + weight * self.system.residual(
-                motion.u + fraction * (u - motion.u), self._amplitudes(motion, y, fraction, dt)
-            )
+            u_between = motion.u + fraction * (u - motion.u)
+            mu_between = self._amplitudes(motion, y, fraction, dt)
+            residual = residual + weight * self.system.residual(u_between, mu_between)
         if self.viscous:
-            residual = residual + self.viscous.force(
-                motion.u, u, (1 - alpha_f) * v + alpha_f * motion.v, 1 - alpha_f, dt
-            )
+            residual = residual + self.viscous.force(motion.u, u, mean_velocity, 1 - alpha_f, dt)
         if self.device is None:
             return residual
         # conjugates are held at the end of the step; (1 - alpha_f) keeps the matrix symmetric
@@ -616,15 +631,17 @@ class Integrator:
         work = sum(
             self._work(name, motion, mu, potentials, mean_forces.get(name)) for name in potentials
         )
-        step, velocity = u - motion.u, (1 - alpha_f) * v + alpha_f * motion.v
+        step, mean_velocity = u - motion.u, (1 - alpha_f) * v + alpha_f * motion.v
         # drag times the mean velocity works along the step, at supports too
         if self.supports and self.drag:
             begin, end = self.supports.velocity(motion.t, False), self.supports.velocity(t, True)
             step_of_all = step + dt / 2 * (begin + end)
-            velocity = velocity + (1 - alpha_f) * end + alpha_f * begin
-            dissipated = self.drag * dot(comm, step_of_all, self.supports.times(velocity))
+            mean_velocity = mean_velocity + (1 - alpha_f) * end + alpha_f * begin
+            dissipated = self.drag * dot(comm, step_of_all, self.supports.times(mean_velocity))
+        elif self.drag:
+            dissipated = self.drag * dot(comm, step, self._times(mean_velocity))
         else:
-            dissipated = self.drag * dot(comm, step, self._times(velocity)) if self.drag else 0.0
+            dissipated = 0.0
         error = self._error(motion, end_motion, dt)
         if self.viscous:
             dissipated += dot(comm, step, self.viscous.accept(motion.u, u, dt))
@@ -649,7 +666,8 @@ class Integrator:
         if viscous is None:
             return error
         # a motion that creeps: errors of the steps add up in its own time |v|/|a|
-        if viscous.creep_time > dt and dt**2 * acceleration_change > ACCELERATION_ROUNDING * length:
+        is_significant = dt**2 * acceleration_change > ACCELERATION_ROUNDING * length
+        if viscous.creep_time > dt and is_significant:
             acceleration = max(max_abs(comm, end_motion.a), acceleration_change)
             motion_time = max_abs(comm, end_motion.v) / max(acceleration, 1e-300)
             error *= max(1.0, min(viscous.creep_time, motion_time) / dt)
@@ -730,12 +748,16 @@ class Integrator:
             mu = self._amplitudes(motion, y, fraction, dt)
             force += weight * self.system.potential(u, mu, name)
         if supports and name in supports.names:
-            # end and begin of the step; at a jump the end counts before it, the begin after it
-            ends = (end_motion, end_motion.t, True), (motion, motion.t, False)
-            a, a_before = (end.a + supports.acceleration(t, is_end) for end, t, is_end in ends)
-            v, v_before = (end.v + supports.velocity(t, is_end) for end, t, is_end in ends)
-            acceleration = (1 - alpha_m) * a + alpha_m * a_before
-            velocity = (1 - alpha_f) * v + alpha_f * v_before
+            # at a jump the end of the step counts before it, the begin after it
+            end, begin = (end_motion, end_motion.t, True), (motion, motion.t, False)
+            a_end, a_begin = (
+                at.a + supports.acceleration(t, before_jump) for at, t, before_jump in (end, begin)
+            )
+            v_end, v_begin = (
+                at.v + supports.velocity(t, before_jump) for at, t, before_jump in (end, begin)
+            )
+            acceleration = (1 - alpha_m) * a_end + alpha_m * a_begin
+            velocity = (1 - alpha_f) * v_end + alpha_f * v_begin
             rate = supports.displacement_rate(self._amplitudes(motion, y, 1 - alpha_f, dt), name)
             inertia = supports.times(acceleration + self.drag * velocity)
             force += dot(self.system.comm, inertia, rate)

@@ -76,11 +76,9 @@ class DistributionSection(Section):
             raise ValueError(
                 f"a lognormal number is positive: its mean must be too, here {self._mean:g}"
             )
-        # the inverse of the distribution function would be rounding
-        if (
-            self.kind in ("normal", "lognormal")
-            and np.diff(self._probabilities)[0] < MIN_PROBABILITY
-        ):
+        # bounds far from the mean: the inverse of the distribution function would be rounding
+        has_mean = self.kind in ("normal", "lognormal")
+        if has_mean and np.diff(self._probabilities)[0] < MIN_PROBABILITY:
             raise ValueError(
                 f"almost no number lies between above and below, here {low:g} and {high:g}: choose "
                 f"bounds closer to the mean, {self._mean:g}"
@@ -99,28 +97,24 @@ class DistributionSection(Section):
 
         A word or a number of `values`, or a number, with its unit as text if it has one.
         """
+        # choice: the value at whose step the distribution function passes the probability
         if self.kind == "choice":
             assert self.values
             weights = np.array(self.weights or [1.0] * len(self.values))
-            steps = np.cumsum(weights) / weights.sum()  # of the distribution function
-            return self._with_unit(
-                self.values[int(np.searchsorted(steps, probability, side="right"))]
-            )
+            cumulated = np.cumsum(weights) / weights.sum()
+            index = int(np.searchsorted(cumulated, probability, side="right"))
+            return self._with_unit(self.values[index])
+        # uniform
         low, high = self._bounds
         if self.kind == "uniform":
             return self._with_unit(low + probability * (high - low))
-        # the distribution between the bounds is a part of the normal one
-        first_probability, last_probability = self._probabilities
-        centre, width = self._normal
+        # normal or lognormal: between the bounds is a part of the distribution without bounds
+        below_low, below_high = self._probabilities
+        in_whole = below_low + probability * (below_high - below_low)
         # not 0 or 1, whose quantiles are infinite
-        inner = min(
-            max(
-                first_probability + probability * (last_probability - first_probability),
-                nextafter(0, 1),
-            ),
-            nextafter(1, 0),
-        )
-        x = NormalDist(centre, width).inv_cdf(inner)
+        in_whole = min(max(in_whole, nextafter(0, 1)), nextafter(1, 0))
+        centre, width = self._normal
+        x = NormalDist(centre, width).inv_cdf(in_whole)
         value = np.exp(x) if self.kind == "lognormal" else x
         return self._with_unit(float(np.clip(value, low, high)))
 
@@ -141,17 +135,17 @@ class DistributionSection(Section):
         assert self.deviation is not None
         if self.kind == "normal":
             return self._mean, self.deviation
-        spread = log(1 + (self.deviation / self._mean) ** 2)
-        return log(self._mean) - spread / 2, sqrt(spread)
+        variance_of_log = log(1 + (self.deviation / self._mean) ** 2)
+        return log(self._mean) - variance_of_log / 2, sqrt(variance_of_log)
 
     @property
     def _probabilities(self) -> tuple[float, float]:
         """Probabilities of numbers below each bound, of the distribution without bounds."""
         centre, width = self._normal
-        ends = np.array(self._bounds)
+        bounds = np.array(self._bounds)
         with np.errstate(divide="ignore"):
-            ends = np.log(np.maximum(ends, 0.0)) if self.kind == "lognormal" else ends
-        below_low, below_high = (NormalDist(centre, width).cdf(end) for end in ends)
+            bounds = np.log(np.maximum(bounds, 0.0)) if self.kind == "lognormal" else bounds
+        below_low, below_high = (NormalDist(centre, width).cdf(bound) for bound in bounds)
         return below_low, below_high
 
     def _with_unit(self, value: Value) -> Value:
@@ -187,6 +181,7 @@ def random_places(
     """Return random places on a sphere, uniform in area between two polar angles.
 
     A place at less than `distance` from an earlier one is drawn again (random sequential addition).
+    If one of them finds no room in `MAX_TRIES`, all begin again.
 
     Parameters
     ----------
@@ -208,21 +203,16 @@ def random_places(
         If not even a dense packing has room, or none was found.
     """
     refuse_no_room(count, polar, distance)
-    low, high = cos(radians(polar[1])), cos(radians(polar[0]))  # of z: uniform in z is so in area
+    # bounds of the height z on the unit sphere; what is uniform in z is uniform in area
+    z_bounds = cos(radians(polar[1])), cos(radians(polar[0]))
     max_cosine = cos(radians(distance))
     for _ in range(MAX_STARTS):
         places = np.empty((0, 3))
         for _ in range(count):
-            for _ in range(MAX_TRIES):
-                z, azimuth = rng.uniform(low, high), rng.uniform(0.0, 2 * pi)
-                place = np.array(
-                    [np.sqrt(1 - z * z) * np.cos(azimuth), np.sqrt(1 - z * z) * np.sin(azimuth), z]
-                )
-                if (places @ place <= max_cosine).all():
-                    places = np.vstack([places, place])
-                    break
-            else:  # no try has found room: all begins again
+            place = _place_with_room(rng, places, z_bounds, max_cosine)
+            if place is None:
                 break
+            places = np.vstack([places, place])
         if len(places) == count:
             angles = np.degrees(
                 [np.arccos(places[:, 2]), np.arctan2(places[:, 1], places[:, 0]) % (2 * pi)]
@@ -234,8 +224,34 @@ def random_places(
     )
 
 
+def _place_with_room(
+    rng: np.random.Generator, places: Array, z_bounds: tuple[float, float], max_cosine: float
+) -> Array | None:
+    """Return a random place (3,) on the unit sphere, away from earlier ones; None if none is found.
+
+    Parameters
+    ----------
+    places
+        (n, 3) earlier places.
+    z_bounds
+        Least and largest height z.
+    max_cosine
+        Cosine of the least angle between two places.
+    """
+    for _ in range(MAX_TRIES):
+        z, azimuth = rng.uniform(*z_bounds), rng.uniform(0.0, 2 * pi)
+        rho = np.sqrt(1 - z * z)
+        place = np.array([rho * np.cos(azimuth), rho * np.sin(azimuth), z])
+        if (places @ place <= max_cosine).all():
+            return place
+    return None
+
+
 def refuse_no_room(count: int, polar: tuple[float, float], distance: float) -> None:
     """Refuse places on a sphere if discs around them have more area than their zone.
+
+    Each place has a disc of half the distance as its radius. The zone is what lies between the
+    polar angles, and a radius beyond them.
 
     Parameters
     ----------
@@ -251,19 +267,15 @@ def refuse_no_room(count: int, polar: tuple[float, float], distance: float) -> N
     NoRoom
         If the discs are too large or too many even for a hexagonal packing.
     """
-    # each place has a disc of half the distance, which may reach beyond the zone
     disc_radius = radians(distance) / 2
-    zone_begin, zone_end = (
-        max(radians(polar[0]) - disc_radius, 0.0),
-        min(radians(polar[1]) + disc_radius, pi),
-    )
+    zone_begin = max(radians(polar[0]) - disc_radius, 0.0)
+    zone_end = min(radians(polar[1]) + disc_radius, pi)
+    # area of the zone over that of a disc; one place always has room, and any number of points
+    max_count = np.inf
     if disc_radius:
-        # area of the zone over that of a disc; one place always has room
         max_count = max(
             DENSEST_PACKING * (cos(zone_begin) - cos(zone_end)) / (1 - cos(disc_radius)), 1.0
         )
-    else:
-        max_count = np.inf
     if count > max_count:
         raise NoRoom(
             f"{count} places at least {distance:g} degrees apart do not fit between the polar "

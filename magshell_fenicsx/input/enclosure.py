@@ -84,9 +84,9 @@ def _negative(a: Interval) -> Interval:
 
 def _multiply(a: Interval, b: Interval) -> Interval:
     """Return all products of two numbers of the intervals."""
-    # a number is an interval with one array as both bounds
-    ends = [(c.low,) if c.low is c.high else (c.low, c.high) for c in (a, b)]
-    products = [x * y for x in ends[0] for y in ends[1]]
+    # the bounds of each factor; a number is an interval with one array as both bounds
+    bounds_of_a, bounds_of_b = ((c.low,) if c.low is c.high else (c.low, c.high) for c in (a, b))
+    products = [x * y for x in bounds_of_a for y in bounds_of_b]
     if np.isnan(sum(products)).any():
         products = [np.where(np.isnan(p), 0.0, p) for p in products]  # zero times infinity
     return a.hull(*products)
@@ -108,11 +108,12 @@ def _power(a: Interval, p: Interval) -> Interval:
 
     A negative x has powers with integer n alone.
     """
+    # an exponent that varies: NumPy has no real power of a negative number with a broken one
     if p.low.ndim or p.low != p.high:
-        # NumPy has no real power of a negative number with a broken exponent.
         return _exp(_multiply(p, _log(a)))
+    # a number as the exponent: one that is no integer has powers of numbers >= 0 alone
     n = float(p.low)
-    if not n.is_integer() or abs(n) > 1e9:  # of numbers that are not negative
+    if not n.is_integer() or abs(n) > 1e9:
         return _power_positive(Interval(np.maximum(a.low, 0.0), a.high), n)
     if n < 0:
         return _inverse(_power(a, Interval.number(-n)))
@@ -299,16 +300,18 @@ class Enclosure(NDArrayOperatorsMixin):
         intervals = [
             a.values if isinstance(a, Enclosure) else Interval.number(a) for a in arguments
         ]
-        partial_slopes = SLOPES[ufunc](*intervals)  # by each argument
+        # slopes by x, y, z: sums over arguments of the derivative by it times its own slopes
+        derivatives = SLOPES[ufunc](*intervals)
         slopes = [Interval.number(np.zeros_like(self.middle))] * 3
-        for a, factor in zip(arguments, partial_slopes, strict=True):
+        for a, derivative in zip(arguments, derivatives, strict=True):
             if isinstance(a, Enclosure):
                 pairs = zip(slopes, a.slopes, strict=True)
-                slopes = [_add(total, _multiply(factor, slope)) for total, slope in pairs]
+                slopes = [_add(total, _multiply(derivative, slope)) for total, slope in pairs]
+        # the value in the middle, and the largest change from there to the boundary of the box
         middle = ufunc(*(a.middle if isinstance(a, Enclosure) else a for a in arguments))
         max_change = np.zeros_like(self.middle)
         for slope, half in zip(slopes, self.halves, strict=True):
-            # without a slope there is no change, in an infinite box too
+            # a slope of zero makes no change, in an infinite box too (not 0 times infinity)
             max_change = max_change + np.where(slope.size == 0, 0.0, slope.size * half)
         linear_bounds = Interval.between(middle - max_change, middle + max_change)
         values = VALUES[ufunc](*intervals).intersection(linear_bounds)

@@ -55,14 +55,16 @@ class Taylor(NDArrayOperatorsMixin):
         """
         if method != "__call__" or options or ufunc not in PARTIALS:
             return NotImplemented
+        # derivatives of the function by its arguments, and those arguments that have derivatives
         values = [a.value if isinstance(a, Taylor) else a for a in arguments]
-        # a number has no derivatives
-        positions = [i for i, a in enumerate(arguments) if isinstance(a, Taylor)]
         first_partials, second_partials = PARTIALS[ufunc](*values)
+        positions = [i for i, a in enumerate(arguments) if isinstance(a, Taylor)]
+        # first derivatives by the arguments times the derivatives of these
         gradient, hessian = np.zeros_like(self.gradient), np.zeros_like(self.hessian)
         for i in positions:
             gradient = gradient + first_partials[i] * arguments[i].gradient
             hessian = hessian + first_partials[i] * arguments[i].hessian
+        # second derivatives by pairs of arguments times the products of their gradients
         for (i, j), partial in second_partials.items():
             if i in positions and j in positions:
                 product = arguments[i].gradient[:, None] * arguments[j].gradient
@@ -224,8 +226,8 @@ class FormulaGroup:
         The boxes lie between corners (n, 3), see `FormulaFunction.bounds`. In another frame they
         are replaced by boxes along its axes that contain them.
         """
+        # in another frame: the box along the formulas' axes that contains the rotated box
         if self.frame is not None:
-            # box along the formulas' axes that contains the rotated box
             middle, half = (low + high) / 2 @ self.frame, (high - low) / 2 @ np.abs(self.frame)
             low, high = middle - half, middle + half
         bounds = [f.bounds(self.length * low, self.length * high) for f in self.functions]
@@ -307,25 +309,32 @@ def _parse(text: str) -> _Program:
         if "nested parentheses" in str(e):
             raise ValueError(f"{excerpt!r}: allowed are 200 brackets within each other") from None
         raise ValueError(f"{excerpt!r} is not a formula") from None
-    # names of functions may only be called, and other names may not
-    called_functions = {id(node.func) for node in nodes if isinstance(node, ast.Call)}
+    # what is called must be a function, and all other names must not
+    called_names = {id(node.func) for node in nodes if isinstance(node, ast.Call)}
     for node in nodes:
-        allowed = isinstance(node, _ALLOWED)
-        if isinstance(node, ast.Constant):
-            allowed = isinstance(node.value, int | float) and not isinstance(node.value, bool)
-        if isinstance(node, ast.Name):
-            allowed = node.id in (FUNCTIONS if id(node) in called_functions else NAMES)
-        if isinstance(node, ast.Call):
-            name = node.func.id if isinstance(node.func, ast.Name) else ""
-            allowed = (  # nin: the number of arguments of NumPy's function
-                name in FUNCTIONS and not node.keywords and len(node.args) == FUNCTIONS[name].nin
-            )
-        if not allowed:
+        if not _is_allowed(node, is_called=id(node) in called_names):
             raise ValueError(
                 f"{excerpt!r}: allowed are numbers, {', '.join(NAMES)}, + - * / **, "
                 f"{', '.join(FUNCTIONS)}"
             )
     return _without_repetition(_steps(tree))
+
+
+def _is_allowed(node: ast.AST, *, is_called: bool) -> bool:
+    """Return whether a formula may have a node; `is_called` is whether a call has it as function.
+
+    Allowed are numbers, x, y, z and pi, operators, and calls of known functions with as many
+    arguments as they take.
+    """
+    if isinstance(node, ast.Constant):
+        return isinstance(node.value, int | float) and not isinstance(node.value, bool)
+    if isinstance(node, ast.Name):
+        return node.id in (FUNCTIONS if is_called else NAMES)
+    if isinstance(node, ast.Call):
+        name = node.func.id if isinstance(node.func, ast.Name) else ""
+        # nin: the number of arguments of NumPy's function
+        return name in FUNCTIONS and not node.keywords and len(node.args) == FUNCTIONS[name].nin
+    return isinstance(node, _ALLOWED)
 
 
 def _without_repetition(steps: list[_Step]) -> _Program:
@@ -344,17 +353,22 @@ def _without_repetition(steps: list[_Step]) -> _Program:
         Its step i makes value i: from a number, a name, or a function of earlier values by their
         numbers. A function also lists the values that no later step uses, to free their memory.
     """
+    # what makes a value -> its number; and the numbers of the values on the stack
     number_of_value, value_stack = dict[Any, int](), list[int]()
+    # the steps that make new values, each with the numbers of its arguments
     unique_steps, operands = list[Any](), list[tuple[int, ...]]()
     for step in steps:
-        # numbers of the values that a function takes from the stack; step[1] is their count
-        arguments = tuple(value_stack[-step[1] :]) if isinstance(step, tuple) else ()
-        value_stack = value_stack[: len(value_stack) - len(arguments)]
+        # the arguments of a function are taken from the stack
+        arguments: tuple[int, ...] = ()
         key: Any = step
         if isinstance(step, tuple):
-            key = step[0], arguments
+            function, count = step
+            arguments = tuple(value_stack[-count:])
+            value_stack = value_stack[: len(value_stack) - count]
+            key = function, arguments
         elif not isinstance(step, str):
             key = step.hex()  # 0.0 and -0.0 are not the same
+        # a step with the same key has made the same value before
         if key not in number_of_value:
             number_of_value[key] = len(unique_steps)
             unique_steps.append(step)
@@ -408,6 +422,8 @@ def symbolic(text: str, functions: Mapping[str, Callable[..., Any]], x: Any, y: 
     names, stack = {"x": x, "y": y, "z": z, "pi": float(np.pi)}, list[Any]()
     for step in _steps(ast.parse(text, mode="eval")):
         if isinstance(step, tuple):
+            # the value of the function replaces its arguments on the stack; operators have no
+            # replacement: symbols know them
             function, count = step
             stack[-count:] = [replacements.get(function, function)(*stack[-count:])]
         else:
@@ -433,8 +449,8 @@ def _steps(tree: ast.Expression) -> list[_Step]:
     """
     steps: list[_Step] = []
     pending: list[ast.AST] = [tree.body]
-    # The last operation first, and of its values the last first; then all backwards, since a stack
-    # machine needs the values before their operation.
+    # The tree is walked backwards: each operation comes before its values, and the last value
+    # first. The reversed result has what a stack machine needs: the values, then their operation.
     while pending:
         node = pending.pop()
         if isinstance(node, ast.BinOp):
@@ -541,11 +557,12 @@ class FormulasInSpace:
 
         Places `x` (n, 3) are in the formulas' unit of length; the first index is the component.
         """
+        # value (3, n), gradient (3, 3, n) and second derivatives (3, 3, 3, n) of the components
         taylors, Q = [component(x @ self.axes) for component in self.components], self.axes
-        # from the formulas' frame to that of the places, each index by Q
         B, G, H = (
             np.stack([getattr(f, d) for f in taylors]) for d in ("value", "gradient", "hessian")
         )
+        # from the formulas' frame to that of the places: each index is turned by Q
         return (
             np.einsum("ai,in->na", Q, B),
             np.einsum("ai,bj,ijn->nab", Q, Q, G, optimize=True),

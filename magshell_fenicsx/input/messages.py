@@ -117,8 +117,8 @@ class InvalidCase(CaseError):
 def explained(errors: Sequence[Any], source: Source, case: type[BaseModel]) -> str:
     """Return one line for each mistake in a case.
 
-    Pydantic tries all members of a union, and each has an error. Of these, errors within a list or
-    a mapping count, else one error about the value.
+    Pydantic tries all members of a union, and each of them gives an error. If there are errors
+    within a list or a mapping, these are told. Otherwise the errors about the value itself are.
 
     Parameters
     ----------
@@ -162,6 +162,7 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
     case
         Class of the case.
     """
+    # pydantic's words, in those of this program
     value, kind = error["input"], error["type"]
     problem = error["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
     problem = re.sub(
@@ -173,11 +174,12 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
         is_name = NAME_PATTERN_PART in error["ctx"]["pattern"]
         name_rule, number_rule = "a letter, then letters, digits and _", "a number with a unit"
         problem = f"must be {name_rule if is_name else number_rule}"
-    # a message that begins with a key of its own is about that key
-    if own_key := re.match(r"(\w+(\.[^.:]+)+): ", problem):  # of a rule between sections
+    # a message of a rule between sections begins with a key of its own, which it is about
+    if own_key := re.match(r"(\w+(\.[^.:]+)+): ", problem):
         keys = own_key[1].split(".")
         location = tuple(int(key) if key.isdecimal() else key for key in keys)
         problem = problem[own_key.end() :]
+    # the line by the kind of the error: first those that need no value, then those with the value
     place, key = source.place(location), dotted(location) or "case"
     if kind == "list_type":
         problem = "must be a list, in brackets"
@@ -199,9 +201,10 @@ def explain(error: Any, location: Location, source: Source, case: type[BaseModel
     # own messages, and choices, need no meaning of the key
     says_all = kind in ("value_error", "literal_error")
     meaning = "" if says_all else _meaning(location, source.data, case)
+    # the value; of a text that has become a number both, since limits are those of the number
     text_in_case = _data_at(source.data, location, str) if isinstance(value, float) else ""
     text = shown_value(value)
-    if text_in_case:  # limits are those of the number that the text became
+    if text_in_case:
         text = f"{shown_value(text_in_case)} is {value:.6g}"
     return f"{place}: {key}: {text}: {problem}{meaning}"
 
@@ -262,8 +265,9 @@ def shown_value(value: Any) -> str:
 def _without_tag(loc: Location, data: Any, case: type[BaseModel]) -> Location:
     """Return the location of an error in a case, without the tags that pydantic inserts.
 
-    Pydantic puts the tag of a union's member after the key of the union. The walk along `loc` knows
-    at each key the section classes that may be there: several below a union, one after its tag.
+    Pydantic puts the tag of a union's member after the key of the union. The walk along `loc` keeps
+    the section classes that may be at the present place: several below the key of a union, one
+    after its tag, none below a plain value.
 
     Parameters
     ----------
@@ -274,27 +278,32 @@ def _without_tag(loc: Location, data: Any, case: type[BaseModel]) -> Location:
     case
         Class of the case.
     """
-    sections, keys, below_names = [case], list[str | int](), False
+    # `is_name`: whether the next part of `loc` is a name that the user gives to a section
+    sections, keys, is_name = [case], list[str | int](), False
     for key in loc:
         if key in NO_KEYS:
             continue
-        # a word that neither the class nor the data has as a key
+        # a word that neither the class nor the data has as a key is the tag of another union: one
+        # of values, or of a section and a list of it
         fields = sections[0].model_fields if len(sections) == 1 else ()
-        may_be_tag = len(sections) < 2 and not below_names and isinstance(key, str)
+        may_be_tag = len(sections) < 2 and not is_name and isinstance(key, str)
         if may_be_tag and key not in {*fields, *_data_at(data, keys, dict)}:
-            continue  # of a union of values, or of a section and a list of it
-        if below_names:  # a name of the user, whatever its tag or key is
-            keys.append(key)
-            below_names = False
             continue
-        if len(sections) > 1 and not isinstance(key, int):  # the tag: it leaves one class
+        # a name of the user, which may look like a tag or a key
+        if is_name:
+            keys.append(key)
+            is_name = False
+            continue
+        # the tag of a union of sections: it leaves one class
+        if len(sections) > 1 and not isinstance(key, int):
             sections = [m for m in sections if _tag_key([m]) and key in _tags(m)][:1] or sections
             continue
+        # a key or a position in a list; the field of a key says what may be below it
         keys.append(key)
         if isinstance(key, str) and sections:
             field = sections[0].model_fields.get(key)
             sections = list(dict.fromkeys(_models(field.annotation))) if field else []
-            below_names = _has_names(field)
+            is_name = _has_names(field)
     return tuple(keys)
 
 
@@ -370,26 +379,27 @@ def _section_at(
     case
         Class of the case.
     """
-    section, field, sections, below_names = case, None, list[type[BaseModel]](), False
+    # `sections` may be at the present place; `is_name`: whether the next key is a user's name
+    section, field, sections, is_name = case, None, list[type[BaseModel]](), False
     for key in location:
+        # the data at the key
         if isinstance(data, dict):
             data = data.get(key)
         else:
             data = data[key] if isinstance(data, list) and isinstance(key, int) else None
-        # None: the key is a position in a list, a name of the user, or unknown
-        field = None if below_names else section.model_fields.get(str(key))
-        if field or not (below_names or isinstance(key, int)):
+        # the field is None if the key is a position in a list, a name of the user, or unknown;
+        # positions and names keep the sections that the key before them has
+        field = None if is_name else section.model_fields.get(str(key))
+        if field or not (is_name or isinstance(key, int)):
             sections = _models(field.annotation) if field else []
-        below_names = _has_names(field)
-        if sections and not below_names:
-            tag = (
-                data.get(_tag_key(sections))
-                if len(sections) > 1 and isinstance(data, dict)
-                else None
-            )
-            section = next(
-                (m for m in sections if tag is not None and tag in _tags(m)), sections[0]
-            )
+        is_name = _has_names(field)
+        # of several sections the one whose tag the data have, or else the first
+        if sections and not is_name:
+            tag = None
+            if len(sections) > 1 and isinstance(data, dict):
+                tag = data.get(_tag_key(sections))
+            has_tag = (m for m in sections if tag is not None and tag in _tags(m))
+            section = next(has_tag, sections[0])
     return section, field
 
 

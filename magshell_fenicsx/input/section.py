@@ -152,8 +152,9 @@ def in_unit(text: str, unit: str) -> float:
         If the text is no number with a unit, or of another dimension.
     """
     number, unit_of_text = number_and_unit(text)
+    # a bare number, where that is allowed
     if not unit_of_text and number and (not unit or float(number) == 0):
-        return float(number)  # a bare number that may be one
+        return float(number)
     if not unit or not number:
         raise ValueError(f"{text} is not convertible to {unit or 'a bare number'}")
     # the same unit needs no rounding by a conversion

@@ -106,7 +106,7 @@ def read_source(file: Path, settings: Sequence[str] = ()) -> Source:
     except UnicodeDecodeError:
         raise CaseError(f"{file}: is not a text file in UTF-8") from None
     source = Source(str(file), {}, folder=file.parent.absolute())
-    # twice: nodes have lines, data have the merged keys
+    # the text is parsed twice: nodes have the lines of keys, and data have merged keys (<<)
     root_node = _parsed(source, lambda: yaml.compose(text, Loader=_Loader))
     if not isinstance(root_node, yaml.MappingNode):
         raise CaseError(
@@ -195,10 +195,43 @@ def override(source: Source, assignment: str) -> None:
         raise CaseError(
             f"--set {assignment}: write it as key.path=value, for example --set mesh.degree=3"
         )
-    keys = path.strip().split(".")
+    section, location = _section_of_setting(source, assignment, path.strip().split("."))
+    # the new value, checked as a source of its own
+    setting = Source(f"--set {assignment}", {})
+    setting_node = _parsed(setting, lambda: yaml.compose(text, Loader=_Loader))
+    _note_places(setting_node or yaml.ScalarNode("", ""), (), setting)
+    section[location[-1]] = _parsed(setting, lambda: yaml.load(text, Loader=_Loader))
+    # a replaced key that the file has is removed; one that another setting gave stays, and both
+    # are refused together later
+    replaced_key = REPLACED_KEYS.get(location, "")
+    place_of_replaced_key = source.places.get((*location[:-1], replaced_key), "--set")
+    if not place_of_replaced_key.startswith("--set"):
+        section.pop(replaced_key, None)
+    # the place of the key, and of sections on the way that the setting has made
+    for length in range(1, len(location) + 1):
+        if length == len(location) or location[:length] not in source.places:
+            source.places[location[:length]] = f"--set {assignment}"
+
+
+def _section_of_setting(
+    source: Source, assignment: str, keys: Sequence[str]
+) -> tuple[Any, Location]:
+    """Return the section or list that has the last of the keys of a setting, and their location.
+
+    Sections that are missing on the way are made. In the location, positions in lists are numbers.
+
+    Parameters
+    ----------
+    assignment
+        The setting, for messages.
+
+    Raises
+    ------
+    CaseError
+        If a key on the way is neither a section nor an item of a list.
+    """
     section: Any = source.data
     location: list[str | int] = []
-    # walk down to the section of the last key, and make sections that are missing
     for i, key in enumerate(keys):
         if isinstance(section, list):
             if not key.isdecimal() or int(key) >= len(section):
@@ -209,23 +242,13 @@ def override(source: Source, assignment: str) -> None:
         elif not isinstance(section, dict):
             raise CaseError(f"--set {assignment}: {keys[i - 1]} is a value, not a section")
         location.append(int(key) if isinstance(section, list) else key)
+        # down to the section of the next key
         if i < len(keys) - 1:
             if isinstance(section, list):
                 section = section[int(key)]
             else:
                 section = section.setdefault(key, {})
-    setting = Source(f"--set {assignment}", {})  # a source of its own, for messages and checks
-    setting_node = _parsed(setting, lambda: yaml.compose(text, Loader=_Loader))
-    _note_places(setting_node or yaml.ScalarNode("", ""), (), setting)
-    section[location[-1]] = _parsed(setting, lambda: yaml.load(text, Loader=_Loader))
-    replaced_key = REPLACED_KEYS.get(tuple(location), "")
-    # of a file: a key that another setting gave stays, and both are refused together
-    if not source.places.get((*location[:-1], replaced_key), "--set").startswith("--set"):
-        section.pop(replaced_key, None)
-    # the place of the key, and of sections on the way that the setting has made
-    for length in range(1, len(keys) + 1):
-        if length == len(keys) or tuple(location[:length]) not in source.places:
-            source.places[tuple(location[:length])] = f"--set {assignment}"
+    return section, tuple(location)
 
 
 def dotted(location: Location) -> str:

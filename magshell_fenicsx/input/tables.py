@@ -110,7 +110,9 @@ def read_rows(file: Path, files: Files) -> TableRows:
     # an .npz file has no lines: its rows are counted from 1
     lines = cells.lines or range(1, 1 + next(iter(lengths))[0])
     for name, column in columns.items():
-        for row in np.flatnonzero(np.abs(column) > MAX_MEASURED_NUMBER)[:1]:  # the first, if any
+        too_large = np.flatnonzero(np.abs(column) > MAX_MEASURED_NUMBER)
+        if len(too_large):
+            row = too_large[0]
             raise TableError(
                 f"line {lines[row]}: {name}: {column[row]:g}: allowed are numbers up to "
                 f"{MAX_MEASURED_NUMBER:g} in size"
@@ -145,9 +147,10 @@ def _cells(file: Path, files: Files) -> _TableCells:
 def _by_name(cells: _TableCells) -> tuple[dict[str, Array], dict[str, str | None]]:
     """Return the columns by their names, and the units by these, from headers such as "x [mm]"."""
     headers = [_name_and_unit(header) for header in cells.columns]
-    _refuse_double([name for name, _ in headers])
+    names = [name for name, _ in headers]
+    _refuse_double(names)
     values = [np.asarray(v, dtype=float) for v in cells.columns.values()]
-    return {name: v for (name, _), v in zip(headers, values, strict=True)}, dict(headers)
+    return dict(zip(names, values, strict=True)), dict(headers)
 
 
 def _refuse_double(names: Sequence[str]) -> None:
@@ -277,7 +280,8 @@ def _csv_cells(text: str) -> _TableCells:
     header, begin = _header(text)
     separator, names = _separator(header), _names(header)
     _refuse_double(names)
-    # an array takes less memory than a list: there may be millions of cells
+    # all cells, row by row, and the line of each row; an array takes less memory than a list, and
+    # there may be millions of cells
     cell_values, lines, word = array("d"), list[int](), ""
     for line, row in _rows(text, separator, begin):
         if len(row) != len(names):

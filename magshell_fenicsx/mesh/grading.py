@@ -100,7 +100,7 @@ class DiscFeature:
         s, g, a = self.size, self.growth, min(self.radius, reach)
         outer = g * (reach - a) / s  # relative growth of the size from the disc to the reach
         ratio = outer / (1 + outer)
-        # the integral from a to the reach, in closed form
+        # the integral from a to the reach, in closed form; up to a the size is s
         outside_disc = 2 * pi * (a / (s * g) * outer / (1 + outer) + (log1p(outer) - ratio) / g**2)
         return PER_AREA * (pi * a**2 / s**2 + outside_disc)
 
@@ -162,9 +162,7 @@ class SquaresFeature:
         area, least_size, growth = 4 * self.halves**2, self.size, self.growth
         disc = DiscFeature((0.0, 0.0), sqrt(float(area.sum()) / pi), least_size, growth)
         # without those in the disc itself, which the squares have
-        cells_within = DiscFeature((0.0, 0.0), disc.radius, least_size, growth).cells(
-            min(disc.radius, reach)
-        )
+        cells_within = disc.cells(min(disc.radius, reach))
         cells_outside = max(disc.cells(reach) - cells_within, 0.0)
         return float(PER_AREA * (area / self.sizes**2).sum() + cells_outside)
 
@@ -265,9 +263,12 @@ class Grading:
             len(f.halves) if isinstance(f, SquaresFeature) else 1 for f in self.features
         )
         budget = max(MIN_CELL_BUDGET, MAX_SIZE_EVALUATIONS // max(1, feature_count))
+        # each round adds the triangles of cells in which the size varies little, and goes on with
+        # the quarters of all other cells
         undivided_cells, total = _EstimateCells.of_shape(shape), 0.0
         while len(undivided_cells.low):
             centres, area, radius = undivided_cells.centres_areas_radii()
+            # sizes at the centres, and their upper and lower bounds in the cells
             sizes, max_sizes, min_sizes = (
                 self._size_bound(centres, factor * radius) for factor in (0.0, 1.0, -1.0)
             )
@@ -278,7 +279,7 @@ class Grading:
             divided = (uncertainty > CELL_TOLERANCE * triangles) & (
                 uncertainty > TOTAL_TOLERANCE * (total + triangles.sum())
             )
-            if divided.sum() * 4 > budget:
+            if divided.sum() * 4 > budget:  # too many cells to look at: all are taken as they are
                 divided[:] = False
             total += float(triangles[~divided].sum())
             undivided_cells, budget = undivided_cells.quarters(divided), budget - len(divided)
@@ -326,9 +327,11 @@ class _EstimateCells:
         bounds_by_axis = [
             np.linspace(a, b, int(n) + 1) for a, b, n in zip(low, high, counts, strict=True)
         ]
+        lower_by_axis = [bounds[:-1] for bounds in bounds_by_axis]
+        upper_by_axis = [bounds[1:] for bounds in bounds_by_axis]
         low, high = (
             np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
-            for axes in ([v[:-1] for v in bounds_by_axis], [v[1:] for v in bounds_by_axis])
+            for axes in (lower_by_axis, upper_by_axis)
         )
         return cls(low, high, polar)
 

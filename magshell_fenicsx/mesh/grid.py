@@ -104,6 +104,7 @@ class Grid:
         coordinate.
         """
         low, high = self.low[axis], self.high[axis]
+        # lines that must be there, each once
         movable = [line for _, line in self._movable_groups(axis, points)]
         required = np.unique([*self._straight_lines(axis), *movable])
         is_new = np.diff(required) > CHART_TOLERANCE * (high - low)
@@ -116,6 +117,7 @@ class Grid:
         if self.glued[axis] and sum(intervals) < MIN_GLUED_COUNT:
             min_count = -(-MIN_GLUED_COUNT // len(intervals))  # rounded up
             intervals = [max(n, min_count) for n in intervals]
+        # divide the interval between each two required lines into its number of quadrilaterals
         lines = [required[:1]]
         for i, n in enumerate(intervals):
             new_lines = np.linspace(required[i], required[i + 1], n + 1)[1:]
@@ -195,15 +197,18 @@ def grid_mesh(grid: Grid, points: Mapping[str, Array], embedding: Embedding) -> 
     for name, point in points.items():
         if (point < grid.low - tolerance).any() or (point > grid.high + tolerance).any():
             raise MeshError(f"the point {name} is not on the surface")
+    # vertices (n + 1, m + 1, 2) of the quadrilaterals, and their centres (n, m, 2)
     x, y = (grid.lines(axis, list(points.values())) for axis in range(2))
     n, m = len(x) - 1, len(y) - 1  # quadrilaterals along both axes
     vertices = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1)
     _move_to_points(vertices, grid, points)
     centres = (vertices[:-1, :-1] + vertices[1:, 1:]) / 2
     nodes = np.concatenate([vertices.reshape(-1, 2), centres.reshape(-1, 2)])
-    number = np.arange((n + 1) * (m + 1)).reshape(n + 1, m + 1)
-    centre = number.size + np.arange(n * m).reshape(n, m)
-    # of each quadrilateral, counter-clockwise
+    # their numbers: all vertices first, then all centres
+    vertex_count = (n + 1) * (m + 1)
+    number = np.arange(vertex_count).reshape(n + 1, m + 1)
+    centre = vertex_count + np.arange(n * m).reshape(n, m)
+    # corners of each quadrilateral, counter-clockwise; a triangle has two of them and the centre
     corners = [number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]]
     cells = np.concatenate(
         [
@@ -211,11 +216,13 @@ def grid_mesh(grid: Grid, points: Mapping[str, Array], embedding: Embedding) -> 
             for i in range(4)
         ]
     )
+    # the last line of a glued axis is the first one
     representative = np.arange(len(nodes))
     if grid.glued[0]:
         representative[number[-1]] = representative[number[0]]
     if grid.glued[1]:
         representative[number[:, -1]] = representative[number[:, 0]]
+    # edges, in the order of `Grid.sides`
     edges: dict[str, NDArray[np.int64]] = {}
     numbers_of_sides = (number[0], number[-1], number[:, 0], number[:, -1])
     for name, numbers in zip(grid.sides, numbers_of_sides, strict=True):
@@ -234,21 +241,26 @@ def _move_to_points(vertices: Array, grid: Grid, points: Mapping[str, Array]) ->
         If two points take one vertex, or one would move a straight line.
     """
     extent, places = np.subtract(grid.high, grid.low), list(points.values())
+    # numbers of a vertex -> the first point that takes it
     point_of_vertex = dict[tuple[int, int], tuple[str, Array]]()
     numbers = grid.vertices_of(places)
+
+    def shortest(difference: Array) -> Array:
+        """Return a difference (2,) of places; across glued ends the shorter way counts."""
+        whole_turns = np.where(grid.glued, np.round(difference / extent) * extent, 0.0)
+        return np.asarray(difference - whole_turns)
+
     for number, (name, place) in enumerate(points.items()):
         i, j = int(numbers[number, 0]), int(numbers[number, 1])
         first_name, first_place = point_of_vertex.setdefault((i, j), (name, place))
-        offset = np.asarray(place - vertices[i, j])  # by which the vertex is moved
-        # across glued ends, places that differ by the extent are the same
-        offset -= np.where(grid.glued, np.round(offset / extent) * extent, 0.0)
-        distance = place - first_place
-        distance = distance - np.where(grid.glued, np.round(distance / extent) * extent, 0.0)
+        offset = shortest(place - vertices[i, j])  # by which the vertex is moved
+        distance = shortest(place - first_place)
         if (np.abs(distance) > CHART_TOLERANCE * extent).any():
             raise MeshError(
                 f"the points {first_name} and {name} are too near to each other "
                 "for the elements there"
             )
+        # a straight line stays, but the ends of a glued axis may be bent
         for axis in range(2):
             line = grid.straight_line_at(axis, float(place[axis]))
             is_glued_end = grid.glued[axis] and line in (grid.low[axis], grid.high[axis])
@@ -337,6 +349,7 @@ class RimmedGrid:
             if (points.max(axis=0) > grid.low).all() and begins_inside:
                 rims_inside.append(points)
         surfaces = [rectangle(), *faces_within(occ, rims_inside, rectangle)]
+        # grid lines inside the rectangle, each from one side to the other
         for axis, other_axis in ((0, 1), (1, 0)):
             for coordinate in (*grid.fixed_lines[axis], *grid.movable_lines[axis]):
                 if not grid.low[axis] < coordinate < grid.high[axis]:

@@ -82,6 +82,7 @@ def split(patch: PatchMesh) -> Quadrilaterals:
     The corners of a quadrilateral are a vertex, the middle of a side, the centre of the triangle,
     and the middle of the other side.
     """
+    # the divided reference triangle, and its nodes' shape functions in the triangle that is divided
     reference, quads, nodes_on_sides = _reference_split()
     order = ORDERS[patch.cells.shape[1]]
     geometry = basix.create_element(
@@ -90,6 +91,7 @@ def split(patch: PatchMesh) -> Quadrilaterals:
     to_dolfinx = perm_gmsh(mesh.CellType.triangle, patch.cells.shape[1])
     # [0] shape functions and [1:] their two derivatives, at the places of the quadrilaterals' nodes
     values = geometry.tabulate(1, reference)[..., 0]
+    # numbers of the new nodes, and their coordinates in chart or space
     vertices, corners = np.unique(patch.corners, return_inverse=True)
     corners = corners.reshape(-1, 3)
     sides, numbers = _node_numbers(corners, len(vertices), len(reference), nodes_on_sides)
@@ -104,6 +106,21 @@ def split(patch: PatchMesh) -> Quadrilaterals:
     else:
         a1, a2 = np.einsum("dqk,ckx->dcqx", values[1:], patch.embedding(patch.nodes)[dolfinx_cells])
         offsets = _mitred_offsets(a1, a2, numbers, quads)
+    edges = _halved_edges(patch, vertices, sides)
+    places = patch.embedding(nodes)
+    return Quadrilaterals(nodes, places, offsets, numbers[:, quads].reshape(-1, 9), edges)
+
+
+def _halved_edges(patch: PatchMesh, vertices: Numbers, sides: Numbers) -> dict[str, Numbers]:
+    """Return the named edges with each side divided into two: name -> pairs of new node numbers.
+
+    Parameters
+    ----------
+    vertices
+        Old number of each vertex.
+    sides
+        (s, 2) new numbers of the vertices of each side, the lower one first.
+    """
     first_side_node = len(vertices)
     # a side has three nodes between its vertices, see `_node_numbers`: + 1 is the middle one
     middle_of_side = {
@@ -112,12 +129,12 @@ def split(patch: PatchMesh) -> Quadrilaterals:
     edges = dict[str, Numbers]()
     for name, pairs in patch.edges.items():
         halves = list[list[int]]()
+        # the new number of a vertex is its index in `vertices`
         for a, b in np.searchsorted(vertices, pairs):
             middle = middle_of_side[int(min(a, b)), int(max(a, b))]
             halves += [[int(a), middle], [middle, int(b)]]
         edges[name] = np.array(halves, dtype=np.int64).reshape(-1, 2)
-    places = patch.embedding(nodes)
-    return Quadrilaterals(nodes, places, offsets, numbers[:, quads].reshape(-1, 9), edges)
+    return edges
 
 
 def _node_numbers(
@@ -149,6 +166,7 @@ def _node_numbers(
     for side, nodes in enumerate(nodes_on_sides):
         position = np.where(is_backwards[side][:, None], [2, 1, 0], [0, 1, 2])
         numbers[:, nodes] = vertex_count + 3 * side_numbers[side][:, None] + position
+    # all other nodes are inside and belong to one triangle
     inner = np.setdiff1d(np.arange(nodes_per_triangle), [0, 1, 2, *np.ravel(nodes_on_sides)])
     first_inner = vertex_count + 3 * len(sides)
     first_of_triangle = first_inner + len(inner) * np.arange(len(corners))[:, None]
@@ -167,10 +185,12 @@ def _mitred_offsets(a1: Array, a2: Array, numbers: Numbers, quads: Numbers) -> A
     """Return offsets (nodes, 3) for a surface that may have kinks.
 
     An offset is the vector by which a node moves when all faces around it move outward by one. At
-    corners of quadrilaterals it is the mean normal over its mean cosine with the cells' normals.
-    Each cell's normal is weighted by the cell's angle there. This is exact between two faces and
-    between three that are normal to each other. The difference from a cell's own normal is
-    interpolated bilinearly to the nodes between the corners.
+    a corner of quadrilaterals it is the mean m of the normals of the cells there, divided by the
+    mean cosine between m and these normals. Each cell's normal is weighted by the cell's angle at
+    the corner. This is exact between two faces, and between three that are normal to each other.
+
+    At other nodes of a cell, the offset is the cell's normal there plus a difference. The
+    difference is known at the four corners and interpolated bilinearly between them.
 
     Parameters
     ----------
@@ -182,25 +202,42 @@ def _mitred_offsets(a1: Array, a2: Array, numbers: Numbers, quads: Numbers) -> A
         (3, 9) places of the three quadrilaterals.
     """
     n = _unit(np.cross(a1, a2))
-    # angle of the cell at each place: pi but at the triangle's vertices, which are the first places
-    weights = np.full(n.shape[:2], np.pi)
-    for corner, (e, f) in enumerate(((a1, a2), (a2 - a1, -a1), (-a2, a1 - a2))):
-        cosine = np.sum(_unit(e[:, corner]) * _unit(f[:, corner]), axis=1)
-        weights[:, corner] = np.arccos(np.clip(cosine, -1, 1))
+    # sum of the weighted normals of all cells at each node, and the sum of the weights
+    weights = _angles_at_places(a1, a2)
     total = np.zeros((numbers.max() + 1, 3))
     np.add.at(total, numbers, weights[..., None] * n)
     total_weight = np.bincount(numbers.ravel(), weights.ravel())[:, None]
-    # mean normal over its mean cosine, which is |total|^2/total_weight^2
+    # the mean normal total/total_weight, divided by |total|^2/total_weight^2
     mitre = total * total_weight / np.maximum(np.sum(total**2, axis=1, keepdims=True), TINY)
+    # shape functions (9 nodes, 4 corners) of a quadrilateral, 1 at one corner and 0 at the others
     xi, eta = quadrilateral_nodes().T
     bilinear = np.column_stack([(1 - xi) * (1 - eta), xi * (1 - eta), (1 - xi) * eta, xi * eta])
-    # the first four places of a quadrilateral are its corners
-    difference = mitre[numbers[:, quads[:, :4]]] - n[:, quads[:, :4]]
+    # difference from the cell's normal at corners, (cells, 3 quadrilaterals, 4 corners, 3)
+    corners = quads[:, :4]  # the first four places of a quadrilateral
+    difference = mitre[numbers[:, corners]] - n[:, corners]
     directions = n[:, quads] + np.einsum("kc,mqcx->mqkx", bilinear, difference)
     # mean over the quadrilaterals at each node
+    nodes_of_quads = numbers[:, quads]
     offsets = np.zeros_like(total)
-    np.add.at(offsets, numbers[:, quads], directions)
-    return np.asarray(offsets / np.bincount(numbers[:, quads].ravel())[:, None])
+    np.add.at(offsets, nodes_of_quads, directions)
+    return np.asarray(offsets / np.bincount(nodes_of_quads.ravel())[:, None])
+
+
+def _angles_at_places(a1: Array, a2: Array) -> Array:
+    """Return the angle (cells, places) of each triangle at places: pi but at its vertices.
+
+    Parameters
+    ----------
+    a1, a2
+        (cells, places, 3) tangents. The first three places are the vertices.
+    """
+    angles = np.full(a1.shape[:2], np.pi)
+    # the two sides that leave each vertex
+    sides_at_vertices = ((a1, a2), (a2 - a1, -a1), (-a2, a1 - a2))
+    for vertex, (e, f) in enumerate(sides_at_vertices):
+        cosine = np.sum(_unit(e[:, vertex]) * _unit(f[:, vertex]), axis=1)
+        angles[:, vertex] = np.arccos(np.clip(cosine, -1, 1))
+    return angles
 
 
 def _unit(v: NDArray[Any]) -> Array:
@@ -225,6 +262,7 @@ def _reference_split() -> tuple[Array, Numbers, list[list[int]]]:
     centre = VERTICES.mean(axis=0)
     places = [*VERTICES]
     quads = []
+    # the quadrilateral at each vertex; its nodes are numbered at their first occurrence
     for i in range(3):
         vertex, next_vertex, previous_vertex = (VERTICES[(i + k) % 3] for k in range(3))
         middle, other_middle = (vertex + next_vertex) / 2, (vertex + previous_vertex) / 2
@@ -335,8 +373,9 @@ def sweep(
         On every rank, if the body overlaps itself.
     """
     quads = split(patch)
+    # where the layers begin and end, from 0 inside to 1 outside
     bounds = np.linspace(0, 1, layers + 1) if isinstance(layers, int) else np.array(layers)
-    # heights of the levels, from 0 inside to 1 outside
+    # heights of the levels: the begin of the first layer, then the middle and end of each layer
     middles_and_ends = [((a + b) / 2, b) for a, b in pairwise(bounds)]
     heights = np.concatenate([bounds[:1], *middles_and_ends])
     factors = np.ones(len(quads.places)) if factor is None else factor(quads.places)
@@ -352,10 +391,6 @@ def sweep(
     original_cells = domain.topology.original_cell_index
     triangle, layer = original_cells // (3 * layer_count), original_cells % layer_count
     points = {name: patch.embedding(x[None])[0] for name, x in patch.points.items()}
-    normals = dict[str, Array]()
-    for name, x in points.items():
-        offset = quads.offsets[np.argmin(np.linalg.norm(quads.places - x, axis=1))]
-        normals[name] = offset / np.linalg.norm(offset)
     # the body's node above node q of the mid-surface, at level k, has the number q levels + k
     node, level = np.divmod(domain.geometry.input_global_indices, len(heights))
     w0 = None
@@ -365,7 +400,7 @@ def sweep(
         mesh=domain,
         faces=_named_faces(domain, quads, len(heights)),
         points=points,
-        normals=normals,
+        normals={name: _normal_at(x, quads) for name, x in points.items()},
         patches={name: mask[triangle] for name, mask in patch.patches.items()},
         layer_bounds=np.column_stack([bounds[layer], bounds[layer + 1]]),
         chart=quads.nodes[node],
@@ -373,6 +408,13 @@ def sweep(
         thickness=thickness[node],
         w0=w0,
     )
+
+
+def _normal_at(x: Array, quads: Quadrilaterals) -> Array:
+    """Return the unit normal (3,) of the mid-surface at the node that is nearest to a place."""
+    nearest = np.argmin(np.linalg.norm(quads.places - x, axis=1))
+    offset = quads.offsets[nearest]
+    return np.asarray(offset / np.linalg.norm(offset))
 
 
 def _refuse_overlap(X: Array, cells: Numbers) -> None:
@@ -396,9 +438,11 @@ def _refuse_overlap(X: Array, cells: Numbers) -> None:
     # derivatives of the shape functions at the nodes
     tables = element.tabulate(1, element.points)[1:, :, :, 0]
     for some_cells in np.array_split(cells, len(cells) // CELLS_PER_CHECK + 1):
+        # determinants of the Jacobian, (cells, nodes)
         volumes = np.linalg.det(np.einsum("dqk,ckx->cqdx", tables, X[some_cells]))
         if (volumes <= 0).any():
-            place = X[some_cells[np.argwhere(volumes <= 0)[0][0]]].mean(axis=0)
+            first_bad = np.argwhere(volumes <= 0)[0][0]
+            place = X[some_cells[first_bad]].mean(axis=0)
             raise MeshError(
                 f"model: solid: the body overlaps itself around {place_text(place)}/R: "
                 "half its thickness is more than the radius of curvature, or than a fold leaves "
@@ -427,6 +471,7 @@ def _swept_cells(quads: Numbers, layers: int) -> Numbers:
     node_of_quad = np.argmin(distances, axis=1)
     level = np.rint(2 * points[:, 2]).astype(np.int64)
     levels = 2 * layers + 1
+    # a layer begins two levels above the one before
     cells = [quads[:, node_of_quad] * levels + level + 2 * layer for layer in range(layers)]
     return np.stack(cells, axis=1).reshape(-1, 27)
 

@@ -58,9 +58,11 @@ def nodal_normals(nodes: Array, cells: NDArray[np.int64]) -> Array:
     a1, a2 = np.einsum(
         "dqk,ckx->dcqx", element.tabulate(1, element.points)[1:, :, :, 0], nodes[dolfinx_cells]
     )
-    # angle of each triangle at its nodes: pi at nodes on its sides, and no matter inside
+    # angle of each triangle at its nodes: pi at nodes on its sides. At inner nodes any angle gives
+    # the same normal, as they have one triangle alone
     angles = np.full(dolfinx_cells.shape, np.pi)
-    sides_at_vertices = ((a1, a2), (a2 - a1, -a1), (-a2, a1 - a2))  # vertices are the first nodes
+    # the two sides that leave each vertex; vertices are the first nodes
+    sides_at_vertices = ((a1, a2), (a2 - a1, -a1), (-a2, a1 - a2))
     for vertex, (e, f) in enumerate(sides_at_vertices):
         cosine = np.sum(_unit(e[:, vertex]) * _unit(f[:, vertex]), axis=1)
         angles[:, vertex] = np.arccos(np.clip(cosine, -1, 1))
@@ -88,6 +90,8 @@ class Midsurface:
         Name -> facets (local numbers) of that boundary edge.
     points
         Name -> (3,) position of a vertex.
+    _patch
+        The triangulation, complete on every rank; `_original_cells` has this rank's cells in it.
     """
 
     mesh: mesh.Mesh
@@ -223,6 +227,7 @@ class Midsurface:
         the sheets that end there are excluded.
         """
         if self._patch.t_junctions:
+            # triangles with a vertex on the edge that ends there
             edges = [self._patch.edges[name].ravel() for name in self._patch.t_junctions]
             vertices = np.unique(np.concatenate(edges))
             ends_on_sheet = np.asarray(np.isin(self._patch.corners, vertices).any(axis=1))

@@ -318,31 +318,22 @@ def _halved(patch: PatchMesh, mirror: Mirror, edge_name: str) -> PatchMesh:
     MeshError
         If triangles lie across the plane or in it, or all are on one side.
     """
-    places = patch.embedding(patch.nodes)
-    distances, extent = mirror.signed_distance(places), np.ptp(places, axis=0).max()
-    corners = distances[patch.cells[:, :3]]
-    in_half = corners.mean(axis=1) > 0  # by the centre of each triangle
-    depths = np.where(in_half[:, None], corners, -corners)  # into each triangle's own half
-    crosses_plane = depths.min() < -ROUNDING * extent
-    lies_in_plane = depths.max(axis=1).min() <= ROUNDING * extent
-    if in_half.all() or not in_half.any() or crosses_plane or lies_in_plane:
-        raise MeshError(
-            f"symmetry: half: no edges of the mesh lie in the plane {plane_text(mirror)}: "
-            "mesh it with a curve there"
-        )
-    cells = patch.cells[in_half]
-    used, cells = np.unique(cells, return_inverse=True)
-    cells = cells.reshape(-1, patch.cells.shape[1])
+    in_half = _triangles_in_half(patch, mirror)
+    # number the nodes of these triangles anew
+    used, numbers = np.unique(patch.cells[in_half], return_inverse=True)
+    cells = numbers.reshape(-1, patch.cells.shape[1])
+    # old representative -> the first node that is glued to it and is in the half, in new numbers.
+    # In reversed order the first of several glued nodes is written last, and stays
     glued = patch.representative
     representative = np.arange(len(patch.nodes)) if glued is None else glued
-    # for each vertex, its first node that is in the half, in new numbers; in reversed order the
-    # first of several glued nodes is written last, and stays
     first_node = np.full(len(patch.nodes), -1, dtype=np.int64)
     first_node[representative[used][::-1]] = np.arange(len(used))[::-1]
     edges = {name: first_node[representative[pairs]] for name, pairs in patch.edges.items()}
-    border = border_pairs(first_node[representative[used[directed_sides(cells)]]])
+    sides = used[directed_sides(cells)]  # in old numbers
+    border = border_pairs(first_node[representative[sides]])
     # drops sides of edges in the other half
     edges = on_border(edges, border)
+    # border sides without a name are in the plane
     named_pairs = {pair for pairs in edges.values() for pair in as_set(pairs)}
     if pairs_in_plane := sorted(as_set(border) - named_pairs):
         edges[edge_name] = np.array(pairs_in_plane, dtype=np.int64)
@@ -357,6 +348,29 @@ def _halved(patch: PatchMesh, mirror: Mirror, edge_name: str) -> PatchMesh:
         source_triangles=None if source_triangles is None else source_triangles[in_half],
         t_junctions={name: mask[in_half] for name, mask in patch.t_junctions.items()},
     )
+
+
+def _triangles_in_half(patch: PatchMesh, mirror: Mirror) -> NDArray[np.bool_]:
+    """Return whether each triangle (m,) is in the half of a plane.
+
+    Raises
+    ------
+    MeshError
+        If triangles lie across the plane or in it, or all are on one side.
+    """
+    places = patch.embedding(patch.nodes)
+    distances, extent = mirror.signed_distance(places), np.ptp(places, axis=0).max()
+    corners = distances[patch.cells[:, :3]]
+    in_half = corners.mean(axis=1) > 0  # by the centre of each triangle
+    depths = np.where(in_half[:, None], corners, -corners)  # into each triangle's own half
+    crosses_plane = depths.min() < -ROUNDING * extent
+    lies_in_plane = depths.max(axis=1).min() <= ROUNDING * extent
+    if in_half.all() or not in_half.any() or crosses_plane or lies_in_plane:
+        raise MeshError(
+            f"symmetry: half: no edges of the mesh lie in the plane {plane_text(mirror)}: "
+            "mesh it with a curve there"
+        )
+    return np.asarray(in_half)
 
 
 def plane_text(mirror: Mirror) -> str:

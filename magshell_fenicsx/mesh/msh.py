@@ -75,20 +75,9 @@ def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells
     MeshError
         If a triangle has no area, or the surface has one side or is torn.
     """
-    v0, v1, v2 = (nodes[cells[:, i]] for i in range(3))
-    areas = np.linalg.norm(np.cross(v1 - v0, v2 - v0), axis=1) / 2
-    squared_side = np.linalg.norm(v1 - v0, axis=1) ** 2
-    flat = np.flatnonzero(areas <= FLAT_TRIANGLE_TOLERANCE * squared_side)
-    if len(flat):
-        raise MeshError(f"the triangle at {place_text(v0[flat[0]])} has no area")
+    areas = _areas(nodes, cells)
     edges = directed_sides(cells)
-    _, edge_of_side, side_counts = np.unique(
-        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    # sort the sides by edge; the two sides of an inner edge then follow one another
-    sides_by_edge = np.argsort(edge_of_side.ravel(), kind="stable")
-    first_of_inner = np.cumsum(side_counts)[side_counts == 2] - 2
-    side, opposite_side = sides_by_edge[first_of_inner], sides_by_edge[first_of_inner + 1]
+    side, opposite_side = _sides_of_inner_edges(edges)
     # neighbours that agree run through their edge in opposite directions
     agree = edges[side, 0] != edges[opposite_side, 0]
     m = len(cells)
@@ -108,6 +97,7 @@ def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells
             f"{place_text(place)}"
         )
     _refuse_torn(nodes, cells, part[:m], first_copy)
+    # in each component, either the triangles oriented as its first one stay, or all others do
     keeps_orientation = np.empty(m, dtype=bool)
     components = np.minimum(part[:m], part[m:])  # one number for both parts
     for component in np.unique(components):
@@ -119,12 +109,47 @@ def oriented(nodes: Array, cells: Cells, first_copy: int | None = None) -> Cells
     return np.where(keeps_orientation[:, None], cells, reversed_cells)
 
 
+def _areas(nodes: Array, cells: Cells) -> Array:
+    """Return the areas (m,) of triangles, by their vertices.
+
+    Raises
+    ------
+    MeshError
+        If a triangle has no area.
+    """
+    v0, v1, v2 = (nodes[cells[:, i]] for i in range(3))
+    areas = np.linalg.norm(np.cross(v1 - v0, v2 - v0), axis=1) / 2
+    squared_side = np.linalg.norm(v1 - v0, axis=1) ** 2
+    flat = np.flatnonzero(areas <= FLAT_TRIANGLE_TOLERANCE * squared_side)
+    if len(flat):
+        raise MeshError(f"the triangle at {place_text(v0[flat[0]])} has no area")
+    return np.asarray(areas)
+
+
+def _sides_of_inner_edges(sides: Cells) -> tuple[Cells, Cells]:
+    """Return the numbers of the first and of the second side at each edge with two triangles.
+
+    Parameters
+    ----------
+    sides
+        (3 m, 2) of all triangles, as of `directed_sides`; an edge has two triangles at most.
+    """
+    _, edge_of_side, side_counts = np.unique(
+        np.sort(sides, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    # sort the sides by edge; the two sides of an inner edge then follow one another
+    sides_by_edge = np.argsort(edge_of_side.ravel(), kind="stable")
+    first_of_inner = np.cumsum(side_counts)[side_counts == 2] - 2
+    return sides_by_edge[first_of_inner], sides_by_edge[first_of_inner + 1]
+
+
 def _is_reversed(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.bool_]) -> bool:
     """Return whether a component shall have the orientation opposite to its first triangle's.
 
-    The larger area decides. If both areas are equal, the normals shall point upwards on the whole,
-    else along e2 or e1, else out of the volume. The numbers of triangles never decide, as they
-    would make the orientation depend on the mesh.
+    The orientation with the larger area is taken. If both areas are equal, it is the one in which
+    the sum of all normals points upwards. If that is zero upwards, it points along e2; then along
+    e1; and at last out of the volume. The numbers of triangles never decide, as they would make
+    the orientation depend on the mesh.
 
     Parameters
     ----------
@@ -139,6 +164,7 @@ def _is_reversed(nodes: Array, cells: Cells, areas: Array, as_first: NDArray[np.
     a, b, c = (nodes[cells[:, i]] - nodes[np.unique(cells)].mean(axis=0) for i in range(3))
     # area vectors, all in the orientation of the first triangle
     vectors = np.where(as_first[:, None], 1, -1) * np.cross(b - a, c - a) / 2
+    # proportional to the enclosed volume: vertices a are relative to the mean of all nodes
     outward = (a * vectors).sum(axis=1) / np.ptp(nodes, axis=0).max()
     # the first criterion that is not zero by symmetry decides
     for components in (vectors[:, 2], vectors[:, 1], vectors[:, 0], outward):
@@ -197,28 +223,36 @@ def border_edges(nodes: Array, cells: Cells, curves: Mapping[str, Cells]) -> dic
     named_pairs = {pair for lines in curves.values() for pair in as_set(lines)}
     unnamed = [(int(a), int(b)) for a, b in border if (int(a), int(b)) not in named_pairs]
     if unnamed:
-        # a second node at one end tells that triangles are not connected, else there is a hole
-        place = nodes[list(unnamed[0])].mean(axis=0)
-        vertices = np.unique(cells[:, :3])
-        extent = np.ptp(nodes[vertices], axis=0).max()
-        corner = nodes[unnamed[0][0]]
-        distances = np.linalg.norm(nodes[vertices] - corner, axis=1)
-        if np.sum(distances < SAME_PLACE_TOLERANCE * extent) > 1:
-            raise MeshError(
-                f"there are two nodes at {place_text(corner)}: "
-                "the triangles beside it are not connected"
-            )
-        raise MeshError(
-            f"the surface ends at the edge around {place_text(place)}, "
-            "which belongs to no physical curve: close the hole, or name the edge "
-            "(an edge without a condition is free)"
-        )
+        raise _error_of_unnamed(nodes, cells, unnamed[0])
     ends, counts = np.unique(border, return_counts=True)
     if (counts > 2).any():  # a vertex has two border edges
         raise MeshError(
             f"the surface touches itself in the vertex {place_text(nodes[ends[counts > 2][0]])}"
         )
     return on_border(curves, border)
+
+
+def _error_of_unnamed(nodes: Array, cells: Cells, side: tuple[int, int]) -> MeshError:
+    """Return the error for a border side without a name, given by its two vertices.
+
+    If there is a second node at its first vertex, triangles are not connected; if not, there is a
+    hole.
+    """
+    vertices = np.unique(cells[:, :3])
+    extent = np.ptp(nodes[vertices], axis=0).max()
+    corner = nodes[side[0]]
+    distances = np.linalg.norm(nodes[vertices] - corner, axis=1)
+    if np.sum(distances < SAME_PLACE_TOLERANCE * extent) > 1:
+        return MeshError(
+            f"there are two nodes at {place_text(corner)}: "
+            "the triangles beside it are not connected"
+        )
+    middle = nodes[list(side)].mean(axis=0)
+    return MeshError(
+        f"the surface ends at the edge around {place_text(middle)}, "
+        "which belongs to no physical curve: close the hole, or name the edge "
+        "(an edge without a condition is free)"
+    )
 
 
 @dataclass(frozen=True)
@@ -367,17 +401,9 @@ def _patch_of_triangles(file: MeshFile) -> PatchMesh:
         If the surface cannot carry a shell.
     """
     triangles = file.content()
-    nodes, cells, edges = triangles.nodes, triangles.cells, dict(triangles.edges)
-    used, numbers = np.unique(cells, return_inverse=True)  # drops nodes without a triangle
-    cells = numbers.reshape(cells.shape)
-    new_number = np.full(len(nodes), -1, dtype=np.int64)
-    new_number[used] = np.arange(len(used))
-    nodes = nodes[used]
-    for name, pairs in edges.items():
-        edges[name] = new_number[pairs]
-        if (edges[name] < 0).any():
-            raise MeshError(f"{file.path}: the physical curve {name} is not part of the surface")
-    first_copy = len(nodes)  # copies of nodes at T-junctions follow the nodes
+    nodes, cells, edges = _without_unused_nodes(file, triangles)
+    # take T-junctions apart; copies of nodes there follow the nodes
+    first_copy = len(nodes)
     origin, cells, t_junctions = separate_sheets(nodes, cells)
     nodes = nodes[origin]
     if t_junctions:
@@ -389,6 +415,7 @@ def _patch_of_triangles(file: MeshFile) -> PatchMesh:
                 "take another"
             )
         edges[name] = t_junction.pairs
+    # give all triangles one orientation
     cells_of_file = cells
     cells = oriented(nodes, cells, first_copy if t_junctions else None)
     # reversing exchanges the second and the third vertex
@@ -406,6 +433,28 @@ def _patch_of_triangles(file: MeshFile) -> PatchMesh:
         source_triangles=np.column_stack([np.arange(len(cells)), is_reversed]),
         t_junctions={name: t_junction.supports for name, t_junction in t_junctions.items()},
     )
+
+
+def _without_unused_nodes(
+    file: MeshFile, triangles: SurfaceTriangles
+) -> tuple[Array, Cells, dict[str, Cells]]:
+    """Return nodes, cells and edges of triangles, with the nodes of triangles alone.
+
+    Raises
+    ------
+    MeshError
+        If an edge has a node without a triangle.
+    """
+    nodes, cells, edges = triangles.nodes, triangles.cells, dict(triangles.edges)
+    used, numbers = np.unique(cells, return_inverse=True)
+    # old number of a node -> its new one; -1 without a triangle
+    new_number = np.full(len(nodes), -1, dtype=np.int64)
+    new_number[used] = np.arange(len(used))
+    for name, pairs in edges.items():
+        edges[name] = new_number[pairs]
+        if (edges[name] < 0).any():
+            raise MeshError(f"{file.path}: the physical curve {name} is not part of the surface")
+    return nodes[used], numbers.reshape(cells.shape), edges
 
 
 def cell_count(file: MeshFile) -> int:
@@ -454,14 +503,8 @@ def _named_vertices(
     corners = patch.nodes[numbers]  # all vertices
     held_vertices = [pairs.ravel() for name, pairs in patch.edges.items() if name in held_edges]
     is_free = ~np.isin(numbers, np.concatenate([*held_vertices, np.zeros(0, dtype=np.int64)]))
-    candidates = np.array([*corners, *shell_poles])
-    x, y, z = np.round(candidates[:, :3], HEIGHT_DIGITS).T
-    is_shell_pole = np.arange(len(x)) >= len(corners)
-    nearest_corner = scipy.spatial.cKDTree(corners[:, :3]).query(candidates[:, :3])[1]
-    # the last key counts first: height, free edge, a shell's pole, then y and x
-    pole = np.lexsort((x, y, is_shell_pole, is_free[nearest_corner], z))[-1]
-    vertices = {"pole": candidates[pole]}
-    for name, x in points.items():  # x is now a place
+    vertices = {"pole": _pole(corners, is_free, shell_poles)}
+    for name, x in points.items():
         distance = np.linalg.norm(corners[:, :3] - x[:3], axis=1)
         nearest = corners[np.argmin(distance)]
         if distance.min() > POINT_TOLERANCE * np.ptp(corners[:, :3], axis=0).max():
@@ -472,6 +515,26 @@ def _named_vertices(
             )
         vertices[name] = nearest
     return vertices
+
+
+def _pole(corners: Array, is_free: NDArray[np.bool_], shell_poles: Sequence[Array]) -> Array:
+    """Return the highest of all vertices and shells' poles, (d,).
+
+    Parameters
+    ----------
+    corners, is_free
+        (n, d) vertices, and whether each is on no held edge.
+    shell_poles
+        Poles (d,) of several shells.
+    """
+    candidates = np.array([*corners, *shell_poles])
+    x, y, z = np.round(candidates[:, :3], HEIGHT_DIGITS).T
+    is_shell_pole = np.arange(len(x)) >= len(corners)
+    # a shell's pole is free if the vertex at its place is so
+    nearest_corner = scipy.spatial.cKDTree(corners[:, :3]).query(candidates[:, :3])[1]
+    # the last key counts first: height, free or held, a shell's pole or not, then y and x
+    order = np.lexsort((x, y, is_shell_pole, is_free[nearest_corner], z))
+    return np.asarray(candidates[order[-1]])
 
 
 def _triangles_of_file(file: MeshFile) -> SurfaceTriangles:
@@ -498,8 +561,10 @@ def _triangles_of_file(file: MeshFile) -> SurfaceTriangles:
     if len({nodes.shape[1] for _, nodes in blocks}) != 1:
         raise MeshError(f"{file.path}: it has no triangles, or triangles of several orders")
     cells = _node_indices(file, content, np.concatenate([nodes for _, nodes in blocks]))
+    # a patch is a physical group of surfaces: a triangle is in it if its surface is
     entity = np.concatenate([np.full(len(nodes), entity) for entity, nodes in blocks])
     patches = {name: np.isin(entity, entities) for name, entities in content.groups[2].items()}
+    # an edge is a physical group of curves; a line begins with its two vertices
     edges = {}
     for name, entities in content.groups[1].items():
         lines = [
@@ -548,9 +613,10 @@ def _node_indices(
         If a node is not there.
     """
     order = np.argsort(content.tags)
+    # where each number stands in the sorted tags; beyond the last tag it gets the last place
     positions = np.searchsorted(content.tags, numbers, sorter=order).clip(max=len(order) - 1)
-    # a missing number has found a neighbour, which is told below
     indices: NDArray[np.int64] = order[positions]
+    # a missing number has found another tag
     if (missing := content.tags[indices] != numbers).any():
         raise MeshError(
             f"{file.path}: it has elements with the node {numbers[missing][0]}, which is not there"

@@ -79,11 +79,12 @@ def parsed(content: bytes) -> MshContent:
         process = subprocess.run(
             command, env=env, cwd=folder, capture_output=True, text=True, check=False
         )
+        # exit codes: 0 success, `UNUSABLE` without gmsh, negative after a crash
         if process.returncode == UNUSABLE:
             raise Unusable(process.stderr.strip())
         if process.returncode:
-            reason = "it crashed"  # by a signal: the exit code is negative
-            if process.returncode > 0:
+            reason = "it crashed"
+            if process.returncode > 0:  # the last line of its traceback says why
                 reason = (process.stderr.strip().splitlines() or ["nothing"])[-1]
             reason = reason.replace(str(copy), "the file").removeprefix("Exception: ").strip()
             raise MeshError(
@@ -103,7 +104,7 @@ def _fields_of_model(
     blocks, groups = Blocks(), dict[int, dict[str, list[int]]]({1: {}, 2: {}})
     for dim, entity in model.getEntities():
         for kind, _, nodes in zip(*model.mesh.getElements(dim, entity), strict=True):
-            name, _, _, width, *_ = model.mesh.getElementProperties(kind)
+            name, _, _, width, *_ = model.mesh.getElementProperties(kind)  # width: nodes of one
             elements = nodes.astype(np.int64).reshape(-1, width)
             # MSH 2 repeats an element for each of its groups; the order of the rest is kept
             first_index = np.unique(elements, axis=0, return_index=True)[1]

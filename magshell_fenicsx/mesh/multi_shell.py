@@ -245,22 +245,15 @@ def union_of_shells(
     points = dict[str, Array]()
     patches = dict[str, NDArray[np.bool_]]()
     cell_count = sum(len(member.patch.cells) for member in members)
-
-    def with_shell_number(coordinates: Array, number: int) -> Array:
-        """Return nodes (n, 10) for coordinates (n, d) of the shell with this number."""
-        nodes_of_shell = np.zeros((len(coordinates), 3 + MAX_SHELL_COORDINATES + 1))
-        nodes_of_shell[:, 3 : 3 + coordinates.shape[1]], nodes_of_shell[:, -1] = coordinates, number
-        nodes_of_shell[:, :3] = embedding(nodes_of_shell)  # which reads the numbers just set
-        return nodes_of_shell
-
     first_node = first_cell = 0
     for number, member in enumerate(members):
         patch = _with_nodes_per_cell(member.patch, nodes_per_cell)
         node_count = len(patch.nodes)
-        nodes.append(with_shell_number(patch.nodes, number))
+        nodes.append(_with_shell_number(patch.nodes, number, embedding))
         cells.append(patch.cells + first_node)
         glued = np.arange(node_count) if patch.representative is None else patch.representative
         representatives.append(glued + first_node)
+        # edges: those in a symmetry plane may be one edge of all shells
         for name, pairs in patch.edges.items():
             is_common = one_symmetry_edge and name in (SYMMETRY_EDGE, SECOND_SYMMETRY_EDGE)
             name_of_all = name if is_common else f"{member.name}_{name}"
@@ -269,7 +262,7 @@ def union_of_shells(
         for name in patch.points:
             # a shell's pole is a point of all shells even if the case does not name it
             if name in ("pole", *member.points):
-                node = with_shell_number(patch.points[name][None], number)[0]
+                node = _with_shell_number(patch.points[name][None], number, embedding)[0]
                 points[f"{member.name}_{name}"] = node
         end_cell = first_cell + len(patch.cells)
         all_cells = np.ones(len(patch.cells), dtype=bool)  # "": the shell as a patch of its own
@@ -295,6 +288,21 @@ def union_of_shells(
     )
 
 
+def _with_shell_number(coordinates: Array, number: int, embedding: MultiShellEmbedding) -> Array:
+    """Return nodes (n, 10) of several shells for coordinates (n, d) in one of them.
+
+    Parameters
+    ----------
+    number
+        Number of the shell.
+    """
+    nodes = np.zeros((len(coordinates), 3 + MAX_SHELL_COORDINATES + 1))
+    nodes[:, 3 : 3 + coordinates.shape[1]] = coordinates
+    nodes[:, -1] = number
+    nodes[:, :3] = embedding(nodes)  # which reads the numbers just set
+    return nodes
+
+
 def with_joints(patch: PatchMesh, joints: Sequence[tuple[str, str]]) -> PatchMesh:
     """Return the triangulation with edges glued at joints.
 
@@ -317,7 +325,8 @@ def with_joints(patch: PatchMesh, joints: Sequence[tuple[str, str]]) -> PatchMes
     for edges, key, ends_on_shell in zip(joints, keys, are_t_junctions, strict=True):
         if not ends_on_shell:
             patch = glue_edges(patch, edges, key)
-    # only now, since gluing may divide triangles: a mask has a value for each triangle
+    # masks of the joints, only now: a mask has a value for each triangle, and gluing may have
+    # divided triangles. A T-junction has none
     masks, glued_names = list[tuple[NDArray[np.bool_], NDArray[np.bool_]] | None](), set[str]()
     for edges, ends_on_shell in zip(joints, are_t_junctions, strict=True):
         if ends_on_shell:
@@ -441,18 +450,13 @@ def _with_vertices_on_edge(
     gap
         Largest distance of a target from the edge over R, and this target (3,).
     """
-    pairs, triangle_sides = patch.edges[edge], patch.corners[:, TRIANGLE_SIDES]
-    # the two vertices of a side -> its triangle, and its number there (0 to 2)
-    cell_and_side = {
-        tuple(sorted(triangle_sides[c, s])): (c, s)
-        for c, s in np.ndindex(*triangle_sides.shape[:2])
-    }
-    # for each of the S sides on the edge
-    cell, side = np.array([cell_and_side[tuple(sorted(pair))] for pair in pairs]).T
-    S, T = len(pairs), len(targets)
-    start, end = REFERENCE_VERTICES[TRIANGLE_SIDES[side]].transpose(1, 0, 2)
-    t = np.full((S, T), 0.5)  # parameter along each side, from 0 to 1; the search begins midway
-    end_places = patch.nodes[patch.cells[cell[:, None], TRIANGLE_SIDES[side]], :3]
+    cell, side = _sides_on_edge(patch, edge)
+    S, T = len(cell), len(targets)
+    # ends of the S sides, in the reference triangle, and as places with the chord between them
+    vertices_of_sides = TRIANGLE_SIDES[side]  # (S, 2), from 0 to 2
+    start, end = REFERENCE_VERTICES[vertices_of_sides].transpose(1, 0, 2)
+    end_nodes = patch.cells[cell[:, None], vertices_of_sides]
+    end_places = patch.nodes[end_nodes, :3]
     chord = end_places[:, 1] - end_places[:, 0]
 
     def place_on_sides(t: Array) -> Array:
@@ -462,11 +466,13 @@ def _with_vertices_on_edge(
         return np.asarray(places.reshape(S, T, 3))
 
     # move t to the point of each curved side closest to each target, by projection on its chord
+    t = np.full((S, T), 0.5)  # parameter along each side, from 0 to 1; the search begins midway
     squared_lengths = np.einsum("si,si->s", chord, chord)[:, None]
     for _ in range(PROJECTION_ITERATIONS):
         offset = targets[None] - place_on_sides(t)
         t = np.clip(t + np.einsum("sti,si->st", offset, chord) / squared_lengths, 0, 1)
     distance = np.linalg.norm(targets[None] - place_on_sides(t), axis=2)
+    # the nearest side of each target, and the target that is farthest from its nearest side
     nearest_side = distance.argmin(axis=0)
     farthest = int(distance.min(axis=0).argmax())
     gap = float(distance[nearest_side[farthest], farthest]), targets[farthest]
@@ -477,6 +483,18 @@ def _with_vertices_on_edge(
         cuts = np.sort(t_on_nearest[is_new & (nearest_side == number)])
         patch = _with_divided_triangle(patch, edge, int(cell[number]), int(side[number]), cuts)
     return patch, gap
+
+
+def _sides_on_edge(patch: PatchMesh, edge: str) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Return the triangle of each side on an edge, and the number of the side there (0 to 2)."""
+    triangle_sides = patch.corners[:, TRIANGLE_SIDES]  # (m, 3 sides, 2 vertices)
+    # the two vertices of a side -> its triangle, and its number there
+    cell_and_side = {
+        tuple(sorted(triangle_sides[c, s])): (c, s)
+        for c, s in np.ndindex(*triangle_sides.shape[:2])
+    }
+    cell, side = np.array([cell_and_side[tuple(sorted(pair))] for pair in patch.edges[edge]]).T
+    return cell, side
 
 
 def _with_divided_triangle(
@@ -493,14 +511,67 @@ def _with_divided_triangle(
     cuts
         Places along the side at which it is divided, from 0 to 1, growing.
     """
+    assert patch.representative is not None
+    assert patch.source_triangles is not None
+    new_cells, new_nodes, side_nodes = _parts_of_triangle(patch, cell, side, cuts)
+    first_new_node = len(patch.nodes)
+    nodes = np.concatenate([patch.nodes, new_nodes])
+    # coordinates in the shell are interpolated; places in space follow from them exactly
+    nodes[first_new_node:, :3] = patch.embedding(nodes[first_new_node:])
+    cells = np.concatenate([patch.cells, np.array(new_cells[1:])])
+    cells[cell] = new_cells[0]
+    parent_cells = np.full(len(new_cells) - 1, cell)
+    # no new node is glued to another
+    representative = np.concatenate([patch.representative, np.arange(first_new_node, len(nodes))])
+    # in the edge, the pair of the old side is replaced by the pairs of the new sides
+    ends = {int(representative[side_nodes[0]]), int(representative[side_nodes[-1]])}
+    other_pairs = [pair for pair in patch.edges[edge] if {int(pair[0]), int(pair[1])} != ends]
+    new_pairs = representative[np.array([side_nodes[:-1], side_nodes[1:]]).T]
+    pairs = np.concatenate([np.array(other_pairs, dtype=np.int64).reshape(-1, 2), new_pairs])
+
+    def with_new_cells(values: NDArray[Any]) -> NDArray[Any]:
+        """Append the values of the old triangle for the new ones."""
+        return np.concatenate([values, values[parent_cells]])
+
+    return replace(
+        patch,
+        nodes=nodes,
+        cells=cells,
+        representative=representative,
+        edges={**patch.edges, edge: pairs},
+        patches={name: with_new_cells(mask) for name, mask in patch.patches.items()},
+        source_triangles=with_new_cells(patch.source_triangles),
+    )
+
+
+def _parts_of_triangle(
+    patch: PatchMesh, cell: int, side: int, cuts: Array
+) -> tuple[list[NDArray[np.int64]], Array, list[int]]:
+    """Divide a triangle from the vertex opposite to a side.
+
+    Parameters
+    ----------
+    cell, side
+        Number of the triangle, and of its side (0 to 2).
+    cuts
+        Places along the side at which it is divided, from 0 to 1, growing.
+
+    Returns
+    -------
+    new_cells
+        Nodes of each new triangle.
+    new_nodes
+        (k, 10) nodes that are new: first those at the cuts, then those of each new triangle. Their
+        numbers follow that of the last old node.
+    side_nodes
+        Nodes along the side: its ends, and those at the cuts between.
+    """
     import basix  # slow to import, and not needed to read a case
     from dolfinx import mesh
     from dolfinx.cpp.io import perm_gmsh
 
     from magshell_fenicsx.mesh.midsurface import ORDERS
 
-    assert patch.representative is not None
-    assert patch.source_triangles is not None
     # a cell's number of nodes, and the vertices (0 to 2) at the ends of the side
     count, (i, j) = patch.cells.shape[1], TRIANGLE_SIDES[side]
     family, variant = basix.ElementFamily.P, basix.LagrangeVariant.equispaced
@@ -534,32 +605,7 @@ def _with_divided_triangle(
         ]
         new_cells.append(new_cell)
         node_count += further_count
-    nodes = np.concatenate([patch.nodes, *new_nodes])
-    # coordinates in the shell are interpolated; places in space follow from them exactly
-    nodes[first_new_node:, :3] = patch.embedding(nodes[first_new_node:])
-    cells = np.concatenate([patch.cells, np.array(new_cells[1:])])
-    cells[cell] = new_cells[0]
-    parent_cells = np.full(len(new_cells) - 1, cell)
-    representative = np.concatenate([patch.representative, np.arange(first_new_node, node_count)])
-    ends = {int(representative[side_nodes[0]]), int(representative[side_nodes[-1]])}
-    # in the edge, the pair of the old side is replaced by the pairs of the new sides
-    other_pairs = [pair for pair in patch.edges[edge] if {int(pair[0]), int(pair[1])} != ends]
-    new_pairs = representative[np.array([side_nodes[:-1], side_nodes[1:]]).T]
-    pairs = np.concatenate([np.array(other_pairs, dtype=np.int64).reshape(-1, 2), new_pairs])
-
-    def with_new_cells(values: NDArray[Any]) -> NDArray[Any]:
-        """Append the values of the old triangle for the new ones."""
-        return np.concatenate([values, values[parent_cells]])
-
-    return replace(
-        patch,
-        nodes=nodes,
-        cells=cells,
-        representative=representative,
-        edges={**patch.edges, edge: pairs},
-        patches={name: with_new_cells(mask) for name, mask in patch.patches.items()},
-        source_triangles=with_new_cells(patch.source_triangles),
-    )
+    return new_cells, np.concatenate(new_nodes), side_nodes
 
 
 def _nodes_in_cells(patch: PatchMesh, cell: NDArray[np.int64], X: Array) -> Array:
@@ -588,6 +634,7 @@ def _cells_on_edge(patch: PatchMesh, edge: str) -> NDArray[np.bool_]:
     """
     pairs, sides = as_set(patch.edges[edge]), np.sort(directed_sides(patch.corners), axis=1)
     is_side_on_edge = np.array([(int(a), int(b)) in pairs for a, b in sides])
+    # `directed_sides` gives all first sides, then all second, then all third ones
     has_side_on_edge = is_side_on_edge.reshape(3, -1).any(axis=0)
     # an edge is called SHELL_EDGE; the longest name counts, as shells may be called a and a_b
     shell = max((name for name in patch.patches if edge.startswith(f"{name}_")), key=len)
@@ -610,6 +657,7 @@ def _with_nodes_per_cell(patch: PatchMesh, count: int) -> PatchMesh:
 
     family, variant = basix.ElementFamily.P, basix.LagrangeVariant.equispaced
     element = basix.create_element(family, basix.CellType.triangle, ORDERS[count], variant)
+    # coordinates (m, new nodes of a cell, d) at the nodes that follow the three vertices
     places = at_reference_points(patch.nodes, patch.cells, element.points[3:])
     first_new = len(patch.nodes)
     new_numbers = first_new + np.arange(places.shape[0] * places.shape[1]).reshape(places.shape[:2])

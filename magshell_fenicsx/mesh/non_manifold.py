@@ -77,23 +77,17 @@ def separate_sheets(nodes: Array, cells: Cells) -> tuple[Cells, Cells, dict[str,
         if len(cells_at_edge) == 2:
             neighbours.append((cells_at_edge[0], cells_at_edge[1]))
             continue
-        conormals = {cell: _conormal(nodes, pairs[edge], cells[cell, :3]) for cell in cells_at_edge}
-
-        def cosine(two_cells: tuple[int, int], conormals: dict[int, Array] = conormals) -> float:
-            """Return the cosine between two triangles at the edge; -1 if they lie in one plane."""
-            first, second = two_cells
-            return round(float(conormals[first] @ conormals[second]), COSINE_DIGITS)
-
-        flattest = min(combinations(cells_at_edge, 2), key=cosine)
+        flattest = _flattest_pair(nodes, cells, pairs[edge], cells_at_edge)
         neighbours.append(flattest)
         supporting_cells[int(edge)] = flattest
         ending_cells += [(int(edge), cell) for cell in cells_at_edge if cell not in flattest]
+    # triangles of different sheets get different nodes at the T-junctions
     vertices = np.unique(pairs[triangle_counts > 2])  # of T-junctions
     cells, copied_nodes = _with_own_nodes(len(nodes), cells, neighbours, vertices)
-    sheets = _sheet_numbers(m, neighbours)
     origin = np.append(np.arange(len(nodes)), copied_nodes)
-    t_junctions = dict[str, TJunction]()
     # each sheet that ends somewhere is one T-junction
+    sheets = _sheet_numbers(m, neighbours)
+    t_junctions = dict[str, TJunction]()
     for sheet in dict.fromkeys(sheets[cell] for _, cell in ending_cells):
         end_pairs, supports = list[list[int]](), np.zeros(m, dtype=bool)
         for edge, cell in ending_cells:
@@ -106,6 +100,28 @@ def separate_sheets(nodes: Array, cells: Cells) -> tuple[Cells, Cells, dict[str,
         name = JUNCTION_NAME if number == 1 else f"{JUNCTION_NAME}_{number}"
         t_junctions[name] = TJunction(np.array(end_pairs), supports)
     return origin, cells, t_junctions
+
+
+def _flattest_pair(
+    nodes: Array, cells: Cells, edge: Cells, cells_at_edge: list[int]
+) -> tuple[int, int]:
+    """Return the two triangles at an edge, of three or more, that are nearest to one plane.
+
+    Parameters
+    ----------
+    edge
+        (2,) vertices of the edge.
+    cells_at_edge
+        Numbers of the triangles there.
+    """
+    conormals = {cell: _conormal(nodes, edge, cells[cell, :3]) for cell in cells_at_edge}
+
+    def cosine(two_cells: tuple[int, int]) -> float:
+        """Return the cosine between two triangles at the edge; -1 if they lie in one plane."""
+        first, second = two_cells
+        return round(float(conormals[first] @ conormals[second]), COSINE_DIGITS)
+
+    return min(combinations(cells_at_edge, 2), key=cosine)
 
 
 def _conormal(nodes: Array, edge: Cells, corners: Cells) -> Array:
@@ -154,24 +170,29 @@ def _with_own_nodes(
         The old node of each new one.
     """
     cells, copied_nodes = np.array(cells), list[int]()
+    # node -> the triangles around it that touch a junction
     is_at_junction = np.isin(cells[:, :3], vertices).any(axis=1)
     cells_of_node = dict[int, list[int]]()
     for cell in np.flatnonzero(is_at_junction):
         for node in cells[cell]:
             cells_of_node.setdefault(int(node), []).append(int(cell))
+    # triangle -> its neighbours in the same sheet
     neighbours_of_cell = dict[int, set[int]]()
     for first, second in neighbours:
         neighbours_of_cell.setdefault(first, set()).add(second)
         neighbours_of_cell.setdefault(second, set()).add(first)
     for node, cells_at_node in cells_of_node.items():
-        # other vertices are in one sheet; nodes on sides at a junction must be looked at
-        if node not in vertices and node in cells[:, :3]:
+        # a vertex of no junction is in one sheet; a node between two vertices may be on a junction
+        is_vertex_in_one_sheet = node not in vertices and node in cells[:, :3]
+        if is_vertex_in_one_sheet:
             continue
-        for number, group in enumerate(_connected_groups(cells_at_node, neighbours_of_cell)):
-            if number:  # the first group keeps the node
-                for cell in group:
-                    cells[cell][cells[cell] == node] = total + len(copied_nodes)
-                copied_nodes.append(node)
+        # each group is of one sheet: the first one keeps the node, each further one gets a copy
+        _, *further_groups = _connected_groups(cells_at_node, neighbours_of_cell)
+        for group in further_groups:
+            new_node = total + len(copied_nodes)
+            for cell in group:
+                cells[cell][cells[cell] == node] = new_node
+            copied_nodes.append(node)
     return cells, copied_nodes
 
 
@@ -187,7 +208,8 @@ def _connected_groups(
     """
     remaining = set(cells)
     while remaining:
-        # the least cell first, so that the groups come in the same order in each run
+        # a group grows from one cell to its neighbours, as long as there are any; it begins at the
+        # cell with the lowest number, so that the groups come in the same order in each run
         group, queue = set[int](), [min(remaining)]
         while queue:
             cell = queue.pop()
@@ -203,9 +225,10 @@ def _connected_groups(
 def edges_with_new_nodes(
     edges: Mapping[str, Cells], cells: Cells, origin: Cells
 ) -> dict[str, Cells]:
-    """Return named curves (e, 2) in new nodes: a side becomes all border sides at its place.
+    """Return named curves (e, 2) in the new nodes of `separate_sheets`.
 
-    A side that is on no border keeps its nodes.
+    Each side of a curve becomes all border sides at the same place: several, where several sheets
+    end there. A side that is on no border keeps its nodes.
 
     Parameters
     ----------
@@ -215,8 +238,8 @@ def edges_with_new_nodes(
         Triangles, and the old node of each node; results of `separate_sheets`.
     """
     border = border_pairs(directed_sides(cells))
+    # the two old nodes of a side -> all border sides there, in new nodes
     border_sides = dict[tuple[int, ...], list[Cells]]()
-    # several sheets may end at one side: old nodes -> all border sides there
     for side in border:
         old_nodes = tuple(sorted(int(origin[node]) for node in side))
         border_sides.setdefault(old_nodes, []).append(side)

@@ -92,6 +92,7 @@ def fit_scattered(
         # drop the later one of each pair
         places, values = (np.delete(f, duplicates.max(axis=1), axis=0) for f in (places, values))
         tree = scipy.spatial.cKDTree(places)
+    # the patches, each with its places and values
     centres, radii = _covering_balls(tree, np.vstack([cover, places]))
     patches = list[tuple[_PatchPlaces, Array]]()
     for centre, numbers in zip(centres, tree.query_ball_point(centres, radii), strict=True):
@@ -204,7 +205,7 @@ class _PatchPlaces:
     def modes(self) -> tuple[Array, Array]:
         """Eigenvalues (n - q,) and eigenvectors (n, n - q) of the kernel, with lengths over R.
 
-        They are on the complement of the polynomials.
+        They are on the complement of the polynomials: the vectors normal to all q polynomials.
         """
         basis = np.linalg.qr(self.polynomials, mode="complete")[0]
         complement = basis[:, self.polynomials.shape[1] :]
@@ -220,7 +221,7 @@ class _PatchPlaces:
         interpolates.
         """
         sizes, modes = self.modes
-        components, smoothing = modes.T @ values, 0.0
+        components, smoothing = modes.T @ values, 0.0  # values in the modes; lambda
         if noise:
             candidates = sizes[-1] * SMOOTHINGS
             # (lambdas, modes) part of each mode that a lambda removes
@@ -228,6 +229,7 @@ class _PatchPlaces:
             # squares of what is removed, less their mean by noise alone
             risk = removed**2 @ components**2 - 2 * noise**2 * removed.sum(axis=1)
             smoothing = candidates[np.argmin(risk)]
+        # coefficients of the kernels; scale^5 is for places over the scale instead of over R
         kernel = modes @ (components / (sizes + smoothing)) * self.scale**5
         # of the equations K kernel + lambda kernel + P polynomial = values, P polynomial remains
         kernel_values = _kernel(self.places, self.places) @ kernel

@@ -115,12 +115,15 @@ class SplineProfile:
     ----------
     length
         Length of the curve.
+    _curve
+        Cubic spline: length s -> place (r, z).
     """
 
     def __init__(self, points: Array) -> None:
         """Interpolate points (n, 2), and iterate until the parameter is the arc length."""
+        # lengths of the parts between points: of the chords, then of the arcs of the last spline
         steps = np.hypot(*np.diff(points, axis=0).T)
-        for _ in range(ITERATIONS):  # from chords to arcs
+        for _ in range(ITERATIONS):
             knots = np.concatenate([[0.0], np.cumsum(steps)])
             self._curve = scipy.interpolate.CubicSpline(knots, points)
             # lengths of the parts by Gauss quadrature of the speed
@@ -215,7 +218,8 @@ class CappedEmbedding:
         # places (r, z); the nearest sample of the profile is where Newton's method starts
         meridian_places = np.column_stack([np.hypot(places[:, 0], places[:, 1]), places[:, 2]])
         samples = np.linspace(0, self.profile.length, POLE_SAMPLES, dtype=np.float64)
-        s = samples[scipy.spatial.cKDTree(self.profile(samples)).query(meridian_places)[1]]
+        _, nearest = scipy.spatial.cKDTree(self.profile(samples)).query(meridian_places)
+        s = samples[nearest]
         for _ in range(ITERATIONS):  # Newton's method, whose residual vanishes on the surface
             correction = np.sum(
                 (meridian_places - self.profile(s)) * self.profile.tangent(s), axis=1

@@ -116,15 +116,7 @@ def _gmsh_mesh(
         gmsh.model.mesh.setSizeCallback(lambda dim, tag, x, y, z, lc: size(np.array([x, y])))
         gmsh.model.mesh.generate(2)
         gmsh.model.mesh.setOrder(ORDER)
-        tags, xyz, _ = gmsh.model.mesh.getNodes()
-        # gmsh's tag of a node -> its number from 0
-        number = np.zeros(int(tags.max()) + 1, dtype=np.int64)
-        number[tags.astype(np.int64)] = np.arange(len(tags))
-        nodes = xyz.reshape(-1, 3)[:, :2].copy()
-        triangle_tags = gmsh.model.mesh.getElementsByType(TRIANGLE10)[1].astype(np.int64)
-        cells = number[triangle_tags].reshape(-1, 10)
-        line_tags = gmsh.model.mesh.getElementsByType(LINE4)[1].astype(np.int64)
-        lines = number[line_tags].reshape(-1, 4)[:, :2]  # its two ends of a line's four nodes
+        nodes, cells, lines = _nodes_and_elements(gmsh.model)
     except Exception as e:  # gmsh's own errors have no class of their own
         raise MeshError(f"gmsh cannot mesh this surface: {e}") from None
     finally:
@@ -140,6 +132,21 @@ def _halved_at(size: Size, places: Array) -> Size:
     """Return an element size that is half the old one at places (n, 2), growing from there."""
     halved = np.array([size(x) / 2 for x in places])
     return lambda x: min(size(x), float((halved + SIZE_GROWTH * np.hypot(*(places - x).T)).min()))
+
+
+def _nodes_and_elements(model: Any) -> tuple[Array, Numbers, Numbers]:
+    """Return nodes (n, 2), triangles (m, 10) and vertices of lines (k, 2) of gmsh's model."""
+    tags, xyz, _ = model.mesh.getNodes()
+    # gmsh's tag of a node -> its number from 0
+    number = np.zeros(int(tags.max()) + 1, dtype=np.int64)
+    number[tags.astype(np.int64)] = np.arange(len(tags))
+    nodes = xyz.reshape(-1, 3)[:, :2].copy()
+    triangle_tags = model.mesh.getElementsByType(TRIANGLE10)[1].astype(np.int64)
+    cells = number[triangle_tags].reshape(-1, 10)
+    # the first two of a line's four nodes are its ends
+    line_tags = model.mesh.getElementsByType(LINE4)[1].astype(np.int64)
+    lines = number[line_tags].reshape(-1, 4)[:, :2]
+    return nodes, cells, lines
 
 
 def _with_images(shape: PlaneShape, points: Mapping[str, Array]) -> list[Array]:
@@ -193,6 +200,7 @@ def _glued_nodes(shape: PlaneShape, nodes: Array) -> NDArray[np.int64]:
     """
     representative = np.arange(len(nodes))
     for axis, low, high in shape.glued:
+        # nodes on both sides
         first, second = (
             np.flatnonzero(np.abs(nodes[:, axis] - end) < CHART_TOLERANCE) for end in (low, high)
         )

@@ -42,6 +42,8 @@ class ChartUnfolding:
         Whether the chart is a disc around the axis; else its first coordinate goes around e3.
     end
         Where the sector ends: an angle (rad) of a disc, else a first coordinate.
+    _angle
+        Angle of the sector (rad).
 
     Parameters
     ----------
@@ -120,6 +122,10 @@ class SpaceUnfolding:
     ----------
     count
         Number of copies: the waves m of the sector.
+    _sector
+        The sector, with its azimuth and angle.
+    _several_shells
+        Whether the nodes are those of several shells.
     """
 
     def __init__(self, sector: Sector, patch: PatchMesh) -> None:
@@ -224,6 +230,7 @@ def unfold(
         Names of the edges where the first copy begins and the last one ends; equal names make one
         edge of both.
     """
+    # node i of the sector has the number k n + i in copy k
     n, count = len(patch.nodes), unfolding.count
     nodes = np.concatenate([unfolding.image(patch.nodes, k) for k in range(count)])
     mirrored_order = MIRRORED_NODES[patch.cells.shape[1]]
@@ -231,17 +238,14 @@ def unfold(
         [k * n + (patch.cells[:, mirrored_order] if k % 2 else patch.cells) for k in range(count)]
     )
     keys = unfolding.key(nodes)
-    distance = SAME_NODE_TOLERANCE * np.ptp(keys, axis=0).max()
-    nodes_at_place = scipy.spatial.cKDTree(keys).query_ball_point(keys, distance)
-    # for each node the first node at its place
-    first_of_same = np.array([min(numbers) for numbers in nodes_at_place])
+    first_of_same = _first_at_same_place(keys)
     glued_to = np.arange(n) if patch.representative is None else patch.representative
     representative = first_of_same[np.concatenate([k * n + glued_to for k in range(count)])]
     # copies of several shells keep their nodes, which are glued; others share nodes at one place
-    has_own_nodes = keys is not nodes
-    used, numbers = np.unique(
-        np.arange(len(nodes)) if has_own_nodes else first_of_same, return_inverse=True
-    )
+    has_own_nodes = keys is not nodes  # `key` returns other rows for several shells alone
+    kept_nodes = np.arange(len(nodes)) if has_own_nodes else first_of_same
+    used, numbers = np.unique(kept_nodes, return_inverse=True)
+    # number of a node in all copies -> its number in the result; -1 where it is dropped
     new_number = np.full(len(nodes), -1, dtype=np.int64)
     new_number[used] = np.arange(len(used))
 
@@ -251,6 +255,7 @@ def unfold(
             [new_number[representative[k * n + patch.edges[name]]] for k in copies]
         )
 
+    # edges: those between copies vanish, and the outer ends get the names that are given
     last_copy = count - 1
     edges = {
         name: edge_of_copies(name, range(count))
@@ -266,6 +271,8 @@ def unfold(
         edges |= dict(zip(end_names, (first_end, last_end), strict=True))
     is_glued = has_own_nodes or patch.representative is not None
     source_triangles = patch.source_triangles
+    if source_triangles is not None:
+        source_triangles = np.tile(source_triangles, (count, 1))
     return replace(
         patch,
         nodes=nodes[used],
@@ -276,13 +283,24 @@ def unfold(
         points={name: unfolding.image(x[None], 0)[0] for name, x in patch.points.items()},
         representative=new_number[representative[used]] if is_glued else None,
         patches={name: np.tile(mask, count) for name, mask in patch.patches.items()},
-        source_triangles=None
-        if source_triangles is None
-        else np.tile(source_triangles, (count, 1)),
+        source_triangles=source_triangles,
         joints=tuple(
             masks and (np.tile(masks[0], count), np.tile(masks[1], count)) for masks in patch.joints
         ),
     )
+
+
+def _first_at_same_place(keys: Array) -> NDArray[np.int64]:
+    """Return for each node (n,) the lowest number of the nodes at its place.
+
+    Parameters
+    ----------
+    keys
+        (n, k) rows that are equal, but for rounding, for nodes that are the same.
+    """
+    distance = SAME_NODE_TOLERANCE * np.ptp(keys, axis=0).max()
+    nodes_at_place = scipy.spatial.cKDTree(keys).query_ball_point(keys, distance)
+    return np.array([min(numbers) for numbers in nodes_at_place])
 
 
 def double_sector(patch: PatchMesh, angle: float) -> PatchMesh:

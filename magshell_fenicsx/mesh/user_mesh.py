@@ -32,6 +32,19 @@ class UserMesh:
 
     All methods are collective.
 
+    Attributes
+    ----------
+    mesh, comm
+        The dolfinx mesh, and its communicator.
+    _element
+        Lagrange element of the geometry.
+    _owned
+        Number of this rank's own cells.
+    _numbers
+        Number of each local cell, own cells first, ghosts included.
+    _spaces
+        Degree -> space of displacements that was made for it.
+
     Parameters
     ----------
     domain
@@ -89,9 +102,11 @@ class UserMesh:
         # number the used nodes in the order in which they first stand in the cells
         used, first_index, index_of_used = np.unique(cells, return_index=True, return_inverse=True)
         order = np.argsort(first_index)
+        # position of a node in `used` -> its number
         number = np.empty(len(used), dtype=np.int64)
         number[order] = np.arange(len(used))
         places = self._gather_cells(nodes).reshape(-1, 3)[first_index[order]]
+        # edges by dolfinx's global node numbers, and patches by local cells
         pairs_of_edges = {
             name: self._vertex_pairs(self._entities_of_part(f"edges.{name}", part, facet_tags, 1))
             for name, part in edges.items()
@@ -159,8 +174,10 @@ class UserMesh:
         degree, owned = V.element.basix_element.degree, V.mesh.topology.index_map(2).size_local
         nodal = u.x.array.reshape(-1, 3)[V.dofmap.list[:owned]] / scale
         number, is_reversed = source_triangles[:owned].T
+        # in a reversed cell the second and the third vertex are exchanged
         nodal_of_reversed = nodal[:, swapped_nodes(V.element.basix_element)]
         nodal = np.where(is_reversed[:, None, None] == 1, nodal_of_reversed, nodal)
+        # every rank gets the values of all cells, and takes those of its own
         cell_count = self.mesh.topology.index_map(2).size_global
         nodal_of_all = np.zeros((cell_count, *nodal.shape[1:]))
         for numbers, values in self.comm.allgather((number, nodal)):
@@ -238,8 +255,9 @@ class UserMesh:
         """
         tags_name = "facet_tags" if dimension == 1 else "cell_tags"
         entities_name = "facets" if dimension == 1 else "cells"
+        # this rank's entities, or its error; a value is looked up in the tags
         entities: NDArray[np.int32] = np.empty(0, dtype=np.int32)
-        error = ""  # of this rank; all ranks raise the first one together
+        error = ""
         by_value = isinstance(part, int | np.integer)
         if not by_value:
             error = self._error_of_numbers(np.asarray(part), dimension, entities_name)
@@ -250,10 +268,12 @@ class UserMesh:
             error = f"{tags_name} belong to another mesh than that of the shell"
         else:
             entities = np.asarray(tags.find(part))
+        # all ranks raise the first error together
         if first_error := next(filter(None, self.comm.allgather(error)), ""):
             raise MeshError(
                 f"{key}: {part}: {first_error}" if by_value else f"{key}: {first_error}"
             )
+        # a value must be that of an entity on some rank; the message names the values there are
         values = [] if tags is None else np.unique(tags.values)
         values_of_ranks = self.comm.allgather(values)
         allowed = sorted({int(value) for of_rank in values_of_ranks for value in of_rank})

@@ -115,12 +115,14 @@ def flatness(patch: PatchMesh) -> Array:
     sides = corners[:, [1, 2, 0]] - corners
     doubled_area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
     with np.errstate(divide="ignore", invalid="ignore"):
+        # (3 m,) heights over the sides, in the order of `directed_sides`: all first sides first
         heights = (doubled_area[:, None] / np.linalg.norm(sides, axis=2)).T.ravel()
+        # number of the edge of each side; two neighbours share it
         _, edge = np.unique(
             np.sort(directed_sides(patch.corners), axis=1), axis=0, return_inverse=True
         )
         edge = edge.ravel()
-        # sum of the heights of the triangles at each side, in the order of `directed_sides`
+        # h + h' at each side, in the same order; a border side has no neighbour and counts zero
         sum_of_heights = np.bincount(edge, weights=heights)[edge]
         has_neighbour = np.bincount(edge)[edge] > 1
         ratios = np.where(has_neighbour, sum_of_heights / (4 * heights), 0.0)

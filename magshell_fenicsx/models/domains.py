@@ -267,11 +267,12 @@ class IntegrationDomain:
         one tagged measure.
         """
         facets = np.concatenate(facet_groups)
+        # the number of each facet's group
         numbers = np.repeat(
             np.arange(1, len(facet_groups) + 1),
             [len(facets_of_group) for facets_of_group in facet_groups],
         )
-        order = np.argsort(facets)
+        order = np.argsort(facets)  # tags must be sorted by facets
         tags = mesh.meshtags(
             self.mesh, self.mesh.topology.dim - 1, facets[order], numbers[order].astype(np.int32)
         )

@@ -199,11 +199,9 @@ class Context:
     def time_unit(self) -> float | None:
         """The unit R √(ρ/E) of times, in seconds where the case has units; None without density."""
         density, modulus = self.shell.density, self.shell.youngs_modulus
-        return (
-            float(self.shell.reference * np.sqrt(density / modulus))
-            if density and modulus
-            else None
-        )
+        if not (density and modulus):
+            return None
+        return float(self.shell.reference * np.sqrt(density / modulus))
 
 
 @dataclass(frozen=True)
@@ -276,7 +274,15 @@ class Formulas:
 
 @dataclass(frozen=True)
 class Account:
-    """The lines of `magshell check` on one ability: what is in the model, and what is left out."""
+    """The lines of `magshell check` on one ability.
+
+    Attributes
+    ----------
+    included
+        What the model has by it.
+    left_out
+        What the model does not have.
+    """
 
     included: list[str] = field(default_factory=list)
     left_out: list[str] = field(default_factory=list)

@@ -109,16 +109,21 @@ def thickness_ratio_at_points(
         It is a memo: a value that is computed again where displacement or natural shape have
         changed.
         """
-        jets_of = domain.tables(V, points)  # from coefficients to value, d/ds1, d/ds2, ...
+        # makes of coefficients the value and its derivatives d/ds1, d/ds2, ... at the places
+        jets_of = domain.tables(V, points)
 
         def values() -> Array:
             """Return the ratio (cells * places,) at the present displacement."""
-            tangents = jets_of(r0.x.array)[1:3]
+            # both tangents, whose cross product has the area as its length
+            undeformed_tangents = jets_of(r0.x.array)[1:3]
+            deformed_tangents = undeformed_tangents + jets_of(u.x.array)[1:3]
             area0, area = (
-                np.linalg.norm(np.cross(*a), axis=-1)
-                for a in (tangents, tangents + jets_of(u.x.array)[1:3])
+                np.linalg.norm(np.cross(*tangents), axis=-1)
+                for tangents in (undeformed_tangents, deformed_tangents)
             )
-            factor = natural.volume(tangents, points) if natural and natural_values else 1.0
+            factor = (
+                natural.volume(undeformed_tangents, points) if natural and natural_values else 1.0
+            )
             return np.asarray(1 + thins * (factor * area0 / area - 1)).ravel()
 
         return Memo(values, lambda: (r0.x.array, u.x.array, *(natural_values or ())))
@@ -133,7 +138,8 @@ def penalty(s: Array, k: float, soft_penetration: float) -> tuple[Array, Array, 
     Without penetration (s <= 0) all are zero. The three arrays have the shape of s.
     """
     t = np.maximum(s, 0.0)
-    # beyond: the stiffness is k; the constants make psi and psi' continuous
+    # up to the soft penetration psi is a cubic; beyond, psi'' is k, and the constants make psi and
+    # psi' continuous
     is_full = t > soft_penetration
     second = np.where(is_full, k, k * t / soft_penetration)
     first = np.where(is_full, k * (t - soft_penetration / 2), k * t**2 / (2 * soft_penetration))
@@ -150,9 +156,9 @@ def expanded_penalty(
 ) -> tuple[Array, Array, Array]:
     """Return the Taylor polynomial of the penalty energy about s0, with both derivatives.
 
-    The energy psi(s) is that of `penalty`. The polynomial is of second order, or of third
-    `with_third_order`. Differences over a part of `soft_penetration` are better with the second
-    order; the derivative of the second derivative needs the third.
+    The energy psi(s) is that of `penalty`. The polynomial is of the second order, or of the third
+    `with_third_order`. The second order is better for differences over a part of
+    `soft_penetration`. The third order is needed where psi'' itself is differentiated.
 
     Returns
     -------
@@ -165,29 +171,31 @@ def expanded_penalty(
     third = with_third_order * np.where(
         (s0 > 0) & (s0 <= soft_penetration), k / soft_penetration, 0.0
     )
-    curvature = second + step * third
+    second_at_s = second + step * third
     return (
         value + step * (first + step * (second / 2 + step / 6 * third)),
-        first + step * (second + curvature) / 2,
-        curvature,
+        first + step * (second + second_at_s) / 2,
+        second_at_s,
     )
 
 
 def mean_pressure(s0: Array, s1: Array, k: float, soft_penetration: float) -> tuple[Array, Array]:
-    """Return (psi(s1) - psi(s0))/(s1 - s0) and its derivative by s1.
+    """Return the mean pressure (psi(s1) - psi(s0))/(s1 - s0) and its derivative by s1.
 
-    It is the pressure over a step of penetration from s0 to s1 that conserves energy. Simpson's
-    rule gives it where psi'' has no kink between both: the rule is then exact, and needs no
-    division by s1 - s0, which may be zero.
+    It is the pressure over a step of penetration from s0 to s1 that conserves energy. Between the
+    kinks of psi'' the pressure psi' is a polynomial. Simpson's rule then gives its mean exactly,
+    and needs no division by s1 - s0, which may be zero. Steps over a kink take the quotient.
     """
-    # psi, psi' and psi'' at both penetrations
+    # psi, psi' and psi'' at both penetrations, and in the middle
     (v0, p0, _), (v1, p1, k1) = penalty(s0, k, soft_penetration), penalty(s1, k, soft_penetration)
     _, p_middle, k_middle = penalty((s0 + s1) / 2, k, soft_penetration)
+    # Simpson's rule, and its derivative by s1
     simpson, simpson_slope = (p0 + 4 * p_middle + p1) / 6, (2 * k_middle + k1) / 6
+    # the quotient where a step passes a kink; over a tiny step it would be rounding, and Simpson's
+    # rule is good enough
     kinks = (0.0, soft_penetration)
-    passes_kink = np.digitize(s0, kinks) != np.digitize(s1, kinks)
-    # over a tiny step the quotient is rounding, and Simpson's rule good enough
-    passes_kink &= np.abs(s1 - s0) > PENETRATION_ROUNDING * soft_penetration
-    ds = np.where(passes_kink, s1 - s0, 1.0)  # 1 where the quotient is not used
-    mean = np.where(passes_kink, (v1 - v0) / ds, simpson)
-    return mean, np.where(passes_kink, (p1 - mean) / ds, simpson_slope)
+    takes_quotient = np.digitize(s0, kinks) != np.digitize(s1, kinks)
+    takes_quotient &= np.abs(s1 - s0) > PENETRATION_ROUNDING * soft_penetration
+    ds = np.where(takes_quotient, s1 - s0, 1.0)  # 1 where the quotient is not used
+    mean = np.where(takes_quotient, (v1 - v0) / ds, simpson)
+    return mean, np.where(takes_quotient, (p1 - mean) / ds, simpson_slope)

@@ -119,21 +119,23 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
             if section.stiffness:
                 context.has_modulus(f"joints.{i}.stiffness")
                 _refuse_too_stiff(i, section, context)
-            if section.angle is not None and section.edges[1] in shells:
+            edge, other = section.edges
+            is_t_junction = other in shells  # `other` is then a shell, and else an edge
+            if section.angle is not None and is_t_junction:
                 raise ValueError(
                     f"joints.{i}.angle: of an edge on another shell the spring rests as it is "
                     "placed: leave it out"
                 )
-            edge, other = section.edges  # of a T-junction `other` is a shell
-            if other in shells and edge.startswith(f"{other}_"):
+            if is_t_junction and edge.startswith(f"{other}_"):
                 others = ", ".join(sorted(set(shells) - {other})) or "none"
                 raise ValueError(
                     f"joints.{i}: {other}: is the shell of the edge itself, which joins nothing; "
                     f"allowed: {others}"
                 )
+            # an edge may be joined once; on a shell several edges may be
             for name in section.edges:
                 if name in shells:
-                    continue  # on which several edges may be
+                    continue
                 if name in joined_edges:
                     raise ValueError(
                         f"joints.{i}: {name}: an edge that is joined twice; an edge joins one other"
@@ -155,16 +157,20 @@ class CaseJoints(KeyAbility[Sequence[JointSection]]):
         """Return the joints as the model's `Loads` have them, with stiffnesses over E h R."""
         # a case without springs may have no units, hence no scales
         scales = context.scales if any(section.stiffness for section in self.sections) else None
-        joints = tuple(
-            Joint(
-                (section.edges[0], section.edges[1]),
-                section.kind == "rigid",
-                (section.stiffness or 0.0) / (scales.E * scales.h * scales.R) if scales else 0.0,
-                None if section.angle is None else radians(section.angle),
+        joints = list[Joint]()
+        for section in self.sections:
+            stiffness = 0.0
+            if scales:
+                stiffness = (section.stiffness or 0.0) / (scales.E * scales.h * scales.R)
+            joints.append(
+                Joint(
+                    edges=(section.edges[0], section.edges[1]),
+                    rigid=section.kind == "rigid",
+                    stiffness=stiffness,
+                    angle=None if section.angle is None else radians(section.angle),
+                )
             )
-            for section in self.sections
-        )
-        return {"joints": joints}
+        return {"joints": tuple(joints)}
 
 
 def _refuse_too_stiff(number: int, section: JointSection, context: Context) -> None:
@@ -177,16 +183,19 @@ def _refuse_too_stiff(number: int, section: JointSection, context: Context) -> N
     ValueError
         With the largest stiffness that is allowed.
     """
+    # the least bending stiffness of both shells over the thickness, D/h = E h²/(12 (1 - ν²))
     shells, least_stiffness = context.sections["shells"], inf
     for edge in section.edges:
         shells_of_edge = [name for name in shells if edge == name or edge.startswith(f"{name}_")]
+        if not shells_of_edge:
+            continue
         # "a_b_rim" begins with the names of shells a and a_b: the longest name is the right one
-        for shell in (shells[name].shell for name in sorted(shells_of_edge, key=len)[-1:]):
-            thickness = shell.reference / shell.R_over_h
-            least_stiffness = min(
-                least_stiffness,
-                (shell.modulus or inf) * thickness**2 / (12 * (1 - shell.poisson_ratio**2)),
-            )
+        shell = shells[sorted(shells_of_edge, key=len)[-1]].shell
+        thickness = shell.reference / shell.R_over_h
+        stiffness_of_shell = (
+            (shell.modulus or inf) * thickness**2 / (12 * (1 - shell.poisson_ratio**2))
+        )
+        least_stiffness = min(least_stiffness, stiffness_of_shell)
     stiffness = section.stiffness or 0.0
     if stiffness > MAX_RELATIVE_STIFFNESS * least_stiffness:
         raise ValueError(
@@ -350,23 +359,24 @@ class Creases:
             # pairs, one for each side: jets of placement and displacement, and covectors m normal
             # to the edge in the reference plane
             r0, u, m = edge_arguments[:3]
+            # what is summed over joints: energies of springs, and 1 at a joint
             within_shell, springs, is_joint = density.function(*edge_arguments, **options), 0, 0
             conormals = zip(r0, m, strict=True)
-            # mean over both sides of the undeformed length of the edge over that of the reference
+            # undeformed length of the edge over that of the reference, a mean over both sides
             stretch = sum(kin.conormal(jet, covector)[2] for jet, covector in conormals) / 2
+            # sine and cosine of the angle between the normals: undeformed, and deformed
             undeformed = fold_angle(r0[0], r0[1], m[0])
             sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
             for i in range(count):
+                # 1 between the edges of joint i, where the marks are 1 and -1; 0 elsewhere
                 product = plus[i] * minus[i]
-                # 1 between its edges, where the marks are 1 and -1; 0 elsewhere
                 at_joint = product * (product - 1) / 2
+                # the angle theta_0 at rest: that of the placement, or on the way to the spring's
                 sine_at_rest, cosine_at_rest = undeformed
                 if grow:
-                    angle_of_placement = ufl.atan2(undeformed[0], undeformed[1])
-                    rest_angle = angle_of_placement + growth * has_angle[i] * (
-                        angle[i] - angle_of_placement
+                    sine_at_rest, cosine_at_rest = _sine_and_cosine_at_rest(
+                        undeformed, angle[i], growth * has_angle[i]
                     )
-                    sine_at_rest, cosine_at_rest = ufl.sin(rest_angle), ufl.cos(rest_angle)
                 # theta - theta_0 by sine and cosine, without a jump of the angle at 180 degrees
                 rotation = ufl.atan2(
                     sine * cosine_at_rest - cosine * sine_at_rest,
@@ -378,3 +388,20 @@ class Creases:
 
         added = self.marks, self.stiffness, self.angle, self.has_angle, factor
         return replace(density, function=with_springs, parameters=(*density.parameters, *added))
+
+
+def _sine_and_cosine_at_rest(undeformed: Any, angle: Any, growth: Any) -> tuple[Any, Any]:
+    """Return sine and cosine of the angle at which a spring rests, as UFL expressions.
+
+    Parameters
+    ----------
+    undeformed
+        Sine and cosine of the angle of the placement.
+    angle, growth
+        The spring's own angle (rad), and how far the rest angle has grown to it, from 0 to 1.
+    """
+    import ufl
+
+    angle_of_placement = ufl.atan2(undeformed[0], undeformed[1])
+    rest_angle = angle_of_placement + growth * (angle - angle_of_placement)
+    return ufl.sin(rest_angle), ufl.cos(rest_angle)

@@ -86,7 +86,8 @@ class PlySection(Section):
 
         S are the stresses of plane stress; Q has the unit of the moduli.
         """
-        nu21 = self.nu12 * self.E2 / self.E1  # Q is symmetric
+        # in the axes along and across the fibres, symmetric
+        nu21 = self.nu12 * self.E2 / self.E1
         Q_in_ply_axes = np.array(
             [[self.E1, nu21 * self.E1, 0], [nu21 * self.E1, self.E2, 0], [0, 0, 0]]
         ) / (1 - self.nu12 * nu21)
@@ -141,14 +142,11 @@ class LaminateSection(Section):
     @property
     def isotropic(self) -> bool:
         """Whether the laminate is equally stiff in all directions."""
+        # entries of A, B and D; the differences are zero if A11 = A22 and (A11 - A12)/2 = A66, and
+        # likewise for B and D
         matrices = self.matrices(1.0)
-        # zero if A11 = A22 and (A11 - A12)/2 = A66, and likewise for B and D
-        differences = np.stack(
-            [
-                matrices[:, 0] - matrices[:, 2],
-                (matrices[:, 0] - matrices[:, 1]) / 2 - matrices[:, 5],
-            ]
-        )
+        of_11, of_12, of_22, _, _, of_66 = matrices.T
+        differences = np.stack([of_11 - of_22, (of_11 - of_12) / 2 - of_66])
         return not self.twists and bool(
             np.all(np.abs(differences) <= STIFFNESS_TOLERANCE * np.abs(matrices).max())
         )
@@ -247,8 +245,9 @@ class ShellLaminate(Ability):
             With the key and what is allowed.
         """
         section = self.section
-        # E is nan where youngs_modulus has no unit
-        if section.with_units == isnan(case_sizes(context.shell).E):
+        # both must have units, or neither; E is nan where youngs_modulus has none
+        modulus_has_unit = not isnan(case_sizes(context.shell).E)
+        if section.with_units != modulus_has_unit:
             moduli = (
                 "have a unit: youngs_modulus has none"
                 if section.with_units
@@ -284,7 +283,8 @@ def _laminate_symmetry(section: LaminateSection, geometry: str) -> SymmetryConst
     No plane mirrors a laminate that twists. Other laminates are mirrored by planes that keep the
     direction of the angle 0; they are axisymmetric if this is along the meridians.
     """
-    direction = section.direction(geometry)
+    direction = section.direction(geometry)  # of the angle 0; None along the meridians
+    # why it is not axisymmetric; None if it is
     reason = None
     if section.twists:
         reason = (
@@ -295,17 +295,14 @@ def _laminate_symmetry(section: LaminateSection, geometry: str) -> SymmetryConst
         reason = (
             "the angle 0 of the plies is not along the meridians: give laminate.along: meridian"
         )
-
-    # planes through e3 along and across the direction may be planes of symmetry
-    azimuths = (
-        ()
-        if direction is None  # along the meridians no plane through e3 is preferred
-        else tuple(
-            float(np.arctan2(direction[1], direction[0])) + turn for turn in (0.0, np.pi / 2)
-        )
-    )
     if section.twists:
         return SymmetryConstraint(reason, mirrors=no_plane)
+    # planes through e3 along and across a vector may be planes of symmetry; along the meridians no
+    # plane through e3 is preferred
+    azimuths: tuple[float, ...] = ()
+    if direction is not None:
+        azimuth = float(np.arctan2(direction[1], direction[0]))
+        azimuths = tuple(azimuth + turn for turn in (0.0, np.pi / 2))
     return SymmetryConstraint(
         reason, mirrors=lambda mirror: mirror.keeps_lines(direction), azimuths=azimuths
     )
@@ -314,9 +311,10 @@ def _laminate_symmetry(section: LaminateSection, geometry: str) -> SymmetryConst
 def laminate_account(section: LaminateSection, shell: Any) -> str:
     """Return the line of `magshell check` on a laminate: plies and main stiffnesses."""
     A, B, D = section.matrices(shell.youngs_modulus or 1.0)
-    angles = "/".join(f"{ply.angle:g}" for ply in section.plies[:12]) + (
-        "/..." if len(section.plies) > 12 else ""
-    )
+    # the angles of the first twelve plies
+    angles = "/".join(f"{ply.angle:g}" for ply in section.plies[:12])
+    if len(section.plies) > 12:
+        angles += "/..."
     vector = section.direction(shell.geometry)
     direction_words = (
         "the meridian" if vector is None else f"[{', '.join(f'{v:g}' for v in vector)}]"

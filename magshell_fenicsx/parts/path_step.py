@@ -104,14 +104,15 @@ class PathStep(Step):
                 raise ValueError(
                     f"{key} is a target and must be zero, or at least {LEAST_TARGET:g} in size"
                 )
-        if self.until == "target" and (
-            len(targets) > 1 or not set(targets) <= set(fitting) or not (targets or self._end)
-        ):
+        # until: target needs one target that fits, or has a default
+        has_one_target = len(targets) == 1 or (not targets and bool(self._end))
+        if self.until == "target" and not (has_one_target and set(targets) <= set(fitting)):
             names = " or ".join(fitting) or "another control"
             raise ValueError(
                 f"until: target with control: {self.control} needs {names} (and nothing else) as "
                 f"target; control: arc takes {' or '.join(self.targets)}"
             )
+        # a followed branch may have one target; beside other ends a target is refused or a bound
         follows_branch = self.until == "bifurcation" and self.then == "follow"
         if follows_branch and len(targets) > 1:
             raise ValueError(f"{' and '.join(targets)}: a branch has one target")
@@ -123,6 +124,7 @@ class PathStep(Step):
             )
         if self.until == "limit" and targets:
             self._refuse_unfit_bound(list(targets), fitting)
+        # ends that need arc length
         if self.until in ("points", "zero") and prescribed != "arc":
             why = (
                 "counts steps by arc length"
@@ -130,6 +132,7 @@ class PathStep(Step):
                 else "passes the largest load"
             )
             raise ValueError(f"until: {self.until} {why}: it goes with control: arc")
+        # what follows an instability needs one
         if self.then == "snap" and self.until not in ("limit", "bifurcation"):
             raise ValueError("then: snap: goes with until: limit or until: bifurcation")
         if self.then == "follow" and self.until != "bifurcation":
@@ -224,24 +227,25 @@ class PathStep(Step):
     def first_change(self, change: float, load_start: LoadStart, *, by_load: bool) -> float:
         """Return the change of the amplitude in the first step of a path.
 
-        By default the way to the target has equal parts.
+        By default it is the change up to the target, divided into `points` equal parts.
 
         Parameters
         ----------
         change
-            Change from the begin to the target, which has the sign of the first change; without a
-            target the size of the load.
+            Change from the begin of the path to its target. Without a target it is the size of the
+            load.
         load_start
             The amplitude where the step begins.
         by_load
-            Whether `change` is one of the amplitude; else of the conjugate.
+            Whether `change` is a change of the amplitude; else it is one of the conjugate.
         """
         return change / self.points
 
     def step(self, change: float | None, load_start: LoadStart) -> float | None:
-        """Return the first step of a prescribed conjugate; None if it follows from `first_change`.
+        """Return the first step of the conjugate, where that is prescribed.
 
-        `change` is that of the conjugate from the begin to the target; None without a target.
+        None if `first_change`, of the amplitude, says how the path begins. `change` is that of the
+        conjugate from the begin to the target; None without a target.
         """
         return None
 
@@ -251,23 +255,24 @@ class PathStep(Step):
         The targets divide the way into equal parts. The way begins at zero if the amplitude is
         driven for the first time; targets that earlier steps have passed are left out.
         """
+        # the end of the path: a target or bound, with its value in the unit of its key
         goal = self.target or self.limit_target
         quantity: Prescribed = goal[0].quantity if goal else "load"
         by_load = quantity == "load"
         begin_value = load_start.value if by_load else load_start.conjugate
         end = None if goal is None else goal[1] * (load_start.size if by_load else load_start.unit)
         change = load_start.size if end is None else end - begin_value
-        targets: list[float] = []  # values at which the path must have a point
+        # values at which the path must have a point: ahead of the begin, in the direction of change
+        targets: list[float] = []
         if end is not None and (self.until == "target" or self.limit_target):
             begin = begin_value if load_start.is_driven else self.begin(begin_value)
             targets = [float(t) for t in np.linspace(begin, end, self.points + 1)[1:]]
             targets = [t for t in targets if (t - begin_value) * change > 0]
         if self.until == "zero":  # back to the load zero, past the largest load
             targets = [0.0]
-        first_change, first_step = (
-            self.first_change(change, load_start, by_load=by_load),
-            self.step(None if goal is None else change, load_start),
-        )
+        # how it begins
+        first_change = self.first_change(change, load_start, by_load=by_load)
+        first_step = self.step(None if goal is None else change, load_start)
         return Drive(
             self.prescribed,
             quantity,
@@ -355,6 +360,7 @@ class FactorStep(LoadStep):
 
     section: ClassVar[str]
     label: ClassVar[Literal["", "field"]] = ""
+    # whether the program has put the step before the load, which the case alone gives
     _alone: bool = PrivateAttr(default=False)
 
     @property
@@ -375,7 +381,7 @@ class FactorStep(LoadStep):
         is_driven = loading is not None and cls.amplitude in (loading.amplitude, *loading.drives)
         if is_driven or not cls.asked_for(context):
             return []
-        (kind,) = get_args(cls.model_fields["kind"].annotation)
+        (kind,) = get_args(cls.model_fields["kind"].annotation)  # the one word of its Literal
         step = cls.model_validate({"kind": kind})
         step._alone = True
         return [(cls.section, step)]

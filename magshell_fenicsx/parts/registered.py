@@ -146,15 +146,16 @@ class WithOwnTerms(Section):
         """
         # "key.below: name: ..." or "key.below: ..."
         match = re.match(r"([a-z]\w*(?:\.\w+)*): (?:([\w.]+): )?", message)
-        if (
-            not (match and self._origin.place)
-            or match[1].split(".")[0] not in type(self).model_fields
-        ):
+        if not (match and self._origin.place):
             return message
+        keys, name = match[1].split("."), match[2]
+        if keys[0] not in type(self).model_fields:
+            return message
+        if name:
+            keys.append(name)
         # numbers are positions in lists
-        keys = [*match[1].split("."), *([match[2]] if match[2] else [])]
-        path = tuple(int(key) if key.isdecimal() else key for key in keys)
-        return f"{self._origin.place(path)}: {message}"
+        location = tuple(int(key) if key.isdecimal() else key for key in keys)
+        return f"{self._origin.place(location)}: {message}"
 
     @property
     def own_terms(self) -> tuple[OwnTerm, ...]:

@@ -66,6 +66,7 @@ def c_compiler() -> tuple[str, ...]:
     NoCompiler
         If there is no compiler.
     """
+    # the one that CC names; nothing else is tried
     if CC_value := os.environ.get("CC"):
         try:
             command = tuple(shlex.split(CC_value))
@@ -74,6 +75,7 @@ def c_compiler() -> tuple[str, ...]:
         if not command or not shutil.which(command[0]):
             raise NoCompiler(f"CC={CC_value}: there is no such compiler; {HINT}")
         return command
+    # that of Python, the usual ones, and Zig's
     for name in (sysconfig.get_config_var("CC"), *USUAL_COMPILERS):
         command = tuple(shlex.split(name or ""))
         if command and shutil.which(command[0]):
@@ -285,12 +287,13 @@ def compile_libraries(
     try:
         while missing := [library for library in libraries if not library.is_compiled]:
             tell(len(libraries) - len(missing))
+            # start compilations: one more than there are cores, whose code waits for a free core
             for library in missing:
-                # <=: one more than cores, whose code then waits for a free core
                 if not library.running_compilation and len(_running(missing)) <= cores():
                     library.start()
                     tell(sum(library.is_compiled for library in libraries))
-            # else other processes compile all that is missing: their files are looked for
+            # wait for one of them; without any, other processes compile all that is missing, and
+            # their files are looked for again
             if running := _running(missing):
                 wait(running, PROGRESS_SECONDS, FIRST_COMPLETED)
             else:
@@ -377,7 +380,7 @@ def _compile(source: str, options: tuple[str, ...], file: Path) -> None:
         If the compiler fails for any code, or for this code.
     """
     compiler = c_compiler()
-    # tempfile adds eight characters to the prefix
+    # abandoned scratch folders: tempfile adds eight characters to the prefix
     for abandoned in file.parent.glob(f"{file.stem}????????/"):
         shutil.rmtree(abandoned, ignore_errors=True)
     with (

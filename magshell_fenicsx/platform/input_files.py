@@ -225,6 +225,7 @@ def read_vtk(content: bytes, suffix: str) -> "pyvista.DataSet":
     import pyvista  # VTK takes long to import
     from vtkmodules.vtkCommonCore import vtkObject
 
+    # messages are switched off meanwhile, and back to what they were
     vtk_warnings = vtkObject.GetGlobalWarningDisplay()
     logging_level = logging.root.manager.disable
     with TemporaryDirectory() as folder, warnings.catch_warnings():
@@ -247,15 +248,16 @@ def _vtk_declared_bytes(content: bytes) -> int:
 
     It is an upper estimate for XML files: each array counts as long as the longest.
     """
+    # a legacy file: points and cells count as three floats each, fields as their width times count
     if b"<VTKFile" not in content[:4096]:
         counts = [prod(map(int, numbers)) for numbers in LEGACY_GRID.findall(content)]
         counts += [int(numbers) for numbers in LEGACY.findall(content)]
         fields = [int(width) * int(count) for width, count in LEGACY_ARRAY.findall(content)]
-        return 8 * (3 * max(counts, default=0) + sum(fields))  # floats; points have three
+        return 8 * (3 * max(counts, default=0) + sum(fields))
+    # an XML file: the points of structured grids, from first and last index in each direction
     extents = [
         [int(n) for n in re.findall(rb"-?\d+", numbers)] for numbers in EXTENT.findall(content)
     ]
-    # of a structured grid: first and last index in each direction
     points = [
         prod(abs(b - a) + 1 for a, b in zip(extent[::2], extent[1::2], strict=False))
         for extent in extents

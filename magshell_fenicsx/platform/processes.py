@@ -142,6 +142,7 @@ def measure(
             module,
             *arguments,
         ]
+        # run it, with its output in files
         output, errors = Path(scratch) / "output", Path(scratch) / "errors"
         with output.open("wb") as stdout, errors.open("wb") as stderr:
             start = time.perf_counter()
@@ -159,7 +160,7 @@ def measure(
                 process.wait()
                 raise
             wall_s = time.perf_counter() - start
-        # wait4 has reaped the process, so Popen must not wait for it
+        # what it has used; wait4 has reaped the process, so Popen must not wait for it
         process.returncode = os.waitstatus_to_exitcode(status)
         peaks = [int(file.read_text(encoding="utf-8")) for file in Path(scratch).glob("peak.*")]
         return Usage(
@@ -205,16 +206,17 @@ def on_first_rank(comm: "MPI.Comm", do: Callable[[], Result]) -> Result:
     """
     if comm.size == 1:
         return do()
+    # rank 0 sends a pair of result and error, one of which is None
     pickled, failure = b"", None
     if comm.rank == 0:
         try:
             pickled = pickle.dumps((do(), None))
         except Exception as e:
             failure, pickled = e, _pickled(e)
-    # a pair of result and error, as `_pickled` makes it too
     pickled = comm.bcast(pickled)
+    # rank 0 raises the error itself, with its traceback; the others raise the one that was sent
     if failure:
-        raise failure  # with its traceback
+        raise failure
     result: Result
     result, failure = pickle.loads(pickled)
     if failure:
@@ -237,12 +239,14 @@ def raise_on_all_ranks(comm: "MPI.Comm", do: Callable[[], object]) -> None:
         if comm.size == 1:
             raise
         failure = e
-    # errors of all ranks in order, empty where there is none; a rank prefers its own
-    for pickled_error in (
-        comm.allgather(_pickled(failure) if failure else b"") if comm.size > 1 else ()
-    ):
-        if pickled_error:
-            raise failure or pickle.loads(pickled_error)[1]
+    if comm.size == 1:
+        return
+    # errors of all ranks in order, empty where there is none; a rank raises its own, or else the
+    # first one
+    pickled_errors = comm.allgather(_pickled(failure) if failure else b"")
+    first_error = next(filter(None, pickled_errors), None)
+    if first_error:
+        raise failure or pickle.loads(first_error)[1]
 
 
 def _pickled(e: Exception) -> bytes:

@@ -110,9 +110,8 @@ def live_line(ranks: int, say: Say) -> Iterator[tuple[Say, Say]]:
     def rewrite(line: str) -> None:
         """Show a line of parts, separated by two spaces, as far as it fits, as the status line."""
         nonlocal status_line
-        status_line = fit_to_columns(
-            line.split("  "), max(0, shutil.get_terminal_size().columns - RESERVED_COLUMNS)
-        )
+        columns = max(0, shutil.get_terminal_size().columns - RESERVED_COLUMNS)
+        status_line = fit_to_columns(line.split("  "), columns)
         write(f"{ERASE_LINE}{status_line}")
 
     def end(number: int, frame: FrameType | None) -> None:
@@ -134,12 +133,13 @@ def _plain_output(say: Say) -> Iterator[tuple[Say, Say]]:
 
     The second is for statuses. A thread repeats the last status while nothing else is printed.
     """
-    last, status = time.monotonic(), ("", 0.0)  # time of the last line; last status and its time
+    last = time.monotonic()  # time of the last line
+    status = "", 0.0  # last status and its time
     lock, ended = threading.Lock(), threading.Event()
 
     def stay(line: str) -> None:
         nonlocal last
-        with lock:
+        with lock:  # the thread prints too
             last = time.monotonic()
             say(line)
 
@@ -154,7 +154,8 @@ def _plain_output(say: Say) -> Iterator[tuple[Say, Say]]:
         """Print the last status again and again while nothing else is printed, until the end."""
         with suppress(BrokenPipeError):  # which ends the program where it prints next
             while not ended.wait(POLL_FRACTION * STATUS_SECONDS):
-                (line, status_time), time_now = status, time.monotonic()
+                line, status_time = status
+                time_now = time.monotonic()
                 if line and time_now - last >= (1 - POLL_FRACTION) * STATUS_SECONDS:
                     stay(f"{line}  (for {time_now - status_time:.0f} s)")
 

@@ -182,38 +182,52 @@ def refined_squares(
     if isinstance(shape, MeshFile):
         return None
     low, high = extent(shape)
-    # first squares: as many as may be, at most as wide as the chart, and not too large
+    # the first squares are not wider than the chart, and not more than MAX_FIRST_SQUARES
     least_side = float(np.sqrt(np.prod(high - low) / MAX_FIRST_SQUARES))
     first_side = side = max(min(FIRST_SIDE, *(high - low)), least_side)
-    counts = [ceil((b - a) / side - 1e-9) for a, b in zip(low, high, strict=True)]
-    centres_along_axes = [a + side * (np.arange(n) + 0.5) for a, n in zip(low, counts, strict=True)]
-    centres: Array = np.stack(np.meshgrid(*centres_along_axes, indexing="ij"), axis=-1).reshape(
-        -1, 2
-    )
-    groups = list[tuple[Array, Array, Array]]()  # centres, sides and element sizes
+    centres = _covering_squares(low, high, side)
+    # results of each round: centres, sides and element sizes of squares
+    groups = list[tuple[Array, Array, Array]]()
+    # each round treats squares of one side; the next round has the quarters of some of them
     while len(centres) and len(centres) <= MAX_SQUARES:
-        chart = centres[:, None] + side * LOCAL  # samples (squares, n, 2)
+        # samples (squares, n, 2) of the squares, without squares that lie off the chart
+        chart = centres[:, None] + side * LOCAL
         on_chart = within_chart(shape, chart)
         has_samples = on_chart.any(axis=1)
         centres, chart, on_chart = centres[has_samples], chart[has_samples], on_chart[has_samples]
+        # the element size that each square needs
         x = places(chart.reshape(-1, 2)).reshape(*chart.shape[:2], 3)
         needed_size = sizes(x, on_chart, side)
-        # squares that are neither divided nor need elements smaller than the first are left out
-        divided = (needed_size < side) & (side > min_size)
         bounded_size = np.maximum(needed_size, min_size)
-        is_refined = ~divided & (bounded_size < first_side)
-        sides = np.full(int(is_refined.sum()), side)
-        groups.append((centres[is_refined], sides, bounded_size[is_refined]))
+        # a square is divided, or kept if it needs small elements, or left out
+        is_divided = (needed_size < side) & (side > min_size)
+        is_kept = ~is_divided & (bounded_size < first_side)
+        sides = np.full(int(is_kept.sum()), side)
+        groups.append((centres[is_kept], sides, bounded_size[is_kept]))
         side /= 2
-        offsets = side / 2 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
-        centres = (centres[divided][:, None] + offsets).reshape(-1, 2)
-    if len(centres):  # so many that they all get the least size that can be paid for
+        centres = _centres_of_quarters(centres[is_divided], side)
+    # squares are left if there are too many to go on: all get elements as large as themselves
+    if len(centres):
         sides = np.full(len(centres), side)
         groups.append((centres, sides, np.full(len(centres), max(side, min_size))))
     if not sum(len(sides) for _, sides, _ in groups):
         return None
     all_centres, all_sides, all_sizes = (np.concatenate(v) for v in zip(*groups, strict=True))
     return SquaresFeature(all_centres, all_sides / 2, all_sizes)
+
+
+def _covering_squares(low: Array, high: Array, side: float) -> Array:
+    """Return the centres (n, 2) of equal squares that cover the box between two corners (2,)."""
+    counts = [ceil((b - a) / side - 1e-9) for a, b in zip(low, high, strict=True)]
+    centres_along_axes = [a + side * (np.arange(n) + 0.5) for a, n in zip(low, counts, strict=True)]
+    grid = np.meshgrid(*centres_along_axes, indexing="ij")
+    return np.asarray(np.stack(grid, axis=-1).reshape(-1, 2))
+
+
+def _centres_of_quarters(centres: Array, side: float) -> Array:
+    """Return the centres (4 n, 2) of the quarters of n squares; a quarter has the given side."""
+    offsets = side / 2 * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+    return (centres[:, None] + offsets).reshape(-1, 2)
 
 
 def extent(shape: PlaneShape | Grid) -> tuple[Array, Array]:
@@ -245,6 +259,7 @@ def adaptive_cells(formulas: FormulaGroup, outline: Outline) -> RefinedParts:
         The undivided cells, each with area, centre, size and the variance of the formulas in it.
     """
     shape = outline.chart(None, ANY_GRADING)
+    # corners of the first triangles, and the map of their points to places in space
     if isinstance(shape, MeshFile):
         mesh = read_msh(shape, {})
         triangles, embedding = mesh.nodes[mesh.cells[:, :3]], space_embedding
@@ -253,8 +268,10 @@ def adaptive_cells(formulas: FormulaGroup, outline: Outline) -> RefinedParts:
         radius = shape.reach if isinstance(shape, DiscShape) else None
 
         def embedding(x: Array) -> Array:
-            """Return the places (n, 3) of points (n, 2) of the chart, or of a disc's square."""
-            # from the square around the disc onto it, with its sides onto the circle
+            """Return the places (n, 3) of points (n, 2) of the chart, or of a disc's square.
+
+            The square around a disc is mapped onto the disc, and its sides onto the circle.
+            """
             on_disc = x * np.sqrt(1 - (x[:, ::-1] / radius) ** 2 / 2) if radius else x
             return outline.perfect(on_disc)
 
@@ -273,6 +290,7 @@ def adaptive_cells(formulas: FormulaGroup, outline: Outline) -> RefinedParts:
         area = np.linalg.norm(np.cross(x[:, 1] - x[:, 0], x[:, 2] - x[:, 0]), axis=1) / 2
         return x, area
 
+    # one part for each triangle: all of it
     reference = SubCells(np.zeros(1, np.int64), np.zeros((1, 2)), np.ones((1, 2)))
     undivided = reference.in_each_cell(np.arange(len(triangles)))
     return refine_where_hidden(formulas, undivided, places_and_areas, lattice, len(triangles))
@@ -286,7 +304,8 @@ def _chart_triangles(shape: PlaneShape | Grid) -> Array:
     low, high = extent(shape)
     t = [np.linspace(a, b, ceil((b - a) / FIRST_SIDE) + 1) for a, b in zip(low, high, strict=True)]
     corners = np.stack(np.meshgrid(*t, indexing="ij"), axis=-1)
-    # the four corners of each rectangle: views of the grid of corners, shifted along its axes
+    # a, b, c, d are the four corners of all rectangles, as parts of the grid of corners: along an
+    # axis, 0 leaves out the last corner ([0:-1]), and 1 leaves out the first ([1:None])
     a, b, c, d = (corners[i : i - 1 or None, j : j - 1 or None] for i in (0, 1) for j in (0, 1))
     return np.concatenate(
         [np.stack(three, axis=-2).reshape(-1, 3, 2) for three in ((a, b, c), (d, c, b))]
@@ -296,8 +315,8 @@ def _chart_triangles(shape: PlaneShape | Grid) -> Array:
 def narrow_places(leaves: Sequence[RefinedParts]) -> Array:
     """Return places (n, 3) over R at which formulas have values that samples may miss.
 
-    These are the centres of small adaptive cells: of each division those with the largest share of
-    the variance, and some of the others.
+    These are the centres of small adaptive cells. Of each division they are those of the
+    `MAX_NARROW_PLACES` cells with the largest variance, and of about as many of the others.
 
     Parameters
     ----------
@@ -307,10 +326,9 @@ def narrow_places(leaves: Sequence[RefinedParts]) -> Array:
     places: list[Array] = [np.zeros((0, 3))]
     for cells in leaves:
         narrow_cells = np.flatnonzero(cells.size < NARROW_SIZE)
-        by_variance = narrow_cells[
-            np.argsort(-cells.area[narrow_cells] * cells.variance[narrow_cells])
-        ]
-        # of those after the first, every so many: as many again
+        negative_variance = -cells.area[narrow_cells] * cells.variance[narrow_cells]
+        by_variance = narrow_cells[np.argsort(negative_variance)]  # the largest comes first
+        # the first cells, and every so many of the rest
         stride = max(1, len(by_variance) // MAX_NARROW_PLACES)
         places.append(cells.centre[by_variance[:MAX_NARROW_PLACES]])
         places.append(cells.centre[by_variance[MAX_NARROW_PLACES::stride]])
@@ -333,7 +351,7 @@ def polynomial_sizes(values: Callable[[Array], Array], leaves: RefinedParts | No
         Division of the surface that shows the formulas, see `adaptive_cells`; None where nothing is
         hidden between samples.
     """
-    # kept from call to call: squares get smaller, and see more
+    # mean and variance are kept from call to call: smaller squares see more of the variance
     variance: float = 0.0
     variance_of_leaves: float = float(leaves.area @ leaves.variance) if leaves else 0.0
     mean: Array | None = None
@@ -345,22 +363,19 @@ def polynomial_sizes(values: Callable[[Array], Array], leaves: RefinedParts | No
         call, with smaller squares.
         """
         nonlocal variance, mean
+        # values less their mean in the first, largest squares, which cover the surface
         f = values(x.reshape(-1, 3)).reshape(*x.shape[:2], -1)
         is_valid = on_chart & np.isfinite(f).all(axis=-1)
-        # of the first, largest squares, which cover the surface
         mean = f[is_valid].mean(axis=0) if mean is None else mean
         f = np.where(is_valid[..., None], f - mean, 0.0)
-        missed = f - BASIS @ (BASIS.T @ f)  # what the polynomial of least squares leaves
-        # squares with invalid samples: the basis is orthonormal only on the valid ones by a new QR
-        for i in np.flatnonzero(~is_valid.all(axis=1)):
-            Q = np.linalg.qr(BASIS[is_valid[i]])[0]
-            missed[i], g = 0.0, f[i][is_valid[i]]
-            missed[i][is_valid[i]] = g - Q @ (Q.T @ g)
+        missed = _missed_by_polynomials(f, is_valid)
+        # variance of all squares, and what the polynomial of each square misses of it
         area = (side / SAMPLES) ** 2  # of the chart, for each sample
         variance = max(variance, area * float((f**2).sum()))
         if variance < SAMPLED_SHARE * variance_of_leaves:  # the samples miss most of it
             variance = variance_of_leaves
         missed_variance = area * (missed**2).sum(axis=(1, 2))
+        # what adaptive cells show and samples miss
         if leaves:
             middle = x[:, len(LOCAL) // 2 + SAMPLES // 2]  # the sample nearest to the centre
             sampled = area * (f**2).sum(axis=(1, 2))
@@ -373,6 +388,27 @@ def polynomial_sizes(values: Callable[[Array], Array], leaves: RefinedParts | No
         return np.where(is_resolved, side, side / 2)
 
     return sizes
+
+
+def _missed_by_polynomials(f: Array, is_valid: Masks) -> Array:
+    """Return what polynomials of least squares leave of samples, zero at invalid samples.
+
+    Parameters
+    ----------
+    f
+        (squares, n, formulas) samples, zero where they are invalid.
+    is_valid
+        (squares, n) whether each sample is on the chart and finite.
+    """
+    missed = f - BASIS @ (BASIS.T @ f)
+    # on the valid samples of a square alone, the basis is not orthonormal: a QR makes one that is
+    for square in np.flatnonzero(~is_valid.all(axis=1)):
+        valid = is_valid[square]
+        Q = np.linalg.qr(BASIS[valid])[0]
+        valid_f = f[square][valid]
+        missed[square] = 0.0
+        missed[square][valid] = valid_f - Q @ (Q.T @ valid_f)
+    return np.asarray(missed)
 
 
 def _unsampled_variance(leaves: RefinedParts, middle: Array, side: float, sampled: Array) -> Array:
@@ -391,9 +427,11 @@ def _unsampled_variance(leaves: RefinedParts, middle: Array, side: float, sample
     sampled
         (squares,) the integral by the samples.
     """
+    # the square of each cell: that of the nearest centre; the distance is infinite without one
     tree = scipy.spatial.cKDTree(middle)
     distance, square = tree.query(leaves.centre, distance_upper_bound=side)
     in_square = np.isfinite(distance) & (leaves.size < side)
+    # the sum over the cells of each square
     integral_of_leaves = (leaves.area * leaves.variance)[in_square]
     integral = np.bincount(square[in_square], integral_of_leaves, len(middle))
     return np.where(sampled < SAMPLED_SHARE * integral, integral, 0.0)
@@ -440,8 +478,9 @@ def imperfection_refinements(
 ) -> tuple[list[SquaresFeature], float]:
     """Return where imperfections without a centre need small elements.
 
-    Squares with small elements are worth while (local) if they need less than half the elements of
-    a mesh of equal ones. Imperfections with a centre bring their own element sizes.
+    An imperfection counts as local if a mesh with small elements in its squares has less than half
+    the elements of one that is as fine everywhere. Imperfections with a centre bring their own
+    element sizes.
 
     Parameters
     ----------
@@ -466,6 +505,7 @@ def imperfection_refinements(
         return perfect.perfect(chart) @ Q
 
     for imperfection in imperfections:
+        # None if the imperfection has one size everywhere, or no square needs small elements
         squares = imperfection.sizes and refined_squares(
             places, perfect, _least_sizes(imperfection.sizes), MIN_IMPERFECTION_SQUARE * h
         )
@@ -473,15 +513,23 @@ def imperfection_refinements(
             size_everywhere = min(size_everywhere, imperfection.size)
             continue
         assert not isinstance(shape, MeshFile)  # it has no squares
-        low, high = extent(shape)
-        # elements of a mesh that is everywhere as fine as the finest square, and of a graded one
-        cells_of_equal_size = PER_AREA * float(np.prod(high - low)) / squares.size**2
-        graded_cells = squares.cells(float(np.linalg.norm(high - low)) / 2)
-        if graded_cells < GRADED_MESH_GAIN * cells_of_equal_size:
+        if _saves_elements(squares, shape):
             local.append(squares)
         else:
             size_everywhere = min(size_everywhere, squares.size)
     return local, size_everywhere
+
+
+def _saves_elements(squares: SquaresFeature, shape: PlaneShape | Grid) -> bool:
+    """Return whether a mesh that is fine in squares alone has far fewer elements.
+
+    It is compared with a mesh that is everywhere as fine as the finest square; see
+    `GRADED_MESH_GAIN`.
+    """
+    low, high = extent(shape)
+    cells_of_equal_size = PER_AREA * float(np.prod(high - low)) / squares.size**2
+    graded_cells = squares.cells(float(np.linalg.norm(high - low)) / 2)
+    return graded_cells < GRADED_MESH_GAIN * cells_of_equal_size
 
 
 def _least_sizes(size_at: Callable[[Array], Array]) -> Sizes:
@@ -530,16 +578,19 @@ def _unresolved_formula(
     """Return messages about what the cells miss of the formulas of one key; collective.
 
     `Q` (3, 3) turns places of the cells' frame into that of the case; `h` is the thickness over R.
-    The messages name errors of the integral, of the stiffness, or of the integral of the square.
-    The cells have the polynomial `fit` in place of the formula. Its relative errors are `missed`,
-    of the integral, and `rest`, in the root of the mean square; `open` is a part not yet seen, and
-    `widest` the largest cell that misses something.
+    One message may be on details that were not seen, and one on an error: that of the integral, of
+    the stiffness or of the integral of the square, whichever is the first that is too large.
+
+    In place of the formula the cells have a polynomial, `fit`. Its relative errors are
+    `fit.missed`, of the integral, and `fit.rest`, the root of the mean square. `fit.open` is the
+    part of the variation not yet seen, and `fit.widest` the largest cell that misses something.
     """
     spec, element, messages = key_formulas.spec, cells.element, list[str]()
 
     def values(x: Array, n: Array) -> Array:
         return key_formulas.values_at(x.reshape(-1, 3) @ Q).reshape(*x.shape[:-1], -1)
 
+    # the polynomial of each cell
     x, normals, _ = cells.evaluate(element.points)
     is_thickness = spec.key == THICKNESS
     fit = project_formula(
@@ -558,9 +609,10 @@ def _unresolved_formula(
             "variation may not be seen"
         )
     stiffness_error = _stiffness_error(values, cells, fit.nodal) if is_thickness else 0.0
-    # of deformed places there is no integral that could stay exact
+    # over deformed places the integral is not exact: a large error of the square counts as its own
     counts_square = spec.deformed and missed_square > SQUARE_TOLERANCE
     missed_integral = max(fit.missed, missed_square if counts_square else 0.0)
+    # a load on elements small enough for it may be smoothed
     is_resolved_load = spec.load and fit.widest < RESOLVED_LOAD * LOAD_SIZE * sqrt(h)
     if missed_integral > INTEGRAL_TOLERANCE:
         messages.append(
@@ -604,35 +656,47 @@ def _stiffness_error(
     float
         The error over the exact value, both summed over all cells.
     """
-    # points (n, 2) in the reference cell and their weights (n,), of all parts into which it is cut
+    # quadrature: points (n, 2) in the reference cell and weights (n,) of all parts that it is cut
+    # into; places, normals and areas of all cells there
     X, w = (v.reshape(-1, *v.shape[2:]) for v in sampling_points(cells))
     x, normals, area = cells.evaluate(X)
     cell_type, degree = cells.element.cell_type, max(cells.element.degree - 2, 0)
     curvatures = basix.create_element(
         basix.ElementFamily.P, cell_type, degree, basix.LagrangeVariant.legendre, discontinuous=True
     )
-    # t is the exact factor of thickness, p the polynomial of the cells
+    # at these points: basis functions phi of curvatures, the exact thickness factor t, and the
+    # cells' polynomial p of it
     phi, weight = curvatures.tabulate(0, X)[0, :, :, 0], (area * w)[..., None]
     t, p = values(x, normals), np.matmul(cells.element.tabulate(0, X)[0, :, :, 0], nodal)
-    # minimum of the bending energy: compliance = m A^-1 m, with the stiffness A of the curvatures
+    # compliance of each cell (c) under a constant moment: m A^-1 m, with the integrals m of phi_i
+    # and A of p^3 phi_i phi_j over its points (q)
     moment = np.einsum("cq,qi->ci", area * w, phi)
     A = np.einsum("cq,cq,qi,qj->cij", area * w, p[..., 0] ** 3, phi, phi, optimize=True)
     compliance = np.einsum("ci,ci->c", moment, np.linalg.solve(A, moment[..., None])[..., 0])
     stiffness = (weight * p**3).sum(axis=(1, 2))
+    # stiffness and compliance (cells, 2) of the exact thickness, and their errors
     exact_values = np.stack([(weight * t**n).sum(axis=(1, 2)) for n in (3, -3)], axis=1)
     error = np.abs(exact_values - np.stack([stiffness, compliance], axis=1))
-    middle = x.mean(axis=1)
-    # position of each cell in the box around the shell, from -1 to 1
-    low = np.min(cells.comm.allgather(x.min(axis=(0, 1), initial=inf)), axis=0)
-    high = np.max(cells.comm.allgather(x.max(axis=(0, 1), initial=-inf)), axis=0)
-    position = (middle - (low + high) / 2) / np.maximum((high - low) / 2, MIN_EXTENT)
-    # squares of moments: constant, and falling to zero along each axis in either direction
+    # squares (cells, 7) of moments: constant, and falling to zero along each axis either way
+    position = _positions_in_box(x, cells.comm)
     moments = [np.ones((len(x), 1)), (1 + position) ** 2, (1 - position) ** 2]
     squared_moments = np.concatenate(moments, axis=1)
+    # the largest relative error (2, 7) of the sums over all cells with these weights
     error_integral, exact_integral = (
         cells.sum_over_ranks(v[..., None] * squared_moments[:, None]) for v in (error, exact_values)
     )
     return float((error_integral / exact_integral).max())
+
+
+def _positions_in_box(x: Array, comm: MPI.Comm) -> Array:
+    """Return positions (cells, 3) in the box around the shell, -1 to 1 along axes; collective.
+
+    The position of a cell is the mean of its places; `x` (cells, n, 3) are those of this rank.
+    """
+    middle = x.mean(axis=1)
+    low = np.min(comm.allgather(x.min(axis=(0, 1), initial=inf)), axis=0)
+    high = np.max(comm.allgather(x.max(axis=(0, 1), initial=-inf)), axis=0)
+    return np.asarray((middle - (low + high) / 2) / np.maximum((high - low) / 2, MIN_EXTENT))
 
 
 def cells_of_patch(patch: PatchMesh, degree: int) -> CellGeometry:

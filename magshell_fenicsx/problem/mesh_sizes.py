@@ -151,26 +151,26 @@ def grading(
         Whether the shell has local imperfections.
     """
     mesh = mesh_section(context)
+    # one size everywhere, without features
     if mesh.size is not None or isinstance(context.shell, MeshSurface):
         default = min(UNIFORM_SIZE * sqrt(h), MAX_SIZE)
         size = mesh.size / context.shell.reference if mesh.size else default
-        # no features
         return Grading([], size / mesh.refinement)
+    # small elements along edges, and where parts need them
     sizing = SizingContext(h, mesh.refinement, context.solid, local)
     growth = _growth(context, sizing)
     features = _edge_features(context, outline, sizing)
     for part in refined:
         features += part.features(outline, sizing, growth)
-    # loads of one class at a place share their small elements; a dict keeps the order
+    # at loads: those of one class at a place share their small elements; a dict keeps the order
     for place, loads in loaded:
         for load_class in {type(load): None for load in loads}:
-            features += load_class.mesh_features(
-                [load for load in loads if type(load) is load_class], place, sizing
-            )
+            loads_of_class = [load for load in loads if type(load) is load_class]
+            features += load_class.mesh_features(loads_of_class, place, sizing)
+    # where formulas vary
     features += varying
-    return Grading(
-        features, min(_largest_size(context, outline, sizing), largest) / mesh.refinement
-    )
+    largest_size = min(_largest_size(context, outline, sizing), largest)
+    return Grading(features, largest_size / mesh.refinement)
 
 
 def _largest_size(context: Context, outline: "Outline", sizing: SizingContext) -> float:
@@ -192,7 +192,7 @@ def _growth(context: Context, sizing: SizingContext) -> float:
 def _edge_features(context: Context, outline: "Outline", sizing: SizingContext) -> list[Feature]:
     """Return small elements along held edges of a grid, or along the rim of a curved disc.
 
-    Flat shapes and discs have none.
+    A curved disc is the chart of a sphere, for example. Flat shapes have none.
     """
     h, growth = sizing.h, _growth(context, sizing)
     if grid := outline.grid:
@@ -200,11 +200,12 @@ def _edge_features(context: Context, outline: "Outline", sizing: SizingContext) 
         size = GRID_EDGE_SIZE * sqrt(h) / sizing.refinement
         conditions = boundary.conditions() if boundary else {}
         features = list[Feature]()
+        # the sides are the low and the high one of the first axis, then those of the second
         for i, name in enumerate(grid.sides):
-            axis, end = i // 2, (grid.low, grid.high)[i % 2]  # low and high side of each axis
+            axis, corner = i // 2, (grid.low, grid.high)[i % 2]
             is_held = conditions.get(name, "free") not in ("free", "symmetry")
             if is_held and not grid.glued[axis]:
-                features.append(LineFeature(axis, end[axis], size, growth))
+                features.append(LineFeature(axis, corner[axis], size, growth))
         return features
     if not outline.disc or context.shell.geometry == "disc":
         return []

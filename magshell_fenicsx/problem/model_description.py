@@ -35,6 +35,7 @@ def describe_model(
     rims
         Number of different rims of dimples besides the pole's.
     """
+    # the law, and what each part of the case has to say
     body = solid_body_of(context)
     included = [model, _body_text(body) if body else _law_text(context)]
     left_out = list[str]()
@@ -47,12 +48,14 @@ def describe_model(
     for step in {step.name: step for step in context.steps}.values():
         if text := step.load.account(step, context):
             included.append(text)
+    # sections of the case that may be absent
     parts = parts_of(context)
     for key, part in PART_CLASSES.items():
         if key in parts:
             included.append(parts[key].account(context.scales))
         else:
             left_out.append(part.absent)
+    # what a reduced model leaves out
     if model == "meridian":
         contact_words = ""
         if loads.pairs:

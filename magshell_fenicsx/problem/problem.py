@@ -95,6 +95,7 @@ def layer_bounds(context: Context) -> list[float]:
     mid-surface, where nodes then lie. Without such layers all elements are equally thick.
     """
     element_count, magnetic = _solid_section(context).layers, context.section_of(MagneticSection)
+    # layers of the remanence, from the inner face outwards
     remanent = magnetic and magnetic.remanent
     magnetised = (remanent and remanent.layers) or []
     if not magnetised:
@@ -103,6 +104,7 @@ def layer_bounds(context: Context) -> list[float]:
     layer_tops = [
         sum(layer.fraction for layer in magnetised[: n + 1]) for n in range(len(magnetised) - 1)
     ]
+    # heights at which elements must end; each interval between them is divided equally
     inner_bounds = {MIDSURFACE_HEIGHT, *(round(top, HEIGHT_DIGITS) for top in layer_tops)}
     bounds = [0.0]
     for low, high in pairwise([0.0, *sorted(inner_bounds), 1.0]):
@@ -408,10 +410,11 @@ class Problem:
         """
         if not (isinstance(self.mirror, Sector) and isinstance(shape, DiscShape)):
             return triangulate(shape, self.size, self.points, self.embedding)
+        # points in the first half of the sector, or their images there
         middle_plane = Mirror.through_axis(self.mirror.angle / 2)
         points = dict[str, NDArray[np.float64]]()
         for name, chart in self.points.items():
-            x = np.append(chart, 0.0)  # a mirror is of space
+            x = np.append(chart, 0.0)  # a mirror reflects points (3,) of space
             in_first_half = middle_plane.signed_distance(x) <= 0
             points[name] = (x if in_first_half else middle_plane.image(x))[:2]
         half_shape = replace(shape, waves=2 * self.mirror.waves)
@@ -438,11 +441,11 @@ class Problem:
             patch = grid_mesh(self.shape, self.points, self.embedding)
         else:
             patch = self._triangulated_by_gmsh(self.shape)
-        # other shapes are made as halves, and the chart of a sector is narrower
-        # whether the mesh has both sides of the mirror plane, so that it must be cut
-        is_complete = isinstance(self.shape, Grid | RimmedGrid)
-        is_complete = is_complete and not isinstance(self.mirror, Sector)
-        return cut(patch, self.mirror) if self.mirror and is_complete else patch
+        # a grid has both sides of the mirror plane of a half, and must be cut; other shapes are
+        # made as halves, and the grid of a sector is as narrow as the sector
+        is_grid = isinstance(self.shape, Grid | RimmedGrid)
+        has_both_sides = is_grid and not isinstance(self.mirror, Sector)
+        return cut(patch, self.mirror) if self.mirror and has_both_sides else patch
 
 
 def meridian_vertices(problem: Problem) -> NDArray[np.float64]:
@@ -459,17 +462,20 @@ def meridian_vertices(problem: Problem) -> NDArray[np.float64]:
         return _vertices_of_shells(problem, meridian)
     has_pole = meridian.names[0] is None  # it begins on the axis, where there is no edge
     h = problem.material.h / meridian.curvature
+    # how far from the begin bodies may touch the shell; shells may meet anywhere
     contact_reach = max((distance for _, distance in problem.body_contacts), default=0.0)
-    contact_reach = (
-        meridian.length if problem.loads.pairs else contact_reach
-    )  # shells may meet anywhere
-    contact_cells = None  # or how far from the begin there are small cells, and their size
+    if problem.loads.pairs:
+        contact_reach = meridian.length
+    # how far from the begin there are small cells, and their size; None without contact
+    contact_cells = None
     if contact_reach:
         contact_cells = contact_reach if has_pole else meridian.length, CONTACT_CELL_SIZE * sqrt(h)
+    # the thickness, or a smaller size of cells on the axis that resolves the contact of a body
+    size_on_axis = min([h, *(size / CELLS_OF_CONTACT for size, _ in problem.body_contacts)])
     return graded_vertices(
         meridian.length,
         meridian.curvature_jumps,
-        min([h, *(size / CELLS_OF_CONTACT for size, _ in problem.body_contacts)]),
+        size_on_axis,
         refinement=problem.mesh.refinement,
         axis=has_pole,
         largest=min(MAX_MERIDIAN_CELL_SIZE * sqrt(h), meridian.largest),

@@ -9,6 +9,7 @@ surface, and may have no potential where an edge is free to move.
 from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.patch import MeshError, PatchMesh, as_set
@@ -157,15 +158,17 @@ def open_edges(
     """
     # name -> sides of triangles, as pairs of vertices
     pairs_of_edges = {name: as_set(pairs) for name, pairs in patch.edges.items()}
-    if patch_names:  # only sides of triangles under pressure count
+    # only sides with both vertices on patches under pressure count
+    if patch_names:
         under_pressure = np.logical_or.reduce([patch.patches[name] for name in patch_names])
         vertices = set(map(int, patch.corners[under_pressure].ravel()))
         pairs_of_edges = {
             name: {pair for pair in pairs if vertices.issuperset(pair)}
             for name, pairs in pairs_of_edges.items()
         }
-    return without_potential(
-        moving_edges(pairs_of_edges, conditions),
-        conditions,
-        lambda name: patch.embedding(patch.nodes[np.unique(patch.edges[name])]),
-    )
+
+    def places_of(name: str) -> NDArray[np.float64]:
+        """Return the places (n, 3) of the vertices of an edge."""
+        return patch.embedding(patch.nodes[np.unique(patch.edges[name])])
+
+    return without_potential(moving_edges(pairs_of_edges, conditions), conditions, places_of)

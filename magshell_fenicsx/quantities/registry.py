@@ -271,6 +271,7 @@ def quantity(name: str) -> Quantity:
     """
     if name in QUANTITIES:
         return QUANTITIES[name]
+    # a second load, or its displacement
     if further_load := re.fullmatch(r"(force|load)_(\d+)", name):
         first_load = QUANTITIES[AMPLITUDES[further_load[1]].column]
         return replace(
@@ -285,29 +286,31 @@ def quantity(name: str) -> Quantity:
             f"at {conjugate[1].replace('_', ' ')}",
             f"Displacement conjugate to {conjugate[1]}, as w_over_h.",
         )
-    numbered_name = re.fullmatch(r"(\w+)_(\d+)", name)  # the amplitude of a second step of a kind
+    # the amplitude of a second step of a kind
+    numbered_name = re.fullmatch(r"(\w+)_(\d+)", name)
     first_of_kind = QUANTITIES.get(numbered_name[1]) if numbered_name else None
     if numbered_name and first_of_kind and first_of_kind.kind == "load":
         return replace(
             first_of_kind, name=name, words=f"{first_of_kind.words} {numbered_name[2]}", symbol=""
         )
-    # of "approach_ball" the quantity is "approach"; of several the longest name fits best
-    if families := [
-        q for q in QUANTITIES.values() if q.each and re.match(rf"{q.name}_[A-Za-z]", name)
-    ]:
+    # one of a family: of "approach_ball" it is "approach"; the longest name that fits is the right
+    # one
+    families = [q for q in QUANTITIES.values() if q.each and re.match(rf"{q.name}_[A-Za-z]", name)]
+    if families:
         longest = max(families, key=lambda q: len(q.name))
         return longest.for_name(name.removeprefix(f"{longest.name}_"))
-    # of a named point or support: the displacement (u), reaction (f) or moment (m) along an axis
-    kinds: dict[str, tuple[Kind, Unit]] = {
+    # of a named point or support: the displacement (u), reaction (f) or moment (m) along an axis;
+    # all else is the factor of a motion or of a user's energy, which is a load
+    kinds_and_units: dict[str, tuple[Kind, Unit]] = {
         "u": ("place", PLACE),
         "f": ("reaction", REACTION),
         "m": ("moment", MOMENT),
     }
-    ending = re.search(r"_([ufm])[xyz]$", name)
-    # all else is the factor of a motion or of a user's energy, which is a load
-    kind, units = (
-        (kinds[ending[1]][0], kinds[ending[1]][1:]) if ending else ("load", (DISTANCE, TURN))
-    )
+    kind: Kind = "load"
+    units: tuple[Unit, ...] = (DISTANCE, TURN)
+    if ending := re.search(r"_([ufm])[xyz]$", name):
+        kind, unit = kinds_and_units[ending[1]]
+        units = (unit,)
     return Quantity(name, name.replace("_", " "), "", kind, units=units)
 
 
@@ -358,14 +361,14 @@ def axes_of(name: str, row: Collection[str] = ()) -> tuple[Quantity, Quantity]:
         Names of the columns that there are. Where w_over_h belongs to another load, this load has a
         column of its own; and the reaction of a motion may have one.
     """
+    # a name that is not registered may be a motion of supports: against it stands its own
+    # reaction, or that of the only motion
     reactions = sorted(q.name for q in QUANTITIES.values() if q.each and q.kind == "reaction")
-    if name in AMPLITUDES:
-        candidates = []
-    else:  # it may be a motion of supports: its own reaction, or that of the only motion
-        candidates = [*(f"{reaction}_{name}" for reaction in reactions), *reactions]
-    for reaction in candidates:
+    candidates = [*(f"{reaction}_{name}" for reaction in reactions), *reactions]
+    for reaction in candidates if name not in AMPLITUDES else []:
         if reaction in row:
             return shown_quantity(name, row), shown_quantity(reaction, row)
+    # any other amplitude: its conjugate, in a column of its own if there is one
     varying, own_column = amplitude(name), f"w_{name}_over_h"
     conjugate = shown_quantity(own_column if own_column in row else varying.conjugate, row)
     value = shown_quantity(varying.column, row)

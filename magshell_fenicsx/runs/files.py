@@ -173,11 +173,13 @@ def _refuse_interrupted(out: Path) -> None:
     """
     if is_replacement_unfinished(out):
         return
+    # without a checkpoint, or without results that took long, nothing would be lost
     file, table = out / checkpoint.NAME, out / "path.csv"
     points = max(read_result(table).count(b"\n") - 1, 0) if table.exists() else 0  # but the header
     has_results = points >= 2 or (out / MESH).exists()  # the undeformed shell alone is no loss
     if not file.exists() or not has_results:
         return
+    # a run with a summary has stopped itself: it was interrupted, or it has ended
     reason = "killed, or its machine stopped"
     if (out / SUMMARY).exists():
         stopped = read_object(out / SUMMARY).get("stopped")
@@ -278,6 +280,13 @@ class RunFiles:
         Brings the fields of a point in the present scene to rank 0.
     _table, _fields
         Writers of path.csv and of the fields; on rank 0, once the run has begun.
+    _origin
+        What summary.json takes from the checkpoint: hashes of files and of sources as they were at
+        the start; on rank 0.
+    _has_whole_shell
+        Whether the files have the whole shell, and not a half that ParaView mirrors; on rank 0.
+    _R
+        The reference length in metres, nan without units; on rank 0.
     """
 
     journal: checkpoint.Checkpoint | None = None
@@ -351,14 +360,15 @@ class RunFiles:
         rows
             Rows of path.csv that the interrupted run has written; empty for a new run.
         """
+        # what summary.json takes from the checkpoint; it has the case and the version itself
         identity = checkpoint.identity_in(self._folder / checkpoint.NAME) or {}
-        # for summary.json, which has the case and the version itself
         self._origin = {
             key: value for key, value in identity.items() if key not in ("case", "version")
         }
         self._table = PathTable(self._folder / "path.csv", self._scene.extra_columns)
+        # the fields have one half of a mirrored shell, with its plane for ParaView; of a sector
+        # they have the whole shell, without a plane
         problem, mirror = self._scene.problem, None
-        # ParaView has one half of a mirrored shell, and all of a shell of sectors
         if problem.mirror and not isinstance(problem.mirror, Sector):
             mirror = problem.mirror.rotated(problem.azimuth).plane
         self._has_whole_shell = mirror is None
@@ -392,6 +402,7 @@ class RunFiles:
             If the point differs from that of the interrupted run.
         """
         number = int(row["point"])
+        # points of the interrupted run: with a row on disk, and with fields too
         if number < len(self._rows):
             _check_equal(row, self._rows[number])
         if number < self.complete_points:
@@ -407,11 +418,12 @@ class RunFiles:
             """Write the row, the grids and the fields of the whole or modelled shell; on rank 0."""
             assert surface is not None
             problem = scene.problem
-            loads_and_state = problem.loads, state.mu, problem.material.h
-            shell = surface
             # the files have one half only if ParaView mirrors it, from the first point on
+            shell = surface
             if mirror and (isinstance(mirror, Sector) or self._has_whole_shell):
                 shell = completed_by_symmetry(surface, mirror)
+            # bodies and sources beside the shell
+            loads_and_state = problem.loads, state.mu, problem.material.h
             shell = replace(
                 shell, outlines=outlines(*loads_and_state), solids=solids(*loads_and_state)
             )

@@ -99,6 +99,9 @@ def _report(
 ) -> None:
     """Keep the gradients of a result in the run's result, write and print them; collective.
 
+    Gradients by numbers are printed as derivatives. Those by fields are printed as the derivative
+    by a uniform change, and the place where the gradient per area is largest.
+
     Parameters
     ----------
     name, kind
@@ -110,27 +113,14 @@ def _report(
     folder
         Folder of the run; None if nothing is written.
     """
-    scene = adjoint.scene  # that of the end, which may be of another model
     fields, slopes = dict[str, FieldGradient](), dict[str, float]()
     for parameter, gradient in gradients.items():
         if isinstance(gradient, FieldGradient):
             fields[parameter] = gradient
         else:
             slopes[parameter] = float(gradient)
-    entry_of_field: dict[str, dict[str, Any]] = {
-        parameter: {"alike": _by_uniform_change(scene, parameter, gradient)}
-        for parameter, gradient in fields.items()
-    }
-    if fields:
-        surface = _surface(scene, adjoint, fields)
-        largest: dict[str, dict[str, Any]] = {}
-        if surface:
-            largest = {parameter: _largest_density(surface, parameter) for parameter in fields}
-        for parameter, entry in scene.comm.bcast(largest).items():
-            entry_of_field[parameter] |= entry
-        if folder:
-            write = partial(_write, gradient_file(folder, name), surface, scene)
-            access_disk(scene.comm, write)
+    file = gradient_file(folder, name) if folder else None
+    entry_of_field = _entries_of_fields(adjoint, fields, file) if fields else {}
     result.gradients[name] = {
         "value": adjoint.value_in_unit,
         "kind": kind,
@@ -138,7 +128,8 @@ def _report(
         "fields": entry_of_field,
     }
     for parameter, entry in entry_of_field.items():
-        # components that are rounding beside the largest density, or beside R, are shown as zero
+        # a component that is only rounding is shown as zero: of the derivative beside the largest
+        # density, of the place (over R) beside R
         uniform = _words(entry["alike"], size=entry["most_per_area"], digits=6)
         place = _words(entry["at"], size=1.0, digits=3)
         say(
@@ -147,6 +138,38 @@ def _report(
         )
     for parameter, slope in slopes.items():
         say(f"d {name}/d {parameter}: {slope:.6g}")
+
+
+def _entries_of_fields(
+    adjoint: Adjoint, fields: Mapping[str, FieldGradient], file: Path | None
+) -> dict[str, dict[str, Any]]:
+    """Return the numbers about gradients by fields, by parameter, and write the file; collective.
+
+    The keys of an entry are those of summary.json: `alike` is the derivative by a uniform change,
+    `most_per_area` and `at` are those of `_largest_density`.
+
+    Parameters
+    ----------
+    fields
+        Parameter -> gradient by it; at least one.
+    file
+        File for the shell with the gradients as fields; None if it is not written.
+    """
+    scene = adjoint.scene  # that of the end, which may be of another model
+    entry_of_field: dict[str, dict[str, Any]] = {
+        parameter: {"alike": _by_uniform_change(scene, parameter, gradient)}
+        for parameter, gradient in fields.items()
+    }
+    # rank 0 has the surface, and tells the others what it finds there
+    surface = _surface(scene, adjoint, fields)
+    largest: dict[str, dict[str, Any]] = {}
+    if surface:
+        largest = {parameter: _largest_density(surface, parameter) for parameter in fields}
+    for parameter, entry in scene.comm.bcast(largest).items():
+        entry_of_field[parameter] |= entry
+    if file:
+        access_disk(scene.comm, partial(_write, file, surface, scene))
+    return entry_of_field
 
 
 def _gradients(
@@ -189,10 +212,11 @@ def _adjoint(result: Result, name: str) -> tuple[str, Adjoint]:
         If the run has no such result.
     """
     scene, history = result.scene, result.path_history
-    if name in FOLDS:  # results at the first instability of the path
+    # a result at the first instability of the path: its kind and its adjoint
+    if name in FOLDS:
         first, *_ = instabilities(scene, history.located, name, max_count=1, begins=history.begins)
         return first
-    # a path that ended elsewhere has no such result at its end
+    # a result at the end; a path that has not reached its end has none
     reason = next(
         (remark for remark in result.remarks if remark.startswith(BEYOND_INSTABILITY)), None
     )
@@ -210,12 +234,12 @@ def _by_uniform_change(scene: Scene, parameter: str, gradient: FieldGradient) ->
     """
     # the sum over all cells
     uniform_derivative = gradient.within(np.ones(len(gradient.forces), dtype=bool))
-    if parameter == "remanence":
-        uniform_derivative = (
-            uniform_derivative[[0, 2]]  # without the component around the axis, which is zero
-            if scene.problem.meridian
-            else uniform_derivative @ rotation(scene.problem.azimuth)
-        )
+    # a vector: on a meridian without the component around the axis, which is zero; else turned from
+    # the model's frame into the case's
+    if parameter == "remanence" and scene.problem.meridian:
+        uniform_derivative = uniform_derivative[[0, 2]]
+    elif parameter == "remanence":
+        uniform_derivative = uniform_derivative @ rotation(scene.problem.azimuth)
     return [float(component) for component in uniform_derivative]
 
 
@@ -241,6 +265,7 @@ def _surface(scene: Scene, adjoint: Adjoint, fields: Mapping[str, FieldGradient]
     model = scene.model
     gathering, densities = gatherer(model, scene.comm), dict[str, Array | None]()
     width = model.V.dofmap.bs  # components at a node: 2 on a meridian, else 3
+    # gradients per area at the nodes on rank 0: a vector field, or a field for each column
     for parameter, gradient in fields.items():
         values = density(scene, gradient)
         if parameter == "remanence":
@@ -248,16 +273,17 @@ def _surface(scene: Scene, adjoint: Adjoint, fields: Mapping[str, FieldGradient]
             densities[parameter] = _at_nodes(scene, gathering, vectors)
             continue
         for i, name in enumerate(columns_of(parameter)):
-            # the gatherer takes vectors: a number goes as the component along e3
+            # the gatherer takes vectors: a number goes as the component along e3, the last one
             vectors = np.zeros((len(values), width))
             vectors[:, -1] = values[:, i]
             at_nodes = _at_nodes(scene, gathering, vectors)
             densities[name] = None if at_nodes is None else at_nodes[:, 2]
-    base = gathering.gather(adjoint.state.u)
-    if base is None:
+    # the deformed surface with these fields, completed to the whole shell
+    deformed = gathering.gather(adjoint.state.u)
+    if deformed is None:
         return None
     gathered_fields = {name: density for name, density in densities.items() if density is not None}
-    surface = replace(base, fields=gathered_fields)
+    surface = replace(deformed, fields=gathered_fields)
     if model.multiplicity > 1:
         assert not model.axisymmetric
         surface = completed_by_symmetry(surface, model.mirror)

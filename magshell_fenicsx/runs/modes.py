@@ -9,7 +9,7 @@ modulus, thickness, reference length and density. A gatherer brings the fields o
 rank 0.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from math import isnan, nan
@@ -157,12 +157,14 @@ class _ModeWriter:
                 self.say(f"warning: no modes of point {number}: {e}")
                 continue
             surface = self._write(number, str(row["label"]), state, label, vector)
+            # on rank 0, of a surface: the place where the mode is largest
             if surface is not None and scene.problem.meridian is None:
                 place = surface.r0[np.argmax(np.abs(surface.fields["mode_w"]))]
                 rounded_place = np.where(np.abs(place) < ROUNDING, 0.0, place)
                 self.result.mode_places[number] = [
                     float(x) for x in rounded_place * scene.problem.length
                 ]
+            # on rank 0, of a mode of the model itself: the number of waves, if it has any
             if surface is not None and not label and (waves := waves_around(surface)):
                 self.say(_waves_message(number, waves))
 
@@ -171,9 +173,11 @@ class _ModeWriter:
 
         Unstable modes beyond the requested number are listed in stability.csv as well.
         """
+        # number of a row -> state, of the points at which modes are requested
         points = self.result.singular
         if section.at == "end":
             points = {self.result.end: self.result.last}
+        # the modes of each point
         by_point: dict[int, list[ShellMode]] = {}
         for number, state in points.items():
             whole_shell, shell, _ = self._modes_of_whole_shell(number)
@@ -191,6 +195,7 @@ class _ModeWriter:
             self.result.scene.comm,
             partial(write_whole, self.folder / "stability.csv", mode_table(by_point)),
         )
+        # a file for each requested mode, and a line about the softest of each point
         for number, modes in by_point.items():
             for rank, mode in enumerate(modes[: section.modes], 1):
                 file = mode_file(self.folder, number, str(rank), mode.label)
@@ -278,7 +283,8 @@ def keeps_state(section: FrequenciesSection | None, point: int) -> bool:
 def symmetric_wave(model: Model) -> str:
     """Return the name of the wave that modes without a label have in a model.
 
-    It is "0" on a meridian, where they do not vary around e3, "symmetric" on a half, else empty.
+    It is "0" on a meridian, where they do not vary around e3. It is "symmetric" on a half, and
+    empty on the whole shell.
     """
     if model.axisymmetric:
         return "0"
@@ -308,16 +314,17 @@ def contact_changes(scene: Scene, state: State, modes: Sequence[ShellMode]) -> l
     stiffened_state = with_stiffer_bodies(scene, state, bodies)
     if stiffened_state is None:
         return [nan] * len(modes)
+    # the modes with stiffer bodies
     whole_shell = mode_space(scene.model)
     shell_modes, state = ShellModes(whole_shell.model), whole_shell.state(stiffened_state)
     stiffer_modes = shell_modes.vibrations(state, len(modes) + FURTHER_MODES)
+    # the smallest change of each mode to one of the same label
     changes = []
     for mode in modes:
-        candidates = [
-            stiffer_mode for stiffer_mode in stiffer_modes if stiffer_mode.label == mode.label
-        ]
         differences = (
-            abs(stiffer_mode.eigenvalue / mode.eigenvalue - 1) for stiffer_mode in candidates
+            abs(stiffer_mode.eigenvalue / mode.eigenvalue - 1)
+            for stiffer_mode in stiffer_modes
+            if stiffer_mode.label == mode.label
         )
         changes.append(min(differences, default=1.0))
     return changes
@@ -363,17 +370,19 @@ def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
             "symmetric tangent"
         )
     states = _states_of_frequencies(result, section, say)
-    symmetric_waves, time_unit = dict[int, str](), scene.problem.time_unit
+    time_unit = scene.problem.time_unit
+    # id of a scene -> what is made once for it; number of a row -> the model with all modes there
     modes_of_scene = dict[int, tuple[ModeSpace, ShellModes]]()
     whole_shells = dict[int, ModeSpace]()
     for number, state in states.items():
+        # the model with all modes of the row's scene, and the solver for them
         scene = result.scene_of(number)
         if id(scene) not in modes_of_scene:
             whole_shell = mode_space(scene.model)
             modes_of_scene[id(scene)] = whole_shell, ShellModes(whole_shell.model)
         whole_shell, shell_modes = modes_of_scene[id(scene)]
         whole_shells[number] = whole_shell
-        symmetric_waves[number] = symmetric_wave(whole_shell.model)
+        # the modes, and how they depend on the stiffness of a contact
         state = stiffened_equilibrium(scene, state)
         try:
             modes = shell_modes.vibrations(
@@ -391,20 +400,44 @@ def frequencies_after(result: Result, folder: Path | None, say: Say) -> None:
         except ModesNotFound as e:
             say(f"warning: no frequencies of point {number}: {e}")
             continue
-        say(_lowest_frequency(number, scene, modes, symmetric_waves[number], time_unit))
-    if folder is None:
-        return
+        wave = symmetric_wave(whole_shell.model)
+        say(_lowest_frequency(number, scene, modes, wave, time_unit))
+    if folder is not None:
+        _write_frequencies(result, folder, states, whole_shells, section.count)
+
+
+def _write_frequencies(
+    result: Result,
+    folder: Path,
+    states: Mapping[int, State],
+    whole_shells: Mapping[int, ModeSpace],
+    count: int,
+) -> None:
+    """Write frequencies.csv, and the modes of the first and the last point as files; collective.
+
+    Parameters
+    ----------
+    states
+        Number of a row -> state, of the requested points in their order.
+    whole_shells
+        Number of a row -> the model with all modes of the shell there.
+    count
+        Number of modes that are written at a point.
+    """
+    comm, time_unit = result.scene.comm, result.scene.problem.time_unit
+    symmetric_waves = {
+        number: symmetric_wave(whole_shell.model) for number, whole_shell in whole_shells.items()
+    }
     content = frequency_table(
         result.frequencies, symmetric_waves, time_unit, result.contact_changes
     )
-    access_disk(scene.comm, partial(write_whole, folder / NAME, content))
+    access_disk(comm, partial(write_whole, folder / NAME, content))
     # the first and the last point, if they have frequencies
     for number in {*list(states)[:1], *list(states)[-1:]} & set(result.frequencies):
-        scene = result.scene_of(number)
-        whole_shell = whole_shells[number]
+        scene, whole_shell = result.scene_of(number), whole_shells[number]
         gathering = gatherer(whole_shell.model, scene.comm)
         state = whole_shell.state(states[number])
-        for rank, mode in enumerate(result.frequencies[number][: section.count], 1):
+        for rank, mode in enumerate(result.frequencies[number][:count], 1):
             file = mode_file(folder, number, f"f{rank}", mode.label)
             write_mode_of(scene, gathering, file, state, mode.label, mode.vector, whole_shell)
 
@@ -446,12 +479,14 @@ def _lowest_frequency(
     time_unit
         Unit of time (s), for hertz; None without.
     """
+    # rigid motions come first, with a frequency of zero; a wave "m = ..." is one of two motions,
+    # with its twin that is turned about e3
     rigid_modes = (
         [mode for mode in modes if mode.eigenvalue == 0.0] if scene.allows_rigid_motion else []
     )
-    # a wave has a twin, turned about e3
     motions = sum(2 if mode.label.startswith("m = ") else 1 for mode in rigid_modes)
     rigid_motions = f"{motions} rigid motions, " if motions else ""
+    # the first mode that is not rigid, or the last of all
     lowest_mode = modes[min(len(rigid_modes), len(modes) - 1)]
     frequency = hertz(lowest_mode.eigenvalue, time_unit)
     hertz_words = "" if frequency is None else f", {frequency:.6g} Hz"

@@ -50,10 +50,11 @@ def surface(scene: Scene, record: Record) -> Surface | None:
     """
     problem, state = scene.problem, record.point.state
     scene.refuse_foreign(state)
-    base = gatherer(scene.model, scene.comm).gather(state.u, state.mu)
-    if base is None:
+    # the modelled part, then the whole shell, in the frame of the case
+    modelled = gatherer(scene.model, scene.comm).gather(state.u, state.mu)
+    if modelled is None:
         return None
-    shell = completed_by_symmetry(base, problem.mirror) if problem.mirror else base
+    shell = completed_by_symmetry(modelled, problem.mirror) if problem.mirror else modelled
     return rotated_surface(shell, problem.azimuth)
 
 
@@ -110,8 +111,9 @@ def off_screen() -> None:
         finally:
             os.close(write_end)  # Xvfb has its own: if it ends, the pipe ends too
         _displays.append(shell_process)
+        # the number of the display, or nothing if Xvfb does not write in time; it writes the whole
+        # line at once, or ends
         readable, _, _ = select([stream], [], [], DISPLAY_TIMEOUT)
-        # the whole line: Xvfb ends if it cannot write that
         name = stream.readline().strip() if readable else ""
     if not name.isdecimal():
         raise RuntimeError("pyvista: finds no display, and Xvfb has made none")
@@ -172,6 +174,7 @@ def curve(scene: Scene, records: Sequence[Record], amplitude: str | None = None)
         )
     table_rows = rows(scene, records)
     pole = pole_of(scene.problem.document.data)
+    # the columns of both axes must be there
     axes = axes_of(name, table_rows[0])
     if not all(axis.name in table_rows[0] for axis in axes):
         varied = dict.fromkeys(record.amplitude for record in records if record.amplitude)

@@ -28,9 +28,18 @@ SUMMED_COLUMNS = ("time", "dissipated", "work")
 class RowMaker:
     """Maker of the rows of one path, which takes its records in their order.
 
-    A record is a point of a history with its origin; a row is a mapping of columns of path.csv. The
-    maker keeps the displacement at the end of the field. It also keeps the sums of the columns in
-    time, at the last record and before the present step.
+    A record is a point of a history with its origin; a row is a mapping of columns of path.csv.
+
+    Attributes
+    ----------
+    _count
+        Number of rows so far.
+    _field_end
+        w_over_h at the last point of a field that comes before the loads.
+    _sums, _sums_before, _step
+        Sums of the columns in time at the last record, and before its step; number of that step.
+    _is_programme
+        Whether the case has a list of steps.
     """
 
     def __init__(self, scene: Scene) -> None:
@@ -106,7 +115,7 @@ def imbalances(
         A displacement of the system that counts as of order one, over R.
     """
     for step in programme:
-        # a static step has the limit too: its snap may be a motion
+        # a static step has a limit too, as its snap may be a motion
         max_imbalance = step.load.motion.balance if step.load.motion else BALANCE
         step_imbalances = [
             _imbalance(row, length)
@@ -144,7 +153,8 @@ def motion_errors(programme: Iterable[ProgrammeStep], all_rows: Sequence[Row]) -
                 f"step {step.number}: the estimated error of its motion is {error:.2g} h, "
                 f"more than tolerance: {motion.tolerance:g}; even the shortest steps leave it"
             )
-        # a motion to an instability ends where states become unstable
+        # a motion that chooses the length of its steps itself; one to an instability does not
+        # count, as it ends where states become unstable
         chooses_step_length = (
             load.motion and load.motion.step is None and load.motion.until != "instability"
         )

@@ -258,6 +258,7 @@ def run(  # noqa: PLR0913 - what a user gives
         If the time limit is negative, the problem cannot be written, or the folder cannot be used.
     """
     start = time.perf_counter()
+    # what cannot be run is refused
     folder = None if out is None else user_folder(out)
     if time_limit is not None and not time_limit >= 0:
         raise CaseError(f"--time-limit {time_limit}: must be a number of seconds, 0 or more")
@@ -265,12 +266,14 @@ def run(  # noqa: PLR0913 - what a user gives
         raise CaseError(
             "out: a run is known again by what it writes of its case: give the problem a 'document'"
         )
+    # where the run reports: rank 0 alone prints
     has_listener = tell is not None
     if comm.rank != 0:
         say, tell = _print_nothing, _print_nothing
     watch = Watch(comm, start, time_limit, signals=out is not None)
     output = RunOutput(comm, say, tell or _print_nothing, watch, start, pictures)
     progress = _kernel_progress(output, keeps_first=is_plain_output(comm.size))
+    # the run; the compilation of kernels also reports its progress if somebody listens
     with reporting_progress_to(progress) if has_listener else nullcontext():
         if pictures and folder and comm.rank == 0:
             from magshell_fenicsx.output.pictures.rendering import library
@@ -324,6 +327,7 @@ def _run(problem: Problem, folder: Path | None, output: RunOutput, *, resume: bo
     if folder:  # before the scene is built, which takes long: the files of the case may change
         write = partial(checkpoint.empty_content, problem.document)
         empty_checkpoint = access_disk(comm, write, "cannot be read")
+    # the scene, and the files of the run
     result = _unloaded_result(problem, folder if resume else None, output)
     scene, mesh = result.scene, result.adapted
     _say_what_is_solved(scene, comm, say)
@@ -335,10 +339,11 @@ def _run(problem: Problem, folder: Path | None, output: RunOutput, *, resume: bo
         # times go on from the interrupted run
         output = replace(output, start=output.start - files.elapsed)
         say(f"resuming after {files.complete_points} points")
+    # the path, and what is written after it
     interruption: RuntimeError | None = None
     scene.progress = progress = RunProgress(scene, output.tell, output.start)
     with output.watch:
-        # until the first point has opened the files, with their journal
+        # no journal until the first point has opened the files, which have one
         scene.journal = StoppableJournal(NoJournal(), output.watch)
         try:
             _follow(result, files, output, progress)
@@ -350,6 +355,7 @@ def _run(problem: Problem, folder: Path | None, output: RunOutput, *, resume: bo
         if files and folder and files.journal:
             result.replayed = files.journal.replayed
             interruption = _write_results(result, files, folder, output, progress, interruption)
+    # the reason of an interruption, and how to go on where a journal has been written
     if interruption:
         is_resumable = files is not None and files.journal is not None
         resume_hint = ""
@@ -504,8 +510,8 @@ def _mesh_for_tolerance(
 ) -> "Adapted | None":
     """Return the mesh that is adapted to the case's `mesh.tolerance`; collective.
 
-    A resumed run takes the mesh that is saved in its folder. Where the path goes on along a branch,
-    the result also has a mesh for that branch.
+    A resumed run takes the mesh that is saved in its folder, if there is one. Where the path may go
+    on along a branch, the result also has a mesh for that branch.
 
     Parameters
     ----------
@@ -527,27 +533,18 @@ def _mesh_for_tolerance(
     if problem.mesh.tolerance is None:
         return None
     from magshell_fenicsx.simulate.adapt.branch import branched
-    from magshell_fenicsx.simulate.adapt.choice import Adapted
     from magshell_fenicsx.simulate.adapt.tolerance import adapted
 
     # an interrupted run has found its mesh already, which takes long
-    mesh_file = folder / MESH if folder else None
-    saved_content = b""
-    if mesh_file:
-        saved_content = access_disk(
-            comm, lambda: read_result(mesh_file) if mesh_file.exists() else b"", "cannot be read"
-        )
-    if saved_content:
-        try:
-            return Adapted.from_json(problem, saved_content)
-        except (ValueError, KeyError, TypeError, IndexError) as e:
-            raise Damaged(f"{mesh_file}: is damaged: {type(e).__name__}: {e}") from None
+    saved_mesh = _saved_mesh(problem, folder / MESH, comm) if folder else None
+    if saved_mesh is not None:
+        return saved_mesh
     try:
         mesh = adapted(problem, comm, say, report)
     except NoResult as e:
         say(f"warning: mesh.tolerance ignored, this run has no scalar result: {e}")
         return None
-    # on a branch in a larger model the result has an error of its own
+    # on a branch, which may be in a larger model, the result has an error of its own
     if not any(step.load.follows_branch or step.load.branch_points for step in problem.programme):
         return mesh
     try:
@@ -557,22 +554,40 @@ def _mesh_for_tolerance(
         return mesh
 
 
+def _saved_mesh(problem: Problem, file: Path, comm: MPI.Comm) -> "Adapted | None":
+    """Return the mesh that an interrupted run has saved in a file; None without one. Collective.
+
+    Raises
+    ------
+    Damaged
+        If the content of the file cannot be used.
+    """
+    from magshell_fenicsx.simulate.adapt.choice import Adapted
+
+    saved_content = access_disk(
+        comm, lambda: read_result(file) if file.exists() else b"", "cannot be read"
+    )
+    if not saved_content:
+        return None
+    try:
+        return Adapted.from_json(problem, saved_content)
+    except (ValueError, KeyError, TypeError, IndexError) as e:
+        raise Damaged(f"{file}: is damaged: {type(e).__name__}: {e}") from None
+
+
 def _branch_error(result: Result) -> float | None:
     """Return the estimated relative error at the end of a branch in a larger model; collective.
 
     None if no mesh was chosen for the branch, or the path has not left its first model.
     """
     assert result.adapted
-    if (
-        result.adapted.branch is None
-        or result.last_record is None
-        or result.last_record.scene is result.scene
-    ):
+    mesh_of_branch, last_record = result.adapted.branch, result.last_record
+    if mesh_of_branch is None or last_record is None or last_record.scene is result.scene:
         return None
     from magshell_fenicsx.simulate.adapt.branch import branch_error
 
     try:
-        return branch_error(result.adapted.branch, result.last_record)
+        return branch_error(mesh_of_branch, last_record)
     except NoResult:
         return None
 
@@ -588,11 +603,10 @@ def _sensitivities(result: Result) -> dict[str, float]:
         If the fold cannot be located accurately enough.
     """
     scene, last_row = result.scene, result.rows[result.end]
-    # steps are numbered from 1
-    step = (
-        scene.problem.programme[int(last_row["step"]) - 1] if last_row["label"] == "fold" else None
-    )
-    if step is None or not step.load.wants_sensitivities:
+    if last_row["label"] != "fold":
+        return {}
+    step = scene.problem.programme[int(last_row["step"]) - 1]  # steps are numbered from 1
+    if not step.load.wants_sensitivities:
         return {}
     from magshell_fenicsx.simulate.sensitivity import fold_at, sensitivities
 
@@ -639,12 +653,13 @@ def _follow(
     """
     scene, row_maker = result.scene, RowMaker(result.scene)
     for record in follow(scene, remark=result.remarks.append):
+        # the first point opens the files, with their journal: before the first solve of a step
         if files and not result.rows:
             if files.journal is None:
                 files.begin()
             assert files.journal
-            # before the first solve of a step
             scene.journal = StoppableJournal(files.journal, output.watch)
+        # the point with its row
         result.path_history.add(record)
         row = row_maker.row(record, time.perf_counter() - output.start)
         number = len(result.rows)
@@ -653,12 +668,14 @@ def _follow(
             result.found[number] = record.point.state
         else:
             result.last_record, result.last, result.end = record, record.point.state, number
+        # states and scenes that are needed after the path
         if keeps_state(scene.problem.frequencies, number):
             result.states_for_frequencies[number] = record.point.state
         if record.scene and record.scene is not scene:
             result.scenes_of_rows[number] = record.scene
         if record.label in LOCATED:
             result.singular[number] = record.point.state
+        # what is written and printed
         if files:
             with result.output:
                 files.write(row, record.point.state, record.scene or scene)
@@ -673,16 +690,18 @@ def _line(row: Row) -> str:
 
     `row` is the point's row of path.csv.
     """
-    # column of the amplitude that varied, and the column of the force
-    varied, force_column = "", "force"
+    # column of the amplitude that varied; empty without
+    varied = ""
     if row["amplitude"]:
         varied = amplitude(str(row["amplitude"])).column
-    # of several bodies each has its own force
+    # column of the force; of several bodies each has its own, which is the conjugate
+    force_column = "force"
     conjugate = amplitude(str(row["amplitude"])).conjugate
     if "load_factor" in row:
         force_column = "load_factor"
     elif conjugate.startswith("force_"):
         force_column = conjugate
+    # the loads with their formats, and the fields of the line
     formats = {"lambda_m": "+.4e", "p_over_pc": ".6f", force_column: "9.5f"}
     fields = [f"{row['point']:4d} {row['label']:>11}"]
     if varied:
@@ -701,8 +720,8 @@ def _line(row: Row) -> str:
 def _value(name: str, row: Row, form: str, words: str = "") -> str:
     """Return "symbol value" of a column of a row, such as "w/h   0.1234".
 
-    The value is in the case's units with five digits if the column has any, else in the format
-    `form`.
+    In a case with units, another column of the row may have the same quantity in a unit. That one
+    is shown, with five digits and its unit. Else the column itself is shown in the format `form`.
 
     Parameters
     ----------
@@ -711,7 +730,7 @@ def _value(name: str, row: Row, form: str, words: str = "") -> str:
     words
         Text in place of the symbol; empty for the symbol.
     """
-    shown = shown_quantity(name, row)
+    shown = shown_quantity(name, row)  # the quantity of the column that is shown
     is_zero = shown.kind == "displacement" and abs(float(row[name])) < ROUNDING
     number = 0.0 if is_zero else float(row[shown.name])
     value, unit = format_number(number, form), ""

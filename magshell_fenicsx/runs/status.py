@@ -90,32 +90,29 @@ def path_end(scene: Scene, step: ProgrammeStep) -> PathEnd:
 
     A scene is the model of a problem with its solver.
     """
-    load, varied_amplitude = step.load, amplitude(step.name)
-    if planned_end := load.expected_end(
-        step, scene.problem.context, scene.problem.loads, scene.problem.azimuth
-    ):
-        return PathEnd(
-            varied_amplitude.column, planned_end.end, planned_end.words, planned_end.steps
-        )
+    problem, load, load_column = scene.problem, step.load, amplitude(step.name).column
+    # an end of the step's own, in words
+    planned_end = load.expected_end(step, problem.context, problem.loads, problem.azimuth)
+    if planned_end:
+        return PathEnd(load_column, planned_end.end, planned_end.words, planned_end.steps)
+    # a number of steps, or an event
     if step.until == "points":
-        return PathEnd(varied_amplitude.column, words=f"{load.points} steps", steps=load.points)
+        return PathEnd(load_column, words=f"{load.points} steps", steps=load.points)
     if step.until != "target" or load.target is None:
-        return PathEnd(varied_amplitude.column, words=EVENT_WORDS.get(step.until, ""))
+        return PathEnd(load_column, words=EVENT_WORDS.get(step.until, ""))
+    # a target of the load; size: the amplitude at a target of one
     target, value = load.target
-    if target.quantity == "load":  # size: the amplitude at a target of one
-        return PathEnd(varied_amplitude.column, value * load.size(scene.problem.context))
-    # else the conjugate: a column of a part, or a displacement
+    if target.quantity == "load":
+        return PathEnd(load_column, value * load.size(problem.context))
+    # a target of the conjugate: in a column of a part
     for observables in OBSERVABLES:
-        if column := observables.conjugates(scene.problem.loads).get(step.name):
+        if column := observables.conjugates(problem.loads).get(step.name):
             return PathEnd(column, value)
+    # or a displacement over h, in a column of its own if there is one
     own_column = f"w_{step.name}_over_h"
-    h_in_unit_of_target = (
-        scene.problem.length * scene.problem.material.h if load.in_lengths else 1.0
-    )
-    return PathEnd(
-        own_column if own_column in scene.extra_columns else target.column,
-        value / h_in_unit_of_target,
-    )
+    displacement_column = own_column if own_column in scene.extra_columns else target.column
+    h_in_unit_of_target = problem.length * problem.material.h if load.in_lengths else 1.0
+    return PathEnd(displacement_column, value / h_in_unit_of_target)
 
 
 def time_left(begin: tuple[float, float], present: tuple[float, float]) -> float | None:
@@ -221,12 +218,14 @@ class RunProgress:
         """
         now, h = time.perf_counter(), self._scene.problem.material.h
         # largest change of an unknown over h, by the tangent du/ds of the path
-        step = float(np.abs(here.du).max(initial=0.0)) * abs(length) / h
+        change = float(np.abs(here.du).max(initial=0.0)) * abs(length) / h
+        # the time so far, and about how much is left since the last point
         remaining = None if self._branched else time_left(self._at_begin, self._at_present)
         time_text = clock(now - self._start)
         if remaining is not None:
             since_point = now - self._at_present[1]
             time_text += f", about {clock(max(0.0, remaining - since_point))} left"
+        # where the path is, and its goal
         step_of_programme = ""
         if self._scene.problem.listed:
             step_of_programme = f" in step {self._step} of {len(self._path_ends)}"
@@ -235,7 +234,7 @@ class RunProgress:
             goal = "the snap"
         elif self._path_end:
             goal = self._path_end.text(self._row)
-        parts = f"{self._count}{step_of_programme}", goal, time_text, f"du/h {step:.2g}"
+        parts = f"{self._count}{step_of_programme}", goal, time_text, f"du/h {change:.2g}"
         self._report("  ".join(part for part in parts if part))
 
     def doing(self, what: str) -> None:

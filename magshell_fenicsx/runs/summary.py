@@ -58,6 +58,7 @@ def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
     for i, fold in enumerate(rows[:-1]):
         if fold["label"] != "fold" or rows[i + 1]["amplitude"] != "time":
             continue
+        # rows of the motion, from the fold to the equilibrium at rest
         moving = [fold, *(row for row in rows[i + 1 :] if row["step"] == fold["step"])]
         if moving[-1]["label"] != "target":
             continue  # it has not come to rest
@@ -65,8 +66,9 @@ def snaps(rows: Sequence[Row]) -> list[dict[str, Any]]:
             np.array([float(row[key]) for row in moving])
             for key in ("time", "w_over_h", "dissipated")
         )
+        # times since the fold at three parts of the way of the deflection. The last two rows are of
+        # one time: the end of the motion, and the equilibrium at rest, which is left out.
         part_of_way = (w - w[0]) / (w[-1] - w[0])
-        # the last two rows are of one time: the motion, then the equilibrium at rest
         departure, half_time, end_of_jump = (
             _first_at(fraction, t[:-1], part_of_way[:-1]) - t[0]
             for fraction in (JUMP_BEGINS, 0.5, JUMP_ENDS)
@@ -102,8 +104,10 @@ def _first_at(fraction: float, times: Array, part_of_way: Array) -> float:
     times, part_of_way
         Times (n,), increasing, and the part of the way (n,) that is done at each.
     """
-    if not (part_of_way >= fraction).any():  # a creeping shell is put to rest from afar
+    # a shell that creeps is put to rest before it has done the whole way
+    if not (part_of_way >= fraction).any():
         return float(times[-1])
+    # the zero in the interval that ends at the first point beyond the fraction
     index = int(np.argmax(part_of_way >= fraction))
     difference = scipy.interpolate.CubicSpline(times, part_of_way - fraction)
     return float(
@@ -395,6 +399,7 @@ def solutions(result: Result) -> list[dict[str, Any]]:
     entries = []
     for number, state in result.found.items():
         row, system = result.rows[number], result.scene_of(number).model.system
+        # norms of the residual, and of the forces of each term
         residual = system.residual(state.u, state.mu)
         forces = (
             factor_of(term.amplitude, state.mu) * system.forces(state.u, state.mu, term.name)

@@ -167,11 +167,13 @@ def scalar_is_axisymmetric(text: str, meridian: MeridianChart, length: float = 1
     length
         R in the unit of length of the formula.
     """
-    # samples of the meridian at all angles; narrow places against their images at azimuth zero
     f, places = formula(text), length * meridian.interior_sample()
-    narrow_places = length * meridian.narrow_places
-    at_azimuth_zero = length * _at_azimuth_zero(meridian.narrow_places)[0]
+    # samples of the meridian, turned about e3 by all angles
     values_by_angle = [f(*(places @ rotation(angle)).T)[:, None] for angle in ANGLES]
+    # narrow places, and these turned to azimuth zero
+    narrow_places = length * meridian.narrow_places
+    turned_places, _ = _at_azimuth_zero(meridian.narrow_places)
+    at_azimuth_zero = length * turned_places
     return _all_equal(values_by_angle) and _all_equal(
         [f(*narrow_places.T)[:, None], f(*at_azimuth_zero.T)[:, None]]
     )
@@ -209,9 +211,10 @@ def vector_is_axisymmetric(
 
 def _at_azimuth_zero(x: Array) -> tuple[Array, Array]:
     """Return places (n, 3) turned about e3 into y = 0, and the rotations (n, 3, 3) that do so."""
-    # cosine and sine of the azimuth; on the axis it is zero
     rho, ones, zeros = np.hypot(x[:, 0], x[:, 1]), np.ones(len(x)), np.zeros(len(x))
-    c, s = np.where(rho > 0, x[:, :2].T / np.where(rho > 0, rho, 1.0), [[1.0], [0.0]])
+    # cosine and sine of the azimuth, which is zero on the axis
+    divisor = np.where(rho > 0, rho, 1.0)
+    c, s = np.where(rho > 0, x[:, :2].T / divisor, [[1.0], [0.0]])
     Q = np.array([[c, s, zeros], [-s, c, zeros], [zeros, zeros, ones]])
     return np.column_stack([rho, zeros, x[:, 2]]), np.moveaxis(Q, 2, 0)
 

@@ -51,25 +51,18 @@ def grid_mirrors(grid: Grid, embedding: Embedding) -> list[Mirror]:
     is_square = abs(extent[0] - extent[1]) < ROUNDING * extent[0]
 
     def places(chart: Array) -> Array:
+        """Return places in space of charts (s, t) from 0 to 1."""
         return embedding(low + chart * extent)
 
     # the last two flips exchange both axes, which only a square allows
     mirrors = []
     flips = FLIPS if is_square and not any(grid.glued) else FLIPS[:2]
-    for axis, (flip, sides) in enumerate(flips):
-        originals, images = places(sample), places(np.column_stack(flip(*sample.T)))
-        # a plane is normal to the line between a place and its image
-        differences = originals - images
-        normal = differences[np.argmax(np.linalg.norm(differences, axis=1))]
-        # around e3 a closed surface has all planes, see `Outline.mirrors`; a flip that moves
-        # nothing has none
-        if (axis == 0 and grid.glued[0]) or not normal.any():
+    for axis, (flip, images_of_sides) in enumerate(flips):
+        # around e3 a closed surface has all planes, see `Outline.mirrors`
+        if axis == 0 and grid.glued[0]:
             continue
-        unit = Mirror.with_normal(normal).normal
-        offset = float(((originals + images) / 2 @ unit).mean())
-        mirror = Mirror(unit, _rounded(offset))
-        error = np.abs(mirror.image(originals) - images).max()
-        if error > ROUNDING * max(1.0, np.abs(originals).max()):
+        mirror = _plane_between(places(sample), places(np.column_stack(flip(*sample.T))))
+        if mirror is None:
             continue
         # right and top are on the half with the larger coordinates
         distances = mirror.signed_distance(places(np.array(SIDE_MIDDLES)))
@@ -77,11 +70,28 @@ def grid_mirrors(grid: Grid, embedding: Embedding) -> list[Mirror]:
             mirror, distances = mirror.reversed, -distances
         removed_edges = dict[str, str]()
         # edges of the half that is not modelled, and their images
-        for i, j in enumerate(sides):
-            if i != j and distances[i] < 0 and not grid.glued[i // 2]:
-                removed_edges[grid.sides[i]] = grid.sides[j]
+        for side, image in enumerate(images_of_sides):
+            is_glued = grid.glued[side // 2]
+            if side != image and distances[side] < 0 and not is_glued:
+                removed_edges[grid.sides[side]] = grid.sides[image]
         mirrors.append(Mirror(mirror.normal, mirror.offset, removed_edges))
     return mirrors
+
+
+def _plane_between(originals: Array, images: Array) -> Mirror | None:
+    """Return the plane that maps places (n, 3) onto their images (n, 3); None without one."""
+    # the plane is normal to the line between a place and its image
+    differences = originals - images
+    normal = differences[np.argmax(np.linalg.norm(differences, axis=1))]
+    if not normal.any():  # all places are their own images
+        return None
+    unit = Mirror.with_normal(normal).normal
+    offset = float(((originals + images) / 2 @ unit).mean())
+    mirror = Mirror(unit, _rounded(offset))
+    error = np.abs(mirror.image(originals) - images).max()
+    if error > ROUNDING * max(1.0, np.abs(originals).max()):
+        return None
+    return mirror
 
 
 def mirror_lines(
@@ -168,9 +178,10 @@ def _candidate_normals(patch: PatchMesh, vectors: Sequence[Array]) -> Iterator[A
 
 
 def _with_edges(mirror: Mirror, patch: PatchMesh, tree: "scipy.spatial.cKDTree") -> Mirror | None:
-    """Return the mirror with its pairs of edges, or None.
+    """Return the mirror with its removed edges, each with its image, or None.
 
-    None if it does not map the triangulation onto itself. `tree` holds the nodes of the patch.
+    None if it does not map the triangulation, its patches and its edges onto themselves, or does
+    not pass along edges of triangles. `tree` holds the nodes of the patch.
     """
     nodes = patch.nodes
     tolerance = ROUNDING * np.ptp(nodes, axis=0).max()
@@ -185,17 +196,12 @@ def _with_edges(mirror: Mirror, patch: PatchMesh, tree: "scipy.spatial.cKDTree")
     twin = _image_triangles(patch.cells[:, :3], image_numbers)
     if twin is None or any((mask != mask[twin]).any() for mask in patch.patches.values()):
         return None
-    # each edge must be mapped onto an edge, perhaps itself
     removed_edges = {}
     for name, pairs in patch.edges.items():
-        image_names = (
-            other_name
-            for other_name, other_pairs in patch.edges.items()
-            if _same_pairs(image_numbers[pairs], other_pairs)
-        )
-        image_name = next(image_names, None)
+        image_name = _edge_with_pairs(image_numbers[pairs], patch)
         if image_name is None:
             return None
+        # edges of the half that is not modelled
         if image_name != name and mirror.signed_distance(nodes[pairs]).mean() < 0:
             removed_edges[name] = image_name
     # only planes along edges of triangles can be cut
@@ -204,6 +210,12 @@ def _with_edges(mirror: Mirror, patch: PatchMesh, tree: "scipy.spatial.cKDTree")
     except MeshError:
         return None
     return Mirror(mirror.normal, mirror.offset, removed_edges)
+
+
+def _edge_with_pairs(pairs: Numbers, patch: PatchMesh) -> str | None:
+    """Return the name of the patch's edge with these pairs of vertices (e, 2); None without one."""
+    names = (name for name, own_pairs in patch.edges.items() if _same_pairs(pairs, own_pairs))
+    return next(names, None)
 
 
 def _image_triangles(cells: Numbers, image: Numbers) -> Numbers | None:
@@ -217,7 +229,7 @@ def _image_triangles(cells: Numbers, image: Numbers) -> Numbers | None:
         (n,) number of the mirror image of each node.
     """
     corners, image_corners = np.sort(cells, axis=1), np.sort(image[cells], axis=1)
-    # sorted triangles and sorted images are equal lists
+    # if each image is a triangle, both lists are equal after sorting
     order, order_of_images = np.lexsort(corners.T), np.lexsort(image_corners.T)
     if (corners[order] != image_corners[order_of_images]).any():
         return None

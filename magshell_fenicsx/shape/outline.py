@@ -106,7 +106,8 @@ class Outline:
     meridian
         The meridian; None if it is closed, or the surface is none of revolution.
     extra_samples
-        Places (n, 3) that samples have besides: those where formulas are narrow.
+        Further places (n, 3) of `sample`: those near which a formula varies over a short distance,
+        so that the other samples could miss it.
     why_no_meridian
         Why several shells have no meridian.
     """
@@ -274,17 +275,18 @@ def reference_shell_of(shell: Surface | ShellSection) -> ReferenceShell:
     factor = shell.thickness_factor
     azimuth = getattr(shell, "azimuth", None)
     return ReferenceShell(
-        shell.geometry,
-        perfect,
-        perfect,
-        shell.reference,
-        shell.R_over_h,
-        shell.poisson_ratio,
-        shell.with_units,
-        shell.edge_polar,
-        factor if isinstance(factor, str) else None,  # only a formula is known at any place
+        geometry=shell.geometry,
+        perfect=perfect,
+        imperfect=perfect,
+        R=shell.reference,
+        R_over_h=shell.R_over_h,
+        nu=shell.poisson_ratio,
+        with_units=shell.with_units,
+        edge_polar=shell.edge_polar,
+        # only a formula is known at any place
+        thickness_factor=factor if isinstance(factor, str) else None,
         # all that the surface depends on, by which it is cached
-        (
+        identity=(
             shell.model_dump_json(exclude={"imperfections"}),
             shell.digest if isinstance(shell, MeshSurface) else None,
         ),
@@ -306,19 +308,29 @@ def outline(shell: Surface | ShellSection) -> Outline:
     if isinstance(shell, CapSurface) and shell.hole is None:
         return _sphere_outline(radians(shell.polar), "rim")
     if isinstance(shell, PlateSurface):
-        high = np.array([1.0, shell.width / shell.reference])
-        grid = Grid((0.0, 0.0), (1.0, float(high[1])), 1.0)
-        return _grid_outline(
-            grid, plane_embedding, plane_normals, lambda x: np.clip(x[:2], 0.0, high), high
-        )
-    # names of the edges at the profile's begin and end; no edge but a pole has the name None
-    profile, names = shell.profile_and_edges
-    if names[1] is not None:
-        return _ring_outline(shell, profile, (names[0], names[1]))
+        return _plate_outline(shell.width / shell.reference)
+    # a surface of revolution; a profile that ends at a pole has None for the name of this end
+    profile, (first_name, last_name) = shell.profile_and_edges
+    if last_name is None:
+        return _capped_outline(profile, first_name)
+    return _ring_outline(shell, profile, (first_name, last_name))
+
+
+def _plate_outline(width: float) -> Outline:
+    """Return the outline of a rectangle of length one; `width` is over the length."""
+    high = np.array([1.0, width])
+    grid = Grid((0.0, 0.0), (1.0, float(high[1])), 1.0)
+    return _grid_outline(
+        grid, plane_embedding, plane_normals, lambda x: np.clip(x[:2], 0.0, high), high
+    )
+
+
+def _capped_outline(profile: Profile, edge_name: str) -> Outline:
+    """Return the outline of a surface of revolution whose profile ends at a pole."""
     embedding = CappedEmbedding(profile)
     perfect = _disc_outline(
         profile.length,
-        names[0],
+        edge_name,
         embedding,
         embedding.normal,
         embedding.inverse,
@@ -514,6 +526,7 @@ def _ring_outline(
         )
     # its element size, 1, is replaced when it is meshed
     grid = Grid(low, high, 1.0, ("left", "right", *names), glued)
+    # the reported point is a corner of the chart: the first one if two sides are one line in space
     highest = np.array(low if any(glued) else high)
     return _grid_outline(grid, embedding, embedding.normal, inverse, highest, meridian)
 

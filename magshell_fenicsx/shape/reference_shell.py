@@ -186,25 +186,8 @@ def locate(at: At, ground: ReferenceShell, key: str) -> tuple[Array, Distance]:
     CaseError
         If the place does not lie on the surface, or a direction does not determine it.
     """
-    # four cases: a point, a direction on a sphere, a place that must be a point, the pole or tip
+    place = _place(at, ground, key)
     perfect = ground.perfect
-    if at.point is not None:
-        place = np.array(at.point) / ground.R
-        if ground.geometry != "mesh":
-            point_key, with_units = f"{key}.at.point", ground.with_units
-            refuse_off_surface(point_key, place, perfect, ground.R, with_units=with_units)
-    elif ground.spherical:
-        place = at.vector()
-        is_polar_allowed = 0 <= at.polar <= 180
-        in_chart = perfect.perfect(perfect.inverse(place)[None])[0]
-        if not is_polar_allowed or np.linalg.norm(in_chart - place) > ON_SPHERE:
-            raise CaseError(f"{key}.at{_off_sphere_text(at, ground)}")
-    elif at.polar or perfect.highest is None or not (perfect.disc or ground.geometry == "strip"):
-        raise CaseError(
-            f"{key}.at: on a {ground.geometry} give its place, at: {{point: [x, y, z]}}"
-        )
-    else:
-        place = perfect.perfect(perfect.highest[None])[0]
     if ground.spherical:
         return place, AngularDistance(place / np.linalg.norm(place))
     if perfect.from_pole and np.hypot(*place[:2]) < ON_AXIS:
@@ -230,6 +213,38 @@ def _off_sphere_text(at: At, ground: ReferenceShell) -> str:
     return f".polar: {at.polar:g}: is not on the shell: allowed {hole:g} to {edge:g}{hint}"
 
 
+def _place(at: At, ground: ReferenceShell, key: str) -> Array:
+    """Return the place (3,) of `locate`, with its parameters.
+
+    Raises
+    ------
+    CaseError
+        As `locate`.
+    """
+    perfect = ground.perfect
+    if at.point is not None:
+        place = np.array(at.point) / ground.R
+        if ground.geometry != "mesh":
+            point_key, with_units = f"{key}.at.point", ground.with_units
+            refuse_off_surface(point_key, place, perfect, ground.R, with_units=with_units)
+        return place
+    if ground.spherical:  # a direction
+        direction = at.vector()
+        is_polar_allowed = 0 <= at.polar <= 180
+        # a direction beyond the edge differs from the place of its chart
+        in_chart = perfect.perfect(perfect.inverse(direction)[None])[0]
+        if not is_polar_allowed or np.linalg.norm(in_chart - direction) > ON_SPHERE:
+            raise CaseError(f"{key}.at{_off_sphere_text(at, ground)}")
+        return direction
+    # elsewhere only the pole or the tip has a direction, which is zero
+    has_pole_or_tip = perfect.disc or ground.geometry == "strip"
+    if at.polar or perfect.highest is None or not has_pole_or_tip:
+        raise CaseError(
+            f"{key}.at: on a {ground.geometry} give its place, at: {{point: [x, y, z]}}"
+        )
+    return np.asarray(perfect.perfect(perfect.highest[None])[0])
+
+
 def refuse_off_surface(
     key: str, x: Array, outline: "Outline", R: float, *, with_units: bool
 ) -> None:
@@ -253,12 +268,15 @@ def refuse_off_surface(
     CaseError
         With a place near it that is on the surface.
     """
-    # the chart of a mesh file is the place itself, and nothing is refused
+    # the chart of a mesh file is the place itself, (3,), and nothing is refused
     chart = outline.inverse(x)
-    nearest = x if len(chart) == 3 else outline.embedding(chart[None])[0]
-    perfect = outline.perfect(chart[None])[0] if len(chart) == 2 else x
+    has_chart = len(chart) == 2
+    # places of the chart on the imperfect and on the perfect surface
+    nearest = outline.embedding(chart[None])[0] if has_chart else x
+    perfect = outline.perfect(chart[None])[0] if has_chart else x
     distances = [float(np.linalg.norm(place - x)) for place in (nearest, perfect)]
     if min(distances) > SAME_PLACE_TOLERANCE:
+        # the message gives the nearest place in mm, or in the unit of the case
         unit_size, unit = (1e3 * R, " mm") if with_units else (R, "")
         # + 0.0 makes zero of a negative zero
         near_place = ", ".join(f"{c * unit_size + 0.0:.13g}{unit}" for c in np.round(nearest, 12))

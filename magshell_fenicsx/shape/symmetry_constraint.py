@@ -108,8 +108,8 @@ def common_mirror(
         allowed = (plane for plane in planes if all(part.mirrors(plane) for part in parts))
         return next(allowed, None)
 
-    # `False`, `True`: whether triangles of a mesh file need not be symmetric
     planes_through_axis = _planes_through_axis(parts, vectors) if outline.round else []
+    # the second argument of `mirrors`: whether triangles of a mesh file need not be symmetric
     mirror = first_allowed(planes_through_axis) or first_allowed(outline.mirrors(units, False))
     if mirror is None and loosely:
         return first_allowed(outline.mirrors(units, True))
@@ -192,9 +192,10 @@ def why_not_axisymmetric(parts: Sequence[SymmetryConstraint]) -> str | None:
 
 
 def energy_without_mirror(parts: Sequence[SymmetryConstraint], outline: "Outline") -> str | None:
-    """Return the name of an energy that alone keeps a case from being a half; None without one.
+    """Return the name of a user's energy that keeps a case from being modelled as a half.
 
-    Energies are the user's. The other parts have a common mirror plane, which it does not allow.
+    It does not allow the mirror plane that all other parts have in common. None if there is no such
+    energy, or no such plane.
     """
     plane = common_mirror([part for part in parts if not part.energy], outline, loosely=True)
     if plane is None:
@@ -233,6 +234,7 @@ def shape_constraint(shell: "ShellSection | Surface", outline: "Outline") -> Sym
         return mirrors_formula(factor, mirror, outline.sample())
 
     reason, meridian = outline.why_no_meridian, outline.meridian
+    # a surface that has a meridian may still have a thickness that differs around e3
     if reason is None and not (outline.round or meridian):
         reason = f"not with a {geometry} that is not closed around e3"
     elif reason is None and not meridian:
@@ -247,13 +249,14 @@ def patch_constraint(
 ) -> SymmetryConstraint:
     """Return the constraint of patches that a key names.
 
-    A meridian knows no patch but a whole shell. So a patch that is none forbids the meridian; only
-    several shells (`assembly`) can be named there. The message is the same for a patch that is not
-    there.
+    Where a case has several shells (`assembly`), their meridians know each whole shell by its name,
+    but no other patch. So a name that is none of a shell forbids the meridian, also where the
+    surface has no such patch.
     """
     assembly = getattr(shell, "assembly", None)
     patch = None
     if assembly:
+        # `laws` has the names of the shells
         patch = next((name for name in sorted(names) if name not in assembly.laws), None)
     return SymmetryConstraint(f"{key}: {patch}: is no whole shell" if patch else None)
 
@@ -278,7 +281,7 @@ def points_constraint(
         places = [outline.embedding(outline.highest[None])[0]]
 
     def mirrors(mirror: Mirror) -> bool:
-        # the chart of a round surface, and the reported point, begin at the plane
+        # a round surface is charted from any plane through e3, and the reported point lies on it
         if outline.round and mirror.through_e3 and not named_places:
             return True
         return all(float(mirror.signed_distance(x)) > -ROUNDING for x in places)

@@ -383,8 +383,8 @@ class EnergyFactory:
         """Return the magnetisation state of a saturating material at the quadrature points.
 
         The state holds two Taylor polynomials of the energy in the field, at u and at u = 0; see
-        `saturation`. It is computed again where `followed`, the placement or u, or the field has
-        changed.
+        `saturation`. It is computed again when the placement, u or the field have changed. `chi` is
+        the susceptibility.
         """
         domain, followed = self.domain, (self.domain.r0, self.u)
         saturation = PointField(domain.mesh, domain.rule, 2 * SIZE)
@@ -646,14 +646,11 @@ class EnergyFactory:
         def thinned(*arguments: Expr, **keywords: Any) -> Expr:
             """Return the density with the keyword `thins` of the cell's own law."""
             # the last parameter holds the cell's modulus, Poisson's ratio, mass density and law
-            *arguments_left, material_numbers = arguments
-            return density.function(
-                *arguments_left,
-                thins=law.with_material(
-                    material_numbers[0], material_numbers[1], material_numbers[3]
-                ).thins,
-                **keywords,
+            *own_arguments, material_numbers = arguments
+            law_of_cell = law.with_material(
+                material_numbers[0], material_numbers[1], material_numbers[3]
             )
+            return density.function(*own_arguments, thins=law_of_cell.thins, **keywords)
 
         return replace(density, function=thinned, parameters=(*density.parameters, cell_materials))
 
@@ -661,10 +658,10 @@ class EnergyFactory:
     def law_of_cells(self) -> Law:
         """Material law of this rank's cells, for arrays (cells, n) of values at places in cells."""
         materials = self.cell_materials
-        return self.material.law_in(
-            materials
-            and materials.x.array.reshape(-1, 4)[materials.function_space.dofmap.list[:, 0]]
-        )
+        if materials is None:
+            return self.material.law_in(None)
+        dof_of_cells = materials.function_space.dofmap.list[:, 0]
+        return self.material.law_in(materials.x.array.reshape(-1, 4)[dof_of_cells])
 
     def _mass_weighted(self, density: Density) -> Density:
         """Return a density per mass times thickness and mass density, where these vary."""

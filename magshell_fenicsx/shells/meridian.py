@@ -99,10 +99,10 @@ class Probe:
         ends = V.mesh.geometry.x[compat.geometry_dofs(V.mesh), 0]
         # the cell that s is in, or least far out of: rounding may put s beside all cells
         cell = int(np.argmin(np.maximum(ends.min(axis=1) - s, s - ends.max(axis=1))))
-        reference_place = np.array([[(s - ends[cell, 0]) / (ends[cell, 1] - ends[cell, 0])]])
-        shape_values, shape_slopes = V.element.basix_element.tabulate(1, reference_place)[
-            :, 0, :, 0
-        ]
+        first_end, last_end = ends[cell]
+        reference_place = np.array([[(s - first_end) / (last_end - first_end)]])
+        tables = V.element.basix_element.tabulate(1, reference_place)
+        shape_values, shape_slopes = tables[:, 0, :, 0]
         nodes = V.dofmap.list[cell]
         turn = np.array([[np.cos(azimuth), np.sin(azimuth), 0.0], [0.0, 0.0, 1.0]])
         # derivatives of the placement; the normal is the tangent turned by 90 degrees
@@ -403,16 +403,18 @@ class MeridianModel(ThinModel):
         "placement" has the nodal values of r0. None if the terms depend on more than such values,
         as with contact or moving supports. Then the forms cannot serve another problem.
         """
-        has_contacts = self.contacts or self.loads.pairs
-        # terms with data that follow the state, or that the forms do not hold
-        follows = (
+        # terms with data that follow the state
+        follows_state = (
             self.growing
-            or has_contacts
+            or self.contacts
+            or self.loads.pairs
             or self.fields
             or self.factory.saturated
             or self.loads.moves
         )
-        if follows or any(e.density is None or e.reference_turn for e in self.energies):
+        # energies whose numbers are not the parameters of a density
+        has_other_numbers = any(e.density is None or e.reference_turn for e in self.energies)
+        if follows_state or has_other_numbers:
             return None
         # amplitudes are not numbers of the problem
         free_constants = {id(constant) for constant in self.factory.free_constants.values()}
@@ -442,11 +444,9 @@ class MeridianModel(ThinModel):
         copied_model = copy(self)
         copied_model.system = self.system.with_number("numbers of the case", numbers, value)
         copied_model.meridian, copied_model.material = model.meridian, model.material
-        copied_model.symmetry_breaking_modes = SymmetryBreakingWaves(
-            self.waves.for_system(
-                copied_model.system, largest_wave_number(model.meridian, model.material.h)
-            )
-        )
+        largest = largest_wave_number(model.meridian, model.material.h)
+        waves = self.waves.for_system(copied_model.system, largest)
+        copied_model.symmetry_breaking_modes = SymmetryBreakingWaves(waves)
         return copied_model
 
     @cached_property

@@ -206,13 +206,11 @@ class ModelBase:
         `mu` are the amplitudes by which supports move; lids over moving edges then count too.
         """
         moving = self.system.moving
+        swept_by_lids = 0.0
         if mu and moving and moving.edge_pressure:
-            lids = moving.edge_pressure.swept_volume(mu)
-        else:
-            lids = 0.0
-        return self.multiplicity * (
-            self.system.at_state(State(u, dict(mu or {}))).integral(self._volume) + lids
-        )
+            swept_by_lids = moving.edge_pressure.swept_volume(mu)
+        at_state = self.system.at_state(State(u, dict(mu or {})))
+        return self.multiplicity * (at_state.integral(self._volume) + swept_by_lids)
 
     def deflection(self, u: Vector, point: str) -> float:
         """Return w/R = -u . n0 at a named vertex; collective."""
@@ -273,10 +271,11 @@ class ModelBase:
         body_contacts = [body_contact for body_contact, _ in self.contacts.values()]
 
         def flags_of_cells() -> NDArray[np.bool_]:
-            body_flags = [body_contact.evenly_pressed() for body_contact in body_contacts]
-            # of each contact: pressures, gaps, and whether cells are evenly pressed
-            shell_flags = [contact.cell_pressures_and_gaps()[2] for contact in self.shell_contacts]
-            return np.asarray(np.any([*body_flags, *shell_flags], axis=0))
+            flags = [body_contact.evenly_pressed() for body_contact in body_contacts]
+            for contact in self.shell_contacts:
+                _, _, is_evenly_pressed = contact.cell_pressures_and_gaps()
+                flags.append(is_evenly_pressed)
+            return np.asarray(np.any(flags, axis=0))
 
         return self.system.at_state(state).evaluate(flags_of_cells)
 
@@ -288,10 +287,15 @@ class ModelBase:
         """
         if not self.shell_contacts:
             return None
-        gaps = self.system.at_state(state).evaluate(
-            lambda: [contact.cell_pressures_and_gaps()[1] for contact in self.shell_contacts]
-        )
-        return np.asarray(np.min(gaps, axis=0))
+
+        def gaps_of_cells() -> Array:
+            gaps = []
+            for contact in self.shell_contacts:
+                _, cell_gaps, _ = contact.cell_pressures_and_gaps()
+                gaps.append(cell_gaps)
+            return np.asarray(np.min(gaps, axis=0))
+
+        return self.system.at_state(state).evaluate(gaps_of_cells)
 
     def loaded_deflection(self, u: Vector, name: str) -> float:
         """Return the w/R on which a force or the dead loads of an amplitude do work; collective.

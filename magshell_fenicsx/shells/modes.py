@@ -152,7 +152,7 @@ class ShellModes:
     ) -> list[ShellMode]:
         """Return the lowest modes, ascending: of every family `count`, and all that are negative.
 
-        They are those of the symmetric part, where the tangent is not symmetric. Waves count once,
+        If the tangent is not symmetric, they are modes of its symmetric part. Waves count once,
         though each has a twin turned by a quarter of its length. The first call compiles a mass
         matrix and the waves' kernels.
 
@@ -206,17 +206,17 @@ class ShellModes:
             M = mass_matrix(self._product(family), family.constraints)
             M = family.projection.mass(M) if family.projection else M
             modes = lowest_modes(symmetric_part(family.tangent(state)), M, count, family.rigid)
-            # modes begin with the kernel; that of torsion also has the motion along the axis, so
-            # `motions` take its place
+            # The first modes are the rigid motions. Those of torsion are left out, since the motion
+            # along the axis is among them: `motions` has the others.
             if family.contains is _turns:
                 modes = modes[family.rigid :]
             shell_modes += [
                 ShellMode(family.label, 0.0, _normalised(motion, M)) for motion in family.motions
             ]
             shell_modes += [
-                ShellMode(family.label, m.eigenvalue, m.vector)
-                for m in modes
-                if family.contains(m.vector)
+                ShellMode(family.label, mode.eigenvalue, mode.vector)
+                for mode in modes
+                if family.contains(mode.vector)
             ]
         return sorted(shell_modes, key=lambda mode: mode.eigenvalue)
 

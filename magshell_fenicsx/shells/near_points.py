@@ -2,9 +2,9 @@
 
 Under a point force a shell without transverse shear bends without limit: its curvature K grows as
 the logarithm of the distance. The second variation of the bending energy along stretches is of the
-order of h^2 K^2 of the membrane's stiffness, and negative, so that where K exceeds about 1/h modes
-around the point become unstable, at loads that fall with the size of elements there. They are
-known by where they are: the gradient of a mode of the shell extends over sqrt(R h) and more, theirs
+order of h^2 K^2 of the membrane's stiffness, and negative. So where K exceeds about 1/h, modes
+around the point become unstable, at loads that fall with the size of elements there. Such modes are
+known by their extent: the gradient of a mode of the shell extends over sqrt(R h) and more, theirs
 over a part of h.
 
 A mode is a displacement, or a wave m around an axisymmetric shell: U cos(m theta) e_rho + V sin(m
@@ -101,29 +101,44 @@ def squared_gradient(model: Model, mode: Vector, waves: int | None) -> tuple[Arr
     nodes, shapes = V.dofmap.list[:owned], element.tabulate(1, X)[..., 0]
 
     def jets(values: Array) -> Array:
-        """(1 + dim, cells, points, components) of values at nodes."""
+        """(1 + dim, cells, points, components) of values at nodes: value, then derivatives."""
         return np.asarray(np.einsum("dqn,cni->dcqi", shapes, values[nodes]))
 
-    # value and derivatives by reference coordinates of the undeformed places
-    r = jets(model.r0.x.array.reshape(-1, V.dofmap.bs))
-    if not model.axisymmetric:
-        # |grad v|² = g^ab v,_a . v,_b
-        v = jets(model.system.with_ghosts(mode[: model.system.size]).reshape(-1, 3))
-        metric = np.einsum("acqi,bcqi->cqab", r[1:], r[1:])
-        inverse = np.linalg.inv(metric)
-        squares = np.einsum("cqab,acqi,bcqi->cq", inverse, v[1:], v[1:])
-        return r[0], squares * np.sqrt(np.linalg.det(metric)) * weights
+    r = jets(model.r0.x.array.reshape(-1, V.dofmap.bs))  # of the undeformed places
+    if model.axisymmetric:
+        v = jets(_wave_at_nodes(mode, model.system.size, waves))
+        return r[0], _squares_on_meridian(r, v, waves or 0) * weights
+    v = jets(model.system.with_ghosts(mode[: model.system.size]).reshape(-1, 3))
+    # |grad v|² = g^ab v,_a . v,_b
+    metric = np.einsum("acqi,bcqi->cqab", r[1:], r[1:])
+    inverse = np.linalg.inv(metric)
+    squares = np.einsum("cqab,acqi,bcqi->cq", inverse, v[1:], v[1:])
+    return r[0], squares * np.sqrt(np.linalg.det(metric)) * weights
+
+
+def _wave_at_nodes(mode: Vector, size: int, waves: int | None) -> Array:
+    """Return the coefficients (nodes, 3) U, V and W of a mode on a meridian.
+
+    Without `waves` the mode is a displacement (U, W) of `size` numbers, and V is zero.
+    """
     if waves is None:
-        U, W = np.moveaxis(mode[: model.system.size].reshape(-1, 2), 1, 0)
-        v = jets(np.column_stack([U, 0 * U, W]))
-    else:
-        P, circumferential, W = np.moveaxis(mode.reshape(-1, 3), 1, 0)
-        v = jets(np.column_stack([P - circumferential, circumferential, W]))
+        U, W = np.moveaxis(mode[:size].reshape(-1, 2), 1, 0)
+        return np.column_stack([U, 0 * U, W])
+    P, V, W = np.moveaxis(mode.reshape(-1, 3), 1, 0)  # P = U + V
+    return np.column_stack([P - V, V, W])
+
+
+def _squares_on_meridian(r: Array, v: Array, m: int) -> Array:
+    """Return the squared gradient of a wave m times area per radian and reference coordinate.
+
+    `r` (2, cells, points, 2) and `v` (2, cells, points, 3) are the places (rho, z) and the
+    coefficients (U, V, W), each with its derivatives by the reference coordinate.
+    """
     # speed: length of the meridian per reference coordinate
-    m, rho, speed = waves or 0, r[0, ..., 0], np.linalg.norm(r[1], axis=-1)
-    U, circumferential, W = np.moveaxis(v[0], -1, 0)
+    rho, speed = r[0, ..., 0], np.linalg.norm(r[1], axis=-1)
+    U, V, W = np.moveaxis(v[0], -1, 0)
     # squares of the derivatives by theta: coefficient of cos along e_theta, of sin along e_rho, e_z
-    around = (U + m * circumferential) ** 2 + (m * U + circumferential) ** 2 + (m * W) ** 2
+    around = (U + m * V) ** 2 + (m * U + V) ** 2 + (m * W) ** 2
     along = np.sum(v[1] ** 2, axis=-1)
-    # area per radian; the factor of the turn is the same everywhere
-    return r[0], (along / speed**2 + around / rho**2) * rho * speed * weights
+    # the factor of the whole turn is left out: it is the same everywhere
+    return np.asarray((along / speed**2 + around / rho**2) * rho * speed)

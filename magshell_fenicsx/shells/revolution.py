@@ -44,6 +44,12 @@ class Revolution:
         (n, 3) undeformed placement and unit normal, lengths in R.
     cells
         (m, 3) node numbers of triangles with the outer side up.
+    _at_ends
+        (2, circles) a cell that has each circle at an end, and this end's number, 0 or 1.
+    _poles
+        Mask of the circles that are one point on the axis.
+    _basis
+        (sectors, 3, 3) e_rho, e_theta and e_z at each sector, as rows.
     """
 
     def __init__(self, model: MeridianModel, sectors: int = 96, kinks: Sequence[int] = ()) -> None:
@@ -58,15 +64,14 @@ class Revolution:
         begin = np.arange(len(vertices)) + np.cumsum([0, *is_apart])
         self.ends = np.column_stack([begin, begin + 1])
         self._at_ends = np.empty((2, self.ends.max() + 1), dtype=np.int64)
-        # row 0: a cell that has each circle; row 1: at which of its ends, 0 or 1
         self._at_ends[0, self.ends] = np.arange(len(vertices))[:, None]
         self._at_ends[1, self.ends] = np.arange(2)
-        poles = model.meridian.poles  # parameters of the places on the axis
+        # parameter of each circle, compared with those of the places on the axis
         s = model.meridian.cells[tuple(self._at_ends)]
-        self._poles = np.asarray(np.isclose(s[:, None], poles).any(axis=1))
+        is_pole = np.isclose(s[:, None], model.meridian.poles).any(axis=1)
+        self._poles = np.asarray(is_pole)
         theta = np.arange(sectors) * 2 * np.pi / sectors
         cos, sin, zero = np.cos(theta), np.sin(theta), 0 * theta
-        # e_rho, e_theta, e_z
         basis = np.array([[cos, sin, zero], [-sin, cos, zero], [zero, zero, zero + 1]])
         self._basis = np.moveaxis(basis, -1, 0)
         normals = nodal_normals(model.r0)
@@ -178,16 +183,16 @@ class Revolution:
         # number of the first node of each circle
         first = np.cumsum([0, *np.where(self._poles, 1, sectors)])
         sector = np.arange(sectors)
-        ring = np.where(self._poles[:, None], 0, sector) + first[:-1, None]
-        # corners of each quadrilateral: a, b at a cell's first end, c, d at its last; b and d are
-        # in the next sector
-        (a, c), (b, d) = (
-            np.moveaxis(nodes_of_circles[self.ends], 1, 0)
-            for nodes_of_circles in (ring, np.roll(ring, -1, axis=1))
-        )
+        # nodes (circles, sectors) at the begin and at the end of each sector
+        nodes = np.where(self._poles[:, None], 0, sector) + first[:-1, None]
+        next_nodes = np.roll(nodes, -1, axis=1)
+        # corners (cells, sectors) of each quadrilateral: a, b at a cell's first end, c, d at its
+        # last; b and d are in the next sector
+        a, c = np.moveaxis(nodes[self.ends], 1, 0)
+        b, d = np.moveaxis(next_nodes[self.ends], 1, 0)
         # a triangle with two corners at a pole is left out
-        begins, ends = (~self._poles[nodes_of_circles] for nodes_of_circles in self.ends.T)
-        bands = [(ends, (a, c, d)), (begins, (a, d, b))]
+        begins_off_axis, ends_off_axis = (~self._poles[circles] for circles in self.ends.T)
+        bands = [(ends_off_axis, (a, c, d)), (begins_off_axis, (a, d, b))]
         return np.concatenate(
             [np.stack(corners, axis=-1)[is_kept].reshape(-1, 3) for is_kept, corners in bands]
         )

@@ -49,6 +49,17 @@ class SectorModes:
         Model of the sector.
     as_half
         Function of the mid-surface of a half that makes the model of the same shell on it.
+
+    Attributes
+    ----------
+    _folding
+        The map between charts of the half and of the sector; set with `half_model`, as are the two
+        below.
+    _numbers, _turns
+        For each node of the half, the sector's node and the rotation (3, 3) that give its
+        displacement.
+    _own, _others
+        Factors of the sector's tangent, and of that of the half.
     """
 
     # for a `StabilityMonitor`: modes are counted but not located, as the turned shape is always
@@ -68,32 +79,27 @@ class SectorModes:
         """
         sector, patch = self._model.mirror, self._model.midsurface.patch
         assert isinstance(sector, Sector)
+        comm = self._model.system.comm
         self._folding = unfolding_of(sector, patch)
-        half = self._as_half(
-            distribute(
-                unfold(patch, self._folding, (SYMMETRY_EDGE, SYMMETRY_EDGE)),
-                self._model.system.comm,
-            )
-        )
-        comm, chart = self._model.system.comm, half.chart()
+        patch_of_half = unfold(patch, self._folding, (SYMMETRY_EDGE, SYMMETRY_EDGE))
+        half = self._as_half(distribute(patch_of_half, comm))
+        chart_of_half = half.chart()
         # charts of all ranks' nodes, in the order in which `unfold` gathers displacements
         nodes = np.concatenate(comm.allgather(self._model.chart()))
         # node of the sector and rotation that give the displacement of each node of the half
-        self._numbers = scipy.spatial.cKDTree(nodes).query(self._folding.to_sector(chart))[1]
-        self._turns = np.array([self._folding.turn(k) for k in range(sector.waves)])[
-            self._folding.copies(chart)
-        ]
+        _, self._numbers = scipy.spatial.cKDTree(nodes).query(
+            self._folding.to_sector(chart_of_half)
+        )
+        turns_of_copies = np.array([self._folding.turn(k) for k in range(sector.waves)])
+        self._turns = turns_of_copies[self._folding.copies(chart_of_half)]
         return half
 
     def unfold(self, u: Vector) -> Vector:
         """Return a sector's displacement on this rank as that of the half; collective."""
         half, system = self.half_model, self._model.system
         sector_values = np.concatenate(system.comm.allgather(u[: system.size].reshape(-1, 3)))
-        return np.asarray(
-            half.system.zero_at_supports(
-                np.einsum("nij,nj->ni", self._turns, sector_values[self._numbers]).ravel()
-            )
-        )
+        values = np.einsum("nij,nj->ni", self._turns, sector_values[self._numbers])
+        return np.asarray(half.system.zero_at_supports(values.ravel()))
 
     def counts(self, state: State) -> Sequence[int]:
         """Return two numbers of unstable modes at a state of the sector; collective.
@@ -109,11 +115,11 @@ class SectorModes:
         symmetric = self._others.negative_pivots - sector_pivots
         modes = half.symmetry_breaking_modes
         assert isinstance(modes, AntisymmetricModes)
-        # the neutral turn of the whole shape is left out of the count
         factors = modes.factor_at(state_of_half)
         antisymmetric = factors.negative_pivots
+        # The turn v of the whole shape about e3 is neutral and left out: the tangent K has one
+        # unstable mode less on the complement of v if v . K^-1 v is negative.
         turning = self._turning(state_of_half)
-        # inertia of the tangent on the complement of the turn
         if turning is not None and dot(half.system.comm, turning, factors.solve(turning)) < 0:
             antisymmetric -= 1
         return [max(symmetric, 0), antisymmetric]

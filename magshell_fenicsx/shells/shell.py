@@ -144,6 +144,21 @@ class ShellModel(ThinModel):
     turns
         Whether its material and all its loads are axisymmetric, so that it may turn about its axis;
         whoever makes the model may set it.
+    moving
+        The motion of the supports; None if none moves.
+    planes
+        All symmetry planes on which edges lie, those of the modelled part first.
+    without_potential
+        Edges at which a live pressure has no potential.
+    _mirror_planes
+        Edge with the condition "symmetry" -> its plane.
+    _mirror_term, _pattern_term
+        Term of the edges on the last of these planes, and the term of interior edges, which gives
+        the sparsity pattern.
+    _constraints
+        Constraints of the displacement by the conditions, without those on mirror planes.
+    _hessians
+        Integrals of the terms' Hessians.
     """
 
     thin: Literal[True] = True
@@ -316,6 +331,7 @@ class ShellModel(ThinModel):
         initial_placement = self.growing and self.growing.initial_placement
         domain = surface_domain(self.r0, initial_placement)
         creases = Creases.of_joints(self.loads.joints, midsurface) if loads.joints else None
+        pressed_sides = side_field(loads.pressed_sides, midsurface) if loads.pressed_sides else None
         return EnergyFactory(
             domain,
             self.u,
@@ -326,9 +342,7 @@ class ShellModel(ThinModel):
             natural_shape,
             free_constants,
             has_folds=is_folded,
-            pressed_sides=side_field(loads.pressed_sides, midsurface)
-            if loads.pressed_sides
-            else None,
+            pressed_sides=pressed_sides,
             creases=creases,
             cell_materials=self.cell_materials,
         )
@@ -488,10 +502,10 @@ class ShellModel(ThinModel):
         moving_cells = None
         if self.moving:
             cells = self.moving.cells
-            moving_cells = (
-                cells,
-                hessian_integrals(self.r0, self.degree, terms, self.kernels, cell_mask=cells),
+            integrals = hessian_integrals(
+                self.r0, self.degree, terms, self.kernels, cell_mask=cells
             )
+            moving_cells = cells, integrals
         tangent = FastTangent(self.u, self._hessians, constraints, moving_cells)
         density_terms = [term for term in terms if isinstance(term, ShellTerm)]
         residual = self._point_residual(density_terms)

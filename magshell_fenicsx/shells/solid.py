@@ -98,6 +98,18 @@ class SolidModel(ModelBase):
         Degree of the displacement: 2.
     sigma
         None: nothing is penalised.
+    without_potential
+        Ends at which a live pressure has no potential.
+    _terms, _pattern
+        All terms of the system, and the one whose form gives the sparsity pattern.
+    _held
+        Constraints by the conditions, without those on the plane of `mirror`.
+    _faces
+        Facets of each face on the plane of `mirror`.
+    _hessians
+        Integrals of the terms' Hessians.
+    _moving
+        The motion of the supports; None if none moves.
     """
 
     thin: Literal[False] = False
@@ -154,7 +166,8 @@ class SolidModel(ModelBase):
         edge_pressure = self._edge_pressure(ends, origin) if is_enclosed else None
         self._moving = moving(self.r0, self.supports, self.loads, edge_pressure)
         self.system = self._system(self._held + self._held_on_mirror([mirror.normal]))
-        # under a pressure the volume that points sweep, else that between the face and the origin
+        # under a pressure (None) the volume that points sweep, else that between the face and the
+        # origin
         if self.loads.pressure or is_enclosed:
             origin = None
         elif origin is None:
@@ -303,8 +316,9 @@ class SolidModel(ModelBase):
         it at the same fraction of their own thickness.
         """
         cells_of_facets = self.body.mesh.topology.connectivity(2, 3)
-        # bounds in the thickness of the cell behind each facet
-        low, high = self.body.layer_bounds[cells_of_facets.array[cells_of_facets.offsets[facets]]].T
+        cells = cells_of_facets.array[cells_of_facets.offsets[facets]]  # behind each facet
+        # bounds of these cells in the thickness
+        low, high = self.body.layer_bounds[cells].T
         has_height = (low < height - ROUNDING) & (height < high + ROUNDING)
         fraction_of_cell = (height - low[has_height]) / (high - low)[has_height]
         return EdgeCurve.from_facets(
@@ -331,10 +345,10 @@ class SolidModel(ModelBase):
         # cells with nodes that supports move, and the tangent's integrals on these cells alone
         moving_cells, factory, motion = None, self.factory, self._moving
         if motion:
-            moving_cells = (
-                motion.cells,
-                body_hessian_integrals(self.body, self.r0, self._terms, self.kernels, motion.cells),
+            integrals = body_hessian_integrals(
+                self.body, self.r0, self._terms, self.kernels, cell_mask=motion.cells
             )
+            moving_cells = motion.cells, integrals
         fast_tangent = FastTangent(self.u, self._hessians, constraints, moving_cells)
         parameters: dict[str, FreeParameter] = {
             **make_parameters(factory.free_constants, self._terms, self.u, self.kernels)
@@ -374,9 +388,11 @@ def _layered(layers: Sequence[tuple[float, Array]], body: BodyMesh) -> ByPatch:
     fractions end where cells do.
     """
     ends = np.cumsum([fraction for fraction, _ in layers])
+    vectors = np.array([vector for _, vector in layers])
     # the layer of each cell is that around the middle of its height
     middle = body.layer_bounds.mean(axis=1)
-    return ByPatch(np.array([vector for _, vector in layers])[np.searchsorted(ends[:-1], middle)])
+    layer_of_cell = np.searchsorted(ends[:-1], middle)
+    return ByPatch(vectors[layer_of_cell])
 
 
 def grown_in_body(density: SolidDensity, shape: Shape) -> SolidDensity:
@@ -387,10 +403,9 @@ def grown_in_body(density: SolidDensity, shape: Shape) -> SolidDensity:
     """
 
     def grown(*arguments: Expr) -> Expr:
-        density_argument_count = len(arguments) - len(shape.parameters)
-        return density.function(
-            *arguments[:density_argument_count],
-            growth=growth_in_body(shape, *arguments[density_argument_count:]),
-        )
+        own_count = len(arguments) - len(shape.parameters)
+        own_arguments, shape_parameters = arguments[:own_count], arguments[own_count:]
+        growth = growth_in_body(shape, *shape_parameters)
+        return density.function(*own_arguments, growth=growth)
 
     return replace(density, function=grown, parameters=(*density.parameters, *shape.parameters))

@@ -67,6 +67,17 @@ class BodyHessianIntegral:
     ----------
     coupling
         Batches that couple several cells; a solid has none.
+    _batches, _geometry
+        The batches of cells, and `_geometry` (see the function) at the points of each.
+    _g, _u
+        Fields at points that kernels read: geometry, and jet of u.
+    _hessians, _pairs
+        Term -> kernel of its Hessian, and the pairs of jet parts that this has.
+    _varying
+        Term -> its parameters that are fields: field at points, and memo of its values in each
+        batch.
+    _coupled
+        All pairs of jet parts that some term has.
     """
 
     coupling: Sequence[EntityBatch] = ()
@@ -133,20 +144,17 @@ class BodyHessianIntegral:
         for name in names:
             for _, values in self._varying[name]:
                 values.renew()
-        for batch_number, (batch, geometry) in enumerate(
-            zip(self._batches, self._geometry, strict=True)
-        ):
+        for i, batch in enumerate(self._batches):
+            # what kernels read at the batch's points
             fill(self._u, self._jets(batch, u))
-            fill(self._g, geometry)
+            fill(self._g, self._geometry[i])
+            # sum of the terms' Hessians at points, then contracted with shape functions
             blocks = HessianBlocks(batch, self._coupled)
             for name in names:
                 for target, values in self._varying[name]:
-                    fill(target, values.latest[batch_number])
-                blocks.add(
-                    self._points.evaluate(self._hessians[name], batch.size),
-                    factors[name],
-                    self._pairs[name],
-                )
+                    fill(target, values.latest[i])
+                hessians = self._points.evaluate(self._hessians[name], batch.size)
+                blocks.add(hessians, factors[name], self._pairs[name])
             element_matrices[batch.cells[0]] += self._contraction.within_side(blocks, 0)
 
     def _jets(self, batch: EntityBatch, field: Array) -> Array:
@@ -158,9 +166,10 @@ class BodyHessianIntegral:
 
         `v` is the jet by which it is differentiated: that of u itself, or of the test function of a
         virtual work. Of a virtual work it is a function of u and v, whose Hessian in v is the
-        symmetric part of the work's derivative.
+        symmetric part of the work's derivative. Sets `_varying` of the term.
         """
         density, g, z = term.density, self._g, self._u
+        # all parameters as expressions at points; those that are fields, with their point fields
         at_points, varying = parameters_at(self._points, density.parameters, 1)
         function = density.work or density.function
         self._varying[term.name] = [
@@ -205,28 +214,30 @@ def body_hessian_integrals(
     """
     V = X.function_space
     nonlinear = [t for t in terms if isinstance(t, SolidTerm) and not t.linear]
+    in_body = [t for t in nonlinear if t.density.region == "body"]
+    on_faces = [t for t in nonlinear if t.density.region != "body"]
+
+    def counted(cells: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Return those of some cells that the mask selects."""
+        return cells if cell_mask is None else cells[cell_mask[cells]]
+
     integrals = []
-    for degree in sorted({t.density.degree for t in nonlinear if t.density.region == "body"}):
-        points, weights = basix.make_quadrature(basix.CellType.hexahedron, degree)
-        cells = np.arange(V.mesh.topology.index_map(3).size_local, dtype=np.int32)
-        counted_cells = cells if cell_mask is None else cells[cell_mask[cells]]
-        terms_of_degree = [
-            t for t in nonlinear if t.density.region == "body" and t.density.degree == degree
-        ]
-        integrals.append(
-            BodyHessianIntegral(X, counted_cells, _rule(V, points, weights), terms_of_degree, log)
-        )
-    for term in nonlinear:
-        if term.density.region == "body":
-            continue
-        # faces of different numbers in their cells have different tables; all ranks go through all
+    # one integral for all terms in the body with one degree of quadrature
+    own_cells = np.arange(V.mesh.topology.index_map(3).size_local, dtype=np.int32)
+    for degree in sorted({t.density.degree for t in in_body}):
+        rule = _rule(V, *basix.make_quadrature(basix.CellType.hexahedron, degree))
+        terms_of_degree = [t for t in in_body if t.density.degree == degree]
+        integrals.append(BodyHessianIntegral(X, counted(own_cells), rule, terms_of_degree, log))
+    # for a term on faces one integral for each number of a face in its cell, since the tables of
+    # shape functions differ; all ranks go through the numbers that some rank has
+    for term in on_faces:
         cells_at_facets, facet_numbers = _cells_at(body, term.density.facets)
         points, weights = term.density.rule
-        for facet in np.flatnonzero(V.mesh.comm.allreduce(np.bincount(facet_numbers, minlength=6))):
+        counts = V.mesh.comm.allreduce(np.bincount(facet_numbers, minlength=6))
+        for facet in np.flatnonzero(counts):
             rule = _rule(V, _on_facet(points, facet), weights)
-            at_facet = cells_at_facets[facet_numbers == facet]
-            counted_cells = at_facet if cell_mask is None else at_facet[cell_mask[at_facet]]
-            integrals.append(BodyHessianIntegral(X, counted_cells, rule, [term], log, facet))
+            cells = counted(cells_at_facets[facet_numbers == facet])
+            integrals.append(BodyHessianIntegral(X, cells, rule, [term], log, facet))
     return integrals
 
 
@@ -253,10 +264,10 @@ def _cells_at(
     """Return the owned cells behind some facets, and the facet's number in each cell."""
     topology = body.mesh.topology
     cells_of_facets = topology.connectivity(2, 3)
+    # the first cell of each facet, which is the only one on the surface
     cells = cells_of_facets.array[cells_of_facets.offsets[facets]]
-    facet_numbers = np.argmax(
-        topology.connectivity(3, 2).array.reshape(-1, 6)[cells] == facets[:, None], axis=1
-    )
+    facets_of_cells = topology.connectivity(3, 2).array.reshape(-1, 6)
+    facet_numbers = np.argmax(facets_of_cells[cells] == facets[:, None], axis=1)
     owned = cells < topology.index_map(3).size_local
     return np.asarray(cells[owned], dtype=np.int32), facet_numbers[owned]
 
@@ -275,11 +286,10 @@ def _geometry(jets: Array, region: str, facet: int | None) -> Array:
     inverse, volume_ratio = np.linalg.inv(G), np.linalg.det(G)
     if facet is None:
         return np.column_stack([flat[:, 0], inverse.reshape(-1, 9), volume_ratio])
-    # area ratio by Nanson's formula; n along the thickness, t along the edge
+    # area ratio by Nanson's formula
     outward = basix.cell.facet_outward_normals(basix.CellType.hexahedron)[facet] @ inverse
-    # the third reference coordinate goes through the thickness
+    area_ratio = volume_ratio * np.linalg.norm(outward, axis=1)
+    # n along the thickness, which is the third reference coordinate; t along the edge
     n, t = flat[:, 3], np.cross(flat[:, 3], outward)
-    unit = [v / np.linalg.norm(v, axis=1)[:, None] for v in (n, t)]
-    return np.column_stack(
-        [flat[:, 0], inverse.reshape(-1, 9), volume_ratio * np.linalg.norm(outward, axis=1), *unit]
-    )
+    unit_vectors = [v / np.linalg.norm(v, axis=1)[:, None] for v in (n, t)]
+    return np.column_stack([flat[:, 0], inverse.reshape(-1, 9), area_ratio, *unit_vectors])

@@ -291,8 +291,8 @@ class TermFactory:
         """Return the magnetisation state of a saturating material at the quadrature points.
 
         The state holds two Taylor polynomials of the energy in the field, at u and at u = 0; see
-        `saturation`. It is computed again where `followed`, the places or u, or the field has
-        changed.
+        `saturation`. It is computed again when the places, u or the field have changed. `chi` is
+        the susceptibility.
         """
         V = self.u.function_space
         saturation, X = PointField(V.mesh, QUADRATURE_DEGREE, 2 * SIZE), fem.Function(V)
@@ -437,10 +437,8 @@ class TermFactory:
 
         def per_volume(X: Expr, u: Expr, H: Expr, *parameters: Expr) -> Expr:
             # after the term's own parameters comes h: energies count over E h R²
-            return (
-                at_point(Jet(X, *flat), Jet(u, *flat), *parameters[:parameter_count])
-                / parameters[parameter_count]
-            )
+            own_parameters, h = parameters[:parameter_count], parameters[parameter_count]
+            return at_point(Jet(X, *flat), Jet(u, *flat), *own_parameters) / h
 
         constants = constants_of(term, self.u.function_space.mesh, self.free_constants)
         return SolidDensity(per_volume, (*constants, *self._constants(self.h)), VALUE)
@@ -508,8 +506,7 @@ class TermFactory:
     ) -> dict[str, SolidDensity]:
         """Return densities of p times the change of volume under the outer face, by term name.
 
-        On hinged ends the volume reaches down to the middle line. There, cells wholly above the
-        line have one density, and those that hold it another, integrated on their upper half.
+        On hinged ends the volume reaches down to the middle line, see `_hinged_facets_above`.
 
         Parameters
         ----------
@@ -548,32 +545,41 @@ class TermFactory:
             )
         }
         if self.hinged:
-            facets = np.unique(np.concatenate([faces[name] for name in self.hinged]))
-            cells_of_facets = self.body.mesh.topology.connectivity(2, 3)
-            # heights of the lower and the upper face of the cell at each facet
-            low, high = self.body.layer_bounds[
-                cells_of_facets.array[cells_of_facets.offsets[facets]]
-            ].T
-            masks = {
-                "whole": low > MIDSURFACE_HEIGHT - HEIGHT_TOLERANCE,
-                "upper": (low < MIDSURFACE_HEIGHT - HEIGHT_TOLERANCE)
-                & (high > MIDSURFACE_HEIGHT + HEIGHT_TOLERANCE),
-            }
-            for name, is_in_mask in masks.items():
+            for name, facets in self._hinged_facets_above().items():
                 # all ranks have the same terms
-                if self.body.mesh.comm.allreduce(int(is_in_mask.sum())):
-                    facets_of_part, upper = facets[is_in_mask], name == "upper"
+                if self.body.mesh.comm.allreduce(len(facets)):
                     densities_by_name[f"pressure {name}"] = SolidDensity(
                         end_density,
                         parameters,
                         VALUE + GRADIENT,
                         QUADRATURE_DEGREE,
                         "end",
-                        facets_of_part,
-                        upper,
-                        end_work,
+                        facets,
+                        upper=name == "upper",
+                        work=end_work,
                     )
         return densities_by_name
+
+    def _hinged_facets_above(self) -> dict[str, Facets]:
+        """Return the facets of hinged ends above the middle line.
+
+        Returns
+        -------
+        dict[str, Facets]
+            "whole": facets of cells wholly above the line. "upper": facets of cells through which
+            the line passes, whose upper half is above it.
+        """
+        facets = np.unique(np.concatenate([self.body.faces[name] for name in self.hinged]))
+        cells_of_facets = self.body.mesh.topology.connectivity(2, 3)
+        cells = cells_of_facets.array[cells_of_facets.offsets[facets]]
+        # heights of the lower and the upper face of the cell at each facet
+        low, high = self.body.layer_bounds[cells].T
+        begins_below = low < MIDSURFACE_HEIGHT - HEIGHT_TOLERANCE
+        ends_above = high > MIDSURFACE_HEIGHT + HEIGHT_TOLERANCE
+        return {
+            "whole": facets[low > MIDSURFACE_HEIGHT - HEIGHT_TOLERANCE],
+            "upper": facets[begins_below & ends_above],
+        }
 
     def _bulk(
         self,
@@ -603,6 +609,7 @@ class TermFactory:
         `SolidDensity.function`.
         """
         domain, u = self.body.mesh, self.u
+        # J: columns are the derivatives of X by the reference coordinates
         X, J, H = ufl.SpatialCoordinate(domain), ufl.Jacobian(domain), ufl.grad(u)
         ds, forms = face_measure(domain, [density.facets for density in densities]), []
         # `face_measure` marks the facets of the first density with 1, and so on
@@ -615,21 +622,23 @@ class TermFactory:
                 # by the area per reference area makes the measure one of the reference cell
                 area = ufl.cross(J[:, 0], J[:, 1])
                 arguments = X, J[:, 0], J[:, 1], u, ufl.dot(H, J[:, 0]), ufl.dot(H, J[:, 1])
-                forms.append(
-                    function(*arguments, *parameters) / ufl.sqrt(ufl.dot(area, area)) * ds(tag)
-                )
+                per_reference_area = function(*arguments, *parameters)
+                forms.append(per_reference_area / ufl.sqrt(ufl.dot(area, area)) * ds(tag))
                 continue
             # an end: n along the thickness, t along the edge
             n = J[:, 2] / ufl.sqrt(ufl.dot(J[:, 2], J[:, 2]))
             t = ufl.cross(n, ufl.FacetNormal(domain))
             per_area = function(X, u, H, n, t / ufl.sqrt(ufl.dot(t, t)), *parameters)
-            # the outer half of a facet has its own rule
-            points, weights = density.rule
-            metadata = {"quadrature_rule": "custom"} | {
-                "quadrature_points": tuple(tuple(x) for x in points),
-                "quadrature_weights": tuple(weights),
-            }
-            forms.append(per_area * (ds(tag, metadata=metadata) if density.upper else ds(tag)))
+            measure = ds(tag)
+            if density.upper:  # the outer half of a facet has its own rule
+                points, weights = density.rule
+                metadata = {
+                    "quadrature_rule": "custom",
+                    "quadrature_points": tuple(tuple(x) for x in points),
+                    "quadrature_weights": tuple(weights),
+                }
+                measure = ds(tag, metadata=metadata)
+            forms.append(per_area * measure)
         return sum(forms[1:], forms[0])
 
     def _constants(self, *values: float | Array) -> tuple[fem.Constant, ...]:

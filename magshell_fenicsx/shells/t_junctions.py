@@ -124,6 +124,18 @@ class TieTerm:
         None: no load parameter multiplies the energy.
     column
         Column of the energy in the results.
+    _unknowns, _gaps, _tangents
+        `unknowns`, `gap` and `tangents` of the `TiedPoints`.
+    _tie
+        (n,) stiffness of the tie of places.
+    _turns
+        Whether there is a tie of normals: a hinge has none.
+    _components
+        Number of unknowns at a node.
+    _own
+        Number of this rank's first unknown, and how many are its own.
+    _placed
+        (n, 12) both tangents of both shells, undeformed.
     """
 
     amplitude = None
@@ -144,9 +156,9 @@ class TieTerm:
         zero; derivatives are taken by it.
         """
         V = u.function_space
-        self._comm, self._u, self._size = V.mesh.comm, u, V.dofmap.bs
+        self._comm, self._u, self._components = V.mesh.comm, u, V.dofmap.bs
         index = V.dofmap.index_map
-        self._own = self._size * index.local_range[0], self._size * index.size_local
+        self._own = self._components * index.local_range[0], self._components * index.size_local
         self.name = self.group = f"joint of {' and '.join(joint.edges)}"
         self._unknowns, self._gaps = tied_points.unknowns, tied_points.gap
         self._tangents, self._tie = tied_points.tangents, tied_points.stiffness[:, 0]
@@ -156,26 +168,33 @@ class TieTerm:
         self._present = self._points.field(TANGENT_COMPONENTS)
         self._moved = self._points.field(TANGENT_COMPONENTS)
         # 0, 1: direction of the edge; 2, 3: sine and cosine of the placement; 4: stiffness
-        self._fixed = fixed_field = self._points.field(5)
-        sine_and_cosine = _angle(self._present, self._moved, fixed_field)
-        sine = sine_and_cosine[0] * fixed_field[3] - sine_and_cosine[1] * fixed_field[2]
-        cosine = sine_and_cosine[1] * fixed_field[3] + sine_and_cosine[0] * fixed_field[2]
-        energy = fixed_field[4] / 2 * ufl.atan2(sine, cosine) ** 2
+        self._fixed = self._points.field(5)
+        self._kernels = self._compile_kernels(log)
+        self._placed = self._apply(self._tangents, global_values(r0))
+        fixed_values = self._fixed.x.array.reshape(-1, 5)[: len(self._unknowns)]
+        fixed_values[:, :2] = tied_points.edge_directions
+        fixed_values[:, 4] = tied_points.stiffness[:, 1]
+        # angle of the placement, at zero displacement; this kernel reads the direction alone
+        fixed_values[:, 2:4] = self._evaluate("angle", 0 * global_values(r0))
+
+    def _compile_kernels(self, log: KernelLog) -> Mapping[str, PointKernel]:
+        """Return the kernels of the angle, and of the energy of the tie of normals; collective.
+
+        The energy and its derivatives are those of the change of the angle since the placement.
+        """
+        fixed = self._fixed
+        sine_and_cosine = _angle(self._present, self._moved, fixed)
+        # sine and cosine of the difference of the present and the undeformed angle
+        sine = sine_and_cosine[0] * fixed[3] - sine_and_cosine[1] * fixed[2]
+        cosine = sine_and_cosine[1] * fixed[3] + sine_and_cosine[0] * fixed[2]
+        energy = fixed[4] / 2 * ufl.atan2(sine, cosine) ** 2
         self._moved.x.array[:] = 0.0
-        self._kernels: Mapping[str, PointKernel] = {
+        return {
             "angle": point_values("T-junction angle", sine_and_cosine, log),
             "energy": point_values("T-junction energy", energy, log),
             "gradient": point_gradient("T-junction gradient", [(energy, self._moved)], log),
             "hessian": full_hessian("T-junction Hessian", energy, self._moved, log),
         }
-        self._placed = self._apply(self._tangents, global_values(r0))
-        fixed_values = fixed_field.x.array.reshape(-1, 5)[: len(self._unknowns)]
-        fixed_values[:, :2], fixed_values[:, 4] = (
-            tied_points.edge_directions,
-            tied_points.stiffness[:, 1],
-        )
-        # the kernel "angle" reads only the direction, which is set, and takes zero displacement
-        fixed_values[:, 2:4] = self._evaluate("angle", 0 * global_values(r0))
 
     # the interface of a term
 
@@ -188,19 +207,21 @@ class TieTerm:
     def energy(self) -> float:
         """Return the elastic energy of both ties at this rank's points; collective."""
         u = global_values(self._u)
-        # the tie of places, then that of normals
-        tie_energy = float(self._tie @ np.sum(self._apply(self._gaps, u) ** 2, axis=1)) / 2
-        return tie_energy + (float(self._evaluate("energy", u).sum()) if self._turns else 0.0)
+        squared_gaps = np.sum(self._apply(self._gaps, u) ** 2, axis=1)
+        energy_of_places = float(self._tie @ squared_gaps) / 2
+        energy_of_normals = float(self._evaluate("energy", u).sum()) if self._turns else 0.0
+        return energy_of_places + energy_of_normals
 
     def add_residual(self, b: Array, factor: float) -> None:
         """Add factor times the forces of the ties to the local vector b; collective."""
         u = global_values(self._u)
         residual = np.zeros(u.size)
-        forces = np.einsum(
-            "nc,nck->nk", self._tie[:, None] * self._apply(self._gaps, u), self._gaps
-        )
-        if self._turns:
+        # forces of the tie of places on the unknowns of each point (n, k)
+        spring_forces = self._tie[:, None] * self._apply(self._gaps, u)
+        forces = np.einsum("nc,nck->nk", spring_forces, self._gaps)
+        if self._turns:  # those of the tie of normals
             forces += np.einsum("nc,nck->nk", self._evaluate("gradient", u), self._tangents)
+        # summed over points, then sent to the ranks that own the unknowns
         np.add.at(residual, self._unknowns, factor * forces)
         add_to_owners(b, residual, self._own, self._comm)
 
@@ -217,7 +238,7 @@ class TieTerm:
         The two arrays hold the first and the second node of each pair.
         """
         # every block of unknowns begins with a node's first component
-        return pairs_of(self._unknowns[:, :: self._size] // self._size)
+        return pairs_of(self._unknowns[:, :: self._components] // self._components)
 
     @property
     def pattern_key(self) -> float:
@@ -236,10 +257,10 @@ class TieTerm:
         if self._turns and len(H):
             hessians = np.zeros((len(H), TANGENT_COMPONENTS, TANGENT_COMPONENTS))
             # the kernel gives the upper triangle of each symmetric Hessian
-            upper = np.triu_indices(TANGENT_COMPONENTS)
-            hessians[:, upper[0], upper[1]] = hessians[:, upper[1], upper[0]] = self._evaluate(
-                "hessian", u
-            )
+            i, j = np.triu_indices(TANGENT_COMPONENTS)
+            upper_entries = self._evaluate("hessian", u)
+            hessians[:, i, j] = upper_entries
+            hessians[:, j, i] = upper_entries
             H += np.einsum("nik,nij,njl->nkl", tangents, hessians, tangents, optimize=True)
         return np.asarray(H)
 
@@ -404,31 +425,45 @@ class MidSurfaces:
         is_other_shell
             Mask of the local cells that belong to the other shell.
         """
-        first, nodes = self.cells.own_range.start, self.cells.nodes
-        cells, ends = _cell_sides(self.V, facets, len(self.cells.own_range))
+        # this rank's cells beside the edge, and their sides on it
+        own_cells, ends = _cell_sides(self.V, facets, len(self.cells.own_range))
+        edge_cells = self.cells.own_range.start + own_cells  # global numbers
         # exact to this degree with as many Gauss points as the element's degree
         s, weights = basix.make_quadrature(basix.CellType.interval, 2 * self._element.degree - 1)
         # Gauss points along each side, in the coordinates of its cell
         X = ends[:, None, 0] + s[None, :, :1] * (ends[:, None, 1] - ends[:, None, 0])
+        # for each point: direction and cell of its side, its place, and the tangent there
         edge_directions = np.repeat(ends[:, 1] - ends[:, 0], len(s), axis=0)
-        cell = np.repeat(first + cells, len(s))
+        cell = np.repeat(edge_cells, len(s))
         on_edge = self.shapes(X.reshape(-1, 2))
-        x = np.einsum("nk,nki->ni", on_edge[0], self.r0[nodes[cell]])
-        tangent = np.einsum("na,ank,nki->ni", edge_directions, on_edge[1:], self.r0[nodes[cell]])
+        nodal_places = self.r0[self.cells.nodes[cell]]
+        x = np.einsum("nk,nki->ni", on_edge[0], nodal_places)
+        tangent = np.einsum("na,ank,nki->ni", edge_directions, on_edge[1:], nodal_places)
         # a point stands for a part of its side's length; the parts sum to the length
-        weight = np.tile(weights, len(cells)) * np.linalg.norm(tangent, axis=1)
+        weight = np.tile(weights, len(own_cells)) * np.linalg.norm(tangent, axis=1)
         length = np.repeat(np.sum(weight.reshape(-1, len(s)), axis=1), len(s))
         # global numbers of the other shell's cells
-        shell = np.flatnonzero(self.cells.gather_values(is_other_shell))
-        other_cell, Y, distances = self.nearest_places(x, shell)
-        # a cell all of whose nodes are near the other shell lies in it
-        places_of_cells = self.r0[nodes[first + cells]]
-        _, _, distances_of_nodes = self.nearest_places(places_of_cells.reshape(-1, 3), shell)
-        distances_of_cells = distances_of_nodes.reshape(places_of_cells.shape[:2])
-        clearance = float(distances_of_cells.max(axis=1, initial=0.0).min(initial=np.inf))
+        other_shell = np.flatnonzero(self.cells.gather_values(is_other_shell))
+        other_cell, Y, distances = self.nearest_places(x, other_shell)
         return EdgeOnShell(
-            cell, on_edge, x, edge_directions, weight, length, other_cell, Y, distances, clearance
+            cell=cell,
+            on_edge=on_edge,
+            x=x,
+            directions=edge_directions,
+            weight=weight,
+            length=length,
+            other_cell=other_cell,
+            Y=Y,
+            distances=distances,
+            clearance=self._clearance(edge_cells, other_shell),
         )
+
+    def _clearance(self, edge_cells: Longs, other_shell: Longs) -> float:
+        """Return `EdgeOnShell.clearance` of cells beside an edge; cells have global numbers."""
+        nodal_places = self.r0[self.cells.nodes[edge_cells]]
+        _, _, distances = self.nearest_places(nodal_places.reshape(-1, 3), other_shell)
+        farthest_of_cells = distances.reshape(nodal_places.shape[:2]).max(axis=1, initial=0.0)
+        return float(farthest_of_cells.min(initial=np.inf))
 
     def nearest_places(self, x: Array, cells: Longs) -> tuple[Longs, Array, Array]:
         """Return the nearest places of some cells to points.
@@ -449,28 +484,12 @@ class MidSurfaces:
         distances
             (n,) distance over R; inf where no cell is near.
         """
-        from scipy.spatial import cKDTree  # takes long to import
-
+        # the values of points without a near cell
         nearest = np.zeros(len(x), dtype=np.int64)
         Y = np.zeros((len(x), 2))
         distances = np.full(len(x), np.inf)
-        nodal_places = self.r0[self.cells.nodes[cells]]
-        centres = nodal_places.mean(axis=1)
-        radii = CELL_RADIUS_FACTOR * np.linalg.norm(nodal_places - centres[:, None], axis=2).max(
-            axis=1
-        )
-        # the cell whose place is nearest has its centre within its radius of that place; points
-        # farther than a radius from the surface need no place
-        if len(cells):
-            cells_near = cKDTree(centres).query_ball_point(x, 2 * radii.max())
-        else:
-            cells_near = [[]] * len(x)
-        # candidates: each point with all cells whose centre is near
-        point = np.repeat(np.arange(len(x)), [len(numbers) for numbers in cells_near])
-        candidate_cells = np.concatenate(
-            [np.asarray(numbers, dtype=np.int64) for numbers in (*cells_near, [])]
-        )
-        if not len(point):
+        candidate_points, candidate_cells = self._candidates(x, cells)
+        if not len(candidate_points):
             return nearest, Y, distances
         # projection needs no corners here: they are for neighbours alone
         surface = Cells(
@@ -482,21 +501,49 @@ class MidSurfaces:
             candidate_cells,
             np.arange(len(candidate_cells)),
             np.ones(len(candidate_cells), dtype=np.int64),
-            point,
+            candidate_points,
         )
+        # the projections found: of which candidate pair, with point, cell and distance
         pair, projections = nearest_places(surface, self.r0, x, candidates, np.inf)
-        point = projections.point
-        candidate_cells = candidate_cells[pair]
-        reference_places = projections.X
-        distance = projections.distance
-        # nearest first; of equally near ones the first cell
-        order = np.lexsort((cells[candidate_cells], np.round(distance, 12), point))
-        # the first candidate of each point in this order
+        point, distance = projections.point, projections.distance
+        cell = cells[candidate_cells[pair]]
+        # by point, then nearest first; of equally near ones the cell of the least number
+        order = np.lexsort((cell, np.round(distance, 12), point))
+        # the first projection of each point in this order
         best = order[np.flatnonzero(np.diff(point[order], prepend=-1))]
-        nearest[point[best]] = cells[candidate_cells[best]]
-        Y[point[best]] = reference_places[best]
+        nearest[point[best]] = cell[best]
+        Y[point[best]] = projections.X[best]
         distances[point[best]] = distance[best]
         return nearest, Y, distances
+
+    def _candidates(self, x: Array, cells: Longs) -> tuple[Longs, Longs]:
+        """Return pairs of points x (n, 3) and near cells, which may hold the nearest places.
+
+        Returns
+        -------
+        points
+            Number of the point of each pair, in ascending order.
+        near_cells
+            Position in `cells` of the cell of each pair.
+        """
+        from scipy.spatial import cKDTree  # takes long to import
+
+        nodal_places = self.r0[self.cells.nodes[cells]]
+        centres = nodal_places.mean(axis=1)
+        distances_from_centre = np.linalg.norm(nodal_places - centres[:, None], axis=2)
+        radii = CELL_RADIUS_FACTOR * distances_from_centre.max(axis=1)
+        # the cell whose place is nearest has its centre within its radius of that place; points
+        # farther than a radius from the surface need no place
+        if len(cells):
+            cells_near = cKDTree(centres).query_ball_point(x, 2 * radii.max())
+        else:
+            cells_near = [[]] * len(x)
+        points = np.repeat(np.arange(len(x)), [len(numbers) for numbers in cells_near])
+        # the empty list at the end is for ranks without points
+        near_cells = np.concatenate(
+            [np.asarray(numbers, dtype=np.int64) for numbers in (*cells_near, [])]
+        )
+        return points, near_cells
 
 
 class MeridianTJunction(TieTerm):
@@ -534,14 +581,18 @@ class MeridianTJunction(TieTerm):
         """Find the parallel that the edge is tied to; parameters are those of the class."""
         V = r0.function_space
         ends, dofs = _ends_of_cells(V), V.dofmap.list
+        # cells and shape functions at the edge, then at its place on the other meridian
         cells, self._shapes = _parallels(V, tied)
         self._nodes = dofs[np.concatenate(cells)].reshape(1, -1).astype(np.int64)
         nodal = r0.x.array.reshape(-1, 2)
         rho = _refuse_parallels_apart(r0, tied, material.h, key, joint)
-        foot = int(cells[0][0])  # the edge's cell; its length is that of a straight one
-        length = np.abs(ends[foot, 1] - ends[foot, 0]) * np.linalg.norm(
-            self._shapes[0][1] @ nodal[dofs[foot]]
+        # length of the edge's cell, as if it were straight
+        edge_cell = int(cells[0][0])
+        _, slopes = self._shapes[0]
+        length = np.abs(ends[edge_cell, 1] - ends[edge_cell, 0]) * np.linalg.norm(
+            slopes @ nodal[dofs[edge_cell]]
         )
+        # a tie must be stiff beside the stiffest of these cells
         stiffer = stiffness[np.concatenate(cells)].max(axis=0, keepdims=True)
         circumference = 2 * np.pi * np.array([rho])
         ties = _tie_stiffness(joint, material, stiffer, np.array([length]), circumference)
@@ -566,9 +617,10 @@ class MeridianTJunction(TieTerm):
         # half: the mean of cos² and sin² around e3
         return _entries(self._numbers(3), np.asarray(H / 2))
 
-    def _numbers(self, size: int) -> Longs:
-        """Return the numbers (1, k) of the unknowns of both cells, `size` of each node."""
-        return np.asarray(size * self._nodes[:, :, None] + np.arange(size)).reshape(1, -1)
+    def _numbers(self, components: int) -> Longs:
+        """Return the numbers (1, k) of the unknowns of both cells, `components` of each node."""
+        first_numbers = components * self._nodes[:, :, None]
+        return np.asarray(first_numbers + np.arange(components)).reshape(1, -1)
 
     def _maps(self, components: Array) -> tuple[Array, Array]:
         """Return `gap` and `tangents` of `TiedPoints`, from the unknowns of both cells.
@@ -612,9 +664,9 @@ def _parallels(
     for s, cells_at in zip(tied, cells, strict=True):
         # s in the reference coordinates of its cells, and slopes by s
         lengths = (ends[cells_at, 1] - ends[cells_at, 0])[:, None]
-        N, slopes = V.element.basix_element.tabulate(1, (s - ends[cells_at, :1]) / lengths)[
-            ..., 0
-        ] / len(cells_at)
+        reference_places = (s - ends[cells_at, :1]) / lengths
+        tables = V.element.basix_element.tabulate(1, reference_places)[..., 0]
+        N, slopes = tables / len(cells_at)
         shapes.append((N.ravel(), (slopes / lengths).ravel()))
     return cells, shapes
 
@@ -710,15 +762,14 @@ def _tie_stiffness(
     weight
         (n,) length over R for which each point stands.
     """
-    # a spring has its own stiffness and a hinge none; a rigid joint has one as of an element
+    # a spring has its own stiffness and a hinge has zero; that of a rigid joint follows the cell
     turning_stiffness: Array | float = joint.stiffness
     if joint.rigid:
         turning_stiffness = (
             TIE_STIFFNESS_RATIO * factors[:, 1] * material.bending_stiffness / length
         )
-    return np.column_stack(
-        [weight * TIE_STIFFNESS_RATIO * factors[:, 0] / length, weight * turning_stiffness]
-    )
+    stiffness_of_places = weight * TIE_STIFFNESS_RATIO * factors[:, 0] / length
+    return np.column_stack([stiffness_of_places, weight * turning_stiffness])
 
 
 def _refuse_apart(
@@ -773,10 +824,9 @@ def _cell_sides(V: fem.FunctionSpace, facets: NDArray[np.int32], owned: int) -> 
     for facet in facets:
         cell = int(to_cell.links(facet)[0])  # a boundary facet has one cell
         if cell < owned:  # ghosts are other ranks'
+            side = int(np.flatnonzero(to_facet.links(cell) == facet)[0])
             cells.append(cell)
-            ends.append(
-                CORNERS[SIDE_CORNERS[int(np.flatnonzero(to_facet.links(cell) == facet)[0])]]
-            )
+            ends.append(CORNERS[SIDE_CORNERS[side]])
     return np.array(cells, dtype=np.int64), np.array(ends).reshape(-1, 2, 2)
 
 
@@ -838,9 +888,10 @@ def refuse_misplaced_edges(
 def _refuse_coinciding_shells(
     tied_edges: Sequence[TiedEdge], surface: Midsurface, r0: fem.Function, h: float
 ) -> None:
-    """Refuse two shells that stand on a third one and lie in each other; collective.
+    """Refuse two shells with tied edges that coincide where one edge is; collective.
 
-    `h` is the thickness over R.
+    They do so if a cell beside one edge lies in the mid-surface of the other edge's shell, as where
+    two shells stand on the same place of a third one. `h` is the thickness over R.
 
     Raises
     ------
@@ -849,16 +900,18 @@ def _refuse_coinciding_shells(
     """
     if len(tied_edges) < 2:
         return
-    # each edge against the shell of each other edge, as if it stood on that shell
     surfaces, comm = MidSurfaces.gather(r0), r0.function_space.mesh.comm
-    for (joint, key, _), (other_joint, _, _) in permutations(tied_edges, 2):
-        edge, other_edge = joint.edges[0], other_joint.edges[0]
+    for tied_edge, other_tied_edge in permutations(tied_edges, 2):
+        key, edge = tied_edge.key, tied_edge.joint.edges[0]
+        other_edge = other_tied_edge.joint.edges[0]
         shell, other_shell = (_shell_of_edge(name, surface) for name in (edge, other_edge))
         # one shell with two edges, or an edge of a mesh file, whose sheets have no names
         if shell == other_shell or other_shell is None:
             continue
-        place = surfaces.edge_on_shell(surface.edges[edge], surface.patches[other_shell])
-        if min(comm.allgather(place.clearance)) < MAX_DISTANCE_IN_THICKNESSES * h:
+        # distance of the cells beside the edge from the shell of the other edge
+        edge_on_other = surfaces.edge_on_shell(surface.edges[edge], surface.patches[other_shell])
+        clearance = min(comm.allgather(edge_on_other.clearance))
+        if clearance < MAX_DISTANCE_IN_THICKNESSES * h:
             raise MeshError(
                 f"{key}: the shells of the edges {edge} and {other_edge} lie in each other: leave "
                 "one of them out, or move it"
@@ -920,11 +973,12 @@ def _stiffness_factors(model: "ShellModel | MeridianModel") -> Array:
     factors = np.ones((cells.size_local + cells.num_ghosts, 2))
     if model.thickness is not None:
         # h(x)/h, its mean in each cell
-        ratio = model.thickness.x.array[model.thickness.function_space.dofmap.list].mean(axis=1)
+        dofs_of_cells = model.thickness.function_space.dofmap.list
+        ratio = model.thickness.x.array[dofs_of_cells].mean(axis=1)
         factors *= np.column_stack([ratio, ratio**3])
     if model.cell_materials is not None:
         # the first of a cell's four material numbers is its modulus over the first shell's
-        factors *= model.cell_materials.x.array.reshape(-1, 4)[
-            model.cell_materials.function_space.dofmap.list[:, 0], :1
-        ]
+        material_numbers = model.cell_materials.x.array.reshape(-1, 4)
+        dof_of_cells = model.cell_materials.function_space.dofmap.list[:, 0]
+        factors *= material_numbers[dof_of_cells, :1]
     return factors

@@ -99,6 +99,18 @@ class Viscosity:
         History variables after the steps so far.
     creep_time
         `kelvin`: the longest time in which the forces let a displacement creep to its end.
+    _field, _places
+        Field of the stress in the forms, and the numbers of its nodes in each cell.
+    _prescribed
+        What the forms take: the stress, and the opening of edges.
+    _elastic_terms
+        Names of the elastic terms.
+    _viscous_tangent
+        Tangent of the viscous forces; None where it is a multiple of the elastic one.
+    _first_strain, _last_strain
+        The last two displacements with their strains.
+    _force
+        The force that was returned last.
     """
 
     def __init__(
@@ -156,11 +168,12 @@ class Viscosity:
         else:
             stress = np.zeros((*self._places.shape, STRAIN_SIZE))
         if self._branches:
-            for branch, q, end in zip(
-                self._branches, self.memory.strains, self._evolved(u0, u1, dt), strict=True
+            # strains of the springs at the begin and at the end of the step, linear between these
+            first_strains, last_strains = self.memory.strains, self._evolved(u0, u1, dt)
+            for branch, first, last in zip(
+                self._branches, first_strains, last_strains, strict=True
             ):
-                # q is linear between the ends of the step
-                stress += branch.modulus * (part * end + (1 - part) * q)
+                stress += branch.modulus * (part * last + (1 - part) * first)
         # edges have no history: in the middle of a step, an opening has the rate 2/dt times it
         edge_stiffness = self.stiffness(dt, 2 / dt) if dt else 0.0
         self._force = self._forces(stress, u0, displacement, edge_stiffness)
@@ -215,13 +228,9 @@ class Viscosity:
         if rate is None:
             return None
         change_of_rate = self._strain_change(u0, u1) / dt - rate
-        return self._forces(
-            sum(b.modulus * self._bending_share(b, dt) for b in self._branches) * change_of_rate,
-            # from u1 to u1, without stiffness: edges have no part in the estimate
-            u1,
-            u1,
-            0.0,
-        )
+        stiffness = sum(b.modulus * self._bending_share(b, dt) for b in self._branches)
+        # edges have no part in the estimate: they open from u1 to u1, with zero stiffness
+        return self._forces(stiffness * change_of_rate, u1, u1, 0.0)
 
     def _forces(self, stress: Array, u0: Vector, u1: Vector, stiffness: float) -> Vector:
         """Return the forces of a stress at nodes and of edges that open from u0 to u1; collective.
@@ -242,25 +251,24 @@ class Viscosity:
             (prescribed.last_displacement, u1),
         ):
             field.x.array[:] = system.with_ghosts(displacement, self._mu)
+        # gradient of the works by u, at u1
         return system.at_state(State(u1, self._mu)).gradient(self._forms)
 
     def _evolved(self, u0: Vector, u1: Vector, dt: float) -> list[Array]:
         """Return the strain q of each branch at the end of a step, (cells, nodes, 12).
 
         It integrates dq/dt = dE/dt - q/tau exactly for a strain E that is quadratic in time,
-        through both ends of the step and the begin of the step before. The last two terms are the
-        parts of E's mean rate and of its curvature in time.
+        through both ends of the step and the begin of the step before.
         """
         strain_change, rate = self._strain_change(u0, u1), self.memory.rate
         change_of_rate = 0.0 if rate is None else strain_change / dt - rate
-        return [
-            np.asarray(
-                np.exp(-dt / b.time) * q
-                + _retained_share(b, dt) * strain_change
-                + self._bending_share(b, dt) * change_of_rate
-            )
-            for b, q in zip(self._branches, self.memory.strains, strict=True)
-        ]
+        evolved = []
+        for b, q in zip(self._branches, self.memory.strains, strict=True):
+            decayed = np.exp(-dt / b.time) * q
+            by_mean_rate = _retained_share(b, dt) * strain_change
+            by_curvature = self._bending_share(b, dt) * change_of_rate  # of E over time
+            evolved.append(np.asarray(decayed + by_mean_rate + by_curvature))
+        return evolved
 
     def _bending_share(self, branch: Branch, dt: float) -> float:
         """Return the factor from a change in the mean strain rate to the strain of a spring.
@@ -290,10 +298,10 @@ class Viscosity:
 
     def _strain_rate(self, u: Vector, v: Vector) -> Array:
         """Return the rate of strain at u along v, by a central difference; collective."""
-        size = max_abs(self._model.system.comm, v)
-        if size == 0:
+        speed = max_abs(self._model.system.comm, v)
+        if speed == 0:
             return np.zeros((*self._places.shape, STRAIN_SIZE))
-        step = VELOCITY_STEP_IN_THICKNESSES * self._model.material.h / size
+        step = VELOCITY_STEP_IN_THICKNESSES * self._model.material.h / speed  # in time
         return np.asarray((self._strain(u + step * v) - self._strain(u - step * v)) / (2 * step))
 
     def _strain(self, u: Vector) -> Array:
@@ -555,13 +563,15 @@ def _work_on_interior_edges(
     # means over both sides; `edge` is the inverse metric, the unit conormal and its square
     given_moment, moment, stiffness = 0, 0, 0
     for j, v, side, (nu1, nu2, _) in zip(r0s, us, sides, conormals, strict=True):
-        # v is the jet of u on this side
+        # j and v are the jets of placement and displacement on this side
         edge, law = (kin.inverse_metric(j), (nu1, nu2), 1), _small_strain_law(model, j, side)
         given_moment += law.edge_moment(*stresses.strain(j, side), *edge) / 2
         moment += law.edge_moment(*_strains(j, v), *edge) / 2
         side_stiffness = law.edge_stiffness(kin.membrane_strain(j, v), *edge)
+        # penalty over the width of the cells beside interior edges
         stiffness += side_stiffness / 2 * model.sigma / domain.widths[0]
     opening, jump = stresses.stiff_opening(domain, jump_of), jump_of(r0 + u)
+    # length of the edge over its length in coordinates
     stretch = (conormals[0][2] + conormals[1][2]) / 2
     return (given_moment * jump + opening * (moment + stiffness * jump)) * stretch * domain.dS()
 

@@ -81,6 +81,14 @@ class Waves:
         length 2 pi sqrt(Rh)/(12(1 - nu^2))^(1/4), of which 1.73 (nu = 0.5) to 1.86 (nu = 0) times
         sqrt(R/h) fit around the equator; a wider circle has more, and so has a surface of smaller
         radii of curvature.
+    _nodes, _weights
+        The five m of the interpolation, and the weights of their matrices for each m.
+    _ranges
+        Ranges of m on which definiteness is tested, finer where the last states needed it.
+    _held_once, _held
+        Conditions of the axis and the ends for m = 1, and for all other m.
+    _matrices
+        Matrices that are filled again, by name.
     """
 
     def __init__(
@@ -259,8 +267,8 @@ class Waves:
         """
         # rows and columns of the 3 x 3 blocks: those of the nodes, plus the component
         rows, columns = (
-            3 * a[:, None, None] + np.zeros((3, 3), dtype=np.int64)
-            for a in (self._points.rows, self._points.columns)
+            3 * nodes[:, None, None] + np.zeros((3, 3), dtype=np.int64)
+            for nodes in (self._points.rows, self._points.columns)
         )
         return (rows + np.arange(3)[:, None]).ravel(), (columns + np.arange(3)).ravel()
 
@@ -277,7 +285,9 @@ class Waves:
             np.concatenate([rows, columns[mirrored_entries]]),
             np.concatenate([columns, rows[mirrored_entries]]),
         )
-        K = coo_array((np.concatenate([np.arange(len(rows)), mirrored_entries]), positions)).tocsr()
+        # a matrix whose values are the numbers of entries
+        numbers = np.concatenate([np.arange(len(rows)), mirrored_entries])
+        K = coo_array((numbers, positions)).tocsr()
         return K.indptr.astype(PETSc.IntType), K.indices.astype(PETSc.IntType), K.data
 
     def _indefinite(self, values: NDArray[np.float64]) -> list[int]:
@@ -285,8 +295,9 @@ class Waves:
 
         `values` (5, entries) are the matrices at the nodes of the interpolation in m. On a range of
         m the matrix is a mean of its five Bernstein coefficients with weights that are not
-        negative. If these are positive definite, it is so for every m of the range. Else the range
-        is halved, for the next states too, until its waves are as few as coefficients.
+        negative. If all five are positive definite, the matrix is so for every m of the range. Else
+        the range is halved, for the next states too. A range with no more waves than coefficients
+        is tested wave by wave.
         """
         bands_of_one, bands_of_others = self._bands
         matrix_of_one = bands_of_one.bands([self._weights[1] @ values])
@@ -304,18 +315,20 @@ class Waves:
         while open_ranges:
             wave_range = open_ranges.pop()
             first, last = wave_range.first, wave_range.last
-            # few waves: each is tested; else the first and the last Bernstein coefficient are those
-            # waves themselves, and `inner` has the others
             if wave_range.short:
                 indefinite |= {m for m in range(first, last + 1) if not is_definite_wave(m)}
-            elif not (
+                self._ranges.append(wave_range)
+                continue
+            # the first and the last of the Bernstein coefficients are the matrices of these waves
+            all_are_definite = (
                 is_definite_wave(first)
                 and is_definite_wave(last)
                 and all(is_definite(weights) for weights in wave_range.inner)
-            ):
+            )
+            if all_are_definite:
+                self._ranges.append(wave_range)
+            else:
                 open_ranges += wave_range.halves(self._nodes)
-                continue
-            self._ranges.append(wave_range)
         return sorted(indefinite)
 
     def _interpolated_pivots(self, m: int, values: NDArray[np.float64]) -> int:
@@ -492,6 +505,15 @@ class BandedMatrices:
         Row and column of each entry of the pattern; one triangle is enough.
     constrained_rows
         Rows and columns that are replaced by those of the unit matrix.
+
+    Attributes
+    ----------
+    _free_entries, _band_positions
+        Entries of the pattern outside constrained rows and columns, and their positions in a band.
+    _shape
+        Diagonals and columns of the band.
+    _held_numbers
+        The constrained rows in the order of reverse Cuthill and McKee, that of the band.
     """
 
     def __init__(
@@ -504,20 +526,22 @@ class BandedMatrices:
         n = int(rows.max()) + 1
         positions = np.concatenate([rows, columns]), np.concatenate([columns, rows])
         pattern = coo_array((np.ones(2 * len(rows)), positions), (n, n)).tocsr()
+        # new number of each row
         order = reverse_cuthill_mckee(pattern, symmetric_mode=True)
-        place = np.empty(n, dtype=np.int64)
-        place[order] = np.arange(n)
+        new_number = np.empty(n, dtype=np.int64)
+        new_number[order] = np.arange(n)
         # entries in constrained rows and columns are left out
         is_free = np.ones(n, dtype=bool)
         is_free[constrained_rows] = False
         self._free_entries = np.flatnonzero(is_free[rows] & is_free[columns])
-        rows, columns = rows[self._free_entries], columns[self._free_entries]
-        # lower triangle in the order of reverse Cuthill and McKee
-        i, j = np.maximum(place[rows], place[columns]), np.minimum(place[rows], place[columns])
+        new_rows = new_number[rows[self._free_entries]]
+        new_columns = new_number[columns[self._free_entries]]
+        # entries of the lower triangle
+        i, j = np.maximum(new_rows, new_columns), np.minimum(new_rows, new_columns)
         self._shape = (int((i - j).max(initial=0)) + 1, n)  # diagonals of the band, columns
         # in LAPACK's lower band, column by column
         self._band_positions = (i - j) + j * self._shape[0]
-        self._held_places = place[constrained_rows]
+        self._held_numbers = new_number[constrained_rows]
 
     def bands(self, values: Iterable[Array]) -> Array:
         """Return the lower bands (matrices, band entries) of some matrices.
@@ -529,7 +553,8 @@ class BandedMatrices:
         stacked = np.zeros((len(values), self._shape[0] * self._shape[1]))
         for band, v in zip(stacked, values, strict=True):
             band[self._band_positions] = v.ravel()[self._free_entries]
-        stacked[:, self._held_places * self._shape[0]] = 1.0
+        # the diagonal is the first in each column of the band
+        stacked[:, self._held_numbers * self._shape[0]] = 1.0
         return stacked
 
     def is_positive_definite(self, bands: Array, weights: Array) -> bool:

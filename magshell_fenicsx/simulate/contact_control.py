@@ -85,14 +85,10 @@ def state_at_first_contact(scene: Scene, step: ProgrammeStep, state: State) -> S
     Stopped
         If the body never meets the shell, or the first contact has no equilibrium.
     """
-    target, name, h = (
-        step.load.target or step.load.limit_target,
-        step.name,
-        scene.problem.material.h,
-    )
-    end_of_approach = (
-        target[1] if target and target[0].quantity == "load" else inf
-    )  # of the approach
+    name, h = step.name, scene.problem.material.h
+    # the target is a pair: what it prescribes, and the value
+    target = step.load.target or step.load.limit_target
+    end_of_approach = target[1] if target and target[0].quantity == "load" else inf
     region = scene.model.region(state, name)
     # it touches already, or the step has nowhere to go
     if region.penetration > GAP_TOLERANCE * h or end_of_approach <= state.mu[name]:
@@ -222,13 +218,10 @@ def _is_certain(stage: Stage, point: Point, finer: Mapping[str, float]) -> bool:
     finer
         Setting of a pair's cuts -> number of cuts with closer points.
     """
-    state_here, state_with_finer_cuts = (
-        point.state,
-        State(point.state.u, {**point.state.mu, **finer}),
-    )
+    state_with_finer_cuts = State(point.state.u, {**point.state.mu, **finer})
     try:
         mode, mode_with_finer_cuts = (
-            critical_mode(stage.newton, state) for state in (state_here, state_with_finer_cuts)
+            critical_mode(stage.newton, state) for state in (point.state, state_with_finer_cuts)
         )
     except NoEigenpair:
         return True
@@ -259,16 +252,11 @@ def with_cuts_here(scene: Scene, state: State) -> State:
     Cuts belong to the mesh of a model, so numbers of another one mean nothing here.
     """
     evaluation = scene.model.system.at_state(state)
-    return State(
-        state.u,
-        {
-            **state.mu,
-            **{
-                shell_contact.pair.cuts: evaluation.evaluate(shell_contact.present_cuts)
-                for shell_contact in _with_cuts(scene)
-            },
-        },
-    )
+    numbers = {
+        shell_contact.pair.cuts: evaluation.evaluate(shell_contact.present_cuts)
+        for shell_contact in _with_cuts(scene)
+    }
+    return State(state.u, {**state.mu, **numbers})
 
 
 def _with_cuts(scene: Scene) -> list[SurfaceContact]:
@@ -433,11 +421,12 @@ def refuse_crossing(stage: Stage, low: Point, high: Point) -> None:
     """
     model, states = stage.scene.model, [stage.leave(point.state) for point in (low, high)]
     for field in model.fields:
+        # for each of the two points: `field.places` at its state, and the amplitudes
         ends = list[tuple[NDArray[np.float64], Mapping[str, float]]]()
         for state in states:
-            ends.append(
-                (model.system.at_state(state).evaluate(partial(getattr, field, "places")), state.mu)
-            )
+            evaluation = model.system.at_state(state)
+            ends.append((evaluation.evaluate(partial(getattr, field, "places")), state.mu))
+        # "" on a rank whose nodes pass through nothing
         messages = model.system.comm.allgather(field.passed_through(*ends))
         if message := next((message for message in messages if message), ""):
             raise PathStopped(message, low, final=True)
@@ -483,24 +472,19 @@ def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point)
     model, comm, low = stage.scene.model, stage.scene.comm, points[-1]
     if name not in model.contacts:
         return
-    mu, h = [point.state.mu[name] for point in (*points, high)], stage.newton.system.length
-    # the point of the farthest approach, from where the path may turn
-    turn = int(np.argmax(np.abs(np.subtract(mu, mu[0]))))
+    h = stage.newton.system.length
+    approaches = [point.state.mu[name] for point in (*points, high)]
+    # index of the point of the farthest approach, from where the path may turn
+    turn = int(np.argmax(np.abs(np.subtract(approaches, approaches[0]))))
     distance_from_turn = max_abs(comm, high.state.u - points[min(turn, len(points) - 1)].state.u)
     # `high` is the farthest itself, or too near to the turn to tell the ways apart
     if turn == len(points) or distance_from_turn < RETURN_DISTANCE * h:
         return
+    # is `high` on the way to the turn, that is near the displacement there at the same approach?
     for earlier_point, later_point in pairwise(points[: turn + 1]):
-        mu_a, mu_b = earlier_point.state.mu[name], later_point.state.mu[name]
-        # the approach is not between the two, or a slope du/dmu is infinite
-        if (mu[-1] - mu_a) * (mu[-1] - mu_b) > 0 or not earlier_point.dmu or not later_point.dmu:
+        displacement_before = _displacement_at(name, approaches[-1], earlier_point, later_point)
+        if displacement_before is None:
             continue
-        # displacement on the way there, at the same approach
-        displacement_before = scipy.interpolate.CubicHermiteSpline(
-            [mu_a, mu_b],
-            [earlier_point.state.u, later_point.state.u],
-            [earlier_point.du / earlier_point.dmu, later_point.du / later_point.dmu],
-        )(mu[-1])
         if (
             max_abs(comm, high.state.u - displacement_before)
             < RETURN_TOLERANCE * distance_from_turn
@@ -519,6 +503,30 @@ def refuse_return(stage: Stage, name: str, points: Sequence[Point], high: Point)
                 "the body has left the shell: at its fold the shell snaps under a given approach"
             )
             raise PathStopped(message, high, final=True)
+
+
+def _displacement_at(
+    name: str, value: float, earlier_point: Point, later_point: Point
+) -> NDArray[np.float64] | None:
+    """Return the displacement of a path where an amplitude has a value, between two of its points.
+
+    It is the cubic Hermite polynomial through both points. None if the value is not between theirs,
+    or a slope du/dmu is infinite.
+
+    Parameters
+    ----------
+    name
+        The amplitude.
+    """
+    mu_a, mu_b = earlier_point.state.mu[name], later_point.state.mu[name]
+    is_outside = (value - mu_a) * (value - mu_b) > 0
+    if is_outside or not earlier_point.dmu or not later_point.dmu:
+        return None
+    slope_a, slope_b = earlier_point.du / earlier_point.dmu, later_point.du / later_point.dmu
+    polynomial = scipy.interpolate.CubicHermiteSpline(
+        [mu_a, mu_b], [earlier_point.state.u, later_point.state.u], [slope_a, slope_b]
+    )
+    return np.asarray(polynomial(value))
 
 
 def penetration_message(scene: Scene, state: State, *, moving: bool = False) -> str:

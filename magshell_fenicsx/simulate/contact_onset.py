@@ -1,7 +1,8 @@
 """First contact between shells on the way to a predicted state.
 
-A prediction from before a contact knows nothing of it: shells would lie deep in each other, and
-Newton's method circle. So a step ends just before the first contact, and the next one just behind.
+A prediction from before a contact knows nothing of it: shells would overlap deeply, and Newton's
+method would not converge. So a step ends just before the first contact, and the next one just
+behind.
 
 A step event says at which part of its way a step has to end, 1 for its whole way, and whether this
 is behind a contact; and whether contact forces are lost on the way. A gap is the distance of two
@@ -50,7 +51,9 @@ def first_contact(
     states = leave(here), leave(prediction)
     at_begin, at_end = map(scene.model.system.at_state, states)
     begin_displacement, end_displacement = (gathered_displacement(scene, state) for state in states)
-    first_event, loses_forces = (1.0, False), False
+    # part of the way at which the step ends, and whether this is behind a contact
+    first_event = 1.0, False
+    loses_forces = False
     for contact in contacts:
         if at_begin.evaluate(contact.penetration):
             loses_forces |= not at_end.evaluate(contact.penetration)
@@ -95,24 +98,27 @@ def _onset(contact: SurfaceContact, h: float, u: Array, v: Array) -> tuple[float
     gap_at_low = contact.gap(u)
     if gap_at_low <= 0:
         return 1.0, False
-    is_behind, least_thickness = gap_at_low < NEAR_CONTACT * depth, contact.least_thickness()
-    # low and high: parts of the way before and behind the aimed gap; high is 0 while not known
-    low, high, gap_at_high, aimed_gap = 0.0, 0.0, 0.0, -depth if is_behind else depth
+    # from near the contact the step ends behind it, at the gap -depth, else before it, at +depth
+    is_behind = gap_at_low < NEAR_CONTACT * depth
+    aimed_gap = -depth if is_behind else depth
+    least_thickness = contact.least_thickness()
+    # bracket: parts of the way before and behind the aimed gap. high is 0 while it is not known
+    low, high, gap_at_high = 0.0, 0.0, 0.0
     for _ in range(MAX_GAP_EVALUATIONS):
-        if high:
+        if high:  # linear interpolation of the gap
             part = low + (high - low) * (gap_at_low - aimed_gap) / (gap_at_low - gap_at_high)
         else:  # so far no face can pass through another one
             part = min(
                 1.0, low + (gap_at_low + CROSSING_DISTANCE * least_thickness) / largest_approach
             )
         gap = contact.gap(u + part * (v - u))
-        if gap < aimed_gap - depth:
+        if gap < aimed_gap - depth:  # too far
             high, gap_at_high = part, gap
-        elif gap <= aimed_gap + depth:
+        elif gap <= aimed_gap + depth:  # exact enough
             return part, is_behind
-        elif part == 1.0:
+        elif part == 1.0:  # the whole way is free
             return 1.0, False
-        else:
+        else:  # not far enough
             low, gap_at_low = part, gap
     # not exact enough after all evaluations: the end of the bracket on the wanted side, if known
     return (high if is_behind else low) or low, is_behind

@@ -57,6 +57,8 @@ class ContactsInTime:
         The approaches.
     settings
         Names of the stiffnesses between shells.
+    _begin
+        Displacement at the begin of the present step, and the arguments of contact forces there.
     """
 
     def __init__(
@@ -87,9 +89,8 @@ class ContactsInTime:
         if not self._shell_contacts:
             return {}
         comm, nodes = self._system.comm, v.reshape(-1, self._system.u.function_space.dofmap.bs)
-        largest_of_axes = np.max(
-            [nodes, -nodes], axis=1, initial=0.0
-        )  # (2, 2 or 3): along each axis and back
+        # (2, 2 or 3): the largest velocity along each axis, and that against it
+        largest_of_axes = np.max([nodes, -nodes], axis=1, initial=0.0)
         largest_of_all = np.max(comm.allgather(largest_of_axes), axis=0)
         # no two places move faster relative to each other
         speed = float(np.linalg.norm(largest_of_all.sum(axis=0)))

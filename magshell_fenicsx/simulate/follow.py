@@ -204,6 +204,9 @@ class _StepRun:
         Whether there was an instability.
     place
         Begin of a message that says which step of a list this is; empty for a single load.
+    _last, _first_instability
+        The last record of the path, and the first one of an instability on it that is known to be
+        the first; None so far.
     """
 
     def __init__(self, scene: Scene, step: ProgrammeStep, remark: Callable[[str], None]) -> None:

@@ -55,6 +55,12 @@ class LoadsInTime:
     ----------
     marks
         Times at which loads have kinks or jumps.
+    _mu
+        All amplitudes where the step begins.
+    _curves
+        Amplitude -> its curve in the model's time, of those that have a history.
+    _difference_step
+        Step of differences by time.
 
     Raises
     ------
@@ -71,18 +77,18 @@ class LoadsInTime:
         unit, steps = problem.time_unit or 1.0, {step.name: step.load for step in problem.programme}
         self._curves, self.marks = dict[str, Curve](), set[float]()
         for name, history in histories.items():
-            # histories are in the case's own unit of time
             # a step with this load converts amplitudes to the unit of its target, and back
             step = steps.get(name)
+            # the amplitude at the begin, as a value of the history
             value = step.in_history(state.mu[name]) if step else state.mu[name]
             level = partial(amplitude_of_level, problem, name)
             # a formula (text) gives the factor of the field; levels of a table include it already
             strength = problem.lambda_m if isinstance(history, str) and name == "lambda_m" else 1.0
             self._curves[name] = _scaled(
-                curve(history, time_in_case_unit, level, value),
+                curve(history, time_in_case_unit, level, value),  # in the case's unit of time
                 strength,
                 unit,
-                step.of_history if step else float,
+                amplitude=step.of_history if step else float,
             )
             self.marks |= set(marks(history, time, time(load.duration)))
             first_value, present_value = self._curves[name](0.0, False), state.mu[name]
@@ -119,6 +125,7 @@ class LoadsInTime:
             value_0, value_1, value_2, value_3 = (
                 self._curves[name](t + i * step, backward) for i in range(4)
             )
+            # difference quotients of second order, of f(t), f(t + step), f(t + 2 step), ...
             rates[name] = (
                 (4 * value_1 - 3 * value_0 - value_2) / (2 * step),
                 (2 * value_0 - 5 * value_1 + 4 * value_2 - value_3) / step**2,

@@ -80,12 +80,13 @@ class RefinedSteps:
         u
             The displacement at the row; None at a time between rows.
         """
-        # the coarse run may have ended earlier; its errors go as the square of the steps
-        row, square = min(row, len(self.rows) - 1), self.ratio**2
+        row = min(row, len(self.rows) - 1)  # the coarse run may have ended earlier
+        # errors go as the square of the steps: this is the motion's error over the coarse run's
+        error_ratio = self.ratio**2
         if u is None or self.ratio > CLEAR_STEP_RATIO:
-            return square * self.errors[row]
-        # the error falls with the square of the steps, so the difference of both runs shows it
-        return square / (1 - square) * _distance(scene, u, self.rows[row])
+            return error_ratio * self.errors[row]
+        # the difference of both runs is 1 - error_ratio of the coarse run's error
+        return error_ratio / (1 - error_ratio) * _distance(scene, u, self.rows[row])
 
 
 def _distance(scene: Scene, u: Vector, other: Vector) -> float:
@@ -135,39 +136,62 @@ class StepRefinement:
         scene, tolerance = self.scene, steps.tolerance
         coarse_tolerance = min(COARSE_TOLERANCE_RATIO * tolerance, MAX_COARSE_TOLERANCE)
         coarse_steps = replace(steps, tolerance=max(tolerance, coarse_tolerance))
+        # first run: at each row the speed, the time and the mean step before the row
         speeds = [
             (max_abs(scene.model.system.comm, motion.v), motion.t, mean_step)
             for motion, mean_step in self._rows(coarse_steps)
         ]
         largest_speed, time_of_largest_speed, _ = max(speeds)
         longest_step = max(step for speed, _, step in speeds if speed >= FAST_SPEED * largest_speed)
+        # second run: displacements at its rows
         coarse_steps = replace(coarse_steps, longest=longest_step, fastest=time_of_largest_speed)
         rows = [motion.u for motion, _ in self._rows(coarse_steps)]
-        # lengths of steps over those of the second run, and of a run over those of the run before
+        # further runs. step_factor: their steps over those of the second run; ratio: over those of
+        # the run before
         step_factor, ratio = 1.0, 0.5
         while True:
             step_factor *= ratio
-            errors = list[float]()
-            for i, (motion, _) in enumerate(self._rows(coarse_steps.refined(step_factor))):
-                coarser_u = rows[min(i, len(rows) - 1)]
-                # from the difference of two runs, whose errors go as the square of the steps
-                errors.append(ratio**2 / (1 - ratio**2) * _distance(scene, motion.u, coarser_u))
-                rows[i : i + 1] = [motion.u]
+            errors = self._errors(coarse_steps.refined(step_factor), rows, ratio)
+            # the steps that the motion needs, over those of the second run
             largest_error = max(*errors, TINY_ERROR)
-            needed_refinement = step_factor * float(
-                np.sqrt(AIMED_ERROR * tolerance / largest_error)
-            )
-            needed_refinement = min(
-                max(needed_refinement, MIN_STEP_RATIO),
+            needed_factor = step_factor * float(np.sqrt(AIMED_ERROR * tolerance / largest_error))
+            needed_factor = min(
+                max(needed_factor, MIN_STEP_RATIO),
                 # no longer than the tolerance of single steps asks for, whose error is cubic
                 (tolerance / coarse_steps.tolerance) ** (1 / 3),
             )
-            if needed_refinement * MAX_STEP_RATIO >= step_factor:
-                refined = coarse_steps.refined(needed_refinement)
+            is_fine_enough = needed_factor * MAX_STEP_RATIO >= step_factor
+            if is_fine_enough:
                 return RefinedSteps(
-                    refined, rows[: len(errors)], errors, needed_refinement / step_factor
+                    steps=coarse_steps.refined(needed_factor),
+                    rows=rows[: len(errors)],
+                    errors=errors,
+                    ratio=needed_factor / step_factor,
                 )
             ratio = 0.25
+
+    def _errors(self, steps: TimeSteps, rows: list[Vector], ratio: float) -> list[float]:
+        """Return the estimated errors at the rows of a run, over the system's length; collective.
+
+        They come from the difference between this run and the run before, whose errors go as the
+        square of the steps.
+
+        Parameters
+        ----------
+        steps
+            Options of this run's time steps.
+        rows
+            Displacements at the rows of the run before; those of this run replace them.
+        ratio
+            Length of this run's steps over that of the run before.
+        """
+        errors = list[float]()
+        for i, (motion, _) in enumerate(self._rows(steps)):
+            coarser_u = rows[min(i, len(rows) - 1)]
+            difference = _distance(self.scene, motion.u, coarser_u)
+            errors.append(ratio**2 / (1 - ratio**2) * difference)
+            rows[i : i + 1] = [motion.u]
+        return errors
 
     def _rows(self, steps: TimeSteps) -> Iterator[tuple[Motion, float]]:
         """Yield the motion at each row, and the mean time step before this row."""
@@ -286,15 +310,15 @@ class MotionRows:
             If time steps become too small.
         """
         scene, integrator = self.scene, self.integrator
-        points = list[Point]()
-        while len(points) < POINTS_OF_ROW and isinstance(recorded := scene.journal.replay(), Point):
-            points.append(recorded)
-        is_known = len(points) == POINTS_OF_ROW
-        # the journal has no place for the strains of viscous branches: these are computed again
+        known_points = self._known_points()
+        is_known = len(known_points) == POINTS_OF_ROW
+        # the journal has no strains of viscous branches: a motion with these is computed again
         if is_known and integrator.viscous is None:
-            return self._replayed(*points)
+            point, companion, factored_point = known_points
+            return self._replayed(point, companion, factored_point)
         self._refactor()
-        iterations, factorisations = integrator.iterations, integrator.factorisation.count
+        iterations_before = integrator.iterations
+        factorisations_before = integrator.factorisation.count
         try:
             # not before it is needed: a journal may have all rows
             if self.refinement and not self._refined_steps:
@@ -304,8 +328,8 @@ class MotionRows:
             motion, time_step = self.advanced(motion, time_step, end, is_known=is_known)
         except TimeStopped as e:
             raise Stopped(str(e)) from None
-        iterations = integrator.iterations - iterations
-        factorisations = integrator.factorisation.count - factorisations
+        iterations = integrator.iterations - iterations_before
+        factorisations = integrator.factorisation.count - factorisations_before
         state = scene.model.system.with_moved_supports(State(motion.u, motion.mu))
         error, pivots = self._error(motion, end), self._negative_pivots(state)
         point = Point(
@@ -320,10 +344,20 @@ class MotionRows:
             error=error,
             habit=scene.newton.factorisation.habit,
         )
-        # without those that the journal has
-        for recorded in (point, *self._companions(motion))[len(points) :]:
-            scene.journal.record(recorded)
+        # those of the three points that the journal does not have yet
+        for new_point in (point, *self._companions(motion))[len(known_points) :]:
+            scene.journal.record(new_point)
         return motion, time_step, point
+
+    def _known_points(self) -> list[Point]:
+        """Return the points of the next row that the journal has, at most three."""
+        points = list[Point]()
+        while len(points) < POINTS_OF_ROW:
+            recorded = self.scene.journal.replay()
+            if not isinstance(recorded, Point):
+                break
+            points.append(recorded)
+        return points
 
     def _replayed(
         self, point: Point, companion: Point, factored_point: Point

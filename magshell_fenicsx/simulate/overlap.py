@@ -43,7 +43,7 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
     MeshError
         With the shells, by how much they overlap, and where.
     CaseError
-        If magnetised parts are in each other.
+        If magnetised parts intersect.
     """
     pairs, h, factor = problem.loads.pairs, problem.material.h, problem.thickness
     if not (pairs or problem.loads.joints or problem.loads.interaction) or cells > MAX_CELLS:
@@ -82,9 +82,10 @@ def refuse_overlap(problem: Problem, cells: int) -> None:
 
 
 def _refuse_parts_in_each_other(r0: fem.Function, h: float) -> None:
-    """Check that no mid-surfaces of magnetised parts are in each other.
+    """Check that the mid-surfaces of magnetised parts neither intersect nor coincide.
 
-    Forces between such parts would not be numbers.
+    Forces between such parts would not be numbers. The nodes of each part are compared with the
+    cells of all earlier parts.
 
     Parameters
     ----------

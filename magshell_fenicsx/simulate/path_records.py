@@ -127,7 +127,8 @@ def follow_path(
     earlier_mu = start.state.mu
     for record in records:
         point = stage.point(record.point)
-        earlier_mu = (state := advance(point.state, earlier_mu)).mu
+        state = advance(point.state, earlier_mu)
+        earlier_mu = state.mu
         yield replace(record, point=replace(point, state=state))
     return advance(stage.leave(records.end), earlier_mu)
 
@@ -159,16 +160,21 @@ class _Checks:
     ----------
     walk
         The run that is checked.
+    _step_begin
+        s of the first point of the present step. A step leads from one point to the next, and may
+        be solved several times, each time with changed settings.
+    _pivots_at_begin
+        Negative pivots of this point before settings were changed.
+    _last_cut_step
+        s of the first point of the step in which cuts were last made anew.
     """
 
     walk: ContinuationRun
 
     def __init__(self, stage: Stage, path: Path, returns: bool) -> None:
         self._stage, self._path, self._returns = stage, path, returns
-        # s of the first point of the step in which cuts were last made anew: once for each step
-        self._cut_at = np.nan
-        # s of the first point, and its negative pivots before anything was changed there
-        self._begin = np.nan, 0
+        self._step_begin, self._last_cut_step = np.nan, np.nan
+        self._pivots_at_begin = 0
 
     def __call__(self, low: Point, high: Point) -> State | None:
         """Return the state to solve again with changed penalties or cuts; None if they are fit.
@@ -184,8 +190,8 @@ class _Checks:
         PathStopped, StepTooLong
             If the second point must not follow the first one.
         """
-        if low.s != self._begin[0]:  # a new step; otherwise the same one is solved again
-            self._begin = low.s, low.negative_pivots
+        if low.s != self._step_begin:  # a new step; otherwise the same one is solved again
+            self._step_begin, self._pivots_at_begin = low.s, low.negative_pivots
         # from the journal in a resumed run
         findings = self._path.recorded_values(partial(self._finding, low, high)).values
         if "too_long" in findings:
@@ -194,9 +200,9 @@ class _Checks:
             raise PathStopped(
                 findings["stopped"], high if findings["at_high"] else low, final=findings["final"]
             )
-        changed, of_cuts = findings["stiffer"], not findings["stiffer"]
-        if of_cuts:  # penalties come first: a new depth may need other cuts
-            self._cut_at, changed = low.s, findings["cuts"]
+        changed = findings["stiffer"]
+        if not changed:  # penalties come first: a new depth may need other cuts
+            self._last_cut_step, changed = low.s, findings["cuts"]
             recall_cuts(self._stage, high, changed)
         return State(low.state.u, {**low.state.mu, **changed}) if changed else None
 
@@ -238,10 +244,14 @@ class _Checks:
             return RecordedValues({"stopped": str(e), "at_high": e.point is high, "final": e.final})
         state = stage.leave(high.state)
         stiffer = raised_stiffnesses(stage.scene, state)
-        may_recut = not stiffer and low.s != self._cut_at  # slid points are better than none
+        # new cuts once in a step: points of contact that have slid are better than no solution
+        may_recut = not stiffer and low.s != self._last_cut_step
         cuts = better_cuts(stage.scene, state) if may_recut else {}
-        # between the points, or as changed settings at the first point have moved it behind
-        has_instability = high.has_instability_since(low) or low.negative_pivots != self._begin[1]
+        # the instability is between the points; or changed settings have moved it before the first
+        # point, whose pivots then differ
+        has_instability = (
+            high.has_instability_since(low) or low.negative_pivots != self._pivots_at_begin
+        )
         closer = (
             closer_points(stage, low, high) if has_instability and not (stiffer or cuts) else {}
         )
@@ -261,6 +271,17 @@ class _StageRecords:
         First run.
     branches
         Number of steps for each direction of the branch at the first bifurcation; 0: no branch.
+
+    Attributes
+    ----------
+    _branch_switch
+        The first bifurcation with its branch; None so far.
+    _fold_text
+        Words on the last fold, for a message; "" so far.
+    _furthest
+        Largest amplitude at which the path goes on; finite once an excluded mode is unstable.
+    _stop_reason, _is_final
+        Why the last run has stopped, "" if it has not; and whether no run may go on from there.
     """
 
     def __init__(self, stage: Stage, run: ContinuationRun, branches: int) -> None:
@@ -268,9 +289,8 @@ class _StageRecords:
         self._stage, self._first_run, self._branches = stage, run, branches
         self._goal, self._monitor = run.goal, stage.scene.stability_monitor
         self._branch_switch: BranchSwitch | None = None
-        self._fold_text = ""  # of the last fold
-        self._furthest = np.inf  # largest amplitude, finite once an excluded mode is unstable
-        # why the last run has stopped, "" if it has not; and whether no run may go on from there
+        self._fold_text = ""
+        self._furthest = np.inf
         self._stop_reason, self._is_final = "", False
 
     def records(self) -> Records:
@@ -289,17 +309,18 @@ class _StageRecords:
         stage, goal, run = self._stage, self._goal, self._first_run
         stage.scene.progress.doing("looking for modes that the model excludes")
         path, shortest_step = run.path, run.path.options.smallest
-        if path.control == "load" and goal.targets:
+        if path.control == "load" and goal.targets:  # a fold may come before the target
             run.path = _ending_early(path, path.options.first, shortest_step)
-        for applied in stage.scene.model.fields:  # a place where a field was not known, so far none
-            applied.lost = ""
+        for applied in stage.scene.model.fields:
+            applied.lost = ""  # so far the field is known at all places
         self._monitor.begin(path, run.points[0], stage.leave)
         records_ahead: list[Record] = []  # a fold that load control cannot pass
         next_run: ContinuationRun | None = run
         while next_run:
-            run, path, next_run = next_run, next_run.path, None
-            has_ended = yield from self._records_of_run(run, path)
-            if has_ended:
+            run, next_run = next_run, None
+            path = run.path
+            goal_precedes_stop = yield from self._records_of_run(run, path)
+            if goal_precedes_stop:
                 break
             if self._stop_reason:
                 records_ahead, next_run = _after_stop(
@@ -321,20 +342,21 @@ class _StageRecords:
         return run.points[-1].state
 
     def _records_of_run(self, run: ContinuationRun, path: Path) -> Generator[Record, None, bool]:
-        """Yield the records of one run.
+        """Yield the records of one run, and set `_stop_reason` if it stops.
 
         Returns
         -------
         bool
-            Whether an excluded instability ended the path (the generator's return value).
+            Whether the run has stopped, but its goal, an excluded instability, lies before the stop
+            (the generator's return value). Then no other run follows.
         """
         stage, goal = self._stage, self._goal
         try:
             for label, point in run:
                 is_located = label in LOCATED
-                is_beyond = run.done or abs(point.state.mu[path.name]) > self._furthest
-                # the monitor may skip points in between, but must not skip these
-                crossings = self._monitor.pass_to(point, evaluate=is_located or is_beyond)
+                is_last = run.done or abs(point.state.mu[path.name]) > self._furthest
+                # the monitor may skip points, but not located ones and the last one
+                crossings = self._monitor.pass_to(point, evaluate=is_located or is_last)
                 excluded = list(_excluded_records(stage, path, crossings))
                 if excluded and goal.until == "bifurcation":
                     yield excluded[0]
@@ -348,7 +370,7 @@ class _StageRecords:
             message = _stop_message(stage.scene, path, e, run.points)
             self._stop_reason = message + self._fold_text + stage.scene.lost_field_text()
             self._is_final = e.final
-        # those on the last part of the way, after the monitor's last evaluation
+        # crossings on the last part of the way, after the monitor's last evaluation
         excluded = list(_excluded_records(stage, path, self._monitor.end()))
         if excluded and self._stop_reason and goal.until == "bifurcation":
             yield excluded[0]
@@ -419,15 +441,17 @@ def _after_stop(
 ) -> tuple[list[Record], ContinuationRun | None]:
     """Return how a path goes on after a run that has stopped.
 
-    Under load control a fold may explain why the last step failed. Otherwise a new run takes
-    shorter steps, down to `finest`. Without a target the new run is by arc length.
+    Under load control with a target, a fold may explain why the last step failed: then the path
+    ends at the fold. Without such a fold a new run takes shorter steps, down to `finest`. A path
+    without a target goes on by arc length.
 
     Parameters
     ----------
     walk
         The run that has stopped.
     finest
-        Shortest step that may be tried, as a change of the load.
+        Shortest step that any run may take, as a change of the load. The shortest step of `walk`
+        may be longer.
     final
         Whether the reason forbids that the path goes on.
 
@@ -443,13 +467,12 @@ def _after_stop(
         return [], None if final else _onward_by_arc(stage, walk)
     shortest = path.options.smallest
     last_resort = final or shortest <= finest  # no run in shorter steps follows
+    # largest change of the load at which a fold is looked for
     reach = abs(goal.targets[-1] - last_point.s)
     if not last_resort:  # the fold must be within the failed step, which ends at the next target
-        distances = [
-            # positive where the target is ahead
-            (target - last_point.s) * np.sign(goal.targets[-1] - last_point.s)
-            for target in goal.targets
-        ]
+        sense = np.sign(goal.targets[-1] - last_point.s)
+        # positive where the target is ahead
+        distances = [(target - last_point.s) * sense for target in goal.targets]
         reach = min(2 * shortest, *(distance for distance in distances if distance > 0))
     records_ahead = _fold_ahead(stage, walk, reach)
     if records_ahead or last_resort:
@@ -475,9 +498,10 @@ def _ending_early(path: Path, first: float, finest: float) -> Path:
 def _onward_by_arc(stage: Stage, walk: ContinuationRun) -> ContinuationRun | None:
     """Return a run by arc length from where another run stopped; None if there is none.
 
-    There is none where the run was by arc length already, or has a target: an instability is at the
-    same load under any control, but a target belongs to its control. The first step is as long as
-    the median step of the run that stopped.
+    There is none where the run was by arc length already, or has a target. Without a target the run
+    looks for an instability, which is at the same load under any control. A target is a value of
+    the controlled quantity, and so needs this control. The first step is as long as the median step
+    of the run that stopped.
     """
     path, goal, points = walk.path, walk.goal, walk.points
     if path.control == "arc" or goal.targets:
@@ -489,20 +513,18 @@ def _onward_by_arc(stage: Stage, walk: ContinuationRun) -> ContinuationRun | Non
         )
         for point, next_point in pairwise(points)
     ]
-    first_length = float(
-        np.median(step_lengths or [path.options.first * metric.norm(last_point.du, last_point.dmu)])
-    )
+    # without a step so far: the length of the first step that was tried
+    lengths = step_lengths or [path.options.first * metric.norm(last_point.du, last_point.dmu)]
+    first_length = float(np.median(lengths))
     by_arc = stage.path(
         name,
         "arc",
         StepOptions(first_length, LONGEST * first_length, 1e-6 * first_length),
         metric.scale,
     )
-    start = by_arc.start(
-        last_point.state,
-        # about the change of the amplitude in the first step, which gives its sense
-        last_point.dmu * (last_point.s - points[-2].s if step_lengths else goal.sense),
-    )
+    # of this product the sign alone counts: whether the amplitude first grows or falls
+    change_of_s = last_point.s - points[-2].s if step_lengths else goal.sense
+    start = by_arc.start(last_point.state, last_point.dmu * change_of_s)
     return checked_run(stage, by_arc, start, goal)
 
 
@@ -627,7 +649,7 @@ def _fold_ahead(stage: Stage, walk: ContinuationRun, reach: float) -> list[Recor
     """
     path, points, name = walk.path, walk.points, walk.path.name
     last_point = points[-1]
-    # the change of the load in the last step, or towards the target in a first one
+    # the change of the load in the last step; without one, a first step towards the target
     first_change = np.copysign(path.options.first, walk.goal.targets[-1] - last_point.s)
     load_change = last_point.s - points[-2].s if len(points) > 1 else float(first_change)
     by_arc, start = stage.resume(name, "arc", last_point.state, load_change, path.metric.scale)

@@ -117,8 +117,9 @@ def perfect_modes(problem: Problem, count: int, comm: MPI.Comm) -> tuple[Mode, .
 def _shape(scene: Scene, mode: ShellMode) -> Mode:
     """Return a mode as a function of the place, with largest value 1; collective.
 
-    The function interpolates inward displacements at nodes. With several shells there is one
-    function for each shell that the mode moves.
+    The function interpolates inward displacements at nodes. Of a half the other half's nodes, which
+    are mirror images, count too. With several shells there is one function for each shell that the
+    mode moves.
     """
     model, mirror = scene.model, None
     if model.axisymmetric:
@@ -130,12 +131,12 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
         places, inward_displacements = _at_nodes(scene, model, mode)
         is_of_shell = all_nodes_of_shells(scene)
         mirror = model.mirror if model.multiplicity > 1 else None
-    # sign: of the mirror image
-    node_count, sign = len(places), -1.0 if mode.label == "antisymmetric" else 1.0
-    if mirror:  # the other half has its images behind the nodes
-        places, inward_displacements = (
-            np.vstack([places, mirror.image(places)]),
-            np.concatenate([inward_displacements, sign * inward_displacements]),
+    node_count = len(places)
+    sign_of_image = -1.0 if mode.label == "antisymmetric" else 1.0
+    if mirror:  # images follow the nodes, in the same order
+        places = np.vstack([places, mirror.image(places)])
+        inward_displacements = np.concatenate(
+            [inward_displacements, sign_of_image * inward_displacements]
         )
     inward_displacements = over_largest(places, inward_displacements)
 
@@ -154,7 +155,7 @@ def _shape(scene: Scene, mode: ShellMode) -> Mode:
             places[nodes_and_images], inward_displacements[nodes_and_images], places[nodes]
         )
         # from the model's frame to that of the case
-        return in_frame(MirroredMode(function, mirror, sign), -scene.problem.azimuth)
+        return in_frame(MirroredMode(function, mirror, sign_of_image), -scene.problem.azimuth)
 
     nodes_of_shell = [np.flatnonzero(is_own) for is_own in is_of_shell]
     if len(nodes_of_shell) < 2:
@@ -191,10 +192,11 @@ def _along_meridian(model: "MeridianModel", mode: ShellMode) -> tuple[Array, Arr
 def _at_nodes(scene: Scene, model: "ShellModel", mode: ShellMode) -> tuple[Array, Array]:
     """Return all nodes (n, 3) and inward displacements (n,) there, on every rank; collective."""
     V, comm = model.V, scene.comm
+    # nodes of each own cell: their numbers on this rank, and among all ranks
     dofs = V.dofmap.list[: V.mesh.topology.index_map(2).size_local]
     numbers = V.dofmap.index_map.local_to_global(dofs.ravel().astype(np.int32))
     table = V.element.basix_element.tabulate(1, compat.interpolation_points(V))[:, :, :, 0]
-    # (cells, nodes, 3) of own cells
+    # (cells, nodes, 3): places, displacements and normals, whose lengths are area ratios
     r0, displacements = (
         x.reshape(-1, 3)[dofs] for x in (model.r0.x.array, model.system.with_ghosts(mode.vector))
     )
@@ -202,10 +204,11 @@ def _at_nodes(scene: Scene, model: "ShellModel", mode: ShellMode) -> tuple[Array
     gathered = comm.allgather(
         (numbers, *(vectors.reshape(-1, 3) for vectors in (r0, displacements, np.cross(r_1, r_2))))
     )
+    # one row for each node of each cell of all ranks
     node_numbers, x, displacements, normals_of_cells = (
         np.concatenate(part) for part in zip(*gathered, strict=True)
     )
-    # normals of the cells at a node are added with the area ratio as weight
+    # the normals of all cells at a node are added
     sum_of_normals = np.column_stack(
         [np.bincount(node_numbers, component) for component in normals_of_cells.T]
     )

@@ -268,6 +268,7 @@ def state_with_new_loads(
     """
     ratios = target_ratios(old, new, "load", steps)
     field_names = [name for name in state.mu if name.startswith("lambda_")]
+    # penalties of contact with bodies
     for contact, new_contact in zip(
         old.problem.loads.contacts, new.problem.loads.contacts, strict=True
     ):
@@ -308,6 +309,7 @@ def target_ratios(
         How many steps of the programme count; None: all.
     """
     ratios = dict[str, float]()
+    # a target is a pair: what it prescribes, and the value
     for step, new_step in zip(
         old.problem.programme[:steps], new.problem.programme[:steps], strict=True
     ):

@@ -51,7 +51,8 @@ def point_of_instability(stage: Stage, path: Path, label: str, point: Point) -> 
     def mode() -> Vector:
         if label == "fold":
             return stage.displacement(point.du)
-        return stage.displacement(nearest_to_zero(stage.newton.factor_at(point.state))[1])
+        _, null_vector = nearest_to_zero(stage.newton.factor_at(point.state))
+        return stage.displacement(null_vector)
 
     return _recorded_point(stage, path, mode)
 

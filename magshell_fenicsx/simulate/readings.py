@@ -133,6 +133,10 @@ class PrescribedQuantity:
         Whether the displacement conjugate to the load is prescribed.
     column, dimensionless_column
         Column of the quantity in the case's unit, and that without unit.
+    _unit
+        Value of the amplitude, or of its conjugate, that is 1 in the dimensionless column.
+    _size
+        Size of the case's unit: a value of `column` over that of the dimensionless one.
 
     Raises
     ------
@@ -148,7 +152,6 @@ class PrescribedQuantity:
         self.scene, self.step = scene, programme[-1]
         self.name = self.step.name
         self.by_conjugate = self.step.load.by_conjugate(at_target=True)
-        # unit: the value of the amplitude, or of its conjugate, that is 1 in the column
         self._unit, self.dimensionless_column = 1.0, amplitude(self.name).column
         if self.by_conjugate:
             columns = {name: (column, unit) for column, (name, unit) in conjugates(scene).items()}
@@ -170,14 +173,14 @@ class PrescribedQuantity:
         return float(-self._size * potential / self._unit)
 
     def constraint(self, system: System, place: float) -> ConstraintRow:
-        """Return the equation that holds at a place.
+        """Return the equation that prescribes the load or the displacement at a place.
 
         Parameters
         ----------
         system
             System of the step, with possible further unknowns.
         place
-            Value in the unit of `column`.
+            Value of the load or displacement, in the unit of `column`.
         """
         value = place / self._size * self._unit
         if self.by_conjugate:
@@ -189,7 +192,8 @@ class PrescribedQuantity:
 
         A place is mu times the size of its unit, which may depend on p. So at a fixed place mu
         changes at the negative rate of this size. A gradient by p already lets the load change with
-        the targets of the case (`_load_factor`); the difference of the two rates is returned.
+        the targets of the case (`_load_factor`); the difference of the two rates is returned. It is
+        0 where the displacement is prescribed, as no other value is allowed there.
 
         Parameters
         ----------
@@ -207,6 +211,7 @@ class PrescribedQuantity:
         low_problem, high_problem = (
             problem.with_values({key: value + sign * step}) for sign in (-1, 1)
         )
+        # the size of the unit, and the load by which gradients scale states, at both values
         low_size, high_size = [
             sizes_in_units(problem_nearby).size(self.dimensionless_column)
             for problem_nearby in (low_problem, high_problem)
@@ -257,13 +262,22 @@ class ResultSampler:
     ----------
     requests
         The readings to come.
+
+    Attributes
+    ----------
+    _records, _history
+        All records of the run so far, and those of them on which its end depends.
+    _record_at_place
+        Place -> record of the equilibrium that has been solved there.
+    _stop_reason
+        Why the path has stopped before its end; "" if it has not.
     """
 
     def __init__(self, scene: Scene, requests: Sequence[Reading]) -> None:
         """Follow the path until all places are passed, or to its end if a reading needs this."""
         self.scene, self._history = scene, History()
         self._records, self._record_at_place = list[Record](), dict[float | None, Record]()
-        self._stop_reason, remarks = "", list[str]()  # "": the path has not stopped
+        self._stop_reason, remarks = "", list[str]()
         places_ahead = {request.at for request in requests if request.at is not None}
         to_end = any(request.at is None for request in requests)
         last_step = len(scene.problem.programme)
@@ -272,17 +286,7 @@ class ResultSampler:
                 self._history.add(record)
                 self._records.append(record)
                 if places_ahead and record.step == last_step:
-                    last_records = self._path()[-2:]
-                    place_before, place_now = (
-                        self.prescribed.place_of(end.point.state) for end in last_records
-                    )
-                    # places between the last two points of the path
-                    passed = {
-                        place
-                        for place in places_ahead
-                        if (place_before - place) * (place_now - place) <= 0
-                    }
-                    places_ahead -= passed
+                    places_ahead -= self._just_passed(places_ahead)
                 if record.step == last_step and not places_ahead and not to_end:
                     break
         except Stopped as e:
@@ -290,6 +294,14 @@ class ResultSampler:
         # a path that stops beyond its instability has a remark in place of an error
         remarks_on_end = (text for text in remarks if text.startswith(BEYOND_INSTABILITY))
         self._stop_reason = self._stop_reason or next(remarks_on_end, "")
+
+    def _just_passed(self, places: set[float]) -> set[float]:
+        """Return those of some places that are between the last two points of the path."""
+        last_records = self._path()[-2:]
+        place_before, place_now = (
+            self.prescribed.place_of(record.point.state) for record in last_records
+        )
+        return {place for place in places if (place_before - place) * (place_now - place) <= 0}
 
     @cached_property
     def prescribed(self) -> PrescribedQuantity:
@@ -491,10 +503,11 @@ class ResultSampler:
             raise LostResult(
                 "the iteration has left the path" if outcome.converged else outcome.reason
             )
+        # a state half way to the nearer end replaces this end
         half_way_place = (place + (low_place if part < 0.5 else high_place)) / 2
         middle = half_way_place, self._state_between(stage, low, high, half_way_place, halvings - 1)
-        ends = (middle, high) if part < 0.5 else (low, middle)
-        return self._state_between(stage, *ends, place, halvings - 1)
+        new_low, new_high = (middle, high) if part < 0.5 else (low, middle)
+        return self._state_between(stage, new_low, new_high, place, halvings - 1)
 
     @staticmethod
     def _is_between(low: float, high: float, place: float, slack: float) -> bool:

@@ -26,6 +26,7 @@ from mpi4py import MPI
 from numpy.typing import NDArray
 
 from magshell_fenicsx.assembly.terms import FormTerm
+from magshell_fenicsx.continuation.device import Conjugate
 from magshell_fenicsx.continuation.system import State, Vector, dot
 from magshell_fenicsx.input.source import CaseError
 from magshell_fenicsx.mesh.mirror import rotation
@@ -102,6 +103,7 @@ def functional(scene: Scene, state: State, result: str | Target) -> Functional:
     points = _displacements(scene)
     if result in points:
         point, axis = points[result]
+        # `probe` has the derivatives of the point's displacement by the unknowns, one row per axis
         by_u = scene.problem.length * (_to_case_frame(scene) @ model.probe(point))[axis]
         return Functional(scene.observe(state)[result], system.zero_at_supports(by_u))
     if result in (conjugate_columns := conjugates(scene)):
@@ -121,10 +123,13 @@ def functional(scene: Scene, state: State, result: str | Target) -> Functional:
             deflections=by_normal,
         )
     if result in (forces := _forces(scene)):
-        return _reaction(scene, state, *forces[result], result)
+        support, axis = forces[result]
+        return _reaction(scene, state, support, axis, result)
+    # a column of a part, as of a sensor
     for part_observables in OBSERVABLES:
         if slope := part_observables.slope(scene.view, state, result):
             return Functional(slope.value, slope.by_u, slope.by_mu, slope=slope)
+    # an amplitude, by its name or its column
     name = next((name for name in state.mu if result in (name, amplitude(name).column)), "")
     if name:
         return Functional(state.mu[name], zero_by_u, {name: 1.0})
@@ -232,11 +237,9 @@ def conjugates(scene: Scene) -> dict[str, tuple[str, float]]:
     with_units = {column: (name, scene.conjugate_unit(name)) for column, name in amplitudes.items()}
     for name in (*loads.forces, *loads.dead):
         # the load for an amplitude of one; 0: a dead load of moments has no displacement in h
-        if (
-            load_size := model.force_unit
-            if name in loads.forces
-            else model.load_size.get(name, 0.0)
-        ):
+        is_force = name in loads.forces
+        load_size = model.force_unit if is_force else model.load_size.get(name, 0.0)
+        if load_size:
             column = "w_over_h" if name == loads.displaced else f"w_{name}_over_h"
             with_units[column] = name, load_size * scene.problem.material.h
     return with_units
@@ -313,13 +316,20 @@ def barrier(scene: Scene, step: ProgrammeStep, begin: State, end: State) -> floa
     energy_before, energy_after = (sum(scene.energies(state).values()) for state in (begin, end))
     change = energy_after - energy_before
     for name, q in held_conjugates.items():
-        mu_before, mu_after = begin.mu[name], end.mu[name]
-        work = (
-            # a gas has q as a function of mu; q(mu) returns value and derivative, quad the integral
-            # and its error
-            scipy.integrate.quad(lambda mu, q=q: q(mu)[0], mu_before, mu_after)[0]
-            if callable(q)
-            else q * (mu_after - mu_before)
-        )
-        change += scene.model.multiplicity * work
+        change += scene.model.multiplicity * _work(q, begin.mu[name], end.mu[name])
     return float(change)
+
+
+def _work(q: float | Conjugate, mu_before: float, mu_after: float) -> float:
+    """Return the integral of q dmu between two values of an amplitude.
+
+    Parameters
+    ----------
+    q
+        The held conjugate of the amplitude: a number; or of a gas a function of the amplitude,
+        which returns the conjugate and its derivative.
+    """
+    if not callable(q):
+        return q * (mu_after - mu_before)
+    integral, _ = scipy.integrate.quad(lambda mu, law=q: law(mu)[0], mu_before, mu_after)
+    return float(integral)

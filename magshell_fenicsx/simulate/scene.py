@@ -225,18 +225,23 @@ class Scene:
         else:
             self.model = build_model(self.problem, comm)
         surface = self.model.midsurface
-        # a file may have several pieces, of which each must be held
+        # a clamped support holds a shell for sure. But a mesh file may have several pieces, each of
+        # which must be held; and a meridian is always examined
         is_from_file = surface is not None and surface.from_mesh_file
-        may_be_free = self.model.axisymmetric or is_from_file or not self.problem.fixed
-        self.allows_rigid_motion = may_be_free and self.problem.at_rest
-        motion = ""  # words for a rigid motion that the supports leave free
-        if may_be_free and not self.allows_rigid_motion:
-            motion = self.model.free_motion(self.unloaded().mu)
-        if motion and not self.problem.moves_freely:
+        may_be_loose = self.model.axisymmetric or is_from_file
+        is_held_for_sure = self.problem.fixed and not may_be_loose
+        # for frequencies alone, without loads, nothing need hold the shell
+        self.allows_rigid_motion = not is_held_for_sure and self.problem.at_rest
+        # message on a rigid motion that the supports leave free; "" without one
+        free_motion = ""
+        if not (is_held_for_sure or self.allows_rigid_motion):
+            free_motion = self.model.free_motion(self.unloaded().mu)
+        # only a case of steps in time may leave it free: inertia resists it
+        if free_motion and not self.problem.moves_freely:
             flat = self.flat_triangle
-            raise MeshError(f"mesh: {flat}" if flat else motion + self.problem.support_hint)
-        self.free_in_time = bool(motion)
-        if motion:
+            raise MeshError(f"mesh: {flat}" if flat else free_motion + self.problem.support_hint)
+        self.free_in_time = bool(free_motion)
+        if free_motion:
             self.warnings.append(NOT_COUNTED)
         pairs = [contact.pair for contact in self.model.shell_contacts]
         stiffnesses = {pair.setting: pair.stiffness for pair in pairs}
@@ -461,6 +466,7 @@ class Scene:
         deflection = pole
         if loads.displaced:  # the name of the load whose displacement w is reported
             deflection = model.loaded_deflection(state.u, loads.displaced) / h
+        # a column of an energy is the sum of its groups
         energy_of_column = defaultdict[str, float](float)
         for group, column in {term.group: term.column for term in model.system.terms}.items():
             energy_of_column[column] += energies[group]

@@ -182,6 +182,22 @@ class SceneFamily:
         Number of waves around a meridian; 0: the mode is one of the model itself.
     has_one_scene
         Whether only amplitudes depend on p, so that one scene serves all values.
+    _origin
+        The scene whose mesh and amplitudes all others have: that of the case, or one at another p
+        that has more amplitudes.
+    _record
+        Row at the instability, in the unknowns of the origin.
+    _base, _first
+        The stage that is used at p = `value`, and the row at the instability in its unknowns.
+    _test_value
+        Another value of p, at which forces are compared with those at `value`.
+    _problems, _stages
+        The latest problems and stages, by the value of p.
+    _linear_amplitudes
+        Amplitudes as linear functions of p; None if they are not linear, or not only these depend
+        on p.
+    _shared_forms
+        Forms that the scenes at all p share; None if each has its own.
 
     Raises
     ------
@@ -229,11 +245,13 @@ class SceneFamily:
         low, middle, high = (self._amplitudes(p) for p in (a, (a + b) / 2, b))
         for name in low:
             sum_of_ends = low[name] + high[name]
-            if not isclose(
+            is_linear = isclose(
                 2 * middle[name], sum_of_ends, rel_tol=LINEARITY_TOLERANCE, abs_tol=TINY_AMPLITUDE
-            ):
+            )
+            if not is_linear:
                 return None
-        return _LinearAmplitudes(a, low, {name: (high[name] - low[name]) / (b - a) for name in low})
+        rates = {name: (high[name] - low[name]) / (b - a) for name in low}
+        return _LinearAmplitudes(value=a, amplitudes=low, rates=rates)
 
     def _choose_test_value(self, value: float) -> float:
         """Return another value of p, at which forces are compared with those at `value`.
@@ -252,7 +270,8 @@ class SceneFamily:
         # the scene with the most amplitudes
         test_value = max(candidates, key=lambda p: len(names_at[p]))
         new_names = names_at[test_value] - names
-        if not names_at[test_value] > names:
+        has_all_and_more = names_at[test_value] > names
+        if not has_all_and_more:
             return test_value
         # the scene there has all amplitudes, so it becomes the origin
         old_origin, old_state = self._origin, self._record.point.state
@@ -262,7 +281,7 @@ class SceneFamily:
         mu |= {name: problem.lambda_m if name == "lambda_m" else 0.0 for name in new_names}
         point = replace(self._record.point, state=State(u, mu))
         self._record = replace(self._record, point=point, step=len(problem.programme))
-        # another value than that of the new origin
+        # a test value other than that of the new origin: the other candidate, if there is one
         if len(candidates) > 1:
             return min(candidates, key=lambda p: p == test_value)
         return (value + test_value) / 2
@@ -348,10 +367,10 @@ class SceneFamily:
         crossing
             Point of the boundary at which another mode is neutral as well.
         m
-            Number of waves of the mode that is returned; 0: a mode of the model itself.
+            Number of waves of the mode that is returned; 0: the critical mode of the model itself.
         m_of_boundary
-            Number of waves of the boundary's mode; the mode that is returned is orthogonal to this
-            one where both have the same number.
+            Number of waves of the boundary's mode. Waves (m > 0) of the same number are made
+            orthogonal to this mode.
 
         Raises
         ------
@@ -382,7 +401,7 @@ class SceneFamily:
             None: no such mode.
         """
         factors = self.factored_tangent(p, state, m)
-        # a fixed start without symmetries, so that runs repeat
+        # a fixed first guess without symmetries, so that repeated runs agree
         vector = np.sin(1.0 + np.arange(factors.matrix.getLocalSize()[0]))
         for _ in range(INVERSE_ITERATIONS):
             vector = factors.solve(vector)
@@ -550,6 +569,7 @@ class SceneFamily:
         if self._linear_amplitudes:
             return self._linear_amplitudes.at(p)
         old, new, mu = self._origin.problem, self.problem(p), dict(self._record.point.state.mu)
+        # at the target of an earlier step; a target is a pair of what it prescribes and its value
         earlier_steps = old.programme[: self._record.step - 1]
         for old_step, new_step in zip(earlier_steps, new.programme, strict=False):
             old_target, new_target = (
@@ -560,12 +580,14 @@ class SceneFamily:
             # a later step may have moved it away from the target
             if isclose(mu.get(old_step.name, np.nan), old_target[1], rel_tol=1e-9):
                 mu[old_step.name] = new_target[1]
+        # at the initial value
         old_values, new_values = own_amplitudes(old.loads), own_amplitudes(new.loads)
         mu |= {
             name: new_values[name]
             for name, value in old_values.items()
             if name in new_values and value and mu.get(name) == value
         }
+        # components of the magnetic field
         if old.lambda_m and new.lambda_m != old.lambda_m:
             strength_ratio = new.lambda_m / old.lambda_m
             mu |= {

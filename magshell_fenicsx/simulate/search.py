@@ -124,8 +124,8 @@ class CurvedShell:
         # a fold at the supports could not bend; shallow shells have it half way up
         lowest_plane = min(SUPPORT_DISTANCE * width, self.top / 2)
         height_above = self.height - max((1 - depth) * self.top, lowest_plane)
-        # a mirrored point moves by twice its height above the plane. width log(1 + exp(height /
-        # width)) is a smooth max(0, height), so that the fold is rounded
+        # a mirrored point moves by twice its height above the plane. Instead of max(0, height) the
+        # smooth function width log(1 + exp(height/width)) is taken, so that the fold is rounded
         displacement_along_normal = np.where(
             self.is_own, -2 * width * np.logaddexp(0.0, height_above / width), 0.0
         )
@@ -148,21 +148,24 @@ def _plane(scene: Scene, x: Array, is_own: NDArray[np.bool_]) -> tuple[Array, fl
     """
     is_held = np.zeros(len(x), dtype=bool)
     for support in scene.model.supports.values():
-        is_held[support.dofs[support.dofs < x.size] // x.shape[1]] = True
+        own_dofs = support.dofs[support.dofs < x.size]
+        is_held[own_dofs // x.shape[1]] = True
     is_held &= is_own
-    if scene.model.axisymmetric:
-        return np.array([0.0, 1.0]), float(x[is_held, 1].mean()) if is_held.any() else 0.0
+    if scene.model.axisymmetric:  # the plane is across the axis
+        mean_height = float(x[is_held, 1].mean()) if is_held.any() else 0.0
+        return np.array([0.0, 1.0]), mean_height
     centre, covariance = _moments(scene, x[is_held])
     variances, axes = np.linalg.eigh(covariance)
-    # ascending: supports with one variance that is not zero are on a line, along the last axis
+    # variances ascend. If only the last one is not zero, the supports are on a line along its axis
     if variances[1] <= FLATNESS_TOLERANCE * variances[2]:
         _, covariance = _moments(scene, x[is_own])
-        # zero for a single point: no direction is given
-        direction = np.outer(axes[:, 2], axes[:, 2]) if variances[2] > 0 else np.zeros((3, 3))
-        projection = np.eye(3) - direction
-        # the large eigenvalue along the line keeps the normal across it
+        # projection on the line; zero for a single point, which gives no direction
+        along_line = np.outer(axes[:, 2], axes[:, 2]) if variances[2] > 0 else np.zeros((3, 3))
+        across_line = np.eye(3) - along_line
+        # the covariance of the shell across the line, and a large eigenvalue along it: so the
+        # eigenvector with the least eigenvalue is across the line
         variances, axes = np.linalg.eigh(
-            projection @ covariance @ projection + direction * np.trace(covariance)
+            across_line @ covariance @ across_line + along_line * np.trace(covariance)
         )
     normal = np.where(np.abs(axes[:, 0]) < ROUNDING, 0.0, axes[:, 0])
     # the largest component is positive, so that the sense does not depend on rounding
@@ -283,7 +286,13 @@ def _solutions(stage: Stage, name: str, state: State, search: SearchSection) -> 
     excluded_modes = scene.model.symmetry_breaking_modes
     descend_to_stable = dents.descended if search.stable else None
     solutions_found = further_solutions(
-        path, stage.enter(state), guesses, limits, stage.displaced, descend_to_stable, _rules(stage)
+        path,
+        stage.enter(state),
+        guesses,
+        limits,
+        displacement=stage.displaced,
+        descend=descend_to_stable,
+        rules=_rules(stage),
     )
     for number, solution in enumerate(solutions_found, 1):
         point = stage.point(solution)

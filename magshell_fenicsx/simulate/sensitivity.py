@@ -161,9 +161,11 @@ def _field_column(scene: Scene, state: State) -> dict[str, Vector]:
     )
     with_field = problem.with_values({"magnetic.lambda_m": NONZERO_FIELD, **without_field})
     is_whole = not problem.axisymmetric and problem.mirror is None
-    symmetries = [(each.axisymmetric, each.mirror) for each in (problem, with_field)]
+    symmetry, symmetry_with_field = (
+        (each.axisymmetric, each.mirror) for each in (problem, with_field)
+    )
     assert with_field.loads.magnetic
-    if not is_whole and symmetries[0] != symmetries[1]:
+    if not is_whole and symmetry != symmetry_with_field:
         return {}
     # unknown amplitudes stand behind the displacements
     model_state = State(state.u[: scene.model.system.size], state.mu)
@@ -205,20 +207,22 @@ def _remanence_columns(scene: Scene, fold: Fold) -> dict[str, Vector]:
     field = scene.model.loads.magnetic
     if field is None or (field.soft and field.soft.alone) or scene.model.loads.interaction:
         return {}
-    rims_by_patch, unit_factor = scene.problem.within, np.ones(3)
+    rims_by_patch = scene.problem.within
     if field.patches and scene.problem.context.sections.get("shells"):
         return _remanence_columns_of_shells(scene, fold.state, field, field.patches)
     if not rims_by_patch:
         return {"remanence": _magnetic_column(scene, fold.state, field)}
 
+    # factors of the three components of the remanence
+    ones, zeros = np.ones(3), 0 * np.ones(3)
+
     def factor_of(patch: str) -> WithinRims:
         """Return the factor that is 1 within a patch, and 0 elsewhere."""
-        # three equal components, one for each of the remanence
-        rims = tuple(
-            (rim, unit_factor if name == patch else 0 * unit_factor)
-            for name, rim in rims_by_patch.items()
+        factor_within_rims = tuple(
+            (rim, ones if name == patch else zeros) for name, rim in rims_by_patch.items()
         )
-        return WithinRims(rims, unit_factor if patch == "rest" else 0 * unit_factor)
+        factor_outside = ones if patch == "rest" else zeros
+        return WithinRims(factor_within_rims, factor_outside)
 
     patches = (*rims_by_patch, "rest")
     field_of_patch = {
@@ -245,20 +249,19 @@ def _remanence_columns_of_shells(
         Shell -> its remanence.
     """
     model = scene.model
-    patches_of_cells: Mapping[str, NDArray[np.bool_]]  # shell -> which cells are its own
+    cells_of_patches: Mapping[str, NDArray[np.bool_]]  # shell -> which cells are its own
     if model.midsurface:
         cell_map = model.midsurface.mesh.topology.index_map(2)
-        patches_of_cells, cell_count = (
-            model.midsurface.patches,
-            cell_map.size_local + cell_map.num_ghosts,
-        )
+        cells_of_patches = model.midsurface.patches
+        cell_count = cell_map.size_local + cell_map.num_ghosts
     else:
         assert model.axisymmetric
-        patches_of_cells, cell_count = model.meridian.patches, len(model.meridian.order)
-    without_field = dict.fromkeys(patches, np.zeros(3))
+        cells_of_patches, cell_count = model.meridian.patches, len(model.meridian.order)
+    # the magnetisation with the remanence of one shell, and zero in all others
+    without_remanence = dict.fromkeys(patches, np.zeros(3))
     field_of_shell = {
-        name: replace(field, patches={**without_field, name: remanence}).on_cells(
-            patches_of_cells, cell_count
+        name: replace(field, patches={**without_remanence, name: remanence}).on_cells(
+            cells_of_patches, cell_count
         )
         for name, remanence in patches.items()
     }
@@ -369,8 +372,9 @@ def _varies(problem: Problem, section: ImperfectionSection, name: str) -> bool:
 def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
     """Return the derivative of a fold's amplitude by one number p of an imperfection; collective.
 
-    Two central differences are nested. One with the width `tiny` gives dw0/dp, as exact as rounding
-    allows. The other one moves the surface along dw0/dp by +-`step`, wide enough for the residual.
+    Two central differences are nested. The inner one, between p - `tiny` and p + `tiny`, gives
+    dw0/dp, as exact as rounding allows. The outer one moves the surface along dw0/dp, once for the
+    change `step` of p and once for -`step`; this is wide enough for the residual.
 
     Parameters
     ----------
@@ -384,26 +388,26 @@ def _derivative(stage: Stage, fold: Fold, key: str, name: str) -> float:
     unit = _unit(problem, key, name)
     step, tiny = RESIDUAL_STEP * unit, DEVIATION_STEP * unit
     forward, backward = (
-        _deviation(
-            scene, with_changed_number(problem.imperfections, key, name, change_of_number), key
-        )
-        for change_of_number in (tiny, -tiny)
+        _deviation(scene, with_changed_number(problem.imperfections, key, name, tiny_change), key)
+        for tiny_change in (tiny, -tiny)
     )
 
-    def load_change(change: float) -> float:
+    def amplitude_change(change: float) -> float:
         """Return the change of the fold's amplitude for a change of the number, to first order."""
-        difference = DeviationDifference(forward, backward, change / (2 * tiny))
-        return _load_change(stage, fold, with_deviation(scene, difference))
+        deviation = DeviationDifference(forward, backward, factor=change / (2 * tiny))
+        return _amplitude_change(stage, fold, with_deviation(scene, deviation))
 
+    # amplitude -> keys of the imperfections that it makes grow in a step. Such an amplitude
+    # multiplies the deviation
     keys_of_amplitudes = grown_by(scene.problem.programme, problem.imperfections)
     factors = [
         fold.state.mu[amplitude] for amplitude, keys in keys_of_amplitudes.items() if key in keys
     ]
-    # where the imperfection grows in a step, its amplitude multiplies the deviation
-    return (factors or [1.0])[0] * (load_change(step) - load_change(-step)) / (2 * step)
+    factor = factors[0] if factors else 1.0
+    return factor * (amplitude_change(step) - amplitude_change(-step)) / (2 * step)
 
 
-def _load_change(stage: Stage, fold: Fold, other: Scene) -> float:
+def _amplitude_change(stage: Stage, fold: Fold, other: Scene) -> float:
     """Return -(phi . R)/(phi . R_mu) of a fold's state in a scene with a slightly other shell.
 
     It is the change of the fold's amplitude to first order: at the fold's own displacement and
@@ -489,7 +493,7 @@ def _derivative_by_number(stage: Stage, fold: Fold, key: str) -> float:
     scene, context = stage.scene, stage.scene.problem.context
     value, step = number_at_key(context, key), RESIDUAL_STEP * scale_at_key(context, key)
     forward, backward = (
-        _load_change(stage, fold, perturbed_scene(scene, key, value + change))
+        _amplitude_change(stage, fold, perturbed_scene(scene, key, value + change))
         for change in (step, -step)
     )
     return (forward - backward) / (2 * step)

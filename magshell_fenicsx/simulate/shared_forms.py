@@ -62,11 +62,16 @@ class SharedForms:
         The scene, and its model.
     places
         Name of a term -> the arrays of the model that its forms read.
+
+    Attributes
+    ----------
+    _numbers
+        The numbers of all scenes, by p. Its p = inf stands for the first scene, as no other scene
+        has this p.
     """
 
     def __init__(self, scene: Scene, model: MeridianModel, places: Numbers) -> None:
         self._scene, self._model = scene, model
-        # inf stands for the first scene, as no other scene has this p
         self._numbers = _NumbersOfForms(places, {np.inf: _copied(places)})
 
     @staticmethod

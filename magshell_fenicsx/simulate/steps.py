@@ -110,7 +110,7 @@ def records_of(scene: Scene, step: ProgrammeStep, state: State) -> Records:
 def _within_support_limits(
     scene: Scene, step: ProgrammeStep, state: State, drive: Drive
 ) -> tuple[Drive, str]:
-    """Return a drive that ends before supports hold shells in each other, and why it ends there.
+    """Return a drive that ends before moving supports make shells overlap, and why it ends there.
 
     Parameters
     ----------

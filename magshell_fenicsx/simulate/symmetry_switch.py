@@ -143,10 +143,13 @@ def switch_symmetry(stage: Stage, bifurcation: Record, scale: float) -> Symmetry
     u, phi = _carried_over(stage.scene, new_scene, bifurcation, mode)
     mu = {**new_scene.unloaded().mu, **bifurcation.point.state.mu}
     path = _arc_length_path(new_stage, bifurcation.amplitude, scale)
-    # a guess with contact at rest, then the bifurcation; at each of them a text if it fails
-    located: Point | State | str = _settled_contact(new_stage, path, State(u, mu), phi)
-    if isinstance(located, State):
-        located = path.recorded(partial(_located, new_stage, path, located, phi))
+    # first contact settles, then the bifurcation is located; either returns a text if it fails
+    settled = _settled_contact(new_stage, path, State(u, mu), phi)
+    located: Point | str
+    if isinstance(settled, str):
+        located = settled
+    else:
+        located = path.recorded(partial(_located, new_stage, path, settled, phi))
     if isinstance(located, str):
         raise Stopped(
             f"the bifurcation ({bifurcation.mode}) is not found in the "
@@ -349,12 +352,13 @@ def _at_rest(stage: Stage, path: Path, guess: State, mode: Vector) -> Point | st
         Vector of the step's system.
     """
     try:
-        held_point = held_along(stage.newton, stage.enter(guess), mode)
+        state_and_error = held_along(stage.newton, stage.enter(guess), mode)
     except np.linalg.LinAlgError:
-        held_point = None
-    if held_point is None:
+        state_and_error = None
+    if state_and_error is None:
         return "shells that touch do not come to rest there; take a finer mesh"
-    return _point_along(path, held_point[0], mode, 0)
+    state, _ = state_and_error
+    return _point_along(path, state, mode, unstable=0)
 
 
 def _located(stage: Stage, path: Path, guess: State, phi: Vector) -> Point | str:
@@ -391,6 +395,7 @@ def _differences(old: Scene, event: Record, switch: SymmetrySwitch) -> str:
     """
     new_scene, name = switch.scene, event.amplitude
     state = switch.stage.point(switch.point).state
+    # columns of the results at the bifurcation, in both models
     old_row, new_row = old.observe(event.point.state), new_scene.observe(state)
     old_load, new_load = amount_of(old, name, event.point.state), amount_of(new_scene, name, state)
     load_change = abs(new_load - old_load) / max(abs(old_load), TINY)
@@ -515,16 +520,15 @@ def _evaluated(model: MeridianModel, V: fem.FunctionSpace, x: Vector, s: Array) 
         (n,), meridian parameters.
     """
     domain = model.meridian.mesh
+    # (cells, 2): parameters at the two ends of each cell, in any order
     cell_ends = domain.geometry.x[compat.geometry_dofs(domain), 0]
     cell_begin = cell_ends.min(axis=1)
     order = np.argsort(cell_begin)
-    # the last cell that begins before s
-    cells = order[
-        np.clip(np.searchsorted(cell_begin[order], s, side="right") - 1, 0, len(order) - 1)
-    ]
-    local_coordinate = np.clip(
-        (s - cell_ends[cells, 0]) / (cell_ends[cells, 1] - cell_ends[cells, 0]), 0.0, 1.0
-    )
+    # the last cell that begins before s; the first or the last cell for an s beyond the meridian
+    last_before = np.searchsorted(cell_begin[order], s, side="right") - 1
+    cells = order[np.clip(last_before, 0, len(order) - 1)]
+    first_end, second_end = cell_ends[cells, 0], cell_ends[cells, 1]
+    local_coordinate = np.clip((s - first_end) / (second_end - first_end), 0.0, 1.0)
     # (places, nodes): the element's basis functions, without derivatives
     table = V.element.basix_element.tabulate(0, local_coordinate[:, None])[0, :, :, 0]
     values_at_nodes = x.reshape(-1, V.dofmap.bs)[V.dofmap.list[cells]]
@@ -557,27 +561,31 @@ def _mirrored(old: Scene, new: Scene, u: Vector, mode: Vector) -> tuple[Array, A
         np.concatenate(comm.allgather(local_vector.reshape(-1, 3)))
         for local_vector in local_vectors
     )
-    has_image = mirror.signed_distance(places) > PLANE_TOLERANCE  # others are their own image
+    # nodes of both halves: first those of the half, then the images of those off the plane
+    has_image = mirror.signed_distance(places) > PLANE_TOLERANCE
     reflection = mirror.reflection
     places_of_both_halves = np.concatenate([places, mirror.image(places[has_image])])
+    # (nodes, 6): the displacement, and the mode with the negative of its image
     values = np.hstack(
         [
-            # displacement and mode have images of opposite signs
             np.concatenate([field, sign * field[has_image] @ reflection])
             for field, sign in zip(fields, (1.0, -1.0), strict=True)
         ]
     )
-    # from the new frame to the old one
+    # places of the new nodes, turned from the new frame to the old one
     rotation_to_old = rotation(old.problem.azimuth) @ rotation(new.problem.azimuth).T
     new_places = new.model.r0.x.array[: new.model.system.size].reshape(-1, 3) @ rotation_to_old.T
     new_values = np.zeros((len(new_places), 6))  # three components of each field
     # shells that touch must not be mixed
     for old_nodes, new_nodes in nodes_by_shell(old, new):
         if new_nodes.any():
-            nodes = np.concatenate([old_nodes, old_nodes[has_image]])
+            nodes_of_both_halves = np.concatenate([old_nodes, old_nodes[has_image]])
             new_values[new_nodes] = interpolated_on_surface(
-                places_of_both_halves[nodes], values[nodes], new_places[new_nodes]
+                places_of_both_halves[nodes_of_both_halves],
+                values[nodes_of_both_halves],
+                new_places[new_nodes],
             )
+    # back to the new frame
     return new_values[:, :3] @ rotation_to_old, new_values[:, 3:] @ rotation_to_old
 
 
@@ -601,14 +609,13 @@ def interpolated_on_surface(x: Array, values: Array, places: Array) -> Array:
     centred = offsets - offsets.mean(axis=1, keepdims=True)
     # the two axes of the tangent plane, from the spread of the neighbours
     axes = np.linalg.svd(centred, full_matrices=False)[2][:, :2]
-    first_coordinate, second_coordinate = np.moveaxis(
-        np.einsum("nki,nji->nkj", offsets, axes) / radius[:, None, None], 2, 0
-    )
-    basis = np.stack(  # the ten monomials up to degree 3, the constant first
-        [first_coordinate**i * second_coordinate**j for i in range(4) for j in range(4 - i)], axis=2
-    )
+    # coordinates (n, neighbours) of the neighbours in this plane, over the distance of the farthest
+    coordinates = np.einsum("nki,nji->nkj", offsets, axes) / radius[:, None, None]
+    a, b = np.moveaxis(coordinates, 2, 0)
+    # the ten monomials up to degree 3, the constant first
+    basis = np.stack([a**i * b**j for i in range(4) for j in range(4 - i)], axis=2)
     # at the farthest of the nodes, at distance 1, it is 0.02
-    weight = np.exp(-4 * (first_coordinate**2 + second_coordinate**2))[..., None]
+    weight = np.exp(-4 * (a**2 + b**2))[..., None]
     coefficients = np.linalg.pinv(weight * basis) @ (weight * values[neighbours])
     # the constant of the polynomial is its value at the place
     return np.asarray(coefficients[:, 0])

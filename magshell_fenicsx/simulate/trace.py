@@ -88,12 +88,9 @@ def _number(scene: Scene, name: str, place: str, amount: Any, of_load: bool) -> 
     # conjugates with a unit: the change of volume of a pressure, the displacement of a force
     forces = (*scene.model.loads.forces, *scene.model.contacts)
     may_have_unit = of_load or name == "pressure" or name in forces
-    # a unit of the case, or one of the same dimension for messages
-    text = (
-        unit.text
-        if unit
-        else next((unit_of_quantity.text for unit_of_quantity in quantity(column).units), "")
-    )
+    # the case's unit of this quantity; without one, any unit that says whether it can have a unit
+    any_unit = next((unit_of_quantity.text for unit_of_quantity in quantity(column).units), "")
+    text = unit.text if unit else any_unit
     if not (text and may_have_unit):
         quantity_text = name if of_load else f"the conjugate of {name}"
         raise ValueError(f"{place}: {quantity_text} has no unit here: give a number")
@@ -213,7 +210,9 @@ def trace(  # noqa: PLR0913
 def _with_reached(
     records: Iterator[Record], name: str, targets: Sequence[float]
 ) -> Iterator[Record]:
-    """Yield records; the last one says whether the last target was reached, else it warns.
+    """Yield records; the last one says whether the last target was reached.
+
+    If it was not reached, a warning says where the path ends.
 
     Parameters
     ----------
@@ -226,7 +225,8 @@ def _with_reached(
     last_record, targets_ahead = next(records), len(targets)
     for record in records:
         yield last_record
-        last_record, targets_ahead = record, targets_ahead - (record.label == "target")
+        last_record = record
+        targets_ahead -= record.label == "target"
     if targets_ahead > 0:
         mode = f" ({last_record.mode})" if last_record.mode else ""
         place = f"{last_record.label}{mode} at {name} = {last_record.point.state.mu[name]:.6g}"

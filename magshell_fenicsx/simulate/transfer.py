@@ -49,10 +49,9 @@ def transfer(source: Scene, target: Scene, u: Vector) -> Vector:
         return np.asarray(values[matching].ravel())
     nodes, chart_places, stretch = _all_nodes(source), chart(target), _stretch(source, target)
     if stretch:
-        displacement = stretch.turn(
-            _interpolated(nodes, values, stretch.place(chart_places), stretch.source_rim),
-            chart_places,
-        )
+        places_in_source = stretch.place(chart_places)
+        u_at_places = _interpolated(nodes, values, places_in_source, stretch.source_rim)
+        displacement = stretch.turn(u_at_places, chart_places)
     else:
         scale = system.length / source.model.system.length
         displacement = np.zeros((len(chart_places), values.shape[1]))
@@ -80,7 +79,7 @@ def _interpolated(nodes: Array, values: Array, x: Array, rim: float) -> Array:
     """
     values_at_x: Array = np.zeros((len(x), values.shape[1]))
     polar_of_nodes, polar = np.linalg.norm(nodes, axis=1), np.linalg.norm(x, axis=1)
-    # masks of nodes and of places; nodes on the rim belong to both sides
+    # for each side of the rim two masks, of nodes and of places; those on the rim are in both sides
     within_rim = polar_of_nodes < rim * (1 + ROUNDING), polar < rim * (1 + ROUNDING)
     beyond_rim = polar_of_nodes > rim * (1 - ROUNDING), polar > rim * (1 - ROUNDING)
     dim = nodes.shape[1]

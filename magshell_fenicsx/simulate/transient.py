@@ -182,8 +182,9 @@ def snap_records(
     """
     state, system, unit = fold.point.state, scene.model.system, scene.problem.time_unit or 1.0
     lowest_modes = ShellModes(scene.model).lowest(state, 3)
-    # without modes of other symmetries, which have a label; the first one is neutral here
+    # without modes of other symmetries, which have a label
     eigenvalues = [mode.eigenvalue for mode in lowest_modes if not mode.label]
+    # of the highest of the three; the first one is neutral here
     omega = float(np.sqrt(max(eigenvalues[1:])))
     load = TimeSection(
         kind="time",
@@ -226,6 +227,10 @@ class _MotionStart:
     ----------
     loads
         The amplitudes as functions of time.
+    _drag
+        Drag: a force over mass and velocity, in the unit of time of the model.
+    _u, _v
+        Displacement and velocity at the begin, with those that the step adds.
     """
 
     def __init__(
@@ -239,7 +244,7 @@ class _MotionStart:
         self._scene, self._load, self._state, self._held = scene, load, state, held_conjugates
         self.loads = LoadsInTime(scene.problem, load, state, scene.motions)
         unit = scene.problem.time_unit or 1.0
-        self._drag = float(in_units("1/second")(load.drag)) * unit  # force over mass and velocity
+        self._drag = float(in_units("1/second")(load.drag)) * unit
         u, v = state.u, state.v if isinstance(state, MovingState) else 0.0 * state.u
         if load.push:
             u, v = pushed_along_mode(scene, load.push, state, v)
@@ -346,6 +351,8 @@ class _Energies:
     ----------
     kinetic, largest_kinetic
         Kinetic energy of the model at the last row, and the largest one so far, over E h R^2.
+    _at_begin
+        Kinetic and stored energy at time zero, in the same unit.
     """
 
     def __init__(self, scene: Scene, integrator: Integrator, begin: Motion) -> None:
@@ -457,9 +464,10 @@ def _equilibrium_near(
     Penalties of contact become stiffer until nothing penetrates too much. Collective.
     """
     stage, comm = make_stage(scene, state, held_conjugates), scene.model.system.comm
-    # the solver prescribes one amplitude: here one that nothing has
     start = stage.enter(state)
-    start, new_settings = start.with_(start.u, NO_LOAD, 0.0), dict[str, float]()
+    # the solver needs an amplitude to prescribe: here one that no load has
+    start = start.with_(start.u, NO_LOAD, 0.0)
+    new_settings = dict[str, float]()  # penalties that have become stiffer
     while True:
         outcome = stage.newton.solve(start, NO_LOAD, PrescribedLoad(NO_LOAD, 0.0))
         distance = max_abs(comm, outcome.state.u - start.u) / scene.model.system.length
@@ -473,11 +481,9 @@ def _equilibrium_near(
         start = State(outcome.state.u, {**outcome.state.mu, **new_settings})
     if stage.newton.factor_at(outcome.state).negative_pivots:  # unstable
         return None
-    # without the solver's own amplitude
-    return State(
-        state_at_rest.u,
-        state.mu | {name: state_at_rest.mu[name] for name in (*held_conjugates, *new_settings)},
-    )
+    # new values of unknown amplitudes and of penalties, without the solver's own amplitude
+    changed = {name: state_at_rest.mu[name] for name in (*held_conjugates, *new_settings)}
+    return State(state_at_rest.u, state.mu | changed)
 
 
 def viscosity(scene: Scene, state: State) -> Viscosity | None:
@@ -549,6 +555,7 @@ def velocity_by_formula(scene: Scene, components: Sequence[str]) -> Vector:
     model, R, Q = scene.model, scene.problem.length, rotation(scene.problem.azimuth)
     unit, axes = scene.problem.time_unit or 1.0, model.axes
     places = vectors_in_space(model.r0.x.array, len(axes))
+    # the formulas take places in the case's frame and units, and give velocities in these
     velocity = vector_function(components)(R * places @ Q) @ Q.T * unit / R
     owned = np.ascontiguousarray(velocity[:, axes]).ravel()[: model.system.size]
     return np.asarray(model.system.zero_at_supports(owned))

@@ -300,13 +300,9 @@ def _value(source: Source, span: Range, make_case: MakeCase, may_be_outside: boo
         If the key is a section, a list or a truth value, or its value is outside.
     """
     key_path = span.key.split(".")
-    # as written, else the default
     value_in_case = value_at(source.data, key_path)
-    value_in_case = (
-        value_at(make_case(source).model_dump(mode="json"), key_path)
-        if value_in_case is None
-        else value_in_case
-    )
+    if value_in_case is None:  # not written in the case: the default counts
+        value_in_case = value_at(make_case(source).model_dump(mode="json"), key_path)
     try:
         value = in_unit(str(value_in_case), span.unit)
     except ValueError:  # no number in this unit
@@ -481,11 +477,11 @@ def _followed(
         rows.append(row)
         # largest part of the way so far, as the boundary may turn back
         covered_part = max((row_of_curve["key"] - value) / (end - value) for row_of_curve in rows)
-        remaining = (
-            remaining_time_text((time.perf_counter() - start_time) * (1 / covered_part - 1))
-            if covered_part > 0
-            else ""
-        )
+        remaining = ""
+        if covered_part > 0:
+            # the rest is assumed to take as long in proportion
+            elapsed = time.perf_counter() - start_time
+            remaining = remaining_time_text(elapsed * (1 / covered_part - 1))
         other_modes = f", {row['unstable']} other unstable" if row["unstable"] else ""
         key_text = f"{row['key']:.9g} {span.unit}".rstrip()
         say(
@@ -496,7 +492,8 @@ def _followed(
     def curve(m: int, start_point: BoundaryPoint | None = None) -> Boundary:
         """Return the boundary of modes with m waves around a meridian; 0: of the model itself.
 
-        `start_point` is the crossing at which it begins, if it does.
+        `start_point` is the crossing with another family at which this boundary begins; None if it
+        begins at no crossing.
         """
         kind = family.kind_of(m, start_point)
         return Boundary(
@@ -529,16 +526,25 @@ def _row(
 
     Parameters
     ----------
+    family
+        The scenes of the boundary; its `m` is the number of waves of the mode that is followed, 0
+        for a mode of the model itself.
     label
         "start", or the label of the point on the boundary.
+    locus
+        The point. At a crossing `locus.met` is the number of waves of the other family that is
+        neutral there.
     mode
-        The boundary that the point is on.
+        The boundary that the point is on, with `m` waves.
     name_of_mode
         Name of the model's own mode, as in path.csv of the case.
     """
     # at a crossing two families are neutral: this boundary's and the one that it meets
-    wave_numbers = sorted({mode.m, locus.met} if label == "crossing" else {mode.m})
-    # name of the model's own mode, if it is followed; at a crossing with waves its kind
+    is_crossing = label == "crossing"
+    wave_numbers = sorted({mode.m, locus.met} if is_crossing else {mode.m})
+    unstable = locus.unstable - (locus.unstable_of(locus.met) if is_crossing else 0)
+    # the model's own mode (0 waves) has its name if it is the one that is followed; where it
+    # crosses a mode with waves, its kind ("fold" or "bifurcation") stands for it
     mode_name = "" if family.m else name_of_mode
     if len(wave_numbers) > 1 and not wave_numbers[0]:
         mode_name = family.kind_of(0, locus)
@@ -548,9 +554,7 @@ def _row(
         "kind": label if label in SPECIAL else mode.kind,
         "mode": ", ".join(f"{WAVES}{m}" if m else mode_name for m in wave_numbers),
         "error": float(locus.load_error),
-        "unstable": int(
-            locus.unstable - (locus.unstable_of(locus.met) if label == "crossing" else 0)
-        ),
+        "unstable": int(unstable),
         "factorisations": int(locus.factorisations),
     }
 
@@ -582,7 +586,8 @@ def _put_together(
     # a direction is missing where the start is at that end of the range
     down, up = (outcomes.get(sense, {"rows": [], "stopped": ""}) for sense in (-1, 1))
     # both directions begin with the start, which is taken once
-    rows = [*reversed(down["rows"]), *up["rows"][1 if down["rows"] else 0 :]]
+    first_of_up = 1 if down["rows"] else 0
+    rows = [*reversed(down["rows"]), *up["rows"][first_of_up:]]
     special = [row for row in rows if row["kind"] in SPECIAL]
 
     def sentence(row: dict[str, Any]) -> str:
@@ -593,6 +598,7 @@ def _put_together(
         return f"{place}, {load_text(row, begin['amplitude'])}: {words}{modes}"
 
     sentences = [sentence(row) for row in special]
+    # a boundary that has not stopped, but does not reach an end of the range, turns back before
     stopped = [outcome["stopped"] for outcome in (down, up) if outcome["stopped"]]
     key_range = min(row["key"] for row in rows), max(row["key"] for row in rows)
     for end, key in zip(sorted((span.first, span.last)), key_range, strict=True):

@@ -28,6 +28,13 @@ class Journal:
     `recorded` replays the solves of an interrupted boundary, if the present sources have computed
     them.
 
+    Attributes
+    ----------
+    _name
+        Begin of the names of the files, of identity and part.
+    _count
+        Number of solves so far, stored or computed.
+
     Parameters
     ----------
     folder
@@ -58,7 +65,8 @@ class Journal:
         A result is a point of the boundary, or the reason why there is none.
         """
         # solves come in the same order when a part is repeated, so a number identifies one
-        name, self._count = f"{self._name}-{self._count:04d}", self._count + 1
+        name = f"{self._name}-{self._count:04d}"
+        self._count += 1
         if (saved := self._stored_outcome(name)) is not None:
             return _locus(saved) if "state" in saved else str(saved["reason"])
         solved = solve()

@@ -119,11 +119,9 @@ def boundary_map(
         if setting.partition("=")[0].strip() == axis.name:
             raise CaseError(f"--set {setting}: this key is swept by --over")
     folder, say_on_first_rank = user_folder(out), say if comm.rank == 0 else (lambda line: None)
-    rows, without, boundaries = (
-        list[dict[str, Any]](),
-        dict[str, str](),
-        dict[str, StabilityBoundary](),
-    )
+    # rows of the table; and by values of the second key why there is no boundary, or the boundary
+    rows = list[dict[str, Any]]()
+    without, boundaries = dict[str, str](), dict[str, StabilityBoundary]()
     with FOLDER.locked(folder, comm, Path(file).name):
         for number, value in enumerate(axis.values, 1):
             say_on_first_rank(f"{axis.name} = {value}, {number} of {len(axis.values)}")
@@ -181,10 +179,8 @@ def _content(
     axis
         The second key.
     """
-    first_content, loads = (
-        next(iter(lines.values())).content,
-        [line.content["load"] for line in lines.values()],
-    )
+    first_content = next(iter(lines.values())).content
+    loads = [line.content["load"] for line in lines.values()]
     special = [
         {"second": axis.number(value), **row}
         for value, line in lines.items()

@@ -55,13 +55,14 @@ def draw_boundary(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -
     figure, plot = plt.subplots(figsize=(6.4, 4.4), layout="constrained")
     mode_parts = [part for _, part in _by_mode(rows)]
     for smooth_part in mode_parts:  # the boundary has a corner where two bifurcations cross
-        # intervals, dashed if an end has other unstable modes; lines join intervals of one style
-        pairs = groupby(
-            pairwise(smooth_part), key=lambda each: bool(each[0]["unstable"] or each[1]["unstable"])
+        # intervals between neighbouring points, dashed if an end has other unstable modes
+        intervals_by_style = groupby(
+            pairwise(smooth_part), key=lambda ends: bool(ends[0]["unstable"] or ends[1]["unstable"])
         )
-        for unstable, group in pairs:
-            segments = [*group]
-            line = [segments[0][0], *(upper_point for _, upper_point in segments)]
+        # one line joins the neighbouring intervals of one style
+        for unstable, group in intervals_by_style:
+            intervals = [*group]
+            line = [intervals[0][0], *(second_end for _, second_end in intervals)]
             _line(plot, line, color="C0", linestyle="--" if unstable else "-")
     plot.margins(y=0.2 if len(mode_parts) > 1 else None)
     _marks(plot, "load", rows)
@@ -133,10 +134,11 @@ def draw_map(rows: Sequence[Row], content: Mapping[str, Any], file: Path) -> Non
 
 def _in_units(rows: Sequence[Row], load: str) -> tuple[list[Row], str]:
     """Return rows whose load is in the case's units if they have it, and the label of its axis."""
-    load_quantity = shown_quantity(amplitude(load).column, {name for row in rows for name in row})
-    return [
-        {**row, "load": row.get(load_quantity.name, row["load"])} for row in rows
-    ], load_quantity.label
+    # the column of the load in units if the rows have it, else the one without
+    column_names = {name for row in rows for name in row}
+    load_quantity = shown_quantity(amplitude(load).column, column_names)
+    rows_in_units = [{**row, "load": row.get(load_quantity.name, row["load"])} for row in rows]
+    return rows_in_units, load_quantity.label
 
 
 def _plane(
@@ -226,12 +228,13 @@ def _arms(
 
     None if there is no cusp.
     """
-    cusp_row = next((i for i, row in enumerate(rows) if row["kind"] == "cusp"), None)
-    if cusp_row is None:
+    cusp_number = next((i for i, row in enumerate(rows) if row["kind"] == "cusp"), None)
+    if cusp_number is None:
         return None
+    # from the cusp back to the first row, and on to the last one
     first_arm, second_arm = (
         [(row["key"], row["load"]) for row in part]
-        for part in (rows[cusp_row::-1], rows[cusp_row:])
+        for part in (rows[cusp_number::-1], rows[cusp_number:])
     )
     return first_arm, second_arm
 
@@ -253,23 +256,23 @@ def _regions(
     mode_parts, all_regions = _by_mode(rows), _regions_of_mode(rows, content, limits)
     if len(mode_parts) < 2:
         return all_regions
-    extent, regions = (
-        np.ptp([row["key"] for row in rows]),
-        [region for region in all_regions if region[2] == "stable"],
-    )
+    # the stable regions of the whole boundary, and the region beyond each mode's part of it
+    extent = np.ptp([row["key"] for row in rows])
+    regions = [region for region in all_regions if region[2] == "stable"]
     for mode, part in mode_parts:
         kind = next(
             (row["kind"] for row in part if row["kind"] in ("fold", "bifurcation")), content["kind"]
         )
-        # only the first, the region beyond the boundary
-        for x, y, words in _regions_of_mode(part, {**content, "kind": kind, "mode": mode}, limits)[
-            :1
-        ]:
-            width = np.ptp([row["key"] for row in part]) / extent
-            # limit of the axis on the side of the region
-            outer = limits[1] if y > 0 else limits[0]
-            y = (y + outer) / 2 if width < LOW else y  # beside the names of its neighbours
-            regions.append((x, y, mode if width < NARROW and mode else words))
+        regions_of_part = _regions_of_mode(part, {**content, "kind": kind, "mode": mode}, limits)
+        if not regions_of_part:
+            continue
+        x, y, words = regions_of_part[0]  # the first one is beyond the boundary
+        width = np.ptp([row["key"] for row in part]) / extent
+        # the name over a narrow part stands nearer to the limit of the axis, beside the names of
+        # its neighbours
+        outer = limits[1] if y > 0 else limits[0]
+        y = (y + outer) / 2 if width < LOW else y
+        regions.append((x, y, mode if width < NARROW and mode else words))
     return regions
 
 
@@ -278,7 +281,8 @@ def _regions_of_mode(
 ) -> list[tuple[Any, ...]]:
     """Return the regions beside a boundary of one mode, each as key, load and name.
 
-    They are above and below the middle of the boundary, and between its arms.
+    They are above and below the middle of the boundary, and between its arms. The first one is
+    beyond the boundary: on its side away from load zero.
 
     Parameters
     ----------
@@ -289,32 +293,31 @@ def _regions_of_mode(
         "snaps" if content["kind"] == "fold" else f"buckles {_mode(content['mode'])}".rstrip()
     )
     x = float(np.mean([min(row["key"] for row in rows), max(row["key"] for row in rows)]))
-    # loads of the boundary at the middle of its range of keys, several if it turns back
+    # loads of the boundary at the middle of its range of keys, several if it turns back; linear
+    # between neighbouring rows
     loads_at_middle = sorted(
-        lower_row["load"]
-        + (x - lower_row["key"])
-        / (upper_row["key"] - lower_row["key"])
-        * (upper_row["load"] - lower_row["load"])
-        for lower_row, upper_row in pairwise(rows)
-        if (lower_row["key"] - x) * (upper_row["key"] - x) <= 0
-        and lower_row["key"] != upper_row["key"]
+        row["load"]
+        + (x - row["key"]) / (next_row["key"] - row["key"]) * (next_row["load"] - row["load"])
+        for row, next_row in pairwise(rows)
+        if (row["key"] - x) * (next_row["key"] - x) <= 0 and row["key"] != next_row["key"]
     )
     if not loads_at_middle:
         return []
-    up = np.mean(loads_at_middle) > 0  # loads are negative elsewhere
-    outer, inner = (limits[1], limits[0]) if up else (limits[0], limits[1])
-    outermost_load, innermost_load = (
-        (loads_at_middle[-1], loads_at_middle[0])
-        if up
-        else (loads_at_middle[0], loads_at_middle[-1])
-    )
+    # outer: away from load zero, which is up for positive loads and down for negative ones
+    least_load, largest_load = loads_at_middle[0], loads_at_middle[-1]
+    if np.mean(loads_at_middle) > 0:
+        inner, outer = limits
+        innermost_load, outermost_load = least_load, largest_load
+    else:
+        outer, inner = limits
+        outermost_load, innermost_load = least_load, largest_load
     regions = [
         (x, (outermost_load + outer) / 2, instability_words),
         (x, (innermost_load + inner) / 2, "stable"),
     ]
     if len(loads_at_middle) > 1:
         middle_words = "bistable" if content["kind"] == "fold" else instability_words
-        regions.append((x, (loads_at_middle[0] + loads_at_middle[-1]) / 2, middle_words))
+        regions.append((x, (least_load + largest_load) / 2, middle_words))
         # beyond the second bifurcation the shell is stable again
         if content["kind"] != "fold":
             regions[0] = (x, (outermost_load + outer) / 2, "stable")
@@ -324,7 +327,9 @@ def _regions_of_mode(
 def _by_mode(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
     """Return the modes along the boundary, each with its rows and the crossings at their ends."""
     crossing_numbers = [i for i, row in enumerate(rows) if row["kind"] == "crossing"]
+    # a crossing belongs to the parts on both sides
     row_groups = ([*rows[a : b + 1]] for a, b in pairwise([0, *crossing_numbers, len(rows) - 1]))
+    # the mode of a part is that of its first row that is no crossing
     mode_parts = (
         (next((row["mode"] for row in row_group if row["kind"] != "crossing"), None), row_group)
         for row_group in row_groups

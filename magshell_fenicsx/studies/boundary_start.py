@@ -52,8 +52,8 @@ class Start:
     def instability_in(self, records: Sequence[Record]) -> Record:
         """Return the record of the instability in a history.
 
-        It is the point with the number and the load; else the fold or bifurcation with the nearest
-        load, within a tolerance.
+        It is the point with the number, if it has the load. If not, it is the fold or bifurcation
+        with the nearest load, within a tolerance.
 
         Raises
         ------

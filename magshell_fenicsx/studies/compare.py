@@ -232,16 +232,13 @@ def loaded(run: ModelRun) -> list[dict[str, str]]:
     first = next(i for i, row in enumerate(run.rows) if row["amplitude"] == load_name)
     row_before = run.rows[max(first - 1, 0)]
     load_rows = [
-        row_before,
-        *(
-            row
-            for row in run.rows[first:]
-            if row["amplitude"] == load_name and row["branch"] == "0"
-        ),
+        row for row in run.rows[first:] if row["amplitude"] == load_name and row["branch"] == "0"
     ]
+    # with the displacement since the row before, as text like all columns
+    begin = float(row_before[displacement_column])
     return [
-        {**row, W: repr(float(row[displacement_column]) - float(row_before[displacement_column]))}
-        for row in load_rows
+        {**row, W: repr(float(row[displacement_column]) - begin)}
+        for row in (row_before, *load_rows)
     ]
 
 
@@ -280,7 +277,8 @@ def judge(
 ) -> tuple[str, Callable[[ModelRun], float | None]]:
     """Choose the number by which runs are compared.
 
-    It is `scalar` if given; else k_d if all runs have it; else the load at `judged_place`.
+    It is `scalar` if that is given. If not, it is k_d if all runs have it, and otherwise the load
+    at `judged_place`.
 
     Parameters
     ----------
@@ -317,7 +315,10 @@ def time_at(error: float, runs: Sequence[tuple[float, float]]) -> float | None:
     10.0
     """
     errors_and_seconds = sorted((e, s) for e, s in runs if e > 0)
-    if not errors_and_seconds or not errors_and_seconds[0][0] <= error <= errors_and_seconds[-1][0]:
+    if not errors_and_seconds:
+        return None
+    least_error, largest_error = errors_and_seconds[0][0], errors_and_seconds[-1][0]
+    if not least_error <= error <= largest_error:
         return None
     e, s = np.log(np.array(errors_and_seconds)).T  # logarithms of errors and seconds
     return float(np.exp(np.interp(np.log(error), e, s)))
@@ -484,6 +485,8 @@ def _content(
     scalar
         The requested number; None for the default, see `judge`.
     """
+    # for each model: what is said of its runs, the limit of their values, and the CPU time that an
+    # error of one percent takes
     accounts: dict[ModelName, list[dict[str, Any]]] = {}
     limits: dict[str, float | None] = {}
     seconds: dict[str, float | None] = {}
@@ -512,11 +515,12 @@ def _content(
             (e, run.cpu_s) for e, run in zip(errors, runs_of_model, strict=True) if e is not None
         ]
         seconds[model] = time_at(ONE_PERCENT, measured)
+    # of the finest runs; the order of the models is shell, solid
     final_values = [accounts[model][-1]["value"] for model in MODELS]
     times = [seconds[model] for model in MODELS]
     return {
         "result": name,
-        # solid over shell
+        # of the solid from the shell
         "difference": final_values[1] / final_values[0] - 1 if None not in final_values else None,
         "largest_difference_of_the_curves": max((abs(d.relative) for d in differing), default=None),
         "limits": limits,
@@ -548,12 +552,10 @@ def extrapolated(values: Sequence[float | None], refinements: Sequence[float]) -
     if len(last_values) < 3:
         return None
     error, order = estimated_error([1 / r for r in refinements[-3:]], last_values)
+    if error is None or order is None:
+        return last_values[2]
     # the limit lies beyond the last value, in the direction of the last change
-    return (
-        last_values[2]
-        if error is None or order is None
-        else last_values[2] + copysign(error, last_values[2] - last_values[1])
-    )
+    return last_values[2] + copysign(error, last_values[2] - last_values[1])
 
 
 def draw_comparison(
@@ -579,10 +581,9 @@ def draw_comparison(
     panels = 1 + bool(differing) + any(errors.values())
     figure = Figure(figsize=(4.4 * panels, 3.7), dpi=160, layout="constrained")
     load_amplitude = amplitude(amplitude_of(shell))
-    x_label, y_label = (
-        f"{quantity('w_over_h').latex} {load_amplitude.place} since the field",
-        quantity(load_amplitude.column).label,
-    )
+    x_label = f"{quantity('w_over_h').latex} {load_amplitude.place} since the field"
+    y_label = quantity(load_amplitude.column).label
+    # the curves, then the differences if there are any, and last the errors if there are any
     first, *other_panels = figure.subplots(1, panels, squeeze=False)[0]
     first.plot(
         *curve(shell),

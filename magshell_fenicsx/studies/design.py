@@ -14,7 +14,7 @@ is a critical load.
 import hashlib
 import os
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -88,6 +88,8 @@ class Design:
         Number of the present stage, from 1; 0 for the last one.
     seconds
         Wall time of each new evaluation.
+    _scene
+        Keeps the scene of an evaluation, a model with its solver, for the next one.
     """
 
     variables: Variables
@@ -206,21 +208,16 @@ class Design:
         """Text of the time for the remaining iterations, one evaluation each; "" if short."""
         # the first evaluation is no iteration
         remaining_iterations = self.goal.section.iterations + 1 - len(self.rows)
-        return (
-            remaining_time_text(
-                float(np.mean(self.seconds)) * remaining_iterations, "at most about "
-            )
-            if self.seconds and remaining_iterations > 0
-            else ""
-        )
+        if not self.seconds or remaining_iterations <= 0:
+            return ""
+        seconds_left = float(np.mean(self.seconds)) * remaining_iterations
+        return remaining_time_text(seconds_left, "at most about ")
 
     def _write(self) -> None:
         """Write design.csv, unless no evaluation has results and there is an earlier table."""
-        if (
-            not any(evaluation.values for _, evaluation in self.tried)
-            and (self.folder / "design.csv").exists()
-        ):
-            return  # one that cannot start replaces nothing
+        has_results = any(evaluation.values for _, evaluation in self.tried)
+        if not has_results and (self.folder / "design.csv").exists():
+            return  # a design that cannot start replaces nothing
         columns = list(dict.fromkeys(key for row in self.rows for key in row))
         write_csv(self.rows, columns, self.folder / "design.csv")
 
@@ -275,10 +272,8 @@ def design(
     if case.design is None:
         raise CaseError(f"{file}: design: is missing: it says what varies and what is wanted")
     try:
-        design_variables, goal = (
-            variables(source, case, case.design, make_case),
-            design_goal_of(case, case.design),
-        )
+        design_variables = variables(source, case, case.design, make_case)
+        goal = design_goal_of(case, case.design)
         with FOLDER.locked(folder, comm, Path(file).name):
             # without `resume` stored evaluations are taken too
             if resume and not access_disk(comm, lambda: any((folder / "points").glob("*.json"))):
@@ -308,12 +303,8 @@ def _designed(search: Design, file: Path, comm: MPI.Intracomm) -> dict[str, Any]
     Missed
         If a target is not reached, a constraint not kept, or a step has no result.
     """
-    vary, design_goal, section, folder = (
-        search.variables,
-        search.goal,
-        search.goal.section,
-        search.folder,
-    )
+    vary, design_goal, folder = search.variables, search.goal, search.folder
+    section = design_goal.section
     first_evaluation, best, x, ended = _optimised(search)
     angle_steps = section.remanence.steps if section.remanence else None
     if angle_steps:  # angles that can be made: the rounded design is evaluated once more
@@ -407,18 +398,14 @@ def _optimised(search: Design) -> tuple[DesignEvaluation, DesignEvaluation, Arra
         raise Missed(
             f"no variable has an influence on {', '.join(goal.results)} where the design starts"
         )
+    iterations_before_last = -(-iterations // STAGES_PART)  # rounded up
     for stage in range(len(targets)):
         if stage:  # begin from the best of the stage before
             search.begin(stage, targets)
             goal.begin(search(x))
         is_last = stage == len(targets) - 1
         ended = search_optimum(
-            search,
-            goal,
-            vary,
-            x,
-            # a part, rounded up
-            iterations if is_last else -(-iterations // STAGES_PART),
+            search, goal, vary, x, iterations if is_last else iterations_before_last
         )
         assert search.best
         x, best = search.best
@@ -464,12 +451,12 @@ def _from_here(part: Any, old: Path, new: Path) -> None:
 
     The data are changed in place.
     """
-    # sections and lists; a value has no parts
-    for key, value in (
-        part.items()
-        if isinstance(part, dict)
-        else enumerate(part if isinstance(part, list) else [])
-    ):
+    # the parts of a section or list; a value has none
+    if isinstance(part, dict):
+        keys_and_values: Iterable[tuple[Any, Any]] = part.items()
+    else:
+        keys_and_values = enumerate(part if isinstance(part, list) else [])
+    for key, value in keys_and_values:
         # best.csv is in the new folder already
         if key == "file" and isinstance(value, str) and value != "best.csv":
             part[key] = os.path.relpath(old / value, new)

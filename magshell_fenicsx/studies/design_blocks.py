@@ -87,6 +87,7 @@ class NumberVariable(Bounded):
 
     def put(self, data: dict[str, Any], x: Array) -> None:
         """Set the number in plain data of the case."""
+        # the section or list of the number; missing sections are made
         section: Any = data
         *names, last_word = self.name.split(".")
         for name in names:
@@ -94,9 +95,8 @@ class NumberVariable(Bounded):
                 section[int(name)] if isinstance(section, list) else section.setdefault(name, {})
             )
         value = float(self.values(x)[0])
-        section[int(last_word) if isinstance(section, list) else last_word] = (
-            f"{value:.15g} {self.unit}" if self.unit else value
-        )
+        index_or_key = int(last_word) if isinstance(section, list) else last_word
+        section[index_or_key] = f"{value:.15g} {self.unit}" if self.unit else value
 
 
 def by_components(scene: Scene, field_gradient: FieldGradient) -> Array:
@@ -111,11 +111,10 @@ def by_components(scene: Scene, field_gradient: FieldGradient) -> Array:
     magnetic = loads.magnetic or loads.remanence
     assert magnetic
     assert isinstance(magnetic.remanent, ControlledPattern)
-    return np.asarray(
-        field_gradient.field.function_space.mesh.comm.allreduce(
-            magnetic.remanent.transposed(field_gradient.places, field_gradient.forces)
-        )
-    )
+    # transposed interpolation: from places on this rank's mesh to control points; all ranks add up
+    comm = field_gradient.field.function_space.mesh.comm
+    of_this_rank = magnetic.remanent.transposed(field_gradient.places, field_gradient.forces)
+    return np.asarray(comm.allreduce(of_this_rank))
 
 
 @dataclass(frozen=True)
@@ -160,18 +159,16 @@ class Vectors:
         if not self.planar:
             angles_and_lengths.append(np.arctan2(self.start[:, 1], self.start[:, 0]))
         if self.lengths:
+            least, largest = self.lengths
             length = np.linalg.norm(self.start, axis=1)
-            angles_and_lengths.append(
-                (length - self.lengths[0]) / (self.lengths[1] - self.lengths[0])
-            )
+            angles_and_lengths.append((length - least) / (largest - least))
         return np.concatenate(angles_and_lengths)
 
     @property
     def limits(self) -> list[Limits]:
         """Bounds of the variables: none for angles, 0 and 1 for lengths."""
-        return [(None, None)] * self.angles + [(0.0, 1.0)] * (
-            len(self.start) if self.lengths else 0
-        )
+        length_count = len(self.start) if self.lengths else 0
+        return [(None, None)] * self.angles + [(0.0, 1.0)] * length_count
 
     def vectors(self, x: Array) -> Array:
         """The vectors at the control points, (n, 3) or (n, 2), for variables x."""
@@ -201,6 +198,7 @@ class Vectors:
         There is one array of derivatives for each kind of variable: polar angles, azimuths unless
         the vectors stay in a plane, lengths if they vary.
         """
+        # one row of variables for each kind; lengths are the last one if they vary
         polar, *other_variables = x.reshape(-1, len(self.start))
         s, c = np.sin(polar), np.cos(polar)
         length, length_range = np.linalg.norm(self.start, axis=1), 0.0
@@ -208,26 +206,23 @@ class Vectors:
             length_range = self.lengths[1] - self.lengths[0]
             length = self.lengths[0] + other_variables[-1] * length_range
         length_column = length[:, None]
+        # unit vectors, and derivatives of the vectors by the angles
         if self.planar:
             # in the plane of x and z the vectors have y = 0; on a meridian no y at all
-            no_component = [] if self.controls.is_axisymmetric else [0 * s]
-            # unit vectors, and their derivatives by the polar angle
-            unit, polar_derivative = (
-                np.stack(v, axis=1) for v in ([s, *no_component, c], [c, *no_component, -s])
-            )
-            derivatives = [length_column * polar_derivative]
+            y_component = [] if self.controls.is_axisymmetric else [0 * s]
+            unit = np.stack([s, *y_component, c], axis=1)
+            by_polar = np.stack([c, *y_component, -s], axis=1)
+            derivatives = [length_column * by_polar]
         else:
-            # cosine and sine of the azimuth
-            a, b = np.cos(other_variables[0]), np.sin(other_variables[0])
+            azimuth = other_variables[0]
+            a, b = np.cos(azimuth), np.sin(azimuth)
             unit = np.stack([s * a, s * b, c], axis=1)
-            derivatives = [
-                length_column * np.stack([c * a, c * b, -s], axis=1),
-                length_column * np.stack([-s * b, s * a, 0 * s], axis=1),
-            ]
-        return length_column * unit, [
-            *derivatives,
-            *([length_range * unit] if self.lengths else []),
-        ]
+            by_polar = np.stack([c * a, c * b, -s], axis=1)
+            by_azimuth = np.stack([-s * b, s * a, 0 * s], axis=1)
+            derivatives = [length_column * by_polar, length_column * by_azimuth]
+        if self.lengths:
+            derivatives.append(length_range * unit)
+        return length_column * unit, derivatives
 
     def put(self, data: dict[str, Any], x: Array) -> None:
         """Let the case have a remanence of kind `points`, whose file is named later.
@@ -280,6 +275,7 @@ class ControlPointField(Bounded):
             return np.zeros(len(x))
         # from the model's frame, turned about e3, to that of the case
         places = field_gradient.places.reshape(-1, 3) @ rotation(scene.problem.azimuth)
+        # derivatives (places, components) by the field's values there
         forces = field_gradient.forces.reshape(len(places), -1)[:, : self.start.shape[1]]
         if self.name == "thickness" and self.shells:
             forces = forces * self._shell_ratios(scene, field_gradient.forces.shape[:2])
@@ -302,7 +298,7 @@ class ControlPointField(Bounded):
             # the third component is the twist
             data["natural"] = {**(data.get("natural") or {}), "curvature": [*formulas, 0]}
             return
-        # shell's section, control points in its frame, and its thickness over h
+        # name -> the shell's section, control points in its frame, and its thickness over h
         single_shell = {"": (data["shell"], self.controls, 1.0)} if not self.shells else {}
         several_shells = {
             name: (data["shells"][name]["shell"], *self._controls_on_shell(*pose_and_ratio))
@@ -322,20 +318,13 @@ class ControlPointField(Bounded):
 
         The second value is the shell's thickness over h.
         """
-        control_points = self.controls.places
-        # points of a meridian become (rho, 0, z), and (rho, z) again afterwards
-        places_in_shell = place.to_shell_frame(
-            np.insert(control_points, 1, 0.0, axis=1)
-            if self.controls.is_axisymmetric
-            else control_points
-        )
-        points_of_shell = (
-            np.column_stack(
-                [np.hypot(places_in_shell[:, 0], places_in_shell[:, 1]), places_in_shell[:, 2]]
-            )
-            if self.controls.is_axisymmetric
-            else places_in_shell
-        )
+        points = self.controls.places
+        if self.controls.is_axisymmetric:  # (rho, z) of a meridian: (rho, 0, z) in space
+            points = np.insert(points, 1, 0.0, axis=1)
+        points_of_shell = place.to_shell_frame(points)
+        if self.controls.is_axisymmetric:  # and (rho, z) again
+            x, y, z = points_of_shell.T
+            points_of_shell = np.column_stack([np.hypot(x, y), z])
         return ControlPoints(points_of_shell, self.controls.width / place.scale), ratio
 
     def _shell_ratios(self, scene: Scene, shape: tuple[int, ...]) -> Array:

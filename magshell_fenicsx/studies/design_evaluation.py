@@ -122,6 +122,7 @@ def evaluate(
                 return DesignEvaluation(note=notes[0])
             adjoints, note = _adjoints(scene, path, result, targets)
             notes += [note] if note else []
+            # value and gradient of each mode
             values = [
                 (
                     adjoint_of_mode.value_in_unit,

@@ -77,12 +77,12 @@ def reached_shape(folder: Path, target: Callable[[Array], Array] | None) -> Reac
     # the nodes nearest to the plane y = 0, by rising x
     points_in_plane = np.flatnonzero(distance_from_plane <= distance_from_plane.min() + IN_PLANE)
     points_in_plane = points_in_plane[np.argsort(surface.r0[points_in_plane, 0], kind="stable")]
-    target_points, edges = (
-        target(surface.r0[points_in_plane]) if target else None,
-        edge_lines(replace(surface, u=0 * surface.u)),  # undeformed
-    )
+    undeformed = surface.r0[points_in_plane]
     return ReachedShape(
-        target_points, (surface.r0 + surface.u)[points_in_plane], surface.r0[points_in_plane], edges
+        target=target(undeformed) if target else None,
+        points=(surface.r0 + surface.u)[points_in_plane],
+        undeformed=undeformed,
+        edges=edge_lines(replace(surface, u=0 * surface.u)),
     )
 
 
@@ -171,6 +171,7 @@ def _draw_history(
     target_values
         Result -> the wanted value, a dotted line.
     """
+    # numbers of the evaluations, and whether each was the best so far
     number, best = (
         np.array([row[key] for row in rows], dtype=kind)
         for key, kind in (("evaluation", int), ("best", bool))
@@ -201,13 +202,12 @@ def _draw_history(
             axes.set_yscale("log")
     if axes.get_yscale() == "linear":
         axes.yaxis.set_major_formatter(number_format())
+    # the name of a single result is at the axis; of several the legend has the names
     unit_text = unit if unit in {"Hz", *endings().values()} else ""
-    axis_words = unit_text or _common([result_words(result) for result in results])
-    axes.set_ylabel(
-        result_words(results[0]) + (f"  ({unit_text})" if unit_text else "")
-        if len(results) == 1
-        else axis_words
-    )
+    if len(results) == 1:
+        axes.set_ylabel(result_words(results[0]) + (f"  ({unit_text})" if unit_text else ""))
+    else:
+        axes.set_ylabel(unit_text or _common([result_words(result) for result in results]))
     if len(results) > 1:
         axes.legend(frameon=False, fontsize=8)
 
@@ -251,17 +251,18 @@ def _draw_remanence(axes: Any, vary: Variables, x: Array, shape: ReachedShape | 
     names = (r"\rho", "z") if vary.controls.is_axisymmetric else ("x", "y", "z")
     widest = np.argsort(-np.ptp(places, axis=0), kind="stable")[:2]
     planar = vary.remanence is not None and vary.remanence.planar
-    # planar vectors lie in the plane of x (or rho) and z
+    # components on both axes of the picture; planar vectors lie in the plane of x (or rho) and z
     first, second = (0, len(names) - 1) if planar else sorted(int(i) for i in widest)
     horizontal, up = places[:, first], places[:, second]
+    # points along a meridian or a strip are joined by a line
     line_style = "-" if vary.controls.is_axisymmetric or not places[:, 1:].any() else ""
     axes.plot(horizontal, up, line_style + ".", color="0.6", markersize=3, linewidth=1)
     if shape is not None and not vary.controls.is_axisymmetric:
         axes.plot(*shape.edges[:, [first, second]].T, color="0.6", linewidth=0.8)
     # arrows as long as a part of the shell's extent, drawn in the units of the places
     longest = float(np.hypot(vectors[:, first], vectors[:, second]).max()) or 1.0
-    size = ARROW * float(np.ptp(places, axis=0).max()) / longest
-    right, vertical = size * vectors[:, first], size * vectors[:, second]
+    arrow_scale = ARROW * float(np.ptp(places, axis=0).max()) / longest
+    right, vertical = arrow_scale * vectors[:, first], arrow_scale * vectors[:, second]
     axes.quiver(
         horizontal,
         up,
@@ -273,7 +274,7 @@ def _draw_remanence(axes: Any, vary: Variables, x: Array, shape: ReachedShape | 
         scale_units="xy",
         scale=1,
     )
-    axes.update_datalim(np.column_stack([horizontal + right, up + vertical]))
+    axes.update_datalim(np.column_stack([horizontal + right, up + vertical]))  # tips of arrows
     axes.set(xlabel=f"${names[first]}/R$", ylabel=f"${names[second]}/R$")
     axes.set_title(r"remanence over $|B^\mathrm{r}|$, undeformed")
     axes.set_aspect("equal", adjustable="datalim")
@@ -319,6 +320,7 @@ def _draw_field(axes: Any, field: ControlPointField, values: Array) -> None:
         arc_length = np.concatenate(
             [[0.0], np.cumsum(np.linalg.norm(np.diff(places, axis=0), axis=1))]
         )
+        # only a curvature has two components, 11 and 22, which the legend names
         for number, (line, marker) in enumerate(zip(values.T, ("o-", "s--"), strict=False), 1):
             axes.plot(
                 arc_length,

@@ -226,11 +226,12 @@ def refuse_unfit_numbers(
     numbers = []
     for key in design.numbers:
         low, high, unit = design.bounds(key)
+        # the number in SI units, and as the case file has it: text with a unit, a bare number, or
+        # None where it is a default
         try:
             value, text = number_at_key(case.context, key), value_at(source.data, key.split("."))
         except CaseError as e:
             raise CaseError(f"design.numbers: {e}") from None
-        # a number without text is a default or a bare number
         start = value / si_size(unit)
         if isinstance(text, str):  # check that the case has the unit of the bounds
             try:
@@ -279,6 +280,7 @@ def _fields(case: Case, design: DesignSection) -> tuple[ControlPointField, ...]:
                 f"design.thickness: starts even: leave out "
                 f"shells.{shells_with_factor[0]}.shell.thickness_factor"
             )
+        # values (n, 1) or (n, 2) at the control points at the start
         start: Array
         if name == "thickness":  # that of several shells is 1 but for their patches
             start = (problem.thickness or Thickness()).values_at(places)[:, None]
@@ -337,8 +339,11 @@ def _spread(case: Case, problem: Problem, count: int, width: float | None) -> tu
         Filter width over R; None: the median distance of neighbouring points.
     """
     places = _places(case, problem, count)
-    # [2]: the second nearest point, as the nearest one is the point itself; [0]: distances
-    return places, width or float(np.median(scipy.spatial.cKDTree(places).query(places, [2])[0]))
+    if width:
+        return places, width
+    # the second nearest point, [2], is the neighbour: the nearest one is the point itself
+    distances, _ = scipy.spatial.cKDTree(places).query(places, [2])
+    return places, float(np.median(distances))
 
 
 def _remanence(case: Case, section: RemanenceVariables) -> Vectors:
@@ -405,6 +410,7 @@ def controls_of(
             magnetic.remanent.path, "magnetic.remanent.file", magnetic.remanent.files
         )
         return ControlPoints(places, width or magnetic.remanent.filter or 1.0), vectors
+    # points spread over the surface, with the remanence of the case there
     problem = case.problem()
     places, width = _spread(case, problem, count, width)
     field = magnetisation(magnetic, case.context, 0.0, problem.within)
@@ -428,10 +434,9 @@ def _places(case: Case, problem: Problem, count: int) -> Array:
     """Return points (n, 3) along a meridian or a strip, or far from each other on the surface."""
     if problem.meridian:
         sample = problem.meridian.sample()
+        chosen = np.linspace(0, len(sample) - 1, count).round().astype(int)
         # in the plane y = 0
-        return np.asarray(
-            sample[np.linspace(0, len(sample) - 1, count).round().astype(int)] * [1.0, 0.0, 1.0]
-        )
+        return np.asarray(sample[chosen] * [1.0, 0.0, 1.0])
     if case.shell.geometry == "strip":
         parameters = np.linspace(0.0, 1.0, count)
         return np.column_stack([parameters, 0 * parameters, 0 * parameters])

@@ -155,18 +155,22 @@ class Curve:
         (k, 3) from the root on, in any unit of length.
     bent
         Part of the curve's curvature that the target has.
+
+    Attributes
+    ----------
+    _at
+        Spline: arc length from 0 to 1 -> place (3,), over the length of the curve.
     """
 
     def __init__(self, points: Array, bent: float = 1.0) -> None:
         """Make the spline of the target over its arc length, from 0 at the root to 1 at the tip."""
         # parameter: the length along the chords
-        chord = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
+        chord = _lengths_along(points)
         spline = scipy.interpolate.CubicSpline(chord, points)
         dense_points = spline(np.linspace(0.0, chord[-1], SPLINE_POINTS))
-        dense_points = dense_points if bent == 1.0 else _with_part_of_curvature(dense_points, bent)
-        arc_length = np.concatenate(
-            [[0.0], np.cumsum(np.linalg.norm(np.diff(dense_points, axis=0), axis=1))]
-        )
+        if bent != 1.0:
+            dense_points = _with_part_of_curvature(dense_points, bent)
+        arc_length = _lengths_along(dense_points)
         # place over arc length, both over the length of the curve
         self._at = scipy.interpolate.CubicSpline(
             arc_length / arc_length[-1], dense_points / arc_length[-1]
@@ -180,6 +184,12 @@ class Curve:
         return np.asarray(self._at(x[:, 0])) + x[:, 1:2] * [0.0, 1.0, 0.0]
 
 
+def _lengths_along(points: Array) -> Array:
+    """Return the lengths (n,) along the chords from the first of points (n, 3) to each."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    return np.concatenate([[0.0], np.cumsum(steps)])
+
+
 def _with_part_of_curvature(points: Array, part: float) -> Array:
     """Return the curve (n, 3) with a part of its curvature, and the same first tangent and lengths.
 
@@ -189,23 +199,24 @@ def _with_part_of_curvature(points: Array, part: float) -> Array:
     steps = np.diff(points, axis=0)
     length = np.linalg.norm(steps, axis=1, keepdims=True)
     tangents = steps / length
-    # turns directions of the given curve to those of the curve with less curvature
-    directions, rotation = [tangents[0]], np.eye(3)
-    for direction, next_tangent in itertools.pairwise(tangents):
+    # `rotation` turns tangents of the given curve to those of the curve with less curvature
+    new_tangents, rotation = [tangents[0]], np.eye(3)
+    for tangent, next_tangent in itertools.pairwise(tangents):
         # the turn from one tangent to the next, as axis times angle
-        axis_times_sine = np.cross(direction, next_tangent)
-        angle = np.arctan2(np.linalg.norm(axis_times_sine), direction @ next_tangent)
-        rotation_vector = axis_times_sine * (
-            angle / max(float(np.linalg.norm(axis_times_sine)), 1e-300)
-        )
-        inverse_turn = scipy.spatial.transform.Rotation.from_rotvec(-rotation_vector).as_matrix()
-        rotation = (
-            rotation
-            @ scipy.spatial.transform.Rotation.from_rotvec(part * rotation_vector).as_matrix()
-            @ inverse_turn
-        )
-        directions.append(rotation @ next_tangent)
-    return np.vstack([points[:1], points[0] + np.cumsum(length * np.array(directions), axis=0)])
+        axis_times_sine = np.cross(tangent, next_tangent)
+        sine = np.linalg.norm(axis_times_sine)
+        angle = np.arctan2(sine, tangent @ next_tangent)
+        turn = axis_times_sine * (angle / max(float(sine), 1e-300))
+        # undo the whole turn, and make a part of it
+        rotation = rotation @ _rotation_matrix(part * turn) @ _rotation_matrix(-turn)
+        new_tangents.append(rotation @ next_tangent)
+    # the new curve follows the new tangents, with the old lengths
+    return np.vstack([points[:1], points[0] + np.cumsum(length * np.array(new_tangents), axis=0)])
+
+
+def _rotation_matrix(axis_times_angle: Array) -> Array:
+    """Return the matrix (3, 3) of a rotation, given by axis times angle (3,)."""
+    return np.asarray(scipy.spatial.transform.Rotation.from_rotvec(axis_times_angle).as_matrix())
 
 
 @dataclass
@@ -259,9 +270,8 @@ class DesignGoal:
         scale = self._scale or abs(value) or 1.0
         if objective.value is not None:
             scale = abs(objective.value) or scale
-            return ((value - objective.value) / scale) ** 2, 2 * (
-                value - objective.value
-            ) / scale**2
+            difference = value - objective.value
+            return (difference / scale) ** 2, 2 * difference / scale**2
         sign = -1.0 if objective.maximise else 1.0
         return sign * value / scale, sign / scale
 
@@ -345,7 +355,11 @@ class DesignGoal:
         ]
 
     def _size(self, limit: Limit) -> float:
-        """Return what scales the slack of a constraint: its bound, else its result at the start."""
+        """Return the scale of a constraint's slack.
+
+        It is the absolute bound; without a bound, or with the bound zero, the larger of the two
+        results at the start; and 1 if these are zero too.
+        """
         return (
             abs(limit.bound)
             or max(self.scale.get(result, 0.0) for result in (limit.of, limit.other))
@@ -447,11 +461,11 @@ def search_optimum(
     iterations
         Largest number of the optimiser's steps.
     """
-    # results whose number or order changes; several smooth results; else one smooth result
-    if goal.crossed:
+    if goal.crossed:  # results whose number or order changes
         return raise_lowest(evaluated, goal, vary.limits, first, iterations)
-    if goal.lowest:
+    if goal.lowest:  # several smooth results
         return _raise_lowest_smooth(evaluated, goal, vary, first, iterations)
+    # one smooth result; variables and objective of all evaluations with values
     tried: list[tuple[Array, float]] = []
 
     def objective(x: Array) -> tuple[float, Array]:
@@ -563,13 +577,13 @@ def _last_known(
 ) -> Callable[[Array], tuple[DesignEvaluation, bool]]:
     """Wrap an evaluation so that it always has values.
 
-    Where the path is lost, it returns the last evaluation with values, and False; else the new
-    evaluation, and True.
+    The new function returns the evaluation at x, and True. Where the path is lost, it returns the
+    last evaluation that had values, and False.
     """
     last: list[DesignEvaluation] = []  # one item, which the inner function replaces
 
     def evaluate_or_last(x: Array) -> tuple[DesignEvaluation, bool]:
-        """Return the evaluation at x and True; else the last one with values, and False."""
+        """Return the evaluation at x and True; if it has no values, the last one and False."""
         evaluation = evaluated(x)
         if evaluation.values:
             last[:] = [evaluation]

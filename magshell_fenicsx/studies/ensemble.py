@@ -334,7 +334,11 @@ def solve(sample: Sample, scalar: Scalar, folds: KnownFolds) -> Outcome:
 
 
 def _solved(sample: Sample, scalar: Scalar, folds: KnownFolds) -> Outcome:
-    """Compute a sample: a knockdown from a known fold if possible, else along the path."""
+    """Compute a sample.
+
+    A knockdown is found from the fold of an earlier sample. If that fails, the path is followed, as
+    for every other result.
+    """
     # imperfections may be modes of the perfect shell, which are computed first
     problem = with_modes(sample.case.problem(), MPI.COMM_SELF)
     if scalar.name != "knockdown" or not has_knockdown(sample.case):
@@ -352,28 +356,28 @@ def _along_path(sample: Sample, scene: Scene, folds: KnownFolds) -> Outcome:
     The fold is tried from the first points of the path that lead to it. So the rest of the path
     is not needed.
     """
-    result, row_maker, tries = Result(scene, scene.unloaded()), RowMaker(scene), MOST_TRIES
+    result, row_maker, tries_left = Result(scene, scene.unloaded()), RowMaker(scene), MOST_TRIES
     try:
         for record in follow_alone(scene, search=True, remark=result.remarks.append):
             result.rows.append(row_maker.row(record, 0.0))
             # points of the pressure's path alone lead to its fold
             if record.amplitude != "pressure" or record.mode or record.label == "bifurcation":
                 continue
-            guess = (
-                FoldGuess(record.point.state, record.point.du) if record.label == "fold" else None
-            )
-            # a stable point may already show the fold ahead
-            if record.label == "step" and tries and not record.point.negative_pivots:
-                guess = fold_ahead(scene.newton, record.point, "pressure")
-                tries -= guess is not None  # only a guess costs a try
+            # the guess is the point itself if it is a fold; a stable point may show the fold ahead
+            point, guess = record.point, None
+            if record.label == "fold":
+                guess = FoldGuess(point.state, point.du)
+            elif record.label == "step" and tries_left and not point.negative_pivots:
+                guess = fold_ahead(scene.newton, point, "pressure")
+                tries_left -= guess is not None  # only a guess costs a try
             if guess is None:
                 continue
             try:
                 fold = folds.refined(sample.values, scene, guess)
             except FoldLost:
                 continue
-            # the fold that is found lies ahead on this path
-            if record.label == "fold" or fold.value > record.point.state.mu["pressure"]:
+            # a fold that was found from a stable point must lie ahead on this path
+            if record.label == "fold" or fold.value > point.state.mu["pressure"]:
                 return _of_fold(scene, fold)
     except Stopped as e:
         result.stopped = str(e)

@@ -51,6 +51,7 @@ def draw_ensemble(rows: Sequence[Row], name: str, file: Path) -> None:
     with_density = weibull is not None or len(values) >= MIN_SAMPLES_FOR_HISTOGRAM
     panels = 1 + with_density + (strongest is not None)
     figure = Figure(figsize=(4.2 * panels, 3.6), dpi=160, layout="constrained")
+    # axes of the density (one or none), of the distribution function, and of the correlation
     *density, function = figure.subplots(1, panels, squeeze=False)[0][: 1 + with_density]
     further_axes = figure.axes[1 + with_density :]
     if density:
@@ -199,12 +200,12 @@ def words(key: str) -> str:
     'amplitude over $h$ of the most severe defect'
     """
     parent, _, last_word = key.rpartition(".")
-    name, _, ending = last_word.rpartition("_")
-    name, unit = (
-        (name, "mm")
-        if ending == "mm"
-        else (last_word, "degrees" if last_word in ("polar", "azimuth") else "")
-    )
+    name, unit = last_word, ""
+    first_words, _, ending = last_word.rpartition("_")
+    if ending == "mm":
+        name, unit = first_words, "mm"
+    elif last_word in ("polar", "azimuth"):
+        unit = "degrees"
     name = "amplitude over $h$" if name == "amplitude" and not unit else name.replace("_", " ")
     suffix = " of the most severe defect" if parent.startswith("severest") else ""
     return f"{name}{suffix}" + (f"  ({unit})" if unit else "")

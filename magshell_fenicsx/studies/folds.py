@@ -36,18 +36,16 @@ LEAST_COSINE = 0.5  # between successive null vectors; a smaller value means a j
 def has_knockdown(case: Case) -> bool:
     """Return whether a case ends at a fold of the pressure that can be followed to others."""
     loading = case.loading
-    # with a tolerance each point has its own mesh; a mesh file has no chart in which states are
-    # transferred
-    by_one_mesh = case.mesh.tolerance is None and case.shell.geometry != "mesh"
     if getattr(loading, "kind", "") != "pressure":
         return False
+    # with a tolerance each point has its own mesh; a mesh file has no chart in which states are
+    # transferred
+    can_be_transferred = case.mesh.tolerance is None and case.shell.geometry != "mesh"
     # with branches or a target the run may end elsewhere than at its fold
-    return (
-        by_one_mesh
-        and loading.until == "limit"
-        and not loading.branches
-        and loading.limit_target is None
+    ends_at_fold = (
+        loading.until == "limit" and not loading.branches and loading.limit_target is None
     )
+    return can_be_transferred and ends_at_fold
 
 
 def fold_row(scene: Scene, fold: Fold) -> Row:
@@ -72,10 +70,9 @@ def refuse_later(scene: Scene, fold: Fold, reference_mode: Vector) -> None:
         direction.
     """
     comm, fold_mode, mode = scene.newton.system.comm, fold.phi, reference_mode
-    # cosine of the angle between both null vectors
-    if dot(comm, fold_mode, mode) < LEAST_COSINE * np.sqrt(
-        dot(comm, fold_mode, fold_mode) * dot(comm, mode, mode)
-    ):
+    # the cosine of the angle between both null vectors must be large
+    product = dot(comm, fold_mode, mode)
+    if product < LEAST_COSINE * np.sqrt(dot(comm, fold_mode, fold_mode) * dot(comm, mode, mode)):
         raise FoldLost("another fold was found")
     if fold.value <= 0 or fold.curvature >= 0:
         raise FoldLost("the fold is not a maximum of the pressure")
@@ -96,8 +93,14 @@ def _held_amplitudes(scene: Scene) -> dict[str, float]:
 class Continuation:
     """Follows a fold of the pressure through a parameter p of the case.
 
-    All scenes, models with their solvers, have the same kind of model. The known folds are stored
-    in the unknowns of the last scene.
+    All scenes, models with their solvers, have the same kind of model.
+
+    Attributes
+    ----------
+    _known
+        The last folds with their parameters, (p, fold), in the unknowns of the last scene.
+    _scene
+        The last scene.
 
     Parameters
     ----------
@@ -128,6 +131,7 @@ class Continuation:
         FoldLost
             If none is found, or if there is evidence that it is not the first instability.
         """
+        # known folds in the unknowns of the new scene; they predict the fold at p
         transferred = [(q, self._transferred(fold, scene)) for q, fold in self._known]
         guess = predict_fold(scene.newton.system, transferred, p, _held_amplitudes(scene))
         fold = find_fold(scene.newton, guess, "pressure")
@@ -183,6 +187,11 @@ class KnownFolds:
     """Folds of the pressure of earlier samples on this rank.
 
     From these the folds of other samples on the same mesh are found.
+
+    Attributes
+    ----------
+    _known
+        The last folds, at most `MOST_FOLDS`.
     """
 
     def __init__(self) -> None:
@@ -199,8 +208,8 @@ class KnownFolds:
             Key -> drawn value of the sample.
         reference_mode
             Null vector of another sample's fold, which the fold must resemble. None for a guess on
-            the path of this sample: its soft mode may be a mixture of the modes of several defects,
-            so the inertia alone decides.
+            the path of this sample. There the fold need not resemble any mode, and the inertia
+            alone decides: the soft mode on a path may be a mixture of modes of several defects.
 
         Raises
         ------
@@ -209,10 +218,14 @@ class KnownFolds:
         """
         fold = find_fold(scene.newton, guess, "pressure")
         refuse_later(scene, fold, fold.phi if reference_mode is None else reference_mode)
-        self._known = [
-            *self._known,
-            _StoredFold(values, chart(scene), fold.state.u, fold.value, fold.phi),
-        ][-MOST_FOLDS:]
+        stored_fold = _StoredFold(
+            values=values,
+            nodes=chart(scene),
+            u=fold.state.u,
+            pressure=fold.value,
+            phi=fold.phi,
+        )
+        self._known = [*self._known, stored_fold][-MOST_FOLDS:]
         return fold
 
     def follow(self, values: Values, scene: Scene) -> Fold:
@@ -235,15 +248,17 @@ class KnownFolds:
         if amplitudes.keys() - {"pressure", "lambda_m"}:
             raise FoldLost("other amplitudes are driven before the pressure")
         nodes = chart(scene)
+        # the nearest known fold on the same mesh is the first and only one that is tried
         for neighbour in sorted(
             self._known, key=lambda neighbour: self._distance(values, neighbour.values)
         ):
-            # the same nodes may have other numbers
+            # the same nodes may have other numbers; None if the nodes differ
             node_order = (
                 matching(neighbour.nodes, nodes) if neighbour.nodes.shape == nodes.shape else None
             )
             if node_order is None:
                 continue
+            # displacement and null vector in the order of this scene's nodes
             u, phi = (
                 v.reshape(len(nodes), -1)[node_order].ravel() for v in (neighbour.u, neighbour.phi)
             )
@@ -273,8 +288,9 @@ class KnownFolds:
                 for located in self._known
                 if isinstance(v := located.values.get(key), float | int)
             ]
-            # over the standard deviation; 1 if all values are the same
-            total += ((value_a - value_b) / (float(np.std([*known_numbers, value_a])) or 1.0)) ** 2
+            # the difference over the standard deviation, which is 1 if all values are the same
+            deviation = float(np.std([*known_numbers, value_a])) or 1.0
+            total += ((value_a - value_b) / deviation) ** 2
         return total
 
 
@@ -282,6 +298,11 @@ class Scenes:
     """The scenes of a rank that were used last, each a model with its solver.
 
     Cases that differ by the strength of the field alone share one.
+
+    Attributes
+    ----------
+    _kept
+        Key of a scene, see `_apart_from_strength` -> the scene; the one used last stands last.
     """
 
     def __init__(self) -> None:
@@ -295,8 +316,9 @@ class Scenes:
         MeshError
             If the case cannot be meshed.
         """
+        # the scene is taken out, and put back below as the last one used
         key = _apart_from_strength(case)
-        earlier_scene = self._kept.pop(key, None)  # and put back as the last one used
+        earlier_scene = self._kept.pop(key, None)
         if earlier_scene:
             scene = earlier_scene.with_field_strength(case.context)
         else:

@@ -386,13 +386,11 @@ def _refuse_idle(
     """
     # (p,) largest change of a result by each parameter, relative to the largest result
     strongest = np.abs(slopes * size).max(axis=0) / (np.abs(values).max() or 1.0)
-    # the numbers of a field count together, by the strongest of them
+    # name of a parameter, and its change; the numbers of a field follow the parameters
+    changes = [*zip([p.key for p in parameters], strongest, strict=False)]
     field_changes = strongest[len(parameters) :]
-    changes = [
-        *zip([p.key for p in parameters], strongest, strict=False),
-        (NAME, field_changes.max(initial=np.inf)),
-    ]
-    changes = changes if field_changes.size else changes[:-1]  # without a field
+    if field_changes.size:
+        changes.append((NAME, field_changes.max(initial=np.inf)))
     if idle := [key for key, change in changes if change < INFLUENCE_TOLERANCE]:
         raise CaseError(
             f"identify.parameters: {', '.join(idle)}: has no influence on these data where the "
@@ -402,10 +400,43 @@ def _refuse_idle(
 
 def _content(predictor: Predictor, table: MeasuredTable, posterior: Posterior) -> dict[str, Any]:
     """Return the identified parameters, noise and predictions, as in identify.json."""
-    measured = posterior.measured
+    measured, noise_of_data = posterior.measured, posterior.noise[table.column]
+    noise = {
+        column.header: {
+            "deviation": float(posterior.noise[i]),
+            "unit": column.unit,
+            "estimated": bool(np.isnan(measured.noise[i])),
+            "degrees_of_freedom": None
+            if np.isinf(posterior.freedom[i])
+            else float(posterior.freedom[i]),
+        }
+        for i, column in enumerate(table.columns)
+    }
+    return {
+        "parameters": _content_of_parameters(predictor.parameters, posterior),
+        "correlation": posterior.correlation.tolist(),
+        "covariance": posterior.covariance.tolist(),
+        "noise": noise,
+        "places": table.places,
+        "shape": dict(table.shape),
+        "missing": dict(table.missing),
+        "misfit_over_noise": float(
+            np.sqrt(np.mean(((measured.data - posterior.y) / noise_of_data) ** 2))
+        ),
+        "steps": posterior.steps,
+        "ended": posterior.ended,
+        "rows": _rows_of_data(table, posterior),
+        "sources": code_version(),
+    }
+
+
+def _content_of_parameters(
+    parameters: Sequence[Parameter], posterior: Posterior
+) -> dict[str, dict[str, Any]]:
+    """Return key of a parameter -> its value, deviation, 95 % band and prior, for identify.json."""
     low, high = posterior.band
     quantiles = posterior.quantiles(np.eye(len(posterior.x)))
-    parameters = {
+    return {
         p.key: {
             "value": float(posterior.x[i]),
             "deviation": float(posterior.deviation[i]),
@@ -416,8 +447,12 @@ def _content(predictor: Predictor, table: MeasuredTable, posterior: Posterior) -
             "start": p.start,
             "prior": None if np.isinf(p.deviation) else {"mean": p.mean, "deviation": p.deviation},
         }
-        for i, p in enumerate(predictor.parameters)
+        for i, p in enumerate(parameters)
     }
+
+
+def _rows_of_data(table: MeasuredTable, posterior: Posterior) -> list[dict[str, Any]]:
+    """Return the rows of identify.csv: for each datum its prediction at the fit, with bands."""
     spread, noise_of_data = posterior.spread(posterior.slopes), posterior.noise[table.column]
     # half widths of the 95 % bands: of predictions, and of measurements with noise
     half_width = posterior.quantiles(posterior.slopes) * spread
@@ -427,7 +462,7 @@ def _content(predictor: Predictor, table: MeasuredTable, posterior: Posterior) -
     settings_and_readings = [
         (settings, reading) for settings, readings in table.readings.items() for reading in readings
     ]
-    rows = [
+    return [
         {
             "result": reading.of,
             "column": table.columns[table.column[i]].header,
@@ -443,33 +478,6 @@ def _content(predictor: Predictor, table: MeasuredTable, posterior: Posterior) -
         }
         for i, (settings, reading) in enumerate(settings_and_readings)
     ]
-    noise = {
-        column.header: {
-            "deviation": float(posterior.noise[i]),
-            "unit": column.unit,
-            "estimated": bool(np.isnan(measured.noise[i])),
-            "degrees_of_freedom": None
-            if np.isinf(posterior.freedom[i])
-            else float(posterior.freedom[i]),
-        }
-        for i, column in enumerate(table.columns)
-    }
-    return {
-        "parameters": parameters,
-        "correlation": posterior.correlation.tolist(),
-        "covariance": posterior.covariance.tolist(),
-        "noise": noise,
-        "places": table.places,
-        "shape": dict(table.shape),
-        "missing": dict(table.missing),
-        "misfit_over_noise": float(
-            np.sqrt(np.mean(((measured.data - posterior.y) / noise_of_data) ** 2))
-        ),
-        "steps": posterior.steps,
-        "ended": posterior.ended,
-        "rows": rows,
-        "sources": code_version(),
-    }
 
 
 def _predict_candidates(
@@ -503,43 +511,10 @@ def _predict_candidates(
     narrowed_key = section.narrow or (
         max(relative_deviations, key=relative_deviations.__getitem__) if keys else NAME
     )
-    rows = list[dict[str, Any]]()
-    for reading, unit, noise in others:
-        candidate_predictor = Predictor(
-            predictor.source,
-            predictor.make_case,
-            predictor.parameters,
-            {(): [reading]},  # of the case itself, without settings
-            predictor.folder,
-            predictor.mark,
-            predictor.comm,
-            predictor.field,
-        )
-        prediction, row = (
-            candidate_predictor(posterior.x),
-            {"result": reading.of, "at": "end" if reading.at is None else reading.at, "unit": unit},
-        )
-        predictor.count += candidate_predictor.count
-        if prediction.note:
-            rows.append({**row, "note": prediction.note})
-            continue
-        slope = np.array(prediction.slopes[0])
-        value, half_width = (
-            prediction.values[0],
-            float((posterior.quantiles(slope[None]) * posterior.spread(slope[None]))[0]),
-        )
-        narrowed = _deviations_by_key(keys, posterior.narrowed(slope, noise))
-        low, high = value - half_width, value + half_width
-        rows.append(
-            {
-                **row,
-                "value": value,
-                "low": low,
-                "high": high,
-                "noise": noise,
-                "deviations_then": narrowed,
-            }
-        )
+    rows = [
+        _row_of_candidate(predictor, posterior, reading, unit, noise)
+        for reading, unit, noise in others
+    ]
     predicted_rows = [predicted for predicted in rows if "value" in predicted]
     if not predicted_rows:
         return rows, None
@@ -550,6 +525,51 @@ def _predict_candidates(
         "to": best["deviations_then"][narrowed_key],
     }
     return rows, {"result": best["result"], "at": best["at"], "unit": best["unit"], **narrowing}
+
+
+def _row_of_candidate(
+    predictor: Predictor, posterior: Posterior, reading: Reading, unit: str, noise: float
+) -> dict[str, Any]:
+    """Predict a candidate with its band, or say in a note why it is not predicted; collective.
+
+    Parameters
+    ----------
+    predictor
+        Predictor of the data; it counts this prediction too.
+    reading, unit, noise
+        The candidate, its unit, and the standard deviation of such a measurement.
+    """
+    candidate_predictor = Predictor(
+        predictor.source,
+        predictor.make_case,
+        predictor.parameters,
+        {(): [reading]},  # of the case itself, without settings
+        predictor.folder,
+        predictor.mark,
+        predictor.comm,
+        predictor.field,
+    )
+    prediction = candidate_predictor(posterior.x)
+    predictor.count += candidate_predictor.count
+    place = "end" if reading.at is None else reading.at
+    row = {"result": reading.of, "at": place, "unit": unit}
+    if prediction.note:
+        return {**row, "note": prediction.note}
+    # the only reading of this prediction, and the half width of its band
+    value, slope = prediction.values[0], np.array(prediction.slopes[0])
+    half_widths = posterior.quantiles(slope[None]) * posterior.spread(slope[None])
+    half_width = float(half_widths[0])
+    # the deviations of all parameters after this measurement
+    keys = [parameter.key for parameter in predictor.parameters]
+    narrowed = _deviations_by_key(keys, posterior.narrowed(slope, noise))
+    return {
+        **row,
+        "value": value,
+        "low": value - half_width,
+        "high": value + half_width,
+        "noise": noise,
+        "deviations_then": narrowed,
+    }
 
 
 def _deviations_by_key(keys: Sequence[str], deviations: Array) -> dict[str, float]:
@@ -583,7 +603,7 @@ def _curves(
             for r in readings
             if r.of == result and r.at is not None
         ]
-        # the first point beyond all places of the data
+        # the first point beyond all places of the data (not the start); the last point if none is
         end_index = next(
             (i for i in range(len(curve)) if i and abs(curve[i][0]) >= max(map(abs, places))),
             len(curve) - 1,

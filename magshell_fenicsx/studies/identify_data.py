@@ -188,25 +188,11 @@ class ResultNames:
             result_name: (result_name, result_name.rpartition("_")[2]) for result_name in SCALES
         } | {"hertz_1": ("hertz_1", "Hz")}
         if unit is None:
-            unknown = name not in self._bare and name not in FOLDS
-            # a result with a unit that a name without one may mean, for the message
-            nearest = next(
-                (
-                    result_name
-                    for result_name, (base, si) in units_by_result.items()
-                    if (base == name and result_name.startswith(f"{name}_"))
-                    or (unknown and result_name == f"{name}_{si}")
-                ),
-                None,
-            )
-            if nearest and nearest != name:
-                raise CaseError(
-                    f"{location}: {name}: has no unit: write {name} [{units_by_result[nearest][1]}]"
-                )
-            case_unit = units_by_result.get(name, ("", ""))[1]
-            result = name
-            factor = 1.0
+            self._refuse_missing_unit(name, units_by_result, location)
+            _, case_unit = units_by_result.get(name, ("", ""))
+            result, factor = name, 1.0
         else:
+            # the result itself, or the name with a unit behind it
             fitting = [
                 result_name
                 for result_name in units_by_result
@@ -219,7 +205,7 @@ class ResultNames:
                     "in this case"
                 )
             result = min(fitting, key=len)  # the name with nothing but a unit behind it
-            case_unit = units_by_result[result][1]
+            _, case_unit = units_by_result[result]
             try:
                 factor = column_size(name, unit, case_unit)
             except TableError as e:
@@ -231,15 +217,45 @@ class ResultNames:
                 refuse_unitless(scene, result)
         return result, case_unit, factor
 
+    def _refuse_missing_unit(
+        self, name: str, units_by_result: Mapping[str, tuple[str, str]], location: str
+    ) -> None:
+        """Check that a name without a unit does not mean a result with one.
+
+        In a case with units "w" would mean "w_mm", and "buckling_pressure" would mean
+        "buckling_pressure_Pa".
+
+        Parameters
+        ----------
+        units_by_result
+            Name of a result in units of the case -> its dimensionless name, and its unit.
+
+        Raises
+        ------
+        CaseError
+            With the unit that is missing.
+        """
+        unknown = name not in self._bare and name not in FOLDS
+        nearest = next(
+            (
+                result_name
+                for result_name, (base, si) in units_by_result.items()
+                if (base == name and result_name.startswith(f"{name}_"))
+                or (unknown and result_name == f"{name}_{si}")
+            ),
+            None,
+        )
+        if nearest and nearest != name:
+            _, unit = units_by_result[nearest]
+            raise CaseError(f"{location}: {name}: has no unit: write {name} [{unit}]")
+
     @property
     def _bare(self) -> list[str]:
         """Names of all results without a unit; that of the place is first."""
         scene = self.scene
         place_names = [self.places.dimensionless_column] if self.places else []
-        return [
-            *place_names,
-            *(name for name in differentiable(scene, scene.unloaded()) if name not in place_names),
-        ]
+        results = differentiable(scene, scene.unloaded())
+        return [*place_names, *(name for name in results if name not in place_names)]
 
     def refuse_strange(self, name: str, location: str) -> None:
         """Check that a name of a column of data is a result of the case, with or without its unit.
@@ -272,10 +288,11 @@ class ResultNames:
             If the unit is missing or of another dimension.
         """
         number, unit = number_and_unit(str(amount))
+        # without a unit the factor is 1, and only zero is allowed for a result with a unit
         _, case_unit, factor = (
-            self.result_of(result, None, location)
-            if not unit
-            else self._of_unit(result, unit, location)
+            self._of_unit(result, unit, location)
+            if unit
+            else self.result_of(result, None, location)
         )
         if case_unit and not unit and float(number):
             raise CaseError(
@@ -428,6 +445,7 @@ def with_shape(file: Path, source: Source) -> tuple[Source, list[str], dict[str,
             f"{location}: a shape needs the columns {', '.join(SHAPE)} and of {', '.join(MOVED)} "
             "one or more"
         )
+    # coordinates (x, y, z) of each row
     rows: list[list[float]] = [
         list(map(float, row)) for row in np.column_stack([columns[name] for name in SHAPE])
     ]
@@ -436,6 +454,7 @@ def with_shape(file: Path, source: Source) -> tuple[Source, list[str], dict[str,
     # equal points get the number of their first row, which in reversed order is written last
     point_names = {tuple(row): f"{OF_POINTS}{i}" for i, row in reversed(list(enumerate(rows, 1)))}
     shape = {point_names[tuple(row)]: row for row in rows}
+    # the coordinates as a case has them: text where there is a unit
     texts = {
         name: [
             f"{v!r} {units[axis]}" if units[axis] else v for v, axis in zip(row, SHAPE, strict=True)
@@ -472,8 +491,10 @@ def _refuse_missing(name: str, values: Array, lines: Sequence[int], location: st
     CaseError
         With the first row without a number.
     """
-    for row in np.flatnonzero(np.isnan(values))[:1]:  # the first one, if any
-        raise CaseError(f"{location}: line {lines[row]}: {name}: has a row without a number")
+    rows_without_number = np.flatnonzero(np.isnan(values))
+    if rows_without_number.size:
+        line = lines[rows_without_number[0]]
+        raise CaseError(f"{location}: line {line}: {name}: has a row without a number")
 
 
 def refuse_twice(
@@ -588,6 +609,24 @@ def table_of(
     table = _listed(
         results, keys, place_values, places, section, location, rows, rows_of_file.lines
     )
+    return replace(table, shape=_in_displacement_unit(shape or {}, units, displacement_unit))
+
+
+def _in_displacement_unit(
+    shape: Mapping[str, list[float]], units: Mapping[str, str | None], displacement_unit: str
+) -> dict[str, list[float]]:
+    """Return the points of a measured shape with coordinates in the unit of its displacements.
+
+    Parameters
+    ----------
+    shape
+        Name of a point -> its coordinates (x, y, z) in the file's units.
+    units
+        Header of a column -> its unit in the file; a coordinate without one has that of the
+        displacements.
+    displacement_unit
+        Unit of the displacements in the case; "" if they have none.
+    """
     # sizes of the file's units of coordinates in the unit of displacements
     unit_factors = list[float]()
     for axis in SHAPE if shape else ():
@@ -595,13 +634,10 @@ def table_of(
         unit_factors.append(
             column_size(axis, axis_unit, displacement_unit) if displacement_unit else 1.0
         )
-    return replace(
-        table,
-        shape={
-            name: [a * b for a, b in zip(coordinates, unit_factors, strict=True)]
-            for name, coordinates in (shape or {}).items()
-        },
-    )
+    return {
+        name: [a * b for a, b in zip(coordinates, unit_factors, strict=True)]
+        for name, coordinates in shape.items()
+    }
 
 
 def _refuse_unknown(
@@ -658,37 +694,25 @@ def _listed(
     CaseError
         If there are no numbers, too many, or not finite ones.
     """
-    # by settings, so that all readings of one case are taken in one run
+    # by settings, so that all readings of one case are taken in one run: the readings, their
+    # numbers, the indices of their columns, and their file and line
     readings, data = dict[tuple[str, ...], list[Reading]](), dict[tuple[str, ...], list[float]]()
     column, rows = dict[tuple[str, ...], list[int]](), dict[tuple[str, ...], list[str]]()
-    for row in range(len(results[0][1])):
+    row_count = len(results[0][1])
+    for row in range(row_count):
         settings = tuple(
             f"{key}={float(values[row])!r} {unit}".rstrip() for key, (unit, values) in keys.items()
         )
         place = float(place_values[row]) if places else None
         for number, (measured_column, values) in enumerate(results):
-            value = float(values[row])
+            value, of = float(values[row]), measured_column.of
             if np.isnan(value):
                 continue
-            # folds, frequencies and the barrier are numbers of a whole path, without a place
-            at_place = (
-                place is not None
-                and measured_column.of not in FOLDS
-                and not NAMES.fullmatch(measured_column.of)
-                and measured_column.of != "barrier"
-            )
-            change = (
-                measured_column.of in section.changes or measured_column.header in section.changes
-            )
-            result = (
-                f"{points[row]}{measured_column.of}"
-                # a displacement of the row's point
-                if measured_column.of.startswith("_")
-                else measured_column.of
-            )
-            readings.setdefault(settings, []).append(
-                Reading(result, place if at_place else None, change)
-            )
+            change = of in section.changes or measured_column.header in section.changes
+            # "_ux" is a displacement of the row's point
+            result = f"{points[row]}{of}" if of.startswith("_") else of
+            place_of_result = None if _is_of_whole_path(of) else place
+            readings.setdefault(settings, []).append(Reading(result, place_of_result, change))
             data.setdefault(settings, []).append(value)
             column.setdefault(settings, []).append(number)
             rows.setdefault(settings, []).append(f"{location}: line {lines[row]}")
@@ -713,6 +737,14 @@ def _listed(
         missing=missing,
         rows=rows,
     )
+
+
+def _is_of_whole_path(result: str) -> bool:
+    """Return whether a result is a number of a whole path, without a place.
+
+    Such are folds, frequencies and the barrier.
+    """
+    return result in FOLDS or bool(NAMES.fullmatch(result)) or result == "barrier"
 
 
 def refuse_unfit_section(source: Source, case: Case, section: IdentifySection) -> None:

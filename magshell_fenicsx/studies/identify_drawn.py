@@ -29,10 +29,9 @@ def posterior_samples(posterior: Posterior, count: int) -> Array:
     normal = _decorrelated(scipy.stats.norm.ppf(np.transpose(stratified)), np.argsort(-spread))
     # half widths of Student's t over those of a normal distribution, along each axis; a parameter
     # without deviation does not vary
-    width_ratio = (
-        posterior.quantiles(axes.T * np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0))
-        / NORMAL
-    )
+    inverse_size = np.where(size > 0, 1 / np.where(size > 0, size, 1.0), 0.0)
+    width_ratio = posterior.quantiles(axes.T * inverse_size) / NORMAL
+    # from the axes to the parameters
     return np.asarray(posterior.x + size * ((normal * np.sqrt(spread) * width_ratio) @ axes.T))
 
 
@@ -51,11 +50,12 @@ def _decorrelated(normal: Array, longest: NDArray[np.int64]) -> Array:
     """
     axes = longest[: len(normal) // 2]
     deviation = normal[:, axes].std(axis=0)
-    eigenvalues, eigenvectors = np.linalg.eigh(
-        np.corrcoef(normal[:, axes], rowvar=False).reshape(len(axes), len(axes))
-    )
+    # `reshape`: of a single axis NumPy returns a number
+    correlation = np.corrcoef(normal[:, axes], rowvar=False).reshape(len(axes), len(axes))
+    eigenvalues, eigenvectors = np.linalg.eigh(correlation)
+    # over the deviations, times the inverse root of the correlation matrix V diag(w) V^T, which is
+    # V diag(w)^(-1/2) V^T, times the deviations
     uncorrelated = np.array(normal)
-    # times the inverse root of the correlation matrix
     uncorrelated[:, axes] = (
         normal[:, axes]
         / deviation

@@ -97,15 +97,17 @@ class RemanenceField:
         flux_scale
             |B^r| and its unit.
         """
+        # the numbers of the field in the vector of parameters, and the prior as the data chose it
         block, prior = self.smooth.block, posterior.measured.field
         assert prior
         shape = (len(self.start), len(self.free_components))
         lower_ends, upper_ends = (v[block].reshape(shape) for v in posterior.band)
         # deviation and length that were not given, and ended at a bound of the search
-        fields_at_bounds = [
+        strengths_at_bounds = [
             name for name in prior.at_bounds() if np.isnan(getattr(self.smooth, name))
         ]
-        # trace of C Q, Q the prior's inverse covariance: the number of values that it determines
+        # number of values that the prior determines: the trace of C Q, with the covariance C of the
+        # posterior and the inverse covariance Q of the prior
         prior_share = np.trace(posterior.local[block, block] @ prior.rows.T @ prior.rows)
         return {
             "places": self.controls.places.tolist(),
@@ -118,7 +120,7 @@ class RemanenceField:
             "prior": {
                 "deviation": prior.deviation,
                 "length": prior.length,
-                "at_bounds": fields_at_bounds,
+                "at_bounds": strengths_at_bounds,
             },
             "determined": prior.size - float(prior_share),
             "over": {"value": flux_scale[0], "unit": flux_scale[1]},
@@ -143,7 +145,7 @@ def field_of(
         return None, source
     controls, start = controls_of(case, section.points, section.filter, FIELD_KEY)
     in_plane = controls.is_axisymmetric or case.shell.geometry == "strip"
-    # on a meridian rho and z, on a strip x and z
+    # indices of rho and z of (rho, z) on a meridian, of x and z on a strip, else of x, y and z
     free_components = (0, 1) if controls.is_axisymmetric else (0, 2) if in_plane else (0, 1, 2)
     if len(start) * len(free_components) > MAX_FIELD_NUMBERS:
         raise CaseError(

@@ -87,17 +87,17 @@ def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]])
     shape
         Name of a point -> its undeformed coordinates (x, y, z).
     """
+    # column of a displacement ("ux") -> the largest one; the two largest span the picture
     largest_by_axis = dict[str, float]()
     for row in rows:
         largest_by_axis[row["column"]] = max(
             largest_by_axis.get(row["column"], 0.0), abs(row["measured"])
         )
-    plane_axes, has_labels = (
-        sorted(sorted(largest_by_axis, key=lambda name: -largest_by_axis[name])[:2]),
-        False,
-    )
+    plane_axes = sorted(sorted(largest_by_axis, key=lambda name: -largest_by_axis[name])[:2])
+    has_labels = False
     # one shape for each state of the shell; the legend names the first one alone
     for _, of_shape in groupby(sorted(rows, key=_which), key=_which):
+        # column of a displacement -> name of a point -> its row
         rows_by_point = dict[str, dict[str, Row]]()
         for row in of_shape:
             rows_by_point.setdefault(str(row["column"]), {})[POINT.match(row["result"])[0]] = row  # type: ignore[index]
@@ -106,6 +106,7 @@ def _shape(plot: Any, rows: Sequence[Row], shape: Mapping[str, Sequence[float]])
             for name in shape
             if all(name in rows_by_point.get(axis, {}) for axis in plane_axes)
         ]
+        # undeformed coordinates of the points along both axes
         coordinates = [
             [shape[name]["xyz".index(axis[1])] for name in points] for axis in plane_axes
         ]
@@ -270,15 +271,14 @@ def _parameters(plot: Any, parameters: Mapping[str, Row]) -> None:
     parameters
         Key -> its value, band and prior, as in identify.json.
     """
-    widest = 0.0
+    widest = 0.0  # the largest distance of the end of a band from the fit, over the value
     for i, parameter in enumerate(parameters.values()):
         size = abs(parameter["value"]) or 1.0
         prior = parameter["prior"]
         if prior:
-            middle, half_width = (
-                prior["mean"] / size - np.sign(parameter["value"]),
-                1.96 * prior["deviation"] / size,  # 95 %
-            )
+            # middle of the prior's band, less the fit
+            middle = prior["mean"] / size - np.sign(parameter["value"])
+            half_width = 1.96 * prior["deviation"] / size  # 95 %
             plot.barh(
                 i, 200 * half_width, left=100 * (middle - half_width), height=0.5, color="0.85"
             )
@@ -358,12 +358,11 @@ def _programme_of_step(plot: Any, rows: Sequence[Row], place: str, labels: set[s
         """Return a column of the rows; nan where it is empty."""
         return np.array([np.nan if row[column] == "" else row[column] for row in rows], dtype=float)
 
-    x, bands = (
-        get(place),
-        (
-            ("low_measured", "high_measured", 0.12, "95 %, data"),
-            ("low", "high", 0.35, "95 %, curve"),
-        ),
+    x = get(place)
+    # columns of both ends of a band, its opacity and its label
+    bands = (
+        ("low_measured", "high_measured", 0.12, "95 %, data"),
+        ("low", "high", 0.35, "95 %, curve"),
     )
     for low, high, alpha, text in bands:
         plot.fill_between(x, get(low), get(high), color="C0", alpha=alpha, lw=0, label=label(text))

@@ -109,9 +109,8 @@ class Predictor:
         )
         # a file is known by the parameters, and by all that a prediction depends on
         text = f"{self.mark} {settings_and_readings} {slopes}".encode()
-        file = (
-            self.folder / "points" / f"{hashlib.sha256(x.tobytes() + text).hexdigest()[:16]}.json"
-        )
+        name = hashlib.sha256(x.tobytes() + text).hexdigest()[:16]
+        file = self.folder / "points" / f"{name}.json"
         prediction = on_first_rank(
             self.comm,
             lambda: stored_outcome(
@@ -146,13 +145,13 @@ class Predictor:
         vectors
             File with the vectors of the remanence, if a field is identified.
         """
-        prediction, parameter_keys = (
-            PredictedReadings(),
-            [parameter.key for parameter in self.parameters],
-        )
+        prediction = PredictedReadings()
+        parameter_keys = [parameter.key for parameter in self.parameters]
         for settings, requested in self.readings.items():
             try:
                 scene = self._scene(x, settings, vectors)
+                # name of the field -> its number of values, and the function that gives the
+                # derivatives by them
                 field = self.field
                 fields = (
                     {NAME: (field.start_values.size, partial(field.derivatives, scene))}
@@ -168,7 +167,8 @@ class Predictor:
                     invalid=not isinstance(e, LostResult) or isinstance(e, PlaceOutsidePath),
                 )
             prediction.values += [float(v) for v in readings.values]
-            # derivatives are by numbers in SI units; None, as a number needs no scene for its unit
+            # derivatives are by numbers in SI units: size of each parameter's unit in SI units.
+            # None stands for the scene, which a number does not need
             slopes_of_keys = (
                 parameter.number.gradient(x, None, {parameter.key: 1.0})  # type: ignore[arg-type]
                 for parameter in self.parameters

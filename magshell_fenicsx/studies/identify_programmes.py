@@ -160,21 +160,8 @@ class Programme:
         """
         cases = dict[str, Case]()
         for number, x in enumerate([posterior.x, *posterior_samples(posterior, self.samples)]):
-            vectors = predictor.folder / "points" / f"{self.name}_{number}.csv"
-            if predictor.field:
-                predictor.comm.Barrier()
-                if predictor.comm.rank == 0:
-                    # all ranks read this file, after the second barrier
-                    predictor.write(x, vectors)
-                predictor.comm.Barrier()
-            try:
-                case = self.make_case(
-                    predictor.source_at(predictor.comm.bcast(x), self.source, vectors)
-                )
-                case.problem()
-            except CaseError as e:
-                if not number:  # the fit itself
-                    raise CaseError(f"identify.predict.{self.name}: at the fit: {e}") from None
+            case = self._case_at(predictor, number, x)
+            if case is None:
                 self.keys.append("")  # a run that cannot be made
                 continue
             self.keys.append(identity(case))
@@ -195,6 +182,37 @@ class Programme:
 
         compute(missing, computed, predictor.comm, say)
         predictor.count += len(missing)
+
+    def _case_at(self, predictor: Predictor, number: int, x: Array) -> Case | None:
+        """Return the case of a run; None if drawn parameters make no valid case; collective.
+
+        Parameters
+        ----------
+        number, x
+            Number of the run, 0 for that at the fit, and its parameters (p,).
+
+        Raises
+        ------
+        CaseError
+            If the parameters of the fit make no valid case.
+        """
+        # the file of an identified field, which all ranks read after the second barrier
+        vectors = predictor.folder / "points" / f"{self.name}_{number}.csv"
+        if predictor.field:
+            predictor.comm.Barrier()
+            if predictor.comm.rank == 0:
+                predictor.write(x, vectors)
+            predictor.comm.Barrier()
+        try:
+            case = self.make_case(
+                predictor.source_at(predictor.comm.bcast(x), self.source, vectors)
+            )
+            case.problem()
+        except CaseError as e:
+            if not number:
+                raise CaseError(f"identify.predict.{self.name}: at the fit: {e}") from None
+            return None
+        return case
 
     def _run(self, case: Case) -> Outcome:
         """Run a case on this rank; any exception becomes a failed outcome.
@@ -229,8 +247,8 @@ class Programme:
     def _outcome(self, folder: Path, key: str) -> Outcome | None:
         """Return the stored outcome of a run; None if it is to be computed.
 
-        It is computed again after an error, which may have been one of the machine, and if columns
-        are missing.
+        A stored outcome is not used, and the run computed again, in two cases: it is that of an
+        error, which may have been one of the machine; or it lacks needed columns.
         """
         outcome = stored_outcome_of_case(_file(folder, key))
         if outcome is None or (outcome.stopped or "").startswith(FAILED):
@@ -364,8 +382,9 @@ class Programme:
     ) -> Iterator[dict[str, Any]]:
         """Yield the rows of a column in the table of the prediction, one for each place.
 
-        A missing number is "". The band of a measured value is wider than that of the runs (low,
-        high): half widths of runs and of noise add as roots of squares.
+        A missing number is "". `low` and `high` are the band of the runs. The band of a measured
+        value is wider: on each side its width is the root of the sum of two squares, of the width
+        of the runs' band and of `NORMAL` standard deviations of the noise.
 
         Parameters
         ----------
@@ -382,7 +401,11 @@ class Programme:
         predicted_values = np.array([curve.values_at(column, places, steps) for curve in curves])
         for i, place in enumerate(places):
             value, band = predicted_values[0, i], band_of(predicted_values[1:, i], samples)
-            low, high = band or (np.nan, np.nan)
+            low = high = low_measured = high_measured = np.nan
+            if band:
+                low, high = band
+                low_measured = value - np.hypot(value - min(low, value), NORMAL * noise)
+                high_measured = value + np.hypot(max(high, value) - value, NORMAL * noise)
             row = {
                 "step": int(steps[i]),
                 self.place: float(place),
@@ -391,12 +414,8 @@ class Programme:
                 "predicted": float(value),
                 "low": low,
                 "high": high,
-                "low_measured": value - np.hypot(value - min(low, value), NORMAL * noise)
-                if band
-                else np.nan,
-                "high_measured": value + np.hypot(max(high, value) - value, NORMAL * noise)
-                if band
-                else np.nan,
+                "low_measured": low_measured,
+                "high_measured": high_measured,
             }
             yield {
                 name: "" if isinstance(v, float) and not np.isfinite(v) else v
@@ -434,6 +453,11 @@ class Programme:
 class _PathCurve:
     """The curve of a run, read step by step; branches and other modes are left out.
 
+    Attributes
+    ----------
+    _rows
+        Rows of path.csv that are left.
+
     Parameters
     ----------
     place
@@ -449,14 +473,14 @@ class _PathCurve:
 
         Without a column the values are the places. Both are empty if the run has no such step.
         """
-        # the row before the first one of a step is the point where the step begins
         rows_of_step = [i for i, row in enumerate(self._rows) if row["step"] == step]
-        rows = (
-            self._rows[max(rows_of_step[0] - 1, 0) : rows_of_step[-1] + 1] if rows_of_step else []
-        )
-        return [float(row[self._place]) for row in rows], [
-            float(row[column or self._place]) for row in rows
-        ]
+        if not rows_of_step:
+            return [], []
+        # the row before the first one of a step is the point where the step begins
+        begin, end = max(rows_of_step[0] - 1, 0), rows_of_step[-1] + 1
+        rows = self._rows[begin:end]
+        places = [float(row[self._place]) for row in rows]
+        return places, [float(row[column or self._place]) for row in rows]
 
     def values_at(self, column: PathColumn, places: Array, steps: NDArray[np.int64]) -> Array:
         """Return the values (n,) of a column at places (n,) in their steps (n,).
@@ -466,22 +490,22 @@ class _PathCurve:
         """
         values = np.full(len(places), np.nan)
         for step in np.unique(steps):
+            # places x and values y of the points of the path in this step
             x, y = map(np.array, self.along_step(int(step), column.of))
             if x.size < 2:
                 continue
             y = y - y[0] if column.change else y
-            slack = 1e-9 * np.ptp(x)  # rounding at the ends of an interval
+            # ends of the intervals between neighbouring points, wider by rounding
+            slack = 1e-9 * np.ptp(x)
+            low, high = np.minimum(x[:-1], x[1:]) - slack, np.maximum(x[:-1], x[1:]) + slack
+            has_length = x[1:] != x[:-1]
             for i in np.flatnonzero(steps == step):
-                low, high = np.minimum(x[:-1], x[1:]) - slack, np.maximum(x[:-1], x[1:]) + slack
-                # intervals of the path that have the place within
-                passed = np.flatnonzero(
-                    (low <= places[i]) & (places[i] <= high) & (x[1:] != x[:-1])
-                )
+                has_place = (low <= places[i]) & (places[i] <= high) & has_length
+                passed = np.flatnonzero(has_place)
                 if passed.size:
                     k = passed[0]  # the first interval counts
-                    values[i] = y[k] + (y[k + 1] - y[k]) * np.clip(
-                        (places[i] - x[k]) / (x[k + 1] - x[k]), 0, 1
-                    )
+                    part = np.clip((places[i] - x[k]) / (x[k + 1] - x[k]), 0, 1)
+                    values[i] = y[k] + (y[k + 1] - y[k]) * part
         return values
 
 
@@ -661,6 +685,7 @@ class _PathColumnNames:
         CaseError
             If there is no such column, or a unit is missing or of another dimension.
         """
+        # name of a column in the units of the case -> its unit
         in_units = {q.name: q.si for base in self.all if (q := self.sizes.column(base))}
         if unit is None:
             if name not in self.all or name in TEXTS:
@@ -671,15 +696,16 @@ class _PathColumnNames:
                 )
             return name, 1.0
         fitting = [column for column in in_units if column == name or column.startswith(f"{name}_")]
-        for column in sorted(fitting, key=len):  # the shortest: nothing but a unit behind the name
-            try:
-                return column, column_size(name, unit, in_units[column])
-            except TableError as e:
-                raise CaseError(f"{location}: {e}") from None
-        raise CaseError(
-            f"{location}: {name}: has the unit {unit}, but no column of this name has one in this "
-            "case"
-        )
+        if not fitting:
+            raise CaseError(
+                f"{location}: {name}: has the unit {unit}, but no column of this name has one in "
+                "this case"
+            )
+        column = min(fitting, key=len)  # the shortest: nothing but a unit behind the name
+        try:
+            return column, column_size(name, unit, in_units[column])
+        except TableError as e:
+            raise CaseError(f"{location}: {e}") from None
 
 
 def _measured(
@@ -720,6 +746,7 @@ def _measured(
         raise CaseError(
             f"{location}: needs two columns or more: the place first, then what was measured there"
         )
+    # for each column its header, its column of path.csv, the factor of its unit, and its numbers
     measured = [
         (header, *names.column_of(header, units[header], location), values)
         for header, values in values_by_header.items()
@@ -728,16 +755,16 @@ def _measured(
     for header, result, _, _ in measured:
         refuse_twice(header, result, headers_by_result, location)
         headers_by_result[result] = header
+    # the first column has the places
     (_, place, factor, place_values), *measured_results = measured
     steps = np.asarray(columns.get("step", np.full(place_values.size, last)))
-    # the first row without a place or with a wrong step
-    for row in np.flatnonzero(np.isnan(place_values) | ~np.isin(steps, np.arange(1, last + 1)))[:1]:
-        raise CaseError(
-            f"{location}: line {rows.lines[row]}: a row has no place, or no step of 1 to {last}"
-        )
-    return (
-        place,
-        place_values * factor,
-        steps.astype(np.int64),
-        [PathColumn(h, result, v * f, change=False) for h, result, f, v in measured_results],
-    )
+    has_wrong_step = ~np.isin(steps, np.arange(1, last + 1))
+    bad_rows = np.flatnonzero(np.isnan(place_values) | has_wrong_step)
+    if bad_rows.size:
+        line = rows.lines[bad_rows[0]]
+        raise CaseError(f"{location}: line {line}: a row has no place, or no step of 1 to {last}")
+    path_columns = [
+        PathColumn(header, of=result, data=values * factor_of_column, change=False)
+        for header, result, factor_of_column, values in measured_results
+    ]
+    return place, place_values * factor, steps.astype(np.int64), path_columns

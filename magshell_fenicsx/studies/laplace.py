@@ -192,7 +192,8 @@ class Posterior:
         """Return half widths of 95 % bands over standard deviations, (k,) quantiles of Student's t.
 
         The bands are those of k numbers that are linear in the parameters. The degrees of freedom
-        are Satterthwaite's, from the parts that the columns have in the variance.
+        are Satterthwaite's, see the module: V^2/sum (V_c^2/f_c), where V_c is the part of the
+        variance V of a number that is due to the noise of column c.
 
         Parameters
         ----------
@@ -204,17 +205,17 @@ class Posterior:
         """
         # (k, n) part of the variance of each number that is due to the noise of each datum
         data_variances = (slopes @ self.covariance @ self.slopes.T / self.noise[self.group]) ** 2
+        # V_c, (k, columns), and V, (k,)
         columns = np.arange(len(self.noise))
         column_variances = np.array(
             [data_variances[:, self.group == number].sum(axis=1) for number in columns]
         ).T
         variance = self.spread(slopes) ** 2
-        if column is not None:
+        if column is not None:  # a measured number has the noise of its own column besides
             noise_variance = self.noise[column] ** 2
-            column_variances, variance = (
-                column_variances + noise_variance[:, None] * (column[:, None] == columns),
-                variance + noise_variance,
-            )
+            is_own_column = column[:, None] == columns
+            column_variances = column_variances + noise_variance[:, None] * is_own_column
+            variance = variance + noise_variance
         # V_c/V, (k, columns)
         variance_shares = column_variances / np.where(variance > 0, variance, 1.0)[:, None]
         with np.errstate(divide="ignore"):  # infinite freedom if the noise of all columns is given
@@ -239,17 +240,12 @@ class Posterior:
         slope, noise
             (p,) derivatives of the measured number, and the standard deviation of its noise.
         """
+        # with g = C slope and the variance v of the measured number, the new covariance is
+        # C - g g^T/v
         slope_covariance = self.covariance @ slope
-        # variance of the measured number; with g = C slope, C - g g^T/gain is the new covariance
-        gain = noise**2 + slope @ slope_covariance
-        return np.asarray(
-            np.sqrt(
-                np.maximum(
-                    np.diag(self.covariance) - (slope_covariance**2 / gain if gain > 0 else 0.0),
-                    0.0,
-                )
-            )
-        )
+        variance = noise**2 + slope @ slope_covariance
+        reduction = slope_covariance**2 / variance if variance > 0 else 0.0
+        return np.asarray(np.sqrt(np.maximum(np.diag(self.covariance) - reduction, 0.0)))
 
 
 def fit_posterior(
@@ -295,23 +291,18 @@ def fit_posterior(
         report_step(step, x, misfit / len(measured.data))
         if step == max_steps:  # the last pass only reports
             break
+        # the full step; the iteration ends if it is short for each parameter
         dx = size * np.linalg.lstsq(A * size, scaled_residuals, rcond=None)[0]
         covariance = _covariance(A, size)
         deviation = np.sqrt(np.diag(covariance))
         if (np.abs(dx) < CONVERGED * deviation).all():
             ended = "converged"
             break
-        for halved in range(HALVINGS):
-            next_x = x + dx / 2**halved
-            prediction = model(next_x)
-            if prediction is not None:
-                residuals = measured.rows(*prediction, next_x, noise)[0]
-                if residuals @ residuals < misfit:
-                    break
-        else:
+        lowered = _lowered(model, measured, noise, x, dx, misfit)
+        if lowered is None:
             ended = "no step lowers the misfit"
             break
-        x, (y, J) = next_x, prediction
+        x, (y, J) = lowered
         measured, noise, freedom = _weighed(initial, measured, x, y, J, noise, size)
     # columns whose residuals are left almost no freedom by the parameters
     if (silent := np.flatnonzero(freedom < MIN_NOISE_FREEDOM)).size:
@@ -332,6 +323,32 @@ def fit_posterior(
         ended,
         measured,
     )
+
+
+def _lowered(
+    model: Model, measured: Measured, noise: Array, x: Array, dx: Array, misfit: float
+) -> tuple[Array, tuple[Array, Array]] | None:
+    """Halve a step until the misfit falls; return the parameters there, and their prediction.
+
+    None if no step lowers the misfit.
+
+    Parameters
+    ----------
+    noise
+        Standard deviation of the noise of each column.
+    x, dx
+        (p,) parameters, and the full step.
+    misfit
+        Misfit at x.
+    """
+    for halved in range(HALVINGS):
+        next_x = x + dx / 2**halved
+        prediction = model(next_x)
+        if prediction is not None:
+            residuals = measured.rows(*prediction, next_x, noise)[0]
+            if residuals @ residuals < misfit:
+                return next_x, prediction
+    return None
 
 
 def _covariance(A: Array, size: Array) -> Array:
@@ -391,8 +408,8 @@ def _weighed(
 ) -> tuple[Measured, Array, Array]:
     """Choose the strengths of a field's prior, and estimate noise that is not given.
 
-    With a field both are found together, as the most likely ones; else the noise is that of the
-    residuals.
+    With a field, strengths and noise are found together, as the most likely ones. Without a field
+    there are no strengths, and the noise is estimated from the residuals.
 
     Parameters
     ----------
@@ -469,48 +486,41 @@ class _Strength:
     def z(self, deviation: float, length: float) -> Array:
         """Return the vector z of a deviation and a length, with the noise at the begin.
 
-        Of deviation and length it has only what is unknown.
+        z has the deviation only if it is not given, and the length only if it is not given.
         """
-        return np.log(
-            [*np.array([deviation, length])[self.unknown_strengths], *self.noise[self.unknown]]
-        )
+        strengths = np.array([deviation, length])
+        return np.log([*strengths[self.unknown_strengths], *self.noise[self.unknown]])
 
     def weighed(self, z: Array) -> tuple[Measured, Array]:
         """Return data and priors with the strengths of z, and the noise of each column.
 
-        What z does not have is as given.
+        Strengths and noises that z does not have are as given.
         """
         given_prior, _ = self.fields_of_priors
-        strengths, noise = (
-            np.array([given_prior.deviation, given_prior.length]),
-            np.array(self.noise),
-        )
+        strengths = np.array([given_prior.deviation, given_prior.length])
+        noise = np.array(self.noise)
         # z has logarithms: strengths first, then noises
-        strengths[self.unknown_strengths], noise[self.unknown] = (
-            np.exp(z[: len(self.unknown_strengths)]),
-            np.exp(z[len(self.unknown_strengths) :]),
-        )
-        return replace(
-            self.measured, field=given_prior.with_strength(float(strengths[0]), float(strengths[1]))
-        ), noise
+        count = len(self.unknown_strengths)
+        strengths[self.unknown_strengths] = np.exp(z[:count])
+        noise[self.unknown] = np.exp(z[count:])
+        field = given_prior.with_strength(float(strengths[0]), float(strengths[1]))
+        return replace(self.measured, field=field), noise
 
     def surprise(self, z: Array) -> float:
         """Return -2 ln p(d), up to a constant: how surprising the data are for strengths z.
 
         The parameters are integrated over; the module `smooth` has the formula.
         """
-        (measured, noise), (residuals, A) = self.weighed(z), self._rows(z)
+        measured, noise = self.weighed(z)
+        residuals, A = self._rows(z)
         assert measured.field
-        # A = Q R: det A^T A = (det R)^2, and the least misfit is what Q does not span
+        # A = Q R: the least misfit is the part of the residuals that Q does not span, and
+        # det A^T A = (det R)^2
         Q, R = np.linalg.qr(A * self.size)
         smallest_misfit = residuals @ residuals - np.sum((Q.T @ residuals) ** 2)
         noise_term = 2 * np.log(noise[measured.group]).sum()
-        return float(
-            noise_term
-            - measured.field.determinant
-            + 2 * np.log(np.abs(np.diag(R))).sum()
-            + smallest_misfit
-        )
+        log_determinant = 2 * np.log(np.abs(np.diag(R))).sum()
+        return float(noise_term - measured.field.determinant + log_determinant + smallest_misfit)
 
     def _rows(self, z: Array) -> tuple[Array, Array]:
         """Return residuals and slopes over their standard deviations, at x, for strengths z."""
@@ -524,7 +534,8 @@ class _Strength:
         """
         given_prior, start_prior = self.fields_of_priors
         z = min((self.z(*start) for start in start_prior.starts(given_prior)), key=self.surprise)
-        if len(z):  # else all is given
+        if len(z):  # something is not given
+            # bounds of the unknown strengths, then of the unknown noises
             bounds = [given_prior.bounds[i] for i in self.unknown_strengths]
             smallest_noise = MIN_RELATIVE_NOISE * float(np.abs(self.measured.data).max())
             bounds += [(smallest_noise, 1e3 * float(self.noise[i])) for i in self.unknown]
@@ -550,11 +561,9 @@ class _Strength:
         Stat. Soc. B 71, 319, 2009, section 3).
         """
         _, start_prior = self.fields_of_priors
-        z, count = (
-            self.z(start_prior.deviation, start_prior.length),
-            len(self.unknown_strengths) + len(self.unknown),
-        )
-        if not count:
+        z = self.z(start_prior.deviation, start_prior.length)
+        count = len(self.unknown_strengths) + len(self.unknown)
+        if not count:  # nothing to average over
             return _covariance(self._rows(z)[1], self.size)
 
         def second_difference(a: Array, b: Array) -> float:
@@ -564,7 +573,8 @@ class _Strength:
             ]
             return sum(differences) / (8 * LOG_STRENGTH_STEP**2)
 
-        # samples are normal, as wide as the curvatures say and a little wider
+        # samples are normal, along the principal axes of the curvature of -ln p(d): a little wider
+        # than a normal distribution with this curvature
         step = LOG_STRENGTH_STEP * np.eye(count)
         curvatures, axes = np.linalg.eigh([[second_difference(a, b) for b in step] for a in step])
         scaled_axes = axes * WIDER / np.sqrt(np.maximum(curvatures, SUREST))
@@ -579,6 +589,7 @@ class _Strength:
             + (normal_samples**2).sum(axis=1) / 2
         )
         weights = np.exp(logarithms - logarithms.max())
+        # second moments of the parameters about x, averaged over the samples
         total = np.zeros((len(self.x), len(self.x)))
         for weight, sample in zip(weights / weights.sum(), samples, strict=True):
             residuals, A = self._rows(sample)
@@ -593,9 +604,10 @@ def _estimated(
 ) -> tuple[Array, Array]:
     """Estimate the noise of columns where it is not given, and its degrees of freedom.
 
-    A noise is the root of the squared residuals over their degrees of freedom. The freedom of a
-    column is the number of its data, less their share in determining the parameters: the diagonal
-    of J C J^T/s^2. It is infinite where noise is given.
+    A noise is the root of the sum of squared residuals over their degrees of freedom. The freedom
+    of a column is the number of its data, less the sum of their shares in determining the
+    parameters: a share is an entry of the diagonal of J C J^T/s^2. The freedom is infinite where
+    the noise is given.
 
     Parameters
     ----------
@@ -611,55 +623,53 @@ def _estimated(
     noise, freedom
         Of each column.
     """
-    estimated, freedom, noise_of_data = (
-        np.array(measured.noise),
-        np.full(len(noise), np.inf),
-        noise[measured.group],
-    )
+    # shares (n,) of the data
+    noise_of_data = noise[measured.group]
     C = _covariance(np.vstack([J / noise_of_data[:, None], measured.prior]), size)
     shares = np.einsum("ni,ij,nj->n", J, C, J) / noise_of_data**2
+    estimated, freedom = np.array(measured.noise), np.full(len(noise), np.inf)
+    smallest_noise = MIN_RELATIVE_NOISE * np.abs(measured.data).max()
     for column in np.flatnonzero(np.isnan(measured.noise)):  # not given
         in_column = measured.group == column
         freedom[column] = in_column.sum() - shares[in_column].sum()
-        estimated[column] = max(
-            np.sqrt(
-                ((measured.data - y)[in_column] ** 2).sum() / max(freedom[column], MIN_FREEDOM)
-            ),
-            MIN_RELATIVE_NOISE * np.abs(measured.data).max(),
-        )
+        sum_of_squares = ((measured.data - y)[in_column] ** 2).sum()
+        residual_noise = np.sqrt(sum_of_squares / max(freedom[column], MIN_FREEDOM))
+        estimated[column] = max(residual_noise, smallest_noise)
     return estimated, freedom
 
 
 def nonlinearity(model: Model, posterior: Posterior) -> tuple[float, int]:
     """Compare the misfit with its parabola, at the ends of bands along the longest axes.
 
-    The axes are those of the posterior's ellipsoid, in parameters over their deviations. If the
-    difference is small, the posterior is normal, and the bands are right.
+    The parabola is the misfit that a linear model would have: it rises from the fit by q^2 to the
+    end of a band of q standard deviations. The axes are those of the posterior's ellipsoid, in
+    parameters over their deviations. If the difference is small, the posterior is normal, and the
+    bands are right.
 
     Returns
     -------
     worst
-        Largest difference over the parabola's rise.
+        Largest difference over the parabola's rise, over all ends.
     lost_count
         Number of these ends at which nothing is predicted.
     """
     # the misfit is for the noise and the strengths of the fit, and so must be its parabola
     posterior = replace(posterior, covariance=posterior.local)
     size = posterior.deviation
-    spread, axes = np.linalg.eigh(posterior.correlation)
+    # the longest axes first, with the variances along them
+    variances, axes = np.linalg.eigh(posterior.correlation)
+    longest = np.argsort(-variances)[:MOST_AXES]
+    variances, axes = variances[longest], axes[:, longest]
+    quantiles = posterior.quantiles(axes.T / size)
     worst, lost_count = 0.0, 0
-    longest = np.argsort(-spread)[:MOST_AXES]
-    spread, axes = spread[longest], axes[:, longest]
-    for s, axis, quantile in zip(spread, axes.T, posterior.quantiles(axes.T / size), strict=True):
+    for variance, axis, quantile in zip(variances, axes.T, quantiles, strict=True):
         for signed_quantile in (-quantile, quantile):
-            x = posterior.x + signed_quantile * size * np.sqrt(max(s, 0.0)) * axis
+            x = posterior.x + signed_quantile * size * np.sqrt(max(variance, 0.0)) * axis
             prediction = model(x)
             if prediction is None:
                 lost_count += 1
                 continue
             residuals = posterior.measured.rows(*prediction, x, posterior.noise)[0]
-            # at the end of a band the parabola is higher by quantile^2 than at the fit
-            worst = max(
-                worst, abs(float(residuals @ residuals - posterior.misfit) / quantile**2 - 1)
-            )
+            rise = float(residuals @ residuals - posterior.misfit)
+            worst = max(worst, abs(rise / quantile**2 - 1))
     return worst, lost_count

@@ -7,9 +7,9 @@ the best point so far. This is a bundle method with a trust region (Schramm and 
 2, 121-152, 1992). SciPy's linear programming finds the point. See docs/theory.md.
 
 The p variables x are scaled: y is x over half the range of each, so that the box has the side
-2 size in y. The height of a point is its lowest value, less the penalty of violated constraints;
-the gain of a step is the increase of the height, predicted by the planes. An evaluation has no
-values if the equilibrium path is lost.
+2 `box_size` in y. The height of a point is its lowest value, less the penalty of violated
+constraints; the gain of a step is the increase of the height, predicted by the planes. An
+evaluation has no values if the equilibrium path is lost.
 """
 
 from collections.abc import Callable, Sequence
@@ -113,21 +113,17 @@ def raise_lowest(
         values, slopes = goal.lowest_values(evaluation), span * goal.lowest_slopes(evaluation)
         return _EvaluatedPoint(x / span, values, slopes, constraints, constraint_slopes)
 
-    best, size, (penalty, max_penalty) = evaluate_point(first), FIRST_BOX_SIZE, PENALTY_RANGE
+    best = evaluate_point(first)
     assert best
+    box_size, penalty = FIRST_BOX_SIZE, PENALTY_RANGE[0]
     earlier_points: list[_EvaluatedPoint] = []
     for _ in range(iterations):
-        box = np.maximum(low / span - best.y, -size), np.minimum(high / span - best.y, size)
-        step, gain, violation = _predicted_step(best, earlier_points[-MAX_PLANES:], box, penalty)
-        while violation > CONSTRAINT_TOLERANCE and penalty < max_penalty:
-            penalised_step = _predicted_step(best, earlier_points[-MAX_PLANES:], box, 10 * penalty)
-            _, _, penalised_violation = penalised_step
-            # a larger penalty hardly lowers the violation within the box
-            if penalised_violation > violation / 2:
-                break
-            penalty, (step, gain, violation) = 10 * penalty, penalised_step
+        # least and largest step within the bounds and the box about the best point
+        low_step, high_step = low / span - best.y, high / span - best.y
+        box = np.maximum(low_step, -box_size), np.minimum(high_step, box_size)
+        step, gain, penalty = _penalised_step(best, earlier_points[-MAX_PLANES:], box, penalty)
         if gain < MIN_GAIN:
-            box_text = f"within {size:.2g} of the variables' ranges"
+            box_text = f"within {box_size:.2g} of the variables' ranges"
             return (
                 f"no more than {MIN_GAIN:g} of the value at the start is foreseen to be gained "
                 f"{box_text}"
@@ -140,11 +136,41 @@ def raise_lowest(
             assert next_point
             best, next_point = next_point, best  # the old best is then an earlier point
         earlier_points += [next_point] if next_point else []
+        # the box grows where the prediction was good, and shrinks where no point was accepted
         if gain_ratio > GROWING_GAIN_RATIO:
-            size = min(2 * size, MAX_BOX_SIZE)
+            box_size = min(2 * box_size, MAX_BOX_SIZE)
         elif gain_ratio <= ACCEPTED_GAIN_RATIO:
-            size /= 2 if gain_ratio > -1 else 4  # by more where the prediction was far off
+            box_size /= 2 if gain_ratio > -1 else 4  # by more where the prediction was far off
     return "iteration limit reached"
+
+
+def _penalised_step(
+    best: _EvaluatedPoint,
+    others: Sequence[_EvaluatedPoint],
+    box: tuple[Array, Array],
+    penalty: float,
+) -> tuple[Array, float, float]:
+    """Predict the step as `_predicted_step`, and raise the penalty as long as this helps.
+
+    A larger penalty helps if it lowers the remaining violation to half of it or less.
+
+    Returns
+    -------
+    step, gain
+        (p,) in scaled variables, and the predicted gain.
+    penalty
+        The penalty with which they were predicted.
+    """
+    max_penalty = PENALTY_RANGE[1]
+    step, gain, violation = _predicted_step(best, others, box, penalty)
+    while violation > CONSTRAINT_TOLERANCE and penalty < max_penalty:
+        penalised_step = _predicted_step(best, others, box, 10 * penalty)
+        _, _, penalised_violation = penalised_step
+        # the violation hardly falls: constraints cannot be satisfied within the box
+        if penalised_violation > violation / 2:
+            break
+        penalty, (step, gain, violation) = 10 * penalty, penalised_step
+    return step, gain, penalty
 
 
 def _predicted_step(
@@ -181,6 +207,9 @@ def _predicted_step(
         lowest = best.values.min() + CURVATURE_BOUND * offset @ offset
         planes.append(np.maximum(other.values + other.slopes @ offset, lowest))
         slopes.append(other.slopes)
+    # unknowns of the linear programme: the step (p,), the height t, and the largest violation v,
+    # at least zero. -t + penalty v is minimised, with t - slope step <= plane for each plane, and
+    # -slope step - v <= constraint for each linearised constraint
     variable_count, constraint_count = len(best.y), len(best.constraints)
     value_count = sum(map(len, planes))
     below_planes = np.column_stack(
@@ -189,8 +218,6 @@ def _predicted_step(
     constraint_rows = np.column_stack(
         [-best.constraint_slopes, np.zeros(constraint_count), -np.ones(constraint_count)]
     )
-    # unknowns: the step, the height (below all planes), and the largest violation of the linearised
-    # constraints (at least zero)
     program = scipy.optimize.linprog(
         np.concatenate([np.zeros(variable_count), [-1.0, penalty]]),
         A_ub=np.vstack([below_planes, constraint_rows]),

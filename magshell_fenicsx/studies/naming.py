@@ -48,7 +48,8 @@ def key_words(key: str, unit: str = "") -> str:
         return "amplitude over $h$"
     *_, parent, last_word = ("", *key.split("."))  # a key of one word has the parent ""
     # a flux density says of what field, and a number of which list
-    words = f"{parent} {last_word}" if last_word == "flux_density" or last_word.isdigit() else name
+    needs_parent = last_word == "flux_density" or last_word.isdigit()
+    words = f"{parent} {last_word}" if needs_parent else name
     if last_word in UNITS:
         words = f"{last_word} angle of {parent}" if parent else f"{last_word} angle"
     words = re.sub(r"^position ([012])$", lambda axis: f"position {'xyz'[int(axis[1])]}", words)
@@ -91,11 +92,11 @@ def load_text(row: Mapping[str, Any], name: str) -> str:
     >>> load_text({"load": 0.5, "pressure_Pa": 61.25}, "pressure")
     'p = 61.25 Pa'
     """
-    # the column in units, if the row has it
+    # the column in units if the row has it, else the one without
     load_quantity = shown_quantity(amplitude(name).column, row)
-    return f"{load_quantity.ascii_symbol} = {row.get(load_quantity.name, row['load']):.9g}" + (
-        f" {load_quantity.si}" if load_quantity.name in row else ""
-    )
+    value = row.get(load_quantity.name, row["load"])
+    unit_text = f" {load_quantity.si}" if load_quantity.name in row else ""
+    return f"{load_quantity.ascii_symbol} = {value:.9g}{unit_text}"
 
 
 def split_unit(result: str) -> tuple[str, str] | None:
@@ -149,11 +150,9 @@ def result_label(result: str) -> str:
         for column in (column_quantity, *column_quantity.in_units):
             if column.name == result:
                 return column.label
-    unit = (
-        "Hz"
-        if result.startswith("hertz_")
-        else name_and_unit[1]
-        if (name_and_unit := split_unit(result))
-        else ""
-    )
+    unit = ""
+    if result.startswith("hertz_"):
+        unit = "Hz"
+    elif name_and_unit := split_unit(result):
+        unit = name_and_unit[1]
     return result_words(result) + (f"  ({unit})" if unit else "")

@@ -135,8 +135,8 @@ def _range(text: str, values: str) -> tuple[str, ...]:
     try:
         first, last, number = values.split(":")
         unit = number_and_unit(first)[1] or number_and_unit(last)[1]
-        ends = [in_unit(end, unit) if unit else float(end) for end in (first, last)]
-        start, stop, count = *ends, int(number)
+        start, stop = (in_unit(end, unit) if unit else float(end) for end in (first, last))
+        count = int(number)
     except ValueError:
         raise CaseError(
             f"--over {text}: {values} is not start:stop:count (two numbers of one unit and a whole "
@@ -266,12 +266,13 @@ def identity(case: Case) -> str:
     """
     data = case.model_dump(mode="json") | case.outside
     magnetic = case.magnetic
-    if not (
+    has_magnetic_effect = (
         case.lambda_m  # the size of the magnetic load
         or case.sensors
         or case.field_maps
         or (magnetic and magnetic.interaction != "none")
-    ):
+    )
+    if not has_magnetic_effect:
         del data["magnetic"]
     return hashlib.sha256(json.dumps(data, sort_keys=True).encode()).hexdigest()[:16]
 

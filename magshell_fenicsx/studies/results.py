@@ -69,9 +69,9 @@ class Scalar:
             return _number(next(points, None))
         if self.name in OF_SNAPS:
             first_snap: Mapping[str, float] = next(iter(summary.get("snaps", ())), {})
-            return _number(
-                first_snap.get(OF_SNAPS[self.name])
-            )  # earlier versions have `time` alone
+            # snaps of earlier versions have `time` alone
+            return _number(first_snap.get(OF_SNAPS[self.name]))
+        # a number of the path; branches and excluded modes are left out
         path = [row for row in rows if row["branch"] == "0" and row["mode"] in OWN_MODES]
         # "end" is no column
         if not path or not {self.column, self.at} - {"end"} <= set(path[0]):
@@ -161,9 +161,8 @@ def _crossing(
     # where the place turns back, linear between the two points around it
     if not _monotone(places[window]):
         window = slice(i, i + 2)
-    return float(
-        barycentric_interpolate(places[window], [float(row[column]) for row in path[window]], value)
-    )
+    values = [float(row[column]) for row in path[window]]
+    return float(barycentric_interpolate(places[window], values, value))
 
 
 def _monotone(x: Sequence[float]) -> bool:

@@ -227,6 +227,15 @@ class Heard:
 
     Reminders are written by `remind`, which runs in a thread of its own.
 
+    Attributes
+    ----------
+    _say, _rest
+        The parameters `say` and `remaining_text`.
+    _begun, _last
+        Time of the begin, and of the last line.
+    _ended
+        Event that ends the thread.
+
     Parameters
     ----------
     say
@@ -246,10 +255,11 @@ class Heard:
 
     def remind(self) -> None:
         """Say a reminder after each long silence, until `end` is called."""
-        # wait until the silence would be long, unless a line is said meanwhile
+        # wait until the silence since the last line would be long; `wait` returns True at the end
         while not self._ended.wait(
             max(0.01, self._last + SECONDS_BETWEEN_LINES - time.perf_counter())
         ):
+            # if a line was said meanwhile, go on waiting
             if (time_now := time.perf_counter()) - self._last >= SECONDS_BETWEEN_LINES:
                 self(f"still computing, {clock(time_now - self._begun)} so far{self._rest()}")
 
@@ -426,17 +436,16 @@ class Outcome:
         """Return a named number of the run; None if the run does not have it."""
         if not self.curve:  # a failed run
             return None
-        # as far as a scalar reads it
-        limits = [self.limit] if self.limit else []
+        # summary.json, as far as a scalar reads it
         summary = {
             "knockdown": self.knockdown,
             "barrier": self.barrier,
-            "limit_points": limits,
+            "limit_points": [self.limit] if self.limit else [],
             "snaps": self.snaps,
         }
-        return scalar.value_in(
-            summary, [{key: str(v) for key, v in row.items()} for row in self.curve]
-        )
+        # rows as texts, as in path.csv
+        rows = [{key: str(v) for key, v in row.items()} for row in self.curve]
+        return scalar.value_in(summary, rows)
 
     def serves(self, scalar: Scalar) -> bool:
         """Return whether the outcome is enough for a number.
@@ -467,7 +476,7 @@ def outcome_of(
     columns
         Columns of path.csv that the curve keeps, beside those that the scene adds.
     """
-    # the limit point of k_d first; the others stay in order
+    # the limit point of k_d first, as `False` is sorted before `True`; the others stay in order
     limit_points = sorted(
         result.limit_points,
         key=lambda p: p["amplitude"] != "pressure" or p["value"] != result.knockdown,

@@ -115,6 +115,7 @@ def _sample(
     del drawn_source.data["ensemble"]
     for key, text in drawn_texts.items():
         override(drawn_source, f"{key}={text}")
+    # a drawn section, as of a defect, has a key for each of its numbers
     values = {
         path: value
         for key in drawn_texts
@@ -200,10 +201,10 @@ def refuse_unknown_keys(source: Source, section: EnsembleSection, make_case: Mak
     CaseError
         One message with every such key.
     """
-    medians, messages = (
-        {key: json.dumps(distribution.quantile(0.5)) for key, distribution in section.keys.items()},
-        list[str](),
-    )
+    medians = {
+        key: json.dumps(distribution.quantile(0.5)) for key, distribution in section.keys.items()
+    }
+    messages = list[str]()
     source_with_medians = copy.deepcopy(source)
     del source_with_medians.data["ensemble"]
     for key, text in medians.items():

@@ -327,23 +327,19 @@ class EnsembleSection(Section):
             f"shells.{shell_name}.{IMPERFECTIONS}" if shell_name else IMPERFECTIONS
             for shell_name in self._shells_with_defects
         )
+        on_all_shells = None in self._shells_with_defects
         for key in self.keys:
-            if key.startswith(reserved_keys) or (
-                None in self._shells_with_defects and f".{IMPERFECTIONS}" in key
-            ):
+            is_of_any_shell = f".{IMPERFECTIONS}" in key
+            if key.startswith(reserved_keys) or (on_all_shells and is_of_any_shell):
                 raise ValueError(f"keys: {key}: defects take the place of shell.imperfections")
         return self
 
     @property
     def _listed(self) -> list[PlacedDefectsSection]:
         """The sections of random defects, as a list."""
-        return (
-            self.defects
-            if isinstance(self.defects, list)
-            else [self.defects]
-            if self.defects
-            else []
-        )
+        if isinstance(self.defects, list):
+            return self.defects
+        return [self.defects] if self.defects else []
 
     @property
     def _shells_with_defects(self) -> list[str | None]:
@@ -399,10 +395,13 @@ class EnsembleSection(Section):
         for i, (defect_section, name) in enumerate(defects_by_shell):
             key = f"shells.{name}.{IMPERFECTIONS}" if name else IMPERFECTIONS
             earlier_count = sum(other_name == name for _, other_name in defects_by_shell[:i])
-            # the first one has the generator of a single shell; a second one on a shell its own
-            generator_key = (
-                (f"{key}.{earlier_count}" if earlier_count else key) if i else IMPERFECTIONS
-            )
+            # random numbers: the first section has those of a single shell, each other one its own
+            if i == 0:
+                generator_key = IMPERFECTIONS
+            elif earlier_count:  # a further section on this shell
+                generator_key = f"{key}.{earlier_count}"
+            else:
+                generator_key = key
             defects.setdefault(key, []).extend(
                 defect_section.draw(generator(seed, number, generator_key))
             )

@@ -74,10 +74,8 @@ class Smooth:
         """
         # without the distance of each place to itself
         distances = self.distances + np.where(np.eye(len(self.distances)), np.inf, 0.0)
-        return (WEAKEST, STRONGEST), (
-            float(np.median(distances.min(axis=1))),
-            LONGEST * float(self.distances.max()),
-        )
+        shortest = float(np.median(distances.min(axis=1)))
+        return (WEAKEST, STRONGEST), (shortest, LONGEST * float(self.distances.max()))
 
     @cached_property
     def _factor(self) -> tuple[Array, float]:
@@ -88,9 +86,8 @@ class Smooth:
         r = np.sqrt(3) * self.distances / self.length
         K = (1 + r) * np.exp(-r) + JITTER * np.eye(len(r))
         L = self.deviation * np.linalg.cholesky(K)
-        return scipy.linalg.solve_triangular(L, np.eye(len(L)), lower=True), -2 * float(
-            np.log(np.diag(L)).sum()
-        )
+        W = scipy.linalg.solve_triangular(L, np.eye(len(L)), lower=True)
+        return W, -2 * float(np.log(np.diag(L)).sum())
 
     @property
     def rows(self) -> Array:
@@ -121,8 +118,8 @@ class Smooth:
     def starts(self, prior: "Smooth") -> list[tuple[float, float]]:
         """Return pairs (s, l) from which a search begins.
 
-        If this prior has values, of an earlier search, they are the only start. Else the starts are
-        spread between the bounds, and given values are kept.
+        If this prior has values, of an earlier search, they are the only start. If it has none, the
+        starts are spread between the bounds; but s, or l, keeps its value where that is given.
 
         Parameters
         ----------

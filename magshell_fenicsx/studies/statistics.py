@@ -210,15 +210,17 @@ def correlations(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     """
     from scipy.stats import pearsonr, spearmanr
 
-    correlated = {}
+    # keys of single defects begin with one of these: the imperfections of one shell, and all
+    # sections that have a place (a.b.at.polar: a.b.)
     polar_key, keys = "at.polar", drawn_keys(rows)
-    # begins of keys of single defects: of imperfections of one shell, and of all that have a place
     defect_prefixes = (
         "shell.imperfections.",
         *(key.removesuffix(polar_key) for key in keys if key.endswith(f".{polar_key}")),
     )
-    drawn_keys_only = [key for key in keys if not key.startswith(defect_prefixes)]
-    for key in (*severest_keys(rows), *drawn_keys_only):
+    other_keys = [key for key in keys if not key.startswith(defect_prefixes)]
+    correlated = {}
+    for key in (*severest_keys(rows), *other_keys):
+        # the number and the result of each sample that has both
         pairs = np.array(
             [
                 (x, y)
@@ -308,17 +310,18 @@ def fit(values: Sequence[float] | Array) -> Weibull | None:
     if len(np.unique(x)) < LEAST_DIFFERENT:
         return None
     deviation = float(x.std())
-    # logarithms of the distance, over the standard deviation
+    # logarithm of the distance below the least value, over the standard deviation: bounds of the
+    # search, and the best one so far
     low, high = np.log(SPANS)
     ends, best = (low, high), 0.0
     for _ in range(ROUNDS):
         log_distances = np.linspace(low, high, GRID)
-        best = float(
-            log_distances[np.argmax(_likelihoods(x, x[0] - deviation * np.exp(log_distances)))]
-        )
+        likelihoods = _likelihoods(x, locations=x[0] - deviation * np.exp(log_distances))
+        best = float(log_distances[np.argmax(likelihoods)])
         step = log_distances[1] - log_distances[0]
         # the next grid is between the neighbours of the best point
         low, high = max(best - step, ends[0]), min(best + step, ends[1])
+    # the distribution with the best location
     location = x[0] - deviation * float(np.exp(best))
     shape, scale = (float(v[0]) for v in _best_shape_and_scale(x, np.array([location])))
     smallest_shape, _ = SHAPES
@@ -360,24 +363,26 @@ def _best_shape_and_scale(x: Array, locations: Array) -> tuple[Array, Array]:
     Newton's method for log k, and the scale is mean(t^k)^(1/k). In the code y = log t.
     """
     y = np.log(x - locations[:, None])
-    y, mean_log = y - y.mean(axis=1, keepdims=True), y.mean(axis=1)  # the mean of y is 0 then
+    mean_log = y.mean(axis=1)
+    y = y - y.mean(axis=1, keepdims=True)  # its mean is 0 now, which leaves k unchanged
     # log t of a Weibull distribution has the deviation 1.28/k: a start a little below
     k = 1.2 / np.maximum(y.std(axis=1), 1e-12)
     for _ in range(STEPS):
         largest_exponent = np.max(k[:, None] * y, axis=1, keepdims=True)
-        # t^k, scaled against overflow
+        # t^k, scaled against overflow, and its sums with powers of y
         w = np.exp(k[:, None] * y - largest_exponent)
         s0, s1, s2 = w.sum(axis=1), (w * y).sum(axis=1), (w * y**2).sum(axis=1)
+        # right side less left side of the equation, and its derivative by k
         value, slope = s1 / s0 - 1 / k, s2 / s0 - (s1 / s0) ** 2 + 1 / k**2
         # the step of log k, at most by 1
         k = k * np.exp(np.clip(-value / (slope * k), -1.0, 1.0))
     k = np.clip(k, *SHAPES)
     largest_exponent = np.max(k[:, None] * y, axis=1, keepdims=True)
-    # log of the mean of t^k
-    mean = (
+    # logarithm of the mean of exp(k y), from which the scale follows
+    log_of_mean = (
         np.log(np.mean(np.exp(k[:, None] * y - largest_exponent), axis=1)) + largest_exponent[:, 0]
     )
-    return np.asarray(k), np.asarray(np.exp(mean_log + mean / k))
+    return np.asarray(k), np.asarray(np.exp(mean_log + log_of_mean / k))
 
 
 def intervals(
@@ -395,6 +400,7 @@ def intervals(
     Name of the number -> its interval with the probability `LEVEL`.
     """
     x, rng = np.asarray(values, dtype=float), np.random.default_rng(seed)
+    # name of a number -> its values in all resamples
     resampled: dict[str, list[float]] = {}
     for _ in range(count):
         resample = rng.choice(x, len(x))
@@ -460,15 +466,7 @@ def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") ->
     else:
         lines += ["", "Too few different results for a Weibull distribution."]
     if content["correlations"]:
-        lines += [
-            "",
-            f"| {content['result']} against | Pearson | Spearman |",
-            "| --- | --- | --- |",
-        ]
-        lines += [
-            f"| {key} | {c['pearson']:.3f} | {c['spearman']:.3f} |"
-            for key, c in content["correlations"].items()
-        ]
+        lines += _lines_of_correlations(content)
     if without_weakest := content["without_weakest"]:
         lines += [
             "",
@@ -478,22 +476,48 @@ def report(content: Mapping[str, Any], rows: Sequence[Row], ending: str = "") ->
             "is "
             f"{100 * without_weakest['largest_change']:+.2f} %.",
         ]
-    rows_without_result = [row for row in rows if row["status"] != "found"]
-    if rows_without_result:
-        lines += [
-            "",
-            "Samples without the result:",
-            "",
-            "| sample | status | why |",
-            "| --- | --- | --- |",
-        ]
-        lines += [
-            f"| {row['sample']} | {row['status']} | {str(row['why']).replace('|', '/')} |"
-            for row in rows_without_result[:MOST_LISTED]
-        ]
-        if len(rows_without_result) > MOST_LISTED:
-            lines.append(f"| … | | {len(rows_without_result) - MOST_LISTED} more in {table} |")
+    if rows_without_result := [row for row in rows if row["status"] != "found"]:
+        lines += _lines_of_samples_without_result(rows_without_result, table)
     return "\n".join(lines) + "\n"
+
+
+def _lines_of_correlations(content: Mapping[str, Any]) -> list[str]:
+    """Return the table of correlations in report.md, for the content of summary.json."""
+    return [
+        "",
+        f"| {content['result']} against | Pearson | Spearman |",
+        "| --- | --- | --- |",
+        *(
+            f"| {key} | {c['pearson']:.3f} | {c['spearman']:.3f} |"
+            for key, c in content["correlations"].items()
+        ),
+    ]
+
+
+def _lines_of_samples_without_result(rows: Sequence[Row], table: str) -> list[str]:
+    """Return the list of samples without the result in report.md.
+
+    Parameters
+    ----------
+    rows
+        Rows of these samples in samples.csv; the first `MOST_LISTED` are listed.
+    table
+        Name of the file that has all of them.
+    """
+    lines = [
+        "",
+        "Samples without the result:",
+        "",
+        "| sample | status | why |",
+        "| --- | --- | --- |",
+    ]
+    lines += [
+        f"| {row['sample']} | {row['status']} | {str(row['why']).replace('|', '/')} |"
+        for row in rows[:MOST_LISTED]
+    ]
+    if len(rows) > MOST_LISTED:
+        lines.append(f"| … | | {len(rows) - MOST_LISTED} more in {table} |")
+    return lines
 
 
 def _row(

@@ -80,6 +80,7 @@ def estimated_error(
     p = observed_order(h[-3:], values[-3:]) if len(values) > 2 else None
     if p is None:
         return last_difference, None
+    # C h^p of the last value, as last_difference = |C| (h[-2]^p - h[-1]^p)
     return last_difference * h[-1] ** p / (h[-2] ** p - h[-1] ** p), p
 
 
@@ -170,6 +171,7 @@ def make_rows(
         if reference and row["result"] is not None:
             # the finest run has the estimated error, not zero
             row["error"] = reference.error if row is finest else reference.error_of(row["result"])
+    # the Pareto front: runs with error and time that no other run beats
     cost_column = clock(rows)
     comparable = [row for row in rows if row["error"] is not None and row[cost_column] is not None]
     for row in rows:
@@ -248,15 +250,10 @@ def clock(rows: Sequence[Row]) -> str:
 
 def _beats(a: Row, b: Row, cost_column: str) -> bool:
     """Return whether row a is at least as good as b in time and in error, and better in one."""
-    time_and_error_of_a, time_and_error_of_b = (
-        (a[cost_column], a["error"]),
-        (b[cost_column], b["error"]),
-    )
-    return (
-        time_and_error_of_a != time_and_error_of_b
-        and time_and_error_of_a[0] <= time_and_error_of_b[0]
-        and time_and_error_of_a[1] <= time_and_error_of_b[1]
-    )
+    time_of_a, error_of_a = a[cost_column], a["error"]
+    time_of_b, error_of_b = b[cost_column], b["error"]
+    differ = (time_of_a, error_of_a) != (time_of_b, error_of_b)
+    return differ and time_of_a <= time_of_b and error_of_a <= error_of_b
 
 
 FORMS = {
@@ -437,9 +434,8 @@ def _series(rows: Sequence[Row], keys: Sequence[str]) -> dict[str, list[Row]]:
     varying_names = [name for name in names if len({row[name] for row in rows}) > 1]
     series: dict[str, list[Row]] = {}
     for row in sorted(rows, key=lambda r: r["dofs"]):
-        series.setdefault(
-            ", ".join(f"{short_key(name)} {row[name]}" for name in varying_names) or "runs", []
-        ).append(row)
+        label = ", ".join(f"{short_key(name)} {row[name]}" for name in varying_names) or "runs"
+        series.setdefault(label, []).append(row)
     return series
 
 
@@ -485,8 +481,8 @@ def _errors(
             label="error of the reference itself",
         )
     axes.set(xscale="log", yscale="log")
+    # an axis around the geometric mean, not too short
     if values := [row[quantity] for rows in series.values() for row in rows]:
-        # geometric mean
         middle = (min(values) * max(values)) ** 0.5
         half_range = max(LEAST_SPREAD, 1.1 * (max(values) / min(values)) ** 0.5)
         axes.set_xlim(middle / half_range, middle * half_range)
@@ -501,7 +497,7 @@ def _draw_phase_shares(axes: Any, series: dict[str, list[Row]]) -> None:
     rows = sorted(
         (r for rows in series.values() for r in rows if r["pareto"]), key=lambda r: -r["error"]
     )
-    bottom = [0.0] * len(rows)
+    bottom = [0.0] * len(rows)  # sum of the shares that are drawn already, for each run
     places = range(len(rows))
     for i, (key, label) in enumerate(PHASES.items()):
         if all(row[key] is None for row in rows):

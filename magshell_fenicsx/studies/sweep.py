@@ -237,7 +237,10 @@ def _is_known(file: Path, scalar: Scalar | None) -> bool:
 
 
 def _words(outcome: Outcome, scalar: Scalar | None) -> str:
-    """Return the result of a point in words: the requested number, else its main result."""
+    """Return the result of a point in words: the requested number, or by default its main result.
+
+    The main result is the knockdown, the barrier or the limit point, the first that there is.
+    """
     result_text = "no limit point"
     if scalar and scalar.name != "knockdown":
         value = outcome.value(scalar)
@@ -368,22 +371,24 @@ def run_chain(chain: Chain, folds: SweepCache) -> Iterator[tuple[int, Outcome]]:
     The fold of a point is followed from the point before. Where this fails, the full path is
     computed.
     """
-    continuation = folds.first if len(chain) > 1 else None  # None: compute the path
+    # None: there is no fold to follow, so the path is computed
+    continuation = folds.first if len(chain) > 1 else None
     for link in chain:
-        is_first = link is chain[0]
+        is_first, is_last = link is chain[0], link is chain[-1]
         start_time, factorisations, outcome = time.perf_counter(), 0, None
         if continuation:
-            # another chain's fold serves only on the same mesh
+            # the first point takes the fold of another chain, which serves only on the same mesh
             outcome, factorisations = _by_fold(
                 continuation, link, folds, start_time, same_mesh=is_first
             )
         if not outcome:
             outcome, continuation = _by_path(
-                link, folds.columns, factorisations, start_time, go_on=link is not chain[-1]
+                link, folds.columns, factorisations, start_time, go_on=not is_last
             )
-        # the next chain starts from the first fold of this one
         if is_first:
-            folds.first = continuation = continuation and continuation.from_here()
+            # a continuation without earlier folds, for this chain and for the begin of the next
+            continuation = continuation.from_here() if continuation else None
+            folds.first = continuation
         yield link.number, outcome
 
 
@@ -418,10 +423,8 @@ def _by_fold(
         fold = continuation.follow(link.at, scene)
     except FoldLost:
         return None, factorisation.count - count_before
-    result, work = (
-        Result(scene, fold.state, [fold_row(scene, fold)]),
-        factorisation.count - count_before,
-    )
+    result = Result(scene, fold.state, [fold_row(scene, fold)])
+    work = factorisation.count - count_before
     return outcome_of(result, "fold", work, time.perf_counter() - start, folds.columns), work
 
 
@@ -499,11 +502,12 @@ def with_earlier(
     CaseError
         If the folder has a sweep over other keys, or of another case.
     """
+    # for each earlier and each new point, its values on the axes as texts; tied keys have the same
+    # value, so that the first one stands for the axis
     keys, base = [list(axis.keys) for axis in axes], _base(source, axes)
     earlier = _earlier(folder, keys, base)
-    # tied keys have the same value: the first one stands for the axis
     new_values = [[point.values[axis.keys[0]] for axis in axes] for point in points]
-    # with all values, so that equal numbers in different units are found
+    # axes with all values, in whose units equal numbers in different units are found
     all_axes = [
         Axis(axis.keys, tuple(v[i] for v in (*new_values, *earlier))) for i, axis in enumerate(axes)
     ]
@@ -618,11 +622,10 @@ def _write(
     scalar
         The requested number; None without.
     """
-    points, outcomes = (
-        [point for point, _ in outcomes_of_points],
-        [outcome for _, outcome in outcomes_of_points],
-    )
+    points = [point for point, _ in outcomes_of_points]
+    outcomes = [outcome for _, outcome in outcomes_of_points]
     swept = tuple(points[0].values)
+    # sweep.csv: a row for each point
     rows = [
         {
             **point.values,
@@ -655,6 +658,7 @@ def _write(
     write_csv(
         rows, tuple(dict.fromkeys((*first, *(key for row in rows for key in row)))), folder / TABLE
     )
+    # curves.csv: a line for each point of each path
     lines = [
         {**point.values, **row} for point, outcome in outcomes_of_points for row in outcome.curve
     ]

@@ -148,9 +148,10 @@ def _ends(outcomes: Sequence[Outcome]) -> Results:
     """Return the last load of each curve; the last displacement if all loads are the same."""
     last_rows = [outcome.curve[-1] if outcome.curve else {} for outcome in outcomes]
     last_row = next((row for row in last_rows if row), {})
+    # displacement x and load y of the last amplitude
     x, y = axes_of(str(last_row.get("amplitude", "")) or "force", last_row)
-    # x and y: displacement and load of the last amplitude
-    drawn_quantity = y if np.ptp([y.on_axis(row) for row in last_rows if y.name in row]) > 0 else x
+    loads_differ = np.ptp([y.on_axis(row) for row in last_rows if y.name in row]) > 0
+    drawn_quantity = y if loads_differ else x
     return Results(
         [drawn_quantity.on_axis(row) if drawn_quantity.name in row else None for row in last_rows],
         f"{drawn_quantity.label} at the end",
@@ -164,14 +165,14 @@ def _map(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results:
     """
     from matplotlib.ticker import MaxNLocator
 
-    rows, columns = axes  # the first axis goes up
-    x, y = (sorted(set(axis.numbers or ())) for axis in (columns, rows))
+    # the first axis goes up: it numbers the rows of the grid
+    row_axis, column_axis = axes
+    x, y = (sorted(set(axis.numbers or ())) for axis in (column_axis, row_axis))
     grid = np.full((len(y), len(x)), np.nan)
     for point, value in zip(points, results.values, strict=True):
-        i, j = (
-            y.index(rows.number(point.values[rows.keys[0]])),
-            x.index(columns.number(point.values[columns.keys[0]])),
-        )
+        # tied keys have the same value: the first one stands for the axis
+        i = y.index(row_axis.number(point.values[row_axis.keys[0]]))
+        j = x.index(column_axis.number(point.values[column_axis.keys[0]]))
         grid[i, j] = np.nan if value is None else value
     is_missing = np.isnan(grid)
     if min(grid.shape) < SMOOTH:
@@ -201,7 +202,7 @@ def _map(plot: Any, axes: Sequence[Axis], points: Sequence[SweepPoint], results:
     if results.size:
         second = colorbar.ax.secondary_yaxis("left", functions=_scales(results.size))
         second.set_ylabel(results.measured)
-    plot.set(xlabel=_axis_label(columns), ylabel=_axis_label(rows))
+    plot.set(xlabel=_axis_label(column_axis), ylabel=_axis_label(row_axis))
     plot.locator_params(axis="x", nbins=6)  # long numbers would touch
 
 
@@ -240,6 +241,7 @@ def _values(
 ) -> None:
     """Draw a number of each point over the last axis with numbers; missing ones are left out."""
     axis = last_numeric_axis(axes) or axes[-1]
+    # label of a line, the values on all other axes -> its places (x, value)
     lines: dict[str, list[tuple[float | str, float]]] = {}
     for point, value in zip(points, results.values, strict=True):
         line = lines.setdefault(_label(point, axis), [])

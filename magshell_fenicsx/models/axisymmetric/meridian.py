@@ -167,14 +167,15 @@ class Meridian:
 
         T-junctions do not count. The placement `r0` is that of the model.
         """
-        nodes, normals, angles = r0.function_space.dofmap.list, positions_and_normals(r0)[1], [0.0]
+        nodes, (_, normals) = r0.function_space.dofmap.list, positions_and_normals(r0)
+        angles = [0.0]
         for marks in self.joints:
             if marks is not None:
                 # the cell that ends at the joint (mark 1), and the one that begins there (-1)
-                cells = [int(marks.argmax()), int(marks.argmin())]
+                first, second = int(marks.argmax()), int(marks.argmin())
                 # the node that both cells at the joint share, by its number in each
-                (i,), (j,) = np.nonzero(np.equal.outer(*nodes[cells]))
-                n, m = normals[cells, [i, j]]
+                (i,), (j,) = np.nonzero(np.equal.outer(nodes[first], nodes[second]))
+                n, m = normals[first, i], normals[second, j]
                 angles.append(float(np.arctan2(np.linalg.norm(np.cross(n, m)), n @ m)))
         return max(angles)
 
@@ -185,9 +186,8 @@ class Meridian:
         """
         s, growth = V.tabulate_dof_coordinates()[:, 0], fem.Function(V, name="growth")
         assert isinstance(self.embedding, DeviatedEmbedding)
-        growth.x.array[:] = self.embedding.along_normal(np.column_stack([s, 0 * s]), deviations)[
-            :, [0, 2]  # the meridian is in the plane of e1 and e3
-        ].ravel()
+        change = self.embedding.along_normal(np.column_stack([s, 0 * s]), deviations)
+        growth.x.array[:] = change[:, [0, 2]].ravel()  # the meridian is in the plane of e1 and e3
         return growth
 
 
@@ -271,6 +271,7 @@ def _highest_parameter(embedding: Embedding, vertices: Array, supported: Sequenc
     highest vertex without support, among those on the axis if there are any.
     """
     positions = embedding(np.column_stack([vertices, 0 * vertices]))
+    # distance of each vertex from the nearest support, by the parameter
     distances = np.abs(np.subtract.outer(vertices, supported)).min(axis=1, initial=inf)
     is_free = distances > PARAMETER_TOLERANCE
     highest = np.argmax(positions[:, 2])
@@ -365,17 +366,17 @@ def _equidistributed(corners: Sequence[float], size: Callable[[Array], Array]) -
     segments = []
     for a, b in pairwise(corners):
         s = np.linspace(a, b, 20001)  # fine enough for the integral of 1/size
+        middles = (s[:-1] + s[1:]) / 2
         with np.errstate(over="ignore", divide="ignore"):
             # the number of cells up to s is the integral of 1/size
-            cells_before = np.concatenate(
-                [[0.0], np.cumsum(np.diff(s) / size((s[:-1] + s[1:]) / 2))]
-            )
+            cells_before = np.concatenate([[0.0], np.cumsum(np.diff(s) / size(middles))])
         if not cells_before[-1] < MAX_CELLS:
             raise MeshError(
                 f"mesh: the meridian would have {cells_before[-1]:.2g} cells, allowed "
                 f"{MAX_CELLS:g}: take a larger "
                 "mesh.size, a lower mesh.refinement, or larger bodies"
             )
+        # a whole number of cells; vertices are where equal shares of the integral are reached
         cells = int(np.ceil(cells_before[-1]))
         segment = np.interp(np.linspace(0, cells_before[-1], cells + 1), cells_before, s)
         segment[[0, -1]] = a, b  # without rounding

@@ -20,7 +20,7 @@ from itertools import combinations_with_replacement
 import basix
 import numpy as np
 import ufl
-from dolfinx import fem
+from dolfinx import fem, mesh
 from numpy.typing import NDArray
 from scipy.sparse import coo_array, csr_array
 from ufl.core.expr import Expr
@@ -63,6 +63,8 @@ class WaveHessians:
     rows, columns
         (pairs,) of the nodes of the entries, sorted by rows, rows <= columns: the matrices are
         symmetric.
+    _batches, _sums
+        The batches of entities, and for each the matrix that adds its blocks up into entries.
     """
 
     def __init__(
@@ -73,7 +75,7 @@ class WaveHessians:
         log: KernelLog,
     ) -> None:
         """Sort energies into batches of points, and find the pairs of nodes that they couple."""
-        self._nodes = u.function_space.dofmap.list.astype(np.int64)
+        self._nodes = u.function_space.dofmap.list.astype(np.int64)  # (cells, functions)
         # energies on the same points, which share one batch
         energies_by_support = dict[tuple[int, int, tuple[int, ...]], list[Energy]]()
         for e in energies:
@@ -84,23 +86,21 @@ class WaveHessians:
             for batch in _batches(domain, energies_here[0].density)
         ]
         nodes = [batch.nodes(self._nodes) for batch in self._batches]
+        # a pair of nodes as one number, its code: rows * count + columns
         count = int(self._nodes.max()) + 1
-        # a pair of nodes as one number, rows * count + columns
-        pairs_of_batches = [rows * count + columns for rows, columns in nodes]
+        codes_of_batches = [rows * count + columns for rows, columns in nodes]
         # the matrices are symmetric: only rows <= columns are assembled
-        upper_numbers = [
-            pair_numbers[rows <= columns]
-            for pair_numbers, (rows, columns) in zip(pairs_of_batches, nodes, strict=True)
+        upper_of_batches = [rows <= columns for rows, columns in nodes]
+        upper_codes = [
+            codes[is_upper]
+            for codes, is_upper in zip(codes_of_batches, upper_of_batches, strict=True)
         ]
-        all_pair_numbers = np.unique(np.concatenate(upper_numbers))
-        self.rows, self.columns = all_pair_numbers // count, all_pair_numbers % count
+        all_codes = np.unique(np.concatenate(upper_codes))
+        self.rows, self.columns = all_codes // count, all_codes % count
+        # a pair's number is the position of its code
         self._sums = [
-            _sum_of_blocks(
-                np.searchsorted(all_pair_numbers, pair_numbers),
-                rows <= columns,
-                len(all_pair_numbers),
-            )
-            for pair_numbers, (rows, columns) in zip(pairs_of_batches, nodes, strict=True)
+            _sum_of_blocks(np.searchsorted(all_codes, codes), is_upper, len(all_codes))
+            for codes, is_upper in zip(codes_of_batches, upper_of_batches, strict=True)
         ]
 
     def entries(self, factors: Mapping[str | None, float], waves: Sequence[float]) -> Array:
@@ -139,6 +139,22 @@ class _WaveBatch:
         Energies that are all integrated there.
     log
         Log of compiled kernels.
+
+    Attributes
+    ----------
+    _at_u, _at_r0, _at_initial
+        Point fields: jets of the displacement, the placement and the initial placement, on all
+        sides.
+    _wave
+        Point field: the coefficients of the wave with their derivatives, on all sides.
+    _geometry
+        Point field: covector and length of the cell on each side.
+    _placed
+        Memo whose renewal fills in the jets of the placements.
+    _m
+        The wave number.
+    _given, _varying
+        For each energy: its parameters at points; the point fields among these, with their values.
     """
 
     def __init__(
@@ -212,16 +228,16 @@ class _WaveBatch:
                 upper[wave_index] += factor * self._points.evaluate(
                     self._kernels[number], self._batch.size
                 )
+        # (waves, entities, entries of all points of the entity)
         upper = (upper * self._scales).reshape(len(waves), len(self._batch.cells[0]), -1)
-        has_stiffness = upper.any(
-            axis=(0, 2)
-        )  # a body touches few cells: the matrices of others are zero
+        # a body touches few cells: the matrices of others are zero
+        has_stiffness = upper.any(axis=(0, 2))
         blocks = np.zeros((*upper.shape[:2], len(_UPPER), self._products.shape[1]))
-        # rows of Hessians (waves, entities) times products of shape functions at the points
-        ordered = upper[:, has_stiffness][..., self._order].reshape(-1, len(self._products))
-        blocks[:, has_stiffness] = (ordered @ self._products).reshape(
-            len(waves), -1, *blocks.shape[2:]
-        )
+        # one row for each wave, entity and pair of components; it is multiplied with the products
+        # of shape functions at the points
+        hessian_rows = upper[:, has_stiffness][..., self._order].reshape(-1, len(self._products))
+        matrices = hessian_rows @ self._products
+        blocks[:, has_stiffness] = matrices.reshape(len(waves), -1, *blocks.shape[2:])
         return blocks
 
     def _place(self) -> None:
@@ -249,13 +265,11 @@ class _WaveBatch:
             assert energy.density
             # `start` is the placement from which the energy counts, `shift` leads from there to r0
             if self._counts_from_initial(energy):
-                start, shift = (
-                    initial_jets,
-                    [a - b for a, b in zip(r0, initial_jets, strict=True)],
-                )
+                start = initial_jets
+                shift = [a - b for a, b in zip(r0, initial_jets, strict=True)]
+                displacements = [a + b for a, b in zip(u, shift, strict=True)]
             else:
-                start, shift = (r0, None)
-            displacements = [a + b for a, b in zip(u, shift, strict=True)] if shift else u
+                start, displacements = r0, u
             W = ufl.zero()
             for phase in range(2):  # the cosine's and the sine's
                 wave_jets = [side_jets[phase] for side_jets in jets_of_waves]
@@ -305,16 +319,15 @@ class _WaveBatch:
         the meridian.
         """
         nodal = field.x.array.reshape(-1, PLANE)[self._u.function_space.dofmap.list]
-        sides = [
-            np.tensordot(nodal[cells], table, axes=(1, 2)).transpose(0, 2, 3, 1)
-            * scale[:, None, :, None]
-            for cells, table, scale in zip(
-                self._batch.cells, self._reference, self._by_length, strict=True
-            )
-        ]
-        return np.stack(
-            [side_values.reshape(-1, DERIVATIVES, PLANE) for side_values in sides], axis=1
-        )
+        sides = list[Array]()
+        for cells, table, scale in zip(
+            self._batch.cells, self._reference, self._by_length, strict=True
+        ):
+            # sum over the functions, then (entities, points of an entity, derivatives, components)
+            values = np.tensordot(nodal[cells], table, axes=(1, 2)).transpose(0, 2, 3, 1)
+            values = values * scale[:, None, :, None]
+            sides.append(values.reshape(-1, DERIVATIVES, PLANE))
+        return np.stack(sides, axis=1)
 
     @cached_property
     def _reference(self) -> list[Array]:
@@ -350,14 +363,10 @@ class _WaveBatch:
         tables = np.zeros((points_per_entity, count, derivatives, count, functions))
         for side, table in enumerate(self._reference):
             tables[:, side, :, side] = table
-        tables_of_all_sides = tables.reshape(
-            points_per_entity, count * derivatives, count * functions
-        )
-        return np.asarray(
-            np.einsum("qin,qjm->qijnm", tables_of_all_sides, tables_of_all_sides).reshape(
-                points_per_entity * tables_of_all_sides.shape[1] ** 2, -1
-            )
-        )
+        all_derivatives = count * derivatives
+        all_tables = tables.reshape(points_per_entity, all_derivatives, count * functions)
+        products = np.einsum("qin,qjm->qijnm", all_tables, all_tables)
+        return np.asarray(products.reshape(points_per_entity * all_derivatives**2, -1))
 
     @cached_property
     def _order(self) -> Ints:
@@ -368,9 +377,11 @@ class _WaveBatch:
         the other.
         """
         derivatives = DERIVATIVES * len(self._sides)
+        # positions in the triangle of one point, by (derivative, component) of row and of column
         triangle = _triangle(WAVE * derivatives).reshape(derivatives, WAVE, derivatives, WAVE)
-        points = np.arange(len(self._batch.rule.weights)) * (triangle.max() + 1)
-        return np.stack([(triangle[:, c, :, d] + points[:, None, None]).ravel() for c, d in _UPPER])
+        # where the triangle of each point of an entity begins
+        starts = np.arange(len(self._batch.rule.weights)) * (triangle.max() + 1)
+        return np.stack([(triangle[:, c, :, d] + starts[:, None, None]).ravel() for c, d in _UPPER])
 
     @cached_property
     def _scales(self) -> Array:
@@ -384,6 +395,7 @@ class _WaveBatch:
         density = self._energies[0].density
         lengths = np.abs(_lengths(self._u.function_space)[cells])
         sizes = np.ones(len(cells)) if density and density.on_edges else lengths
+        # a factor for each entity and entry of a wave's jet, then for each entry of the Hessian
         jet_factors = np.repeat(np.hstack(self._by_length), WAVE, axis=1)
         rows, columns = np.triu_indices(jet_factors.shape[1])
         by_length = np.repeat(jet_factors[:, rows] * jet_factors[:, columns], len(weights), axis=0)
@@ -430,16 +442,18 @@ def _sum_of_blocks(numbers: Ints, in_triangle: NDArray[np.bool_], count: int) ->
     count
         Number of all pairs.
     """
+    # positions of the blocks' entries: (entities, pairs of components, functions, functions)
     entries = np.arange(numbers.size * len(_UPPER)).reshape(
         len(numbers), len(_UPPER), *numbers.shape[1:]
     )
+    first_row = 9 * numbers[in_triangle]  # of the nine entries of a pair of nodes
     rows, columns = list[Ints](), list[Ints]()
     for k, (c, d) in enumerate(_UPPER):
-        rows.append(9 * numbers[in_triangle] + WAVE * c + d)
+        rows.append(first_row + WAVE * c + d)
         columns.append(entries[:, k][in_triangle])
         # the transposed pair of components follows by symmetry
         if c < d:
-            rows.append(9 * numbers[in_triangle] + WAVE * d + c)
+            rows.append(first_row + WAVE * d + c)
             columns.append(entries[:, k].transpose(0, 2, 1)[in_triangle])
     positions = np.concatenate(rows), np.concatenate(columns)
     return coo_array((np.ones(len(positions[0])), positions), (9 * count, entries.size)).tocsr()
@@ -475,33 +489,38 @@ def _batches(domain: IntegrationDomain, density: Density | None) -> Iterable[Ent
             (all_cells,), EntityRule((X,), (), weights), np.zeros((len(all_cells) * len(X), 2))
         )
         return
+    cells_at_vertex, local_vertices = _cells_at_vertices(topology, density.facets)
+    for local_numbers in np.unique(local_vertices, axis=0):
+        is_of_kind = (local_vertices == local_numbers).all(axis=1)
+        # the cells on each side; the vertex is their end with the number 0 or 1
+        cells = tuple(np.ascontiguousarray(side) for side in cells_at_vertex[is_of_kind].T)
+        geometry = list[Array]()
+        for side, end in zip(cells, local_numbers, strict=True):
+            outward = np.sign(lengths[side]) * (1 if end else -1)
+            geometry.append(np.column_stack([outward, abs(lengths[side])]))
+        rule = EntityRule(tuple(np.array([[float(end)]]) for end in local_numbers), (), np.ones(1))
+        yield EntityBatch(cells, rule, np.hstack(geometry))
+
+
+def _cells_at_vertices(
+    topology: mesh.Topology, facets: NDArray[np.int32] | None
+) -> tuple[NDArray[np.int32], Ints]:
+    """Return the cells at vertices, and the local number of the vertex in each of these cells.
+
+    Both are (vertices, sides). The vertices are the given ends `facets`, with one side; for None
+    they are all vertices between two cells.
+    """
     topology.create_connectivity(0, 1)
-    cells_of_vertices, vertices_of_cells = (
-        topology.connectivity(0, 1),
-        topology.connectivity(1, 0).array.reshape(-1, 2),
-    )
-    # vertices between two cells, unless the density is on given ends
+    cells_of_vertices = topology.connectivity(0, 1)
+    vertices_of_cells = topology.connectivity(1, 0).array.reshape(-1, 2)
     vertices: NDArray[np.integer] = np.flatnonzero(np.diff(cells_of_vertices.offsets) == 2)
-    if density.facets is not None:
-        vertices = density.facets
+    if facets is not None:
+        vertices = facets
     cells_at_vertex = np.array(
         [cells_of_vertices.links(vertex) for vertex in vertices], dtype=np.int32
     ).reshape(len(vertices), -1)
-    local_vertices = (
-        vertices_of_cells[cells_at_vertex] != np.asarray(vertices)[:, None, None]
-    ).argmin(axis=2)  # the vertex's number in each cell
-    for local_numbers in np.unique(local_vertices, axis=0):
-        is_of_kind = (local_vertices == local_numbers).all(axis=1)
-        cells = tuple(np.ascontiguousarray(side) for side in cells_at_vertex[is_of_kind].T)
-        outward = [
-            np.sign(lengths[side]) * (1 if end else -1)
-            for side, end in zip(cells, local_numbers, strict=True)
-        ]
-        geometry = [
-            np.column_stack([m, abs(lengths[side])]) for m, side in zip(outward, cells, strict=True)
-        ]
-        rule = EntityRule(tuple(np.array([[float(end)]]) for end in local_numbers), (), np.ones(1))
-        yield EntityBatch(cells, rule, np.hstack(geometry))
+    is_other = vertices_of_cells[cells_at_vertex] != np.asarray(vertices)[:, None, None]
+    return cells_at_vertex, is_other.argmin(axis=2)
 
 
 def _lengths(V: fem.FunctionSpace) -> Array:

@@ -89,15 +89,15 @@ class SubCells:
 
     def divided(self) -> "SubCells":
         """Return the children of all parts: first all of the first part, and so on."""
-        children = CHILDREN[self.corner.shape[1]]
-        corners, scales = (np.array(v, dtype=float) for v in zip(*children, strict=True))
         d = self.corner.shape[1]
-        corner = self.corner[:, None] + self.sides[:, None] * corners
-        return SubCells(
-            np.repeat(self.cell, len(children)),
-            corner.reshape(-1, d),
-            (self.sides[:, None] * scales).reshape(-1, d),
-        )
+        children = CHILDREN[d]
+        # of the children of the reference cell, (children, d) each
+        corners, scales = (np.array(v, dtype=float) for v in zip(*children, strict=True))
+        # of the children of all parts, (parts, children, d) each
+        new_corners = self.corner[:, None] + self.sides[:, None] * corners
+        new_sides = self.sides[:, None] * scales
+        numbers = np.repeat(self.cell, len(children))
+        return SubCells(numbers, new_corners.reshape(-1, d), new_sides.reshape(-1, d))
 
     def rule(self, points: Array, weights: Array) -> tuple[Array, Array]:
         """Return points (parts, q, d) and weights (parts, q) of a quadrature rule on each part.
@@ -138,16 +138,19 @@ class Lattice:
     def make(cls, kind: basix.CellType, count: int) -> "Lattice":
         """Return the lattice that divides each side of the reference cell into `count` parts."""
         corners = basix.geometry(kind)
-        interior = basix.create_lattice(kind, count, basix.LatticeType.equispaced, exterior=True)
-        X = np.concatenate([corners, interior])
-        # neighbours are places of the lattice proper, after the corners, one step apart
-        differences = X[None, len(corners) :] - X[len(corners) :, None]
-        steps = np.eye(X.shape[1]) / count
+        # the boundary is included, so that the corners occur twice among all places
+        lattice_places = basix.create_lattice(
+            kind, count, basix.LatticeType.equispaced, exterior=True
+        )
+        # along each axis, neighbours are places of the lattice that differ by one step
+        differences = lattice_places[None] - lattice_places[:, None]
+        steps = np.eye(corners.shape[1]) / count
+        # they are counted among all places, where the corners come first
         pairs = [
             np.argwhere(np.abs(differences - step).max(axis=-1) < 1e-9) + len(corners)
             for step in steps
         ]
-        return cls(X, len(corners), pairs, count)
+        return cls(np.concatenate([corners, lattice_places]), len(corners), pairs, count)
 
     def bent(self, f: Array) -> Array:
         """Return how much the slopes of f differ within each part: (parts, formulas).
@@ -305,19 +308,21 @@ def _sample(
     """
     x, area = places_of(parts)
     low, high = x.min(axis=1), x.max(axis=1)
-    off_centre = np.abs(x.mean(axis=1) - x[:, : lattice.corners].mean(axis=1))
     # in a flat part the means of all places and of the corners agree
+    off_centre = np.abs(x.mean(axis=1) - x[:, : lattice.corners].mean(axis=1))
     bulge = off_centre.max(axis=1, initial=0.0)[:, None]
     bulge = np.where(bulge > VALUE_TOLERANCE, bulge, 0.0)
-    # ranges of values, and the range of slopes times the box's sides
-    lower, upper, bent = formulas.bounds(low - bulge, high + bulge)
+    # (parts, formulas) each: least and largest value in the box, and the range of slopes times the
+    # box's sides
+    lower, upper, slope_range = formulas.bounds(low - bulge, high + bulge)
     values = formulas.values(x.reshape(-1, 3))
     f = values.reshape(*x.shape[:2], values.shape[1])  # a rank may have no parts
     f = np.where(np.isfinite(f), f, 0.0)
     upper, lower = (np.clip(v, -MAX_VALUE, MAX_VALUE) for v in (upper, lower))
-    # ranges beyond most of the values' range, but not more than slopes allow between places
-    hidden = np.minimum(
-        np.maximum(upper - lower - STEP_SHARE * np.ptp(f, axis=1), 0.0), bent / lattice.count
-    )
-    hidden = np.where(bent <= SLOPE_RATIO * lattice.bent(f), 0.0, hidden).sum(axis=1)
+    # the range beyond most of the samples' range, but not more than slopes allow between places
+    beyond_samples = np.maximum(upper - lower - STEP_SHARE * np.ptp(f, axis=1), 0.0)
+    hidden = np.minimum(beyond_samples, slope_range / lattice.count)
+    # nothing is hidden if slopes vary about as much as the samples show
+    is_shown = slope_range <= SLOPE_RATIO * lattice.bent(f)
+    hidden = np.where(is_shown, 0.0, hidden).sum(axis=1)
     return _Samples(area, x.mean(axis=1), (high - low).max(axis=1), hidden, f)

@@ -63,9 +63,9 @@ def antisymmetric_edge(  # noqa: PLR0913 - the arguments of a density with an ad
         return -ufl.dot(mirrored(kin.normal(outer)) - kin.normal(inner), r_nu)
 
     sides = (u + v, u - v)
-    J = jump(r0 + sides[0], r0 + sides[1]) - (natural.kink(nu1, nu2) if natural else 1) * jump(
-        r0, r0
-    )
+    # a natural shape has another kink at the edge than r0
+    deformed_jump = jump(r0 + sides[0], r0 + sides[1])
+    J = deformed_jump - (natural.kink(nu1, nu2) if natural else 1) * jump(r0, r0)
     # moments across the edge and penalty stiffnesses on both sides
     (first_moment, stiffness), (second_moment, _) = (
         densities.normal_moment(r0, side, nu1, nu2, law, natural) for side in sides

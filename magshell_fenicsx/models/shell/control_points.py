@@ -57,12 +57,14 @@ class ControlPoints:
         tree, count = scipy.spatial.cKDTree(self.places), len(self.places)
         neighbour_count = min(FIRST_NEIGHBOURS, count)
         while True:
+            # distances and numbers (m, neighbours) of the points, the nearest first
             distance, number = (
                 v.reshape(len(places), neighbour_count) for v in tree.query(places, neighbour_count)
             )
             # relative to the nearest point, so that weights do not underflow far away
             w = np.exp((distance[:, :1] ** 2 - distance**2) / self.width**2)
-            if neighbour_count == count or w[:, -1].max(initial=0.0) < MIN_RELATIVE_WEIGHT:
+            largest_last_weight = w[:, -1].max(initial=0.0)
+            if neighbour_count == count or largest_last_weight < MIN_RELATIVE_WEIGHT:
                 break
             neighbour_count = min(2 * neighbour_count, count)
         w /= w.sum(axis=1, keepdims=True)

@@ -152,6 +152,8 @@ def fold(
     sine, cosine = fold_angle(r0[0] + u[0], r0[1] + u[1], m[0])
     stretch_across = 1
     if natural:
+        # means over both sides: the natural stretch across the fold, and the ratio by which the
+        # natural shape changes the undeformed angle
         nus = [kin.conormal(j, covector)[:2] for j, covector in zip(r0, m, strict=True)]
         stretch_across = (
             sum(ufl.sqrt(shape.along(*nu)) for shape, nu in zip(natural, nus, strict=True)) / 2
@@ -199,9 +201,8 @@ def clamped(
     """
     nu1, nu2, stretch = kin.conormal(r0, m)
     r, n0 = r0 + u, kin.normal(r0)
-    J = -ufl.dot(
-        (n0 if turn is None else ufl.dot(turn, n0)) - kin.normal(r), r.r1 * nu1 + r.r2 * nu2
-    )
+    held_normal = n0 if turn is None else ufl.dot(turn, n0)
+    J = -ufl.dot(held_normal - kin.normal(r), r.r1 * nu1 + r.r2 * nu2)
     M, D = densities.normal_moment(r0, u, nu1, nu2, law, natural)
     return edge_density(M, D, J, width, sigma) * stretch
 
@@ -241,7 +242,7 @@ def largest_fold(r0: fem.Function, degree: int) -> float:
     V = r0.function_space
     nodes, largest = r0.x.array.reshape(-1, 3), 0.0
     for batch in interior_batches(V, degree):
-        normals = []
+        normals = []  # (edges, points, 3) on each side
         for table, cells in zip(batch.rule.tables, batch.cells, strict=True):
             jets = table.jets(nodes[V.dofmap.list[cells]])
             m = np.cross(jets[:, :, 1], jets[:, :, 2])

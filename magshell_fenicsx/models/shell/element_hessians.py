@@ -75,6 +75,17 @@ class HessianIntegral:
     ----------
     coupling
         The batches of interior edges, which couple two cells; else empty.
+    _u, _r0, _geometry
+        Point fields of one batch at a time: the jets of u and of r0 on all sides; the covector of
+        each side, then the width of the edge.
+    _placements
+        The jets of r0 at the points of each batch.
+    _kernels, _prestress
+        Kernels of the terms by name, and that of the additional stress.
+    _replaced
+        Whether `replace_strain` has been called for the next `add`.
+    _coupled, _contractions
+        Pairs of jet parts that any term couples, and their contraction for each quadrature rule.
     """
 
     def __init__(
@@ -91,7 +102,6 @@ class HessianIntegral:
         self.batches, self._dofs, self._sides = batches, V.dofmap.list, sides
         self._points = PointStorage(max([1, *(batch.size for batch in batches)]))
         self._u, self._r0 = (self._points.field(3 * JET_SIZE * sides) for _ in range(2))
-        # a covector (2,) for each side, and the width of an edge
         self._geometry = self._points.field(2 * sides + 1)
         self._placements = Memo(
             lambda: [self._jets(batch, r0.x.array) for batch in batches], lambda: (r0.x.array,)
@@ -152,15 +162,18 @@ class HessianIntegral:
         for kernel, _ in kernels:
             kernel.renew()
         for number, batch in enumerate(self.batches):
+            # the kernels' inputs at the points of the batch
             fill(self._u, self._jets(batch, u))
             fill(self._r0, placements[number])
             fill(self._geometry, np.repeat(batch.geometry, len(batch.rule.weights), axis=0))
-            contraction = self._contractions[batch.rule]
+            # the weighted sum of all terms' Hessians
             blocks = HessianBlocks(batch, self._coupled)
             for kernel, factor in kernels:
                 blocks.add(kernel.evaluate(number), factor, kernel.pairs)
             if self._replaced and self._prestress:
                 blocks.add(self._prestress.evaluate(number), 1.0, self._prestress.pairs)
+            # element matrices from these, within the cells on each side and between them
+            contraction = self._contractions[batch.rule]
             for side, cells in enumerate(batch.cells):
                 element_matrices[cells] += contraction.within_side(blocks, side)
             if self._sides == 2:
@@ -191,9 +204,8 @@ class HessianIntegral:
         """
         if self._prestress is None:
             return
-        for number, (batch, r0) in enumerate(
-            zip(self.batches, self._placements.renew(), strict=True)
-        ):
+        placements = self._placements.renew()
+        for number, (batch, r0) in enumerate(zip(self.batches, placements, strict=True)):
             # the weighted sum, less the strain of u
             strains = [
                 w * _strain(r0, self._jets(batch, v))
@@ -201,7 +213,8 @@ class HessianIntegral:
             ]
             strain = np.sum(strains, axis=0)
             if excepted_cells is not None:
-                strain[np.repeat(excepted_cells[batch.cells[0]], len(batch.rule.weights))] = 0.0
+                cells, points_per_cell = batch.cells[0], len(batch.rule.weights)
+                strain[np.repeat(excepted_cells[cells], points_per_cell)] = 0.0
             self._prestress.vary(number, strain)
         self._prestress.renew()
         self._replaced = True
@@ -232,6 +245,15 @@ class Kernel:
     of_v
         True for a density of u and v, whose Hessian by v at v = 0 is taken; False for a density of
         u, whose Hessian by u is taken.
+
+    Attributes
+    ----------
+    pairs
+        Pairs of jet parts for which the Hessian has a block that is not zero.
+    _parameters
+        The density's parameters at points.
+    _varying
+        Pairs of a point field among these and its values on each batch.
     """
 
     def __init__(
@@ -269,14 +291,12 @@ class Kernel:
         self.pairs = _pairs(density)
         # z is what the density is differentiated by: v, or the jets of u
         z = self._points.field(3 * JET_SIZE) if of_v else u
-        jets = [
-            [_jet(field, side) for side in range(sides)]
-            for field in ((r0, u, z) if of_v else (r0, u))
-        ]
+        arguments = (r0, u, z) if of_v else (r0, u)
+        jets = [[_jet(field, side) for side in range(sides)] for field in arguments]
+        # on edges: the covector on each side, and the width
         m = [ufl.as_vector([geometry[2 * side], geometry[2 * side + 1]]) for side in range(sides)]
-        W = density.value_at(
-            jets, (m, geometry[2 * sides]) if density.on_edges else None, self._parameters
-        )
+        edge = (m, geometry[2 * sides]) if density.on_edges else None
+        W = density.value_at(jets, edge, self._parameters)
         # W is then a virtual work w(u, v), linear in v. Half of its derivative by u along v is
         # quadratic in v, and has the symmetric part of that derivative as its Hessian.
         if density.work:

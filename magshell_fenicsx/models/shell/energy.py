@@ -107,16 +107,18 @@ class Density:
             Values of the parameters. With two sides, a field that varies holds the values of both,
             one after the other.
         """
-        # the order of `function`: jets, covectors, width, parameters; of one side without a tuple
-        arguments = [*jets, *(edge[:1] if edge else ())]
+        # jets and covectors: a pair of both sides, or the value of the only side
+        covectors = edge[:1] if edge else ()
         sided = [
-            tuple(side_values) if self.sides == 2 else side_values[0] for side_values in arguments
+            tuple(side_values) if self.sides == 2 else side_values[0]
+            for side_values in (*jets, *covectors)
         ]
+        width = edge[1:] if edge else ()
         fields = [
             _halves(p) if self.sides == 2 and isinstance(p, fem.Function) else p for p in parameters
         ]
         density = self.work if self.work and len(jets) == 3 else self.function
-        return density(*sided, *(edge[1:] if edge else ()), *fields)
+        return density(*sided, *width, *fields)
 
 
 def _halves(field: fem.Function) -> tuple[Expr, Expr]:

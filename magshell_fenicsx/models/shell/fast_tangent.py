@@ -89,6 +89,15 @@ class FastTangent:
     moving
         A pair: flags (local cells,) of cells with moving nodes, and integrals of the terms on these
         cells and their edges alone. None without moving nodes.
+
+    Attributes
+    ----------
+    _moving, _moving_integrals
+        Both parts of `moving`; None and empty without moving nodes.
+    _matrix
+        The matrix, to which element matrices are added.
+    _element_matrices
+        (cells, 9, pairs a <= b of functions) the sum of all integrals, stored for the next call.
     """
 
     def __init__(
@@ -144,6 +153,7 @@ class FastTangent:
         product, x = np.zeros((len(v) // 3, 3)), v.reshape(-1, 3)
         element_matrices = np.zeros(self._element_matrices.shape)
         for integral in self._moving_integrals:
+            # products of coupled cells are added at once, those within cells after the loop
 
             def couple(batch: int, K: Array, integral: ElementIntegral = integral) -> None:
                 """Add the products of matrices K that couple the two cells at each edge."""
@@ -151,9 +161,8 @@ class FastTangent:
                 add_coupling_products(product, K, first, second, x)
 
             integral.add(self._u.x.array, factors, element_matrices, couple)
-        add_cell_products(
-            product, element_matrices[self._moving], self._nodes[self._moving], x
-        )  # others have no node that moves
+        # other cells have no node that moves
+        add_cell_products(product, element_matrices[self._moving], self._nodes[self._moving], x)
         return product.ravel()
 
     def _couple(self, first: int, batch: int, K: Array) -> None:
@@ -199,18 +208,16 @@ def hessian_integrals(
     cells = [t for t in nonlinear if t.density.facets is None and t.density.sides == 1]
     interior = [t for t in nonlinear if t.density.sides == 2]
     integrals = []
+    # cells: one integral for each quadrature, None for the usual one
     for rule in dict.fromkeys(t.density.quadrature for t in cells):
         terms_of_rule = [t for t in cells if t.density.quadrature == rule]
         batches = cell_batches(V, rule or cell_quadrature(degree), cell_mask)
-        integrals.append(
-            HessianIntegral(r0, batches, 1, terms_of_rule, log, None if rule else prestress)
-        )
+        prestress_of_rule = None if rule else prestress
+        integrals.append(HessianIntegral(r0, batches, 1, terms_of_rule, log, prestress_of_rule))
     if interior:
-        integrals.append(
-            HessianIntegral(
-                r0, interior_batches(V, edge_quadrature(degree), cell_mask), 2, interior, log
-            )
-        )
+        batches = interior_batches(V, edge_quadrature(degree), cell_mask)
+        integrals.append(HessianIntegral(r0, batches, 2, interior, log))
+    # boundary edges: one integral for each term
     for term in nonlinear:
         if term.density.facets is not None:
             batches = boundary_batches(V, edge_quadrature(degree), term.density.facets, cell_mask)

@@ -101,20 +101,21 @@ class CellGeometry:
             Numbers of the cells; by default all.
         """
         nodal, d = self.nodal[cells], self.dimension
+        # values and first derivatives of the shape functions, then of the place
         table = self.element.tabulate(1, X.reshape(-1, d))[..., 0]
         table = table.reshape(1 + d, *X.shape[:-1], nodal.shape[1])
         x, *slopes = (np.matmul(derivative_table, nodal) for derivative_table in table)
-        if d == 1:
-            if x.shape[-1] == 3:  # an edge
-                return x, np.zeros_like(x), np.linalg.norm(slopes[0], axis=-1)
+        if d == 1 and x.shape[-1] == 3:  # an edge in space
+            return x, np.zeros_like(x), np.linalg.norm(slopes[0], axis=-1)
+        if d == 1:  # a meridian
             (rho, z), (rho_s, z_s) = np.moveaxis(x, -1, 0), np.moveaxis(slopes[0], -1, 0)
             length = np.hypot(rho_s, z_s)
             normals = np.stack([-z_s, 0 * z_s, rho_s], axis=-1) / length[..., None]
             return np.stack([rho, 0 * rho, z], axis=-1), normals, rho * length
         # a surface, or the surfaces across the third axis of a body's cells
         m = np.cross(slopes[0], slopes[1])
-        size = np.linalg.norm(m, axis=-1)
-        return x, m / size[..., None], size
+        area = np.linalg.norm(m, axis=-1)
+        return x, m / area[..., None], area
 
     def sum_over_ranks(self, of_cells: Array) -> Array:
         """Return the sum of values (cells, ...) over the owned cells of all ranks; collective."""
@@ -318,6 +319,7 @@ class _HiddenDetail:
             return uniform_parts.in_each_cell(cells)
         parts = self.parts[np.isin(self.parts.cell, cells)]
         largest = 1.001 * np.abs(uniform_parts.sides[0, 0])  # with a margin for rounding
+        # in each pass small parts are set aside, and the others are divided
         small_parts, too_wide = list[SubCells](), np.abs(parts.sides[:, 0]) > largest
         while too_wide.any():
             small_parts.append(parts[~too_wide])
@@ -353,15 +355,16 @@ def _find_hidden_detail(
     refined = refine_where_hidden(
         formulas, whole_cells, places_of, lattice, cells.owned, cells.comm
     )
-    is_divided = np.zeros(len(cells.nodal), bool)
-    is_smaller = np.abs(refined.parts.sides[:, 0]) < 1  # a part that is not the whole cell
-    is_divided[refined.parts.cell[is_smaller]] = True
-    integrals = np.where(is_divided[:, None], 0.0, sampled_integrals)
+    # a divided cell has parts that are smaller than the whole cell
+    is_smaller = np.abs(refined.parts.sides[:, 0]) < 1
     parts = refined.parts[is_smaller]
+    is_divided = np.zeros(len(cells.nodal), bool)
+    is_divided[parts.cell] = True
+    # integrals over divided cells are sums over their parts, others are those of the samples
+    integrals = np.where(is_divided[:, None], 0.0, sampled_integrals)
     for batch in parts.batches():
         X, w = batch.rule(points, weights)
         x, normals, _ = cells.evaluate(X, batch.cell)
-        # integrals over divided cells are sums over their parts
         np.add.at(integrals, batch.cell, np.einsum("pq,pqi->pi", w, values(x, normals)))
     differences = np.linalg.norm(integrals - sampled_integrals, axis=1)
     if not cells.sum_over_ranks(differences) > 0:
@@ -495,14 +498,13 @@ def _bounded(at_nodes: Array, mean: Array, inner_values: Array, f: Array) -> Arr
     """
     low, high = f.min(axis=1, keepdims=True), f.max(axis=1, keepdims=True)
     all_values = np.concatenate([at_nodes, inner_values], axis=1)
+    smallest = all_values.min(axis=1, keepdims=True)
+    largest = all_values.max(axis=1, keepdims=True)
     contraction = np.ones_like(mean)
-    for limit, extreme in (
-        (low, all_values.min(axis=1, keepdims=True)),
-        (high, all_values.max(axis=1, keepdims=True)),
-    ):
-        excess = extreme - mean
-        contraction = np.minimum(
-            contraction,
-            np.where(np.abs(excess) > 0, (limit - mean) / np.where(excess == 0, 1.0, excess), 1.0),
-        )
+    for limit, extreme in ((low, smallest), (high, largest)):
+        # the factor that takes the extreme value to its limit; 1 for a constant polynomial
+        deviation = extreme - mean
+        divisor = np.where(deviation == 0, 1.0, deviation)
+        factor = np.where(np.abs(deviation) > 0, (limit - mean) / divisor, 1.0)
+        contraction = np.minimum(contraction, factor)
     return np.asarray(mean + np.clip(contraction, 0.0, 1.0) * (at_nodes - mean))

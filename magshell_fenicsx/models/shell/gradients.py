@@ -80,6 +80,19 @@ class PointGradient:
         Function from a field that a density depends on to its values (points, components).
     log
         Log of compiled kernels.
+
+    Attributes
+    ----------
+    _size
+        Number of components of jets on all sides.
+    _u, _v
+        Point fields of the jets of u and v.
+    _inputs
+        What else is filled in for each chunk: placement, geometry, fields of the densities.
+    _W, _work
+        The energy of each term, and the virtual works of loads without potential.
+    _conservative
+        The energies of terms that have no virtual work.
     """
 
     def __init__(
@@ -97,6 +110,7 @@ class PointGradient:
         self._size = terms[0].density.sides * len(parts) * 3
         chunk = max(CHUNK_POINTS // points_per_entity, 1) * points_per_entity
         self._chunks = [slice(first, min(first + chunk, count)) for first in range(0, count, chunk)]
+        # point fields for the points of one chunk
         points = self._points = PointStorage(max(min(count, chunk), 1))
         self._u, placement, point_geometry = (
             points.field(size) for size in (self._size, self._size, geometry.shape[1])
@@ -106,26 +120,17 @@ class PointGradient:
             _KernelInput(point_geometry, Memo(lambda: geometry, tuple)),
         ]
         self._names, self._log = [term.name for term in terms], log
-        # the energy of each term, and virtual works of loads without potential
         self._W, self._work, self._v = list[Expr](), list[Expr](), points.field(self._size)
         for term in terms:
             parameters, varying = parameters_at(points, term.density.parameters, term.density.sides)
             self._inputs += [
                 _KernelInput(target, _field_values(field, values)) for target, field in varying
             ]
-            self._W.append(
-                _energy(term.density, [placement, self._u], point_geometry, parts, parameters)
-            )
-            if term.density.work:
-                self._work.append(
-                    _energy(
-                        term.density,
-                        [placement, self._u, self._v],
-                        point_geometry,
-                        parts,
-                        parameters,
-                    )
-                )
+            fields = [placement, self._u]
+            self._W.append(_energy(term.density, fields, point_geometry, parts, parameters))
+            if term.density.work:  # with a third field its virtual work is returned
+                fields = [placement, self._u, self._v]
+                self._work.append(_energy(term.density, fields, point_geometry, parts, parameters))
         self._conservative = [
             W for W, term in zip(self._W, terms, strict=True) if not term.density.work
         ]
@@ -263,14 +268,13 @@ def _energy(
     if not density.on_edges:
         *_, determinant = frames[0]
         return determinant * density.value_at([r0_jets, *displacement_jets], None, parameters)
-    first = FRAME_SIZE * density.sides
+    first = FRAME_SIZE * density.sides  # the covectors follow the frames
     m = [
         ufl.as_vector([point_geometry[first + 2 * side], point_geometry[first + 2 * side + 1]])
         for side in sides
     ]
-    return density.value_at(
-        [r0_jets, *displacement_jets], (m, point_geometry[first + 2 * density.sides]), parameters
-    )
+    width = point_geometry[first + 2 * density.sides]
+    return density.value_at([r0_jets, *displacement_jets], (m, width), parameters)
 
 
 def _jet(field: fem.Function, side: int, parts: Sequence[str]) -> Jet:

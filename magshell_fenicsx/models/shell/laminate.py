@@ -69,11 +69,11 @@ class Laminate:
         if self.direction is None or self.isotropic:
             return
         unit = self.axes @ self.direction / np.linalg.norm(self.direction)
+        # length of the direction's part in the surface, at each node of each cell
         in_surface = np.linalg.norm(np.cross(normals, unit), axis=-1)
-        if (
-            comm.allreduce(float(in_surface.max(axis=1).min(initial=1.0)), MPI.MIN)
-            < DIRECTION_TOLERANCE
-        ):
+        # the least one of all cells, each by its largest
+        least = comm.allreduce(float(in_surface.max(axis=1).min(initial=1.0)), MPI.MIN)
+        if least < DIRECTION_TOLERANCE:
             raise MeshError(
                 "shell.laminate.along: is normal to a part of the shell, where the angle 0 has no "
                 "direction"
@@ -129,6 +129,7 @@ class Laminated(Law):
         """
         A, B, D = (tuple(float(v) for v in S) for S in laminate.matrices)
         direction, meridian = laminate.direction, laminate.direction is None
+        # meridians are those about the shell's e3
         axis_in_model = laminate.axes @ (np.eye(3)[2] if direction is None else direction)
         axis, origin = (tuple(float(c) for c in v) for v in (axis_in_model, laminate.origin))
         return cls(h, nu, A=A, B=B, D=D, axis=axis, origin=origin, meridian=meridian)
@@ -158,10 +159,11 @@ class Laminated(Law):
             """Return the scalar product of a vector (3,) with vectors (..., 3)."""
             return v[0] * a[..., 0] + v[1] * a[..., 1] + v[2] * a[..., 2]
 
+        # t is the axis itself
         component_1, component_2 = (dot(self.axis, a) for a in (a1, a2))
-        # t = (axis x x) x n is along the meridian, with the place x from a point on the axis: then
-        # t . a = (axis . n) (x . a) - (x . n) (axis . a)
         if self.meridian:
+            # t = (axis x x) x n is along the meridian, with the place x from a point on the axis:
+            # then t . a = (axis . n) (x . a) - (x . n) (axis . a)
             x = [r[..., i] - self.origin[i] for i in range(3)]
             component_1, component_2 = (
                 dot(self.axis, n) * dot(x, a) - dot(x, n) * component
@@ -239,8 +241,8 @@ class Laminated(Law):
         bending_part = _stress(self.D, frame.strain_components(K))
         stretching_part = _stress(self.B, frame.strain_components(E))
         M1, M2, M6 = (
-            self._bending_factor * d - self._coupling_factor * b
-            for d, b in zip(bending_part, stretching_part, strict=True)
+            self._bending_factor * bent - self._coupling_factor * stretched
+            for bent, stretched in zip(bending_part, stretching_part, strict=True)
         )
         return M1, M2, M6
 

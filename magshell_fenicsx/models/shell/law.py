@@ -411,9 +411,9 @@ def lower_index(covector_up: tuple[Scalar, Scalar], up: Tensor) -> tuple[Scalar,
     """
     a11, a12, a22 = up[..., 0, 0], up[..., 0, 1], up[..., 1, 1]
     det = a11 * a22 - a12**2
-    return (a22 * covector_up[0] - a12 * covector_up[1]) / det, (
-        a11 * covector_up[1] - a12 * covector_up[0]
-    ) / det
+    first = (a22 * covector_up[0] - a12 * covector_up[1]) / det
+    second = (a11 * covector_up[1] - a12 * covector_up[0]) / det
+    return first, second
 
 
 def work(S: Components, T: Tensor) -> Scalar:
@@ -455,23 +455,23 @@ def elastic_density(
         The arguments are first the density's own, then the numbers of the law, then thickness and
         materials if there are such fields.
         """
-        # taken off from the end
+        # taken off from the end: the materials on all sides, then the thickness
         arguments_left, factors, materials = list(arguments), [1] * density.sides, None
         if cell_materials is not None:
             materials = by_side(arguments_left.pop())
         if thickness is not None:
             factors = [factor[0] for factor in by_side(arguments_left.pop())]
         count = len(arguments_left) - len(law.numbers)
-        laws = [law.with_numbers(*arguments_left[count:]).thicker(factor) for factor in factors]
+        own_arguments, numbers = arguments_left[:count], arguments_left[count:]
+        laws = [law.with_numbers(*numbers).thicker(factor) for factor in factors]  # on each side
         if materials is not None:
             # components 0, 1 and 3 are modulus, nu and number of the law; the density is not used
             laws = [
-                side_law.with_material(numbers[0], numbers[1], numbers[3])
-                for side_law, numbers in zip(laws, materials, strict=True)
+                side_law.with_material(material[0], material[1], material[3])
+                for side_law, material in zip(laws, materials, strict=True)
             ]
-        return density.function(
-            *arguments_left[:count], law=tuple(laws) if density.sides == 2 else laws[0], **keywords
-        )
+        law_argument = tuple(laws) if density.sides == 2 else laws[0]
+        return density.function(*own_arguments, law=law_argument, **keywords)
 
     fields = (field for field in (thickness, cell_materials) if field is not None)
     parameters = (*density.parameters, *law.numbers, *fields)

@@ -78,7 +78,8 @@ class Ogden(Incompressible):
         """
         surface, total = Stretched(E, up), 0.0
         for mu, alpha in self.terms:
-            z, (V, _, _) = surface.d ** (alpha / 4), _chebyshev(alpha / 2, _uneven(surface))
+            z = surface.d ** (alpha / 4)
+            V, _, _ = _chebyshev(alpha / 2, _uneven(surface))
             # 2 z (1 + V) + 1/z² - 3, rearranged
             total = total + mu / alpha * ((z - 1) ** 2 * (2 * z + 1) / z**2 + 2 * z * V)
         return self.modulus_factor * self.thickness_factor * total
@@ -105,11 +106,14 @@ class Ogden(Incompressible):
         derivatives of the energy of stretching by t and d, as derived in docs/theory.md, Rubber.
         """
         w, softening = _uneven(surface), self.softening
-        y, square_factor, mixed_factor, trace_factor, equibiaxial = 1 + w, 0.0, 0.0, 0.0, 0.0
+        y = 1 + w
+        # sums over the terms; `equibiaxial` is the stiffness to bending in all directions
+        square_factor, mixed_factor, trace_factor, equibiaxial = 0.0, 0.0, 0.0, 0.0
         for mu, alpha in self.terms:
             a = alpha / 2
             V, V1, V2 = _chebyshev(a, w)
             z, m = surface.d ** (a / 2), mu / alpha
+            # first derivative by d and second one by d and t, but for factors
             by_d, by_both = a * (1 + V) - y * V1, (a - 1) * V1 - y * V2
             trace_factor = trace_factor + 2 * m * z * V2
             mixed_factor = mixed_factor + m * z * (4 * by_both + 2 * softening * V1)
@@ -149,25 +153,21 @@ def _chebyshev(a: float, w: Scalar) -> tuple[Scalar, Scalar, Scalar]:
     A power series is used for w below `SERIES_LIMIT`; if a is a small integer it ends, and holds
     for all w. Otherwise V follows from p = exp(a u).
     """
+    # the differential equation of V gives each coefficient from the one before
     coefficients = [0.0, a**2]
     for k in range(1, SERIES_TERMS):
-        # the differential equation of V gives each coefficient from the one before
         coefficients.append(coefficients[-1] * (a**2 - k**2) / ((2 * k + 1) * (k + 1)))
-    series = [
-        _horner(
-            [
-                float(coefficient)
-                for coefficient in np.polynomial.polynomial.polyder(coefficients, n)
-            ],
-            w,
-        )
-        for n in range(3)
-    ]
+    # V and its derivatives by the series
+    series = list[Scalar]()
+    for n in range(3):
+        derivative = np.polynomial.polynomial.polyder(coefficients, n)
+        series.append(_horner([float(coefficient) for coefficient in derivative], w))
     if a == int(a) and abs(a) <= SERIES_TERMS:  # a polynomial
         return series[0], series[1], series[2]
     in_series = ufl.lt(w, SERIES_LIMIT) if isinstance(w, Expr) else np.real(w) < SERIES_LIMIT
     # in the series' range the other branch is evaluated too: it must not divide by zero
     bounded_w = _conditional(in_series, SERIES_LIMIT, w)
+    # V and its derivatives by p = exp(a u), where cosh u = y
     y = 1 + bounded_w
     p = (y + root(bounded_w * (2 + bounded_w))) ** a
     V = (p + 1 / p) / 2 - 1

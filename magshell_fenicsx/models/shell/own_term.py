@@ -321,15 +321,13 @@ class OwnTerm:
                 *arguments_left, rotation = arguments  # the appended parameter comes last
                 jets = (Jet(*(rotated(part, rotation) for part in jet.parts())) for jet in (r0, u))
                 if self.on is not None:
-                    edge, *arguments_left = arguments_left
-                    arguments_left = [
-                        replace(
-                            edge,
-                            outward=rotated(edge.outward, rotation),
-                            along=rotated(edge.along, rotation),
-                        ),
-                        *arguments_left,
-                    ]
+                    edge, *parameters_left = arguments_left
+                    rotated_edge = replace(
+                        edge,
+                        outward=rotated(edge.outward, rotation),
+                        along=rotated(edge.along, rotation),
+                    )
+                    arguments_left = [rotated_edge, *parameters_left]
                 return density(*jets, *arguments_left)
 
             return density_in_frame
@@ -361,11 +359,12 @@ class OwnTerm:
         def density_of_numbers(*arguments: Any) -> Expr:
             """Evaluate the density with vectors (1,) unpacked."""
             # the parameters are the last arguments, after two jets and perhaps an edge
-            jets_and_edge, parameters = arguments[: -len(is_number)], arguments[-len(is_number) :]
-            return density(
-                *jets_and_edge,
-                *(p[0] if number else p for p, number in zip(parameters, is_number, strict=True)),
-            )
+            count = len(is_number)
+            jets_and_edge, parameters = arguments[:-count], arguments[-count:]
+            unpacked = [
+                p[0] if number else p for p, number in zip(parameters, is_number, strict=True)
+            ]
+            return density(*jets_and_edge, *unpacked)
 
         return density_of_numbers
 
@@ -410,7 +409,8 @@ class OwnTerm:
         """
         if self.varying:
             return False
-        # the first coordinate changes places with the second, so that the normal stays outward
+        # a mirror image turns the normal over; so the two coordinates are exchanged, which turns it
+        # back
         order = [
             ("r", *ALL_DERIVATIVES).index(name) for name in ("r", "r2", "r1", "r22", "r12", "r11")
         ]
@@ -525,16 +525,15 @@ class OwnTerm:
         ValueError
             With the density that differs.
         """
-        # the energy's density, if there is one, has no column of its own: ""
-        for column, density in zip(
-            ("", *self.observed)[-len(self.densities) :], self.densities, strict=True
-        ):
+        # columns of the densities; the energy's density, if there is one, has none: ""
+        columns = ("", *self.observed)[-len(self.densities) :]
+        for column, density in zip(columns, self.densities, strict=True):
             for sample in _random_samples()[:COORDINATE_SAMPLES]:
                 value = self._value(sample, density)
                 value_in_others = self._value(_in_other_coordinates(sample), density)
-                if abs(value - value_in_others) > COORDINATE_TOLERANCE * max(
-                    abs(value), abs(value_in_others)
-                ):  # nan: it has no value there
+                difference = abs(value - value_in_others)
+                # false for nan, where the density has no value
+                if difference > COORDINATE_TOLERANCE * max(abs(value), abs(value_in_others)):
                     raise ValueError(
                         f"{self.name}{column and f': {column}'}: depends on the coordinates of r1 "
                         "and r2, which are "
@@ -569,9 +568,8 @@ class OwnTerm:
         """Return whether every density has the same value at two samples, to rounding."""
         for density in self.densities:
             first, second = (self._value(sample, density) for sample in samples)
-            if not abs(first - second) <= SYMMETRY_TOLERANCE * max(
-                abs(first), abs(second)
-            ):  # nan: no symmetry is known
+            rounding = SYMMETRY_TOLERANCE * max(abs(first), abs(second))
+            if not abs(first - second) <= rounding:  # also for nan: no symmetry is known
                 return False
         return True
 
@@ -612,7 +610,8 @@ def _in_other_coordinates(sample: Sample) -> Sample:
     The value of a jet stays; derivatives and covector transform by the matrix `OTHER_COORDINATES`.
     """
     A = OTHER_COORDINATES
-    (r0, u), m = (np.array(jet) for jet in sample[:2]), sample[2]
+    r0, u, m = sample
+    r0, u = np.array(r0), np.array(u)  # copies, which are changed
     for jet in (r0, u):
         # second derivatives as a symmetric matrix of vectors
         second = jet[[3, 4, 4, 5]].reshape(2, 2, 3)  # rows 3 to 5 of a jet are r11, r12, r22
@@ -635,7 +634,7 @@ def _as_expression(
     """
     if isinstance(value, FormulaParameter):  # any number does
         value = 1.0
-    if isinstance(value, UserField):
+    if isinstance(value, UserField):  # its largest values, a number if there is one component
         value = np.where(value.largest == 0, 1.0, value.largest)
         value = value if len(value) > 1 else float(value[0])
     if isinstance(value, ufl.Coefficient):  # any number or vector does

@@ -182,6 +182,15 @@ class _CellTerms:
         The terms; their densities are on cells.
     log
         Log of compiled kernels.
+
+    Attributes
+    ----------
+    _weights
+        Weights of the quadrature on a cell.
+    _sampling
+        From nodal values to jets at points, and from gradients at points to element vectors.
+    _points
+        The densities and their gradients at the points.
     """
 
     def __init__(
@@ -190,40 +199,31 @@ class _CellTerms:
         V = r0.function_space
         self.names = [term.name for term in terms]
         reference_points, self._weights = cell_rule(degree)
-        table, points_per_cell = (
-            ShapeTable.tabulate(V.element.basix_element, reference_points),
-            len(reference_points),
-        )
+        points_per_cell = len(reference_points)
+        table = ShapeTable.tabulate(V.element.basix_element, reference_points)
         # the first derivatives are always needed: the area of the surface is made of them
-        jet_parts = [
-            name
-            for name in JET_NAMES
-            if name in FIRST_DERIVATIVES or any(name in term.density.jet_parts for term in terms)
-        ]
+        jet_parts = _jet_parts_of(terms, FIRST_DERIVATIVES)
         self._sampling = PointSampling(
             table, self._weights, [JET_NAMES.index(part) for part in jet_parts]
         )
-        cells = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)
+        cells = np.arange(V.mesh.topology.index_map(2).size_local, dtype=np.int32)  # owned ones
         frames = cell_frames(V.mesh)
-        geometry = np.repeat(frames[cells], points_per_cell, axis=0)
         count = len(cells) * points_per_cell
 
         def placement() -> Array:
             """Return the placement's jets (points, parts * 3) at the points of the owned cells."""
-            return _placement(r0, table, frames, jet_parts)[cells].reshape(
-                count, 3 * len(jet_parts)
-            )
+            all_cells = _placement(r0, table, frames, jet_parts)
+            return all_cells[cells].reshape(count, 3 * len(jet_parts))
 
-        placements = Memo(placement, lambda: (r0.x.array,))
         self._points = PointGradient(
             terms,
             jet_parts,
-            points_per_cell,
-            count,
-            placements,
-            geometry,
-            lambda field: at_points(field, reference_points, cells),
-            log,
+            points_per_entity=points_per_cell,
+            count=count,
+            r0=Memo(placement, lambda: (r0.x.array,)),
+            geometry=np.repeat(frames[cells], points_per_cell, axis=0),
+            values=lambda field: at_points(field, reference_points, cells),
+            log=log,
         )
 
     def begin(self, *, energies: bool) -> None:
@@ -237,12 +237,8 @@ class _CellTerms:
             return 0.0
         total = 0.0
         for chunk, _ in self._filled(nodal):
-            total += float(
-                np.sum(
-                    self._points.evaluate(chunk, kernel).reshape(-1, len(self._weights))
-                    @ self._weights
-                )
-            )
+            values = self._points.evaluate(chunk, kernel).reshape(-1, len(self._weights))
+            total += float(np.sum(values @ self._weights))
         return total
 
     def add(self, nodal: Array, factors: Mapping[str, float], elements: Array) -> None:
@@ -254,9 +250,8 @@ class _CellTerms:
         if not factor or (kernel := self._points.gradient) is None:
             return
         for chunk, cells in self._filled(nodal):
-            elements[cells] += factor * self._sampling.at_nodes(
-                self._points.evaluate(chunk, kernel)
-            )
+            gradients = self._points.evaluate(chunk, kernel)
+            elements[cells] += factor * self._sampling.at_nodes(gradients)
 
     def _filled(self, nodal: Array) -> Iterator[tuple[slice, slice]]:
         """Yield each chunk of points and its cells, as slices.
@@ -285,6 +280,16 @@ class _EdgeTerms:
         The terms; their densities are on edges.
     log
         Log of compiled kernels.
+
+    Attributes
+    ----------
+    _width
+        Number of components of a jet.
+    _displacement_jets, _back
+        (points of all cells' edges, `_width`): derivatives of u, and gradients of the energy by
+        them.
+    _points_of_terms
+        Name of a term -> rows (points, sides) of its points among these, and its density there.
     """
 
     def __init__(
@@ -292,25 +297,18 @@ class _EdgeTerms:
     ) -> None:
         V = r0.function_space
         self.names = [term.name for term in terms]
+        # the points of the three edges one after the other; all edges have the same weights
         rules = [edge_rule(degree, edge, is_reversed=False) for edge in range(3)]
-        self._weights = rules[0][1]
-        points_per_edge = len(self._weights)
-        reference_points, all_weights = (
-            np.concatenate([points for points, _ in rules]),
-            np.tile(self._weights, 3),
-        )
+        reference_points = np.concatenate([points for points, _ in rules])
+        _, self._weights = rules[0]
+        points_per_edge, all_weights = len(self._weights), np.tile(self._weights, 3)
         table = ShapeTable.tabulate(V.element.basix_element, reference_points)
-        jet_parts = [
-            name
-            for name in JET_NAMES
-            if name in ALL_DERIVATIVES or any(name in term.density.jet_parts for term in terms)
-        ]
+        jet_parts = _jet_parts_of(terms, ALL_DERIVATIVES)
         self._width = 3 * len(jet_parts)
         self._sampling = PointSampling(
             table, all_weights, [JET_NAMES.index(part) for part in jet_parts]
         )
         frames, cells = cell_frames(V.mesh), np.arange(len(V.dofmap.list), dtype=np.int32)
-        # at the points of all cells' edges: derivatives of u, and gradients of the energy by them
         self._displacement_jets, self._back = (
             np.empty((len(cells) * len(reference_points), self._width)) for _ in range(2)
         )
@@ -322,10 +320,7 @@ class _EdgeTerms:
             They are computed on all cells' edges at once, then picked for each term.
             """
             all_cells = _placement(r0, table, frames, jet_parts).reshape(-1, self._width)
-            return {
-                name: all_cells[rows].reshape(len(rows), rows.shape[1] * self._width)
-                for name, (rows, _) in points_of_terms.items()
-            }
+            return {name: _on_sides(all_cells, rows) for name, (rows, _) in points_of_terms.items()}
 
         points_of_terms = {
             term.name: _points_on_edges(V, term.density, frames, points_per_edge) for term in terms
@@ -341,9 +336,7 @@ class _EdgeTerms:
 
             def values(field: fem.Function, rows: NDArray[np.intp] = rows) -> Array:
                 """Return a field's values (points, sides * components) at the points of a term."""
-                return at_points(field, reference_points, cells)[rows].reshape(
-                    len(rows), rows.shape[1] * field.ufl_shape[0]
-                )
+                return _on_sides(at_points(field, reference_points, cells), rows)
 
             at_cells = Memo(partial(placements_on, term.name), lambda: (r0.x.array,))
             points = PointGradient(
@@ -395,14 +388,27 @@ class _EdgeTerms:
         rows, points = self._points_of_terms[name]
         for chunk in points.chunks():
             numbers = rows[chunk].ravel()
-            np.take(
-                self._displacement_jets,
-                numbers,
-                axis=0,
-                out=points.input_array(chunk).reshape(len(numbers), -1),
-                mode="clip",
-            )
+            # the jets of u are copied into the kernel's input
+            kernel_input = points.input_array(chunk).reshape(len(numbers), -1)
+            np.take(self._displacement_jets, numbers, axis=0, out=kernel_input, mode="clip")
             yield numbers, points.evaluate(chunk, kernel)
+
+
+def _jet_parts_of(terms: Sequence[PointTerm], always: Sequence[str]) -> list[str]:
+    """Return the parts of jets that some terms need, and those that are `always` needed.
+
+    They are in the order of `JET_NAMES`.
+    """
+    needed = {*always, *(name for term in terms for name in term.density.jet_parts)}
+    return [name for name in JET_NAMES if name in needed]
+
+
+def _on_sides(values: Array, rows: NDArray[np.intp]) -> Array:
+    """Return values (points, sides * size) on all sides of points, from values (rows, size).
+
+    `rows` (points, sides) are the rows of each point on its sides.
+    """
+    return values[rows].reshape(len(rows), rows.shape[1] * values.shape[1])
 
 
 def _placement(r0: fem.Function, table: ShapeTable, frames: Array, parts: Sequence[str]) -> Array:
@@ -412,9 +418,9 @@ def _placement(r0: fem.Function, table: ShapeTable, frames: Array, parts: Sequen
     the points of the reference cell, `frames` (cells, 4) are `cell_frames`.
     """
     nodes = r0.x.array.reshape(-1, 3)[r0.function_space.dofmap.list]
-    jet = in_own_coordinates(
-        Jet(*np.moveaxis(table.jets(nodes), 2, 0)), [x[:, None, None] for x in frames.T]
-    )
+    by_reference_coordinates = Jet(*np.moveaxis(table.jets(nodes), 2, 0))
+    frame = [numbers[:, None, None] for numbers in frames.T]  # for all points and components
+    jet = in_own_coordinates(by_reference_coordinates, frame)
     return np.stack([getattr(jet, part) for part in parts], axis=2)
 
 
@@ -445,31 +451,31 @@ def _points_on_edges(
         (points, 6 sides + 1): the frame of each side, the covector of each side, then the width
         of the cells at the edge.
     """
+    # cells and local numbers of the edges, (edges, sides) each; the second side may be reversed
     if density.facets is None:
         cells, edges, backwards = interior_edges(V)
         is_reversed = np.column_stack([np.zeros_like(backwards), backwards])
     else:
         cells, edges = boundary_edges(V, density.facets)
         is_reversed = np.zeros(cells.shape, dtype=bool)
-    order = np.where(
-        is_reversed[:, None],
-        np.arange(points_per_edge)[::-1, None],
-        np.arange(points_per_edge)[:, None],
-    )
-    rows = (points_per_edge * (3 * cells + edges))[:, None] + order
-    p, q, s, area = frames[cells].transpose(2, 0, 1)
+    # (edges, points, sides): the number of a point within its edge, then among all points
+    forwards = np.arange(points_per_edge)
+    order = np.where(is_reversed[:, None], forwards[::-1, None], forwards[:, None])
+    first_of_edge = points_per_edge * (3 * cells + edges)
+    rows = first_of_edge[:, None] + order
     # covectors of the reference triangle's edges, taken to the cells' own coordinates
+    p, q, s, area = frames[cells].transpose(2, 0, 1)
     first, second = np.array([edge_covector(edge) for edge in range(3)])[edges].transpose(2, 0, 1)
     m = np.stack([area * p * first, area * (q * first + s * second)], axis=2)  # as long as the edge
     width = edge_width(V, tuple(cells.T), edges[:, 0])
+    # all points of an edge have the same geometry
     columns = [
         frames[cells].reshape(-1, FRAME_SIZE * density.sides),
         m.reshape(-1, 2 * density.sides),
         width[:, None],
     ]
-    return rows.reshape(-1, density.sides), np.repeat(
-        np.concatenate(columns, axis=1), points_per_edge, axis=0
-    )
+    geometry = np.repeat(np.concatenate(columns, axis=1), points_per_edge, axis=0)
+    return rows.reshape(-1, density.sides), geometry
 
 
 Serve = Callable[[Sequence[PointTerm]], FastResidual]

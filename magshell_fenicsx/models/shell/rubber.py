@@ -73,9 +73,8 @@ class Incompressible(Law):
 
     def bending(self, E: Tensor, K: Tensor, up: Tensor) -> Scalar:
         """Return the energy of bending, a quadratic form in a^ij K_ij, tr K and det K."""
-        square_factor, mixed_factor, det_factor, trace_factor = self._stiffness(
-            surface := Stretched(E, up)
-        )
+        surface = Stretched(E, up)
+        square_factor, mixed_factor, det_factor, trace_factor = self._stiffness(surface)
         det = K[..., 0, 0] * K[..., 1, 1] - K[..., 0, 1] ** 2
         T, tau = surface.deformed_trace(K), trace(K, up)  # deformed and undeformed trace of K
         return (
@@ -84,16 +83,15 @@ class Incompressible(Law):
 
     def moment(self, E: Tensor, K: Tensor, up: Tensor) -> Components:
         """Return M with indices up, the derivative of `bending` by K."""
-        square_factor, mixed_factor, det_factor, trace_factor = self._stiffness(
-            surface := Stretched(E, up)
-        )
-        T, tau = surface.deformed_trace(K), trace(K, up)
+        surface = Stretched(E, up)
+        square_factor, mixed_factor, det_factor, trace_factor = self._stiffness(surface)
+        T, tau = surface.deformed_trace(K), trace(K, up)  # deformed and undeformed trace of K
+        # derivatives of the energy by both traces
+        by_T = square_factor * T - mixed_factor / 2 * tau
+        by_tau = trace_factor * tau - mixed_factor / 2 * T
+        # components 11, 12, 22: derivatives of tau and of det K by K
         a = (up[..., 0, 0], up[..., 0, 1], up[..., 1, 1])
         adjugate = (K[..., 1, 1], -K[..., 0, 1], K[..., 0, 0])
-        by_T, by_tau = (
-            square_factor * T - mixed_factor / 2 * tau,
-            trace_factor * tau - mixed_factor / 2 * T,
-        )
         M11, M12, M22 = (
             by_T * deformed_up + by_tau * metric_up - det_factor / 2 * curvature_cofactor
             for deformed_up, metric_up, curvature_cofactor in zip(
@@ -124,8 +122,10 @@ class Incompressible(Law):
 
         The determinant of c (x) c is zero, so that its factor is not needed.
         """
-        square_factor, mixed_factor, _, trace_factor = self._stiffness(surface := Stretched(E, up))
+        surface = Stretched(E, up)
+        square_factor, mixed_factor, _, trace_factor = self._stiffness(surface)
         (c1, c2), (a11, a12, a22) = lower_index(covector_up, up), surface.inverse
+        # the deformed trace of c (x) c; the undeformed one is the square of c
         T = a11 * c1**2 + 2 * a12 * c1 * c2 + a22 * c2**2
         return (
             square_factor * T**2
@@ -190,9 +190,8 @@ class Rubber(Incompressible):
         # h^2/(12 d) times 4/6 and 1/d
         factor = self.modulus_factor * self.thickness_factor**3 * self.h**2 / 18 / surface.d**2
         first_share, second_share, trace_of_C = 1 - self.parameter, self.parameter, 2 + surface.T
-        det_factor = first_share + second_share * (
-            trace_of_C - root(surface.d)
-        )  # W'' has d^2 in place of the root
+        # W'' has d^2 in place of the root
+        det_factor = first_share + second_share * (trace_of_C - root(surface.d))
         return (
             factor * 2 * (first_share + second_share * trace_of_C),
             factor * 2 * second_share,

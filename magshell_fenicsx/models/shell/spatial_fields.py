@@ -225,19 +225,16 @@ class CellPolynomials:
         They are taken on a lattice of twice the degree, so at the nodes and between them: a
         polynomial may leave the range of its nodal values there.
         """
+        divisions = 2 * max(self.element.degree, 1)
         X = basix.create_lattice(
-            self.element.cell_type,
-            2 * max(self.element.degree, 1),
-            basix.LatticeType.equispaced,
-            True,
+            self.element.cell_type, divisions, basix.LatticeType.equispaced, True
         )
         value_table, place_table = (
             element.tabulate(0, X)[0, :, :, 0] for element in (self.element, self.cells.element)
         )
         owned = slice(self.cells.owned)
-        return np.matmul(value_table, self.values[owned]), np.matmul(
-            place_table, self.cells.nodal[owned]
-        )
+        values = np.matmul(value_table, self.values[owned])
+        return values, np.matmul(place_table, self.cells.nodal[owned])
 
     def _reference(self, places: Array) -> Array:
         """Return the reference coordinates (n, 2) of places (n, 3) in the first cell.
@@ -247,6 +244,7 @@ class CellPolynomials:
         element, nodal = self.cells.element, self.cells.nodal[0]
         X = np.full((len(places), 2), 1 / 3)
         for _ in range(MAX_NEWTON_STEPS):
+            # place and tangents at the present reference points
             x, a1, a2 = (
                 derivative_table[..., 0] @ nodal for derivative_table in element.tabulate(1, X)
             )
@@ -307,7 +305,7 @@ def by_patch(
     MeshError
         If there is no such patch.
     """
-    # a patch with a pattern has zero vectors, which the pattern replaces later
+    # a patch with a pattern has zero vectors, in place of which the pattern is evaluated later
     vector_by_patch = {
         name: np.zeros(3) if callable(vector) else vector for name, vector in vectors.items()
     }
@@ -369,15 +367,15 @@ def pattern_field(
     """
     V = r0.function_space
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree + finer, (size,)))
-    nodes, n0 = positions_and_normals(r0, Q.element.basix_element.points)
     field = PlacementField(
         Q, name, lambda r: pattern_field(pattern, r, finer, name=name, key=key, size=size)[0]
     )
+    # places and normals at the nodes of the field
+    nodes, n0 = positions_and_normals(r0, Q.element.basix_element.points)
     # only loads have a finer field
     refuse_unbounded(pattern(nodes, n0), nodes, V.mesh.comm, "loading.loads" if finer else key)
-    projection = project_pattern(
-        pattern, cell_geometry(r0), pattern(inside_cells(nodes), n0), Q.element.basix_element
-    )
+    at_nodes = pattern(inside_cells(nodes), n0)
+    projection = project_pattern(pattern, cell_geometry(r0), at_nodes, Q.element.basix_element)
     field.x.array.reshape(-1, size)[Q.dofmap.list] = projection.nodal
     # on a meridian (two components) integrals are per radian around the axis
     angle = 2 * np.pi if V.dofmap.index_map_bs == 2 else 1.0
@@ -423,33 +421,49 @@ def pattern_on_edge(
     # inside the cells an interpolant will do; only the nodes on facets are projected below
     field, _ = pattern_field(InterpolatedPattern(pattern), r0, finer)
     field.rebuild = lambda r: pattern_on_edge(pattern, r, facets, finer)[0]
-    Q, topology = field.function_space, V.mesh.topology
-    cells, local_sides = _cells_at_facets(topology, facets)
-    element, placement_element = Q.element.basix_element, V.element.basix_element
+    Q = field.function_space
+    cells, local_sides = _cells_at_facets(V.mesh.topology, facets)
+    edges = _facets_as_cells(r0, facets, cells, local_sides)
+    element = Q.element.basix_element
     edge_element = _interval_element(element.degree)
-    edge_placement_element = _interval_element(placement_element.degree)
-    points_by_side = [
-        _points_on_side(element.cell_type, side, edge_placement_element.points) for side in range(3)
-    ]
-    place_tables = [placement_element.tabulate(0, X)[0, :, :, 0] for X in points_by_side]
-    cell_places = r0.x.array.reshape(-1, 3)[V.dofmap.list[cells]]
-    # places on the facets, as cells of dimension one
-    nodal = np.matmul(np.array(place_tables)[local_sides], cell_places).reshape(len(cells), -1, 3)
-    owned = int(np.sum(facets < topology.index_map(1).size_local))
-    edge = CellGeometry(edge_placement_element, nodal, owned, V.mesh.comm)
-    x, normals, _ = edge.evaluate(edge_element.points)
-    projection = project_pattern(pattern, edge, pattern(inside_cells(x), normals), edge_element)
+    x, normals, _ = edges.evaluate(edge_element.points)
+    projection = project_pattern(pattern, edges, pattern(inside_cells(x), normals), edge_element)
     if projection.smooth:
         return field, None
+    # for each side of a cell the nodes of the field that are nodes of the facet
     nodes_by_side = [
         _nearest_nodes(element, _points_on_side(element.cell_type, side, edge_element.points))
         for side in range(3)
     ]
     values = field.x.array.reshape(-1, 3)
-    # the field keeps its nodes inside the cells and takes the projection at those on facets
+    # the field keeps its values inside the cells and takes the projection at nodes on facets
     for cell, side, vectors in zip(cells, local_sides, projection.nodal, strict=True):
         values[Q.dofmap.list[cell][nodes_by_side[side]]] = vectors
     return field, projection.size
+
+
+def _facets_as_cells(
+    r0: fem.Function,
+    facets: NDArray[np.int32],
+    cells: NDArray[np.int64],
+    local_sides: list[int],
+) -> CellGeometry:
+    """Return facets of the boundary as cells of dimension one, with their geometry.
+
+    `cells` and `local_sides` are those of `_cells_at_facets`.
+    """
+    V, topology = r0.function_space, r0.function_space.mesh.topology
+    element = V.element.basix_element
+    edge_element = _interval_element(element.degree)
+    # for each side of the reference triangle: shape functions of the cell at the edge's nodes
+    points_by_side = [
+        _points_on_side(element.cell_type, side, edge_element.points) for side in range(3)
+    ]
+    tables_by_side = np.array([element.tabulate(0, X)[0, :, :, 0] for X in points_by_side])
+    cell_places = r0.x.array.reshape(-1, 3)[V.dofmap.list[cells]]
+    nodal = np.matmul(tables_by_side[local_sides], cell_places).reshape(len(cells), -1, 3)
+    owned = int(np.sum(facets < topology.index_map(1).size_local))
+    return CellGeometry(edge_element, nodal, owned, V.mesh.comm)
 
 
 def _cells_at_facets(
@@ -538,10 +552,11 @@ def positions_and_normals(r0: fem.Function, points: Array | None = None) -> tupl
     are then along (e_rho, e_theta, e_z).
     """
     V = r0.function_space
-    element, size = V.element.basix_element, V.dofmap.index_map_bs
+    element, components = V.element.basix_element, V.dofmap.index_map_bs
+    # values and first derivatives, (derivative, cells, n, components)
     table = element.tabulate(1, element.points if points is None else points)[..., 0]
-    jets = np.einsum("dvk,cki->dcvi", table, r0.x.array.reshape(-1, size)[V.dofmap.list])
-    if size == 2:
+    jets = np.einsum("dvk,cki->dcvi", table, r0.x.array.reshape(-1, components)[V.dofmap.list])
+    if components == 2:  # a meridian
         (rho, z), (rho_s, z_s) = np.moveaxis(jets, -1, 1)
         normals = np.stack([-z_s, 0 * z_s, rho_s], axis=-1) / np.hypot(rho_s, z_s)[..., None]
         return np.stack([rho, 0 * rho, z], axis=-1), np.asarray(normals)

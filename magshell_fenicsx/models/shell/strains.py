@@ -65,15 +65,10 @@ class TangentFrame:
         t = np.stack([t1, np.cross(n0, t1)], axis=-2)
         basis = np.moveaxis(jet[1:3], 0, -2) @ np.swapaxes(t, -1, -2)  # a0_a . t_i as [a, i]
         dual = np.linalg.inv(basis)
-        return cls(
-            jet,
-            t,
-            n0,
-            dual,
-            _of_symmetric(dual)[..., [0, 0, 1], [0, 1, 1], :],  # components 11, 12 and 22
-            _of_symmetric(np.swapaxes(t, -1, -2)),
-            area,
-        )
+        # the change of basis of symmetric tensors, of which the components 11, 12 and 22 are kept
+        in_frame = _of_symmetric(dual)[..., [0, 0, 1], [0, 1, 1], :]
+        in_space = _of_symmetric(np.swapaxes(t, -1, -2))
+        return cls(jet, t, n0, dual, in_frame, in_space, area)
 
     def membrane_strain(self, u: Array) -> Array:
         """Return E_11, E_12, E_22 (..., 3) in the frame, of a displacement.
@@ -173,18 +168,20 @@ class NaturalFrame:
         bent, stretched
             Factors of kappa, and of T and t.
         """
-        t0 = frame.t
-        tensors_in_frame = [
-            np.einsum("...ai,...ij,...bj->...ab", t0, S, t0) for S in (stretched * T, bent * kappa)
-        ]
-        # undeformed curvature b0 = n0 . r0,_ij
+        # U - 1 and kappa in the frame, (..., 2, 2)
+        stretch, curvature = (
+            np.einsum("...ai,...ij,...bj->...ab", frame.t, S, frame.t)
+            for S in (stretched * T, bent * kappa)
+        )
+        # undeformed curvature b0 = n0 . r0,_ij, and the natural thickness s over h
         b = np.einsum("d...i,...i->...d", frame.jet[3:], frame.n0)
         b0, s = _matrix(_times(frame.in_frame, b)), (1 + stretched * t)[..., None, None]
-        U = np.eye(2) + tensors_in_frame[0]
+        U = np.eye(2) + stretch
         # b_n - b0: b0 stretched by U and thickened by s, plus the natural curvature in the metric
         # of U
-        bend = (b0 @ U @ U + U @ U @ b0) / (2 * s) - b0 + U @ tensors_in_frame[1] @ U
-        strain = tensors_in_frame[0] + tensors_in_frame[0] @ tensors_in_frame[0] / 2
+        bend = (b0 @ U @ U + U @ U @ b0) / (2 * s) - b0 + U @ curvature @ U
+        # (U² - 1)/2
+        strain = stretch + stretch @ stretch / 2
         return cls(_components(strain), _components(bend), np.linalg.inv(U), s[..., 0, 0])
 
     def elastic(self, E: Array) -> Array:

@@ -106,7 +106,8 @@ class PlacedFactor:
         The cells are those of a surface in space, or of a meridian with rho and z. The formula of
         the factor is in the shell's own frame, so places are moved there.
         """
-        # nodal: the cells' nodes in the shell's frame, in the components of the mesh; x: in space
+        # x: the cells' nodes in the shell's frame, in space; nodal: in the components of the mesh,
+        # which on a meridian are rho and z
         if cells.nodal.shape[-1] == 3:
             nodal = x = self.place.to_shell_frame(cells.nodal)
         else:
@@ -157,6 +158,7 @@ def thickness_field(
         On every rank, if the factor is too small or too large somewhere, or a patch is unknown.
     """
     V = r0.function_space
+    # values at the nodes without patches, checked before a formula is projected
     nodes, _ = positions_and_normals(r0)
     values = thickness.values_at(nodes)
     refuse_unfit(values, nodes, V.mesh.comm)
@@ -194,8 +196,11 @@ def material_field(
     field = fem.Function(Q, name="material")
     values = field.x.array.reshape(-1, 4)
     for name, material in shells.items():
-        # a field that is constant in cells has one node, 0, in each
-        values[Q.dofmap.list[patch_of(patches, name, "shells")][:, 0]] = material.numbers
+        is_in_shell = patch_of(patches, name, "shells")
+        nodes_of_cells = Q.dofmap.list[is_in_shell][
+            :, 0
+        ]  # one in each: the field is constant there
+        values[nodes_of_cells] = material.numbers
     return field
 
 

@@ -62,8 +62,8 @@ class RevolvedGatherer:
     def __init__(self, model: "MeridianModel", comm: MPI.Comm) -> None:
         """Prepare the gathering for all states of a model of a meridian.
 
-        `_inner` (q, 1) are the samples in the reference cell, `_swept` is the swept surface, and
-        `_recovered` takes samples to the ends of cells.
+        `_inner` (q, 1) are the samples in the reference cell, and `rule` (q,) their weights.
+        `_swept` is the swept surface. `_recovered` takes samples to the ends of cells.
         """
         self.comm, self._model = comm, model
         # Gauss points: as many as a second derivative of the displacement has coefficients
@@ -81,8 +81,9 @@ class RevolvedGatherer:
 
         `mu` has the amplitudes of growing imperfections. "At ends" means at both ends of each cell,
         where values are shown; "at samples" is where strains and moments are computed. `_fields`
-        and `_stresses` are functions of a displacement at ends and at samples; `_at_ends` has the
-        tangent frames at ends, `_constant` the fields that no displacement changes.
+        computes fields of a displacement at ends, `_stresses` strains and moments at samples.
+        `_law` is the law of elasticity at ends, `_at_ends` has the tangent frames there, and
+        `_constant` the fields that no displacement changes.
         """
         model, swept, loads = self._model, self._swept, self._model.loads
         r, r_at_samples = swept.jets(model.r0), swept.inner_jets(model.r0, self._inner)
@@ -90,25 +91,23 @@ class RevolvedGatherer:
             None if model.thickness is None else swept.scalars(model.thickness, points)
             for points in (ENDS, self._inner)
         )
-        cell_materials, made_of = model.cell_materials, None
-        if cell_materials is not None:  # several shells: the four numbers of each cell's material
-            cell_dofs = cell_materials.function_space.dofmap.list[swept.order, 0]
-            made_of = cell_materials.x.array.reshape(-1, 4)[cell_dofs]
+        made_of = self._cell_materials()  # None if all cells have one material
         self._law = model.material.law_in(made_of)
         self._fields = PointFields(
             r,
             model.material,
-            loads.magnetic,
-            thickness_at_ends,
-            loads.contacts,
-            loads.remanence,
-            loads.natural,
-            made_of,
+            field=loads.magnetic,
+            thickness=thickness_at_ends,
+            contacts=loads.contacts,
+            remanence=loads.remanence,
+            natural=loads.natural,
+            made_of=made_of,
         )
         self._stresses = Stresses(
             r_at_samples, model.material, thickness_at_samples, loads.natural, made_of
         )
         self._at_ends = Stresses(r, model.material, thickness_at_ends).frame
+        # imperfections and shell numbers are constant fields too
         if isinstance(model.meridian.embedding, DeviatedEmbedding):
             s, embedding = model.meridian.cells.ravel(), model.meridian.embedding
             deviations = (*embedding.deviations, *deviations_at(loads.growing_imperfections, mu))
@@ -121,6 +120,17 @@ class RevolvedGatherer:
             shell_number = np.argmax(cells_in_shells, axis=0)[swept.order, None].astype(np.float64)
             self._fields.constant[SHELL] = np.asarray(np.repeat(shell_number, 2, axis=1))
         self._constant = self._swept_fields(self._fields.constant)
+
+    def _cell_materials(self) -> Array | None:
+        """Return the four numbers (cells, 4) of each cell's material, see `Stresses`.
+
+        None if all cells have one material.
+        """
+        cell_materials = self._model.cell_materials
+        if cell_materials is None:
+            return None
+        cell_dofs = cell_materials.function_space.dofmap.list[self._swept.order, 0]
+        return np.asarray(cell_materials.x.array.reshape(-1, 4)[cell_dofs])
 
     def _kinks(self) -> list[int]:
         """Return the numbers of the cells before which the normal or a prescribed field jumps."""
@@ -150,6 +160,7 @@ class RevolvedGatherer:
         if self._model.growing:  # imperfections that amplitudes multiply move the placement
             self._set_placement(state.mu)
         swept = self._swept
+        # strains and moments are recovered from samples, other fields are computed at ends
         stresses = self._stresses.values_of(swept.inner_jets(self._model.u, self._inner), state.mu)
         components, jumps = self._recovered.components(stresses)
         tensors = {name: self._at_ends.tensor(S) for name, S in components.items()}
@@ -208,25 +219,28 @@ class RecoveredMeridian:
     ) -> None:
         """Set the recovery, and the matrices from its coefficients to cell ends and to samples.
 
-        Here s (cells, 2) is the parameter along the meridian at the ends of cells.
+        Here s (cells, 2) is the parameter along the meridian at the ends of cells; `ends` (cells,
+        2) are the numbers of vertices there, and `vertices` is the parameter of each vertex.
+        `_pole_cells` are the numbers of the cells at poles, `_to_ends` and `_to_samples` the
+        matrices, and `_weight` (cells, q) the lengths that samples stand for.
         """
         s, ends, poles = model.meridian.cells, swept.ends, model.meridian.poles
         length, cells = np.diff(s), np.arange(len(s))
         samples = s[:, :1] + length * inner[:, 0]
         vertices = np.empty(ends.max() + 1)
         vertices[ends] = s
+        # cells of which one end (0 or 1) is at a pole
         pole_cells, pole_end = np.nonzero(np.isclose(s[..., None], poles).any(axis=2))
-        self._pole_cells, pole, other_end = (
-            pole_cells,
-            s[pole_cells, pole_end],
-            s[pole_cells, 1 - pole_end],
-        )
-        # each cell at a pole gets a mirror image, with one new vertex beyond the pole
-        images = len(vertices) + np.arange(len(pole_cells))
+        self._pole_cells = pole_cells
+        pole, other_end = s[pole_cells, pole_end], s[pole_cells, 1 - pole_end]
+        # each of them gets a mirror image, with one new vertex beyond the pole
+        new_vertices = len(vertices) + np.arange(len(pole_cells))
         vertices = np.concatenate([vertices, 2 * pole - other_end])
+        images = np.column_stack([ends[pole_cells, pole_end], new_vertices])
+        samples_of_images = 2 * pole[:, None] - samples[pole_cells]
         self._recovery = Recovery(
-            cells=np.concatenate([ends, np.column_stack([ends[pole_cells, pole_end], images])]),
-            samples=np.concatenate([samples, 2 * pole[:, None] - samples[pole_cells]])[..., None],
+            cells=np.concatenate([ends, images]),
+            samples=np.concatenate([samples, samples_of_images])[..., None],
             weight=np.concatenate([length, length[pole_cells]]) * rule,
             vertices=vertices[:, None],
             frames=np.ones((len(vertices), 1, 1)),
@@ -239,6 +253,7 @@ class RecoveredMeridian:
         self._to_samples = self._recovery.evaluation_matrix(
             np.repeat(cells, count), samples.reshape(-1, 1), np.tile(hats, (len(cells), 1))
         )
+        # at an end one of the two coordinates is one, the other zero
         self._to_ends = self._recovery.evaluation_matrix(
             np.repeat(cells, 2),
             vertices[ends].reshape(-1, 1),
@@ -277,7 +292,11 @@ class BodyGatherer:
     """Gather the displacement of a solid; its field n0 is the direction of the thickness."""
 
     def __init__(self, model: "SolidModel") -> None:
-        """Gather all that the displacement does not change: cells, nodes; collective."""
+        """Gather all that the displacement does not change; collective.
+
+        `_cells` are the numbers of the nodes of all cells in VTK's order, `_r0` and `_n0` place and
+        direction at all nodes, and `_fields` the imperfections, if there are some.
+        """
         self._model, self.comm = model, model.V.mesh.comm
         V = model.V
         cells = V.dofmap.list[: V.mesh.topology.index_map(3).size_local]  # without ghosts

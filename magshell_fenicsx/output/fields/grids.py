@@ -35,6 +35,7 @@ def grid_content(grid: MapGrid, R: float) -> bytes:
     points, cells, vtk_grid = vtkPoints(), vtkCellArray(), vtkUnstructuredGrid()
     # deep copies: VTK must not refer to memory that numpy frees
     points.SetData(numpy_to_vtk(np.ascontiguousarray(grid.places), deep=True))
+    # VTK's cells: where each begins in one list of corners, and that list
     corners = _cells(grid.points)
     cell_starts = np.arange(0, corners.size + 1, corners.shape[1])
     cells.SetData(
@@ -47,12 +48,15 @@ def grid_content(grid: MapGrid, R: float) -> bytes:
     vtk_grid.SetCells(QUAD if len(grid.points) == 2 else HEXAHEDRON, cells)
     add_array(vtk_grid.GetPointData(), "B", grid.values)
     file_data = vtk_grid.GetFieldData()
+    # what describes the grid: numbers, then texts
     file_arrays = {
         "corner": grid.corner[None],
         "sides": grid.sides,
         "points_along": np.array(grid.points, dtype=float),
     }
-    for name, values in (file_arrays | ({} if isnan(R) else {"R_in_m": np.array([R])})).items():
+    if not isnan(R):
+        file_arrays["R_in_m"] = np.array([R])
+    for name, values in file_arrays.items():
         add_array(file_data, name, values)
     for name in TEXT_FIELDS:
         add_texts(file_data, name, [str(getattr(grid, name))])

@@ -86,17 +86,18 @@ def mode_surface(
             return None
         m = 0 if label == TORSION else int(label.removeprefix(WAVES))
         return _with_mode(*_revolved_wave(model, u, m, vector))
-    base, mode = gatherer.gather(u, mu), gatherer.gather(vector)  # a mode is gathered like a u
-    if base is None or mode is None:
+    # the mode is gathered like a displacement: it is the `u` of a second surface
+    displaced, mode = gatherer.gather(u, mu), gatherer.gather(vector)
+    if displaced is None or mode is None:  # on other ranks than 0
         return None
-    surface = _with_mode(base, mode.u)
+    surface = _with_mode(displaced, mode.u)
     if model.multiplicity > 1:  # the model is a half or a sector
         assert not model.axisymmetric
         surface = completed_by_symmetry(surface, model.mirror)
         if label == "antisymmetric":
             # nodes of the modelled half come first, those of its image after them
             for values in surface.fields.values():
-                values[len(base.r0) :] *= -1
+                values[len(displaced.r0) :] *= -1
     return rotated_surface(surface, azimuth)
 
 
@@ -166,13 +167,15 @@ def mode_caption(number: int, mode: LabelledEigenvalue) -> str:
 def _with_mode(base: Surface, v: Array) -> Surface:
     """Return the surface with a mode v (n, 3) as its fields, scaled to a largest length of one.
 
-    The mode points inward at the first node where its normal component is largest.
+    The sign is such that the mode points inward at the first node where its normal component has
+    its largest magnitude.
     """
     inward = -np.einsum("ij,ij->i", v, base.n0)
-    normal_size = np.abs(inward)
+    magnitude = np.abs(inward)
     # the crests and troughs of a wave differ only by rounding
-    first_crest = np.argmax(normal_size > (1 - CREST_TOLERANCE) * normal_size.max())
-    scale = np.copysign(np.linalg.norm(v, axis=1).max(), inward[first_crest])
+    first_crest = np.argmax(magnitude > (1 - CREST_TOLERANCE) * magnitude.max())
+    largest_length = np.linalg.norm(v, axis=1).max()
+    scale = np.copysign(largest_length, inward[first_crest])
     return replace(base, fields={"mode": v / scale, "mode_w": inward / scale})
 
 
@@ -195,12 +198,15 @@ def _revolved_wave(
     """
     sectors = max(96, 12 * m)  # 96 even without waves, for a round picture
     swept = Revolution(model, sectors)
+    # numbers of the circles of nodes in the function space of the waves
     vertices = swept.vertices(model.symmetry_breaking_modes.waves.V)
+    # each (circles, 1); the sum of the first two is stored, see the parameter
     U_and_V, V, W = vector.reshape(-1, 3)[vertices].T[:, :, None]
     theta = np.arange(sectors) * 2 * np.pi / sectors
     # torsion, m = 0, is V alone, the same at all angles
     cosine, sine = (np.cos(m * theta), np.sin(m * theta)) if m else (0 * theta, 1 + 0 * theta)
     radial, azimuthal = (U_and_V - V) * cosine, V * sine
+    # (circles, sectors): from components along and around the axis to those along e1, e2 and e3
     x = radial * np.cos(theta) - azimuthal * np.sin(theta)
     y = radial * np.sin(theta) + azimuthal * np.cos(theta)
     v = np.stack([x, y, W * cosine], axis=-1)

@@ -89,6 +89,7 @@ def vtp_content(lines: tuple[Array, ...], faces: Sequence[Solid] = ()) -> bytes:
     faces
         Faces of bodies and magnets.
     """
+    # points: those of lines, then the corners of solids
     line_sizes = [len(line) for line in lines]
     # number of each solid's first corner, after the points of lines
     starts = np.cumsum([sum(line_sizes), *(len(solid.points) for solid in faces)])
@@ -98,6 +99,7 @@ def vtp_content(lines: tuple[Array, ...], faces: Sequence[Solid] = ()) -> bytes:
         np.zeros(sum(line_sizes)),  # points of lines are no poles
         *(_poles_of(solid) for solid in faces),
     ]
+    # what tells the solids apart
     counts = [[len(solid.points), len(solid.triangles)] for solid in faces]
     numbers = np.array(counts).reshape(-1, 2)
     names = "".join(f"{solid.name}\0" for solid in faces).encode()
@@ -105,6 +107,7 @@ def vtp_content(lines: tuple[Array, ...], faces: Sequence[Solid] = ()) -> bytes:
         _array("sizes", "Int64", numbers, f'NumberOfTuples="{len(faces)}"'),
         _array("names", "String", np.frombuffer(names, np.uint8), f'NumberOfTuples="{len(faces)}"'),
     ]
+    # the XML of the arrays of all points and of all triangles
     count = sum(len(triangles_of_solid) for triangles_of_solid in triangles)
     corners_of_triangles = np.concatenate([np.zeros((0, 3), int), *triangles])
     pole = _array("pole", "Float64", np.round(np.concatenate(poles), DIGITS))
@@ -181,10 +184,11 @@ def _read(text: str) -> tuple[tuple[Array, ...], tuple[Solid, ...]]:
     # lines and faces have arrays of the same names, so the text is divided first
     before_faces, _, polys = text.partition("<Polys>")
     arrays = {name: text_of_array.split() for name, text_of_array in ARRAY.findall(before_faces)}
-    ends = np.array(arrays["offsets"], dtype=int)
+    line_ends = np.array(arrays["offsets"], dtype=int)
     points = np.array(arrays["Points"], dtype=float).reshape(-1, 3)
-    on_lines = int(ends[-1]) if len(ends) else 0
-    lines = tuple(np.split(points[:on_lines], ends[:-1])) if len(ends) else ()
+    # points of lines come first, then the corners of solids
+    on_lines = int(line_ends[-1]) if len(line_ends) else 0
+    lines = tuple(np.split(points[:on_lines], line_ends[:-1])) if len(line_ends) else ()
     if "sizes" not in arrays:  # without faces, or of an earlier version
         return lines, ()
     solid_counts = np.array(arrays["sizes"], dtype=int).reshape(-1, 2)
@@ -193,19 +197,16 @@ def _read(text: str) -> tuple[tuple[Array, ...], tuple[Solid, ...]]:
     triangles = np.array(connectivity, dtype=int).reshape(-1, 3)
     poles, solids = np.array(arrays["pole"], dtype=float), list[Solid]()
     first_corner, first_triangle = on_lines, 0
-    for name, (point_count, triangle_count) in zip(names, solid_counts, strict=False):
-        pole_values = poles[first_corner : first_corner + point_count]
+    # a zero ends the last name too, so there is an empty name more than solids
+    for name, (corner_count, triangle_count) in zip(names, solid_counts, strict=False):
+        next_corner = first_corner + corner_count
+        next_triangle = first_triangle + triangle_count
+        pole_values = poles[first_corner:next_corner]
         # numbers of corners begin at zero in each solid
-        numbers = triangles[first_triangle : first_triangle + triangle_count] - first_corner
-        if numbers.size and not 0 <= numbers.min() <= numbers.max() < point_count:
+        numbers = triangles[first_triangle:next_triangle] - first_corner
+        if numbers.size and not 0 <= numbers.min() <= numbers.max() < corner_count:
             raise IndexError(name)
-        solids.append(
-            Solid(
-                points[first_corner : first_corner + point_count],
-                numbers,
-                name,
-                pole_values if pole_values.any() else None,
-            )
-        )
-        first_corner, first_triangle = first_corner + point_count, first_triangle + triangle_count
+        poles_of_magnet = pole_values if pole_values.any() else None
+        solids.append(Solid(points[first_corner:next_corner], numbers, name, poles_of_magnet))
+        first_corner, first_triangle = next_corner, next_triangle
     return lines, tuple(solids)

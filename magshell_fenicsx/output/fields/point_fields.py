@@ -65,6 +65,7 @@ def magnetic_loads(
     pattern = field.remanent  # a vector, or a function of places and normals
     Br = pattern(r0, g.n0) if callable(pattern) else np.broadcast_to(pattern, r0.shape)
     Ba = field.applied
+    # first for a convected remanence, then changed for one that rotates
     rotates = field.law == "rotation"
     loads = {"p_mag": magnetic_pressure(g, Br, Ba, h), "k": spring_stiffness(g, Br, Ba)}
     if rotates:
@@ -119,16 +120,13 @@ def in_plane_force(g: SurfaceGeometry, Br: Array, Ba: Array, h: float) -> Array:
     equals h [b_ca (n . Ba)(a^a . Br) + tr b (n . Br)(a_c . Ba)].
     """
     dual = g.dual
-    # (a^a . Br) and (n . Ba)
-    tangential_Br, normal_Ba = (
-        np.einsum("...ai,...i->...a", dual, Br),
-        np.einsum("...i,i->...", g.n0, Ba),
-    )
+    tangential_Br = np.einsum("...ai,...i->...a", dual, Br)  # a^a . Br
+    normal_Ba = np.einsum("...i,i->...", g.n0, Ba)  # n . Ba
     trace = np.einsum("...ab,...ai,...bi->...", g.b0, dual, dual)  # tr b
     covariant = np.einsum("...ca,...a->...c", g.b0, tangential_Br) * normal_Ba[..., None]
-    covariant += (trace * np.einsum("...i,...i->...", g.n0, Br))[..., None] * np.einsum(
-        "...ci,i->...c", g.a, Ba
-    )
+    normal_Br = np.einsum("...i,...i->...", g.n0, Br)  # n . Br
+    tangential_Ba = np.einsum("...ci,i->...c", g.a, Ba)  # a_c . Ba
+    covariant += (trace * normal_Br)[..., None] * tangential_Ba
     return np.asarray(h * np.einsum("...c,...ci->...i", covariant, dual))
 
 
@@ -176,13 +174,12 @@ def torque(g: SurfaceGeometry, Br: Array, Ba: Array, *, rotates: bool = False) -
 
     The remanence rotates with the surface if `rotates`; otherwise it is convected.
     """
-    coefficients = -np.einsum("...i,...i->...", g.n0, Br)[..., None] * np.einsum(
-        "...ai,i->...a", g.dual, Ba
-    )
+    normal_Br = np.einsum("...i,...i->...", g.n0, Br)[..., None]
+    coefficients = -normal_Br * np.einsum("...ai,i->...a", g.dual, Ba)
     if not rotates:
         return Torque(g.n0, coefficients)
     # further terms of a remanence that does not stretch, see `Torque`
-    in_surface = Br - np.einsum("...i,...i->...", g.n0, Br)[..., None] * g.n0
+    in_surface = Br - normal_Br * g.n0
     half_normal_Ba = (g.n0 @ Ba / 2)[..., None]
     coefficients = coefficients + half_normal_Ba * np.einsum("...ai,...i->...a", g.dual, Br)
     return Torque(g.n0, coefficients, g.dual, half_normal_Ba * in_surface)
@@ -220,7 +217,11 @@ class Stresses:
         natural: Natural | None = None,
         made_of: Array | None = None,
     ) -> None:
-        """Set frames, law and natural shape at the points."""
+        """Set frames, law and natural shape at the points.
+
+        `_law` is the law of elasticity for the thickness h, `_natural` the tensors of the natural
+        shape, None without one, and `_unit` the unit of moments.
+        """
         self.frame = frame = TangentFrame.from_jet(r0)
         self._thickness = thickness
         self._law = material.law_in(made_of).at_point(
@@ -247,18 +248,17 @@ class Stresses:
         E_total
             The strain from the drawn shape, if there is a natural one.
         """
-        frame, total = self.frame, {}
+        frame = self.frame
         E, K = frame.membrane_strain(u), frame.curvature_change(u)
         law = self._law if self._thickness is None else self._law.thicker(self._thickness)
-        if self._natural:  # stresses come from the strain beyond the natural shape
-            total["E_total"] = E
-            shape = NaturalFrame.from_tensors(
-                frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0)
-            )
-            E, M = shape.elastic(E), shape.moment(E, K, law)
-        else:
-            M = bending_moment(E, K, law)
-        return {"E": E, "M": np.asarray(M / self._unit), **total}
+        if not self._natural:
+            return {"E": E, "M": np.asarray(bending_moment(E, K, law) / self._unit)}
+        # stresses come from the strain beyond the natural shape, which grows with two amplitudes
+        shape = NaturalFrame.from_tensors(
+            frame, *self._natural, mu.get(CURVATURE, 0.0), mu.get(STRETCH, 0.0)
+        )
+        elastic_strain, M = shape.elastic(E), shape.moment(E, K, law)
+        return {"E": elastic_strain, "M": np.asarray(M / self._unit), "E_total": E}
 
 
 def principal_fields(components: Mapping[str, Array]) -> dict[str, Array]:
@@ -296,7 +296,7 @@ def rubber_fields(fields: Mapping[str, Array], law: Law) -> dict[str, Array]:
     # in principal axes, where strains and stresses are diagonal
     E = np.stack([fields["E_1"], fields["E_2"]], axis=-1)
     squared_stretch = 1 + 2 * E
-    S1, _, S2 = law.stress(E[..., None] * np.eye(2), np.eye(2))
+    S1, _, S2 = law.stress(E[..., None] * np.eye(2), np.eye(2))  # components 11, 12, 22
     stretches = [
         *np.sqrt(np.moveaxis(squared_stretch, -1, 0)),
         1 / np.sqrt(np.prod(squared_stretch, axis=-1)),  # the volume is constant
@@ -379,26 +379,30 @@ class PointFields:
         """Set the constant fields, and what fields of a displacement need.
 
         Formulas are evaluated slightly inside cells, so that one that jumps has both its values.
-        `_field` has the applied field, `_magnetisation` the remanence with or without such a field.
+        `_field` has the applied field. `_magnetisation` has the remanence, with or without an
+        applied field; it is None if the material is soft alone. `_thins` tells where the material
+        thins. `_natural` are the tensors of the natural shape, None where no gap depends on them.
+        `_torque` is None without a uniform field.
         """
         self._contacts, self._h, self._thins = contacts, material.h, material.law_in(made_of).thins
         self._frame, self._field, self._thickness = TangentFrame.from_jet(r0), field, thickness
+        needs_natural_thickness = bool(contacts) and np.any(self._thins)
         self._natural = (
             natural.tensors_at(r0[0], self._frame.n0)
-            if natural and contacts and np.any(self._thins)
+            if natural and needs_natural_thickness
             else None
         )
-        self.constant: dict[str, Array] = {}
-        self._torque: Torque | None = None
         self.n0, self.weight = self._frame.n0, self._frame.area
-        self._magnetisation, self.Br = field or remanence, np.zeros((*r0.shape[1:-1], 0))
+        # soft material, with or without remanence
+        soft = field.soft if field else None
         self.susceptibility = np.zeros((*r0.shape[1:-1], 0))
-        if field and field.soft:
-            self.susceptibility = field.soft.susceptibility_at(inside_cells(r0[0]), self.n0)[
-                ..., None
-            ]
-        if field and field.soft and field.soft.alone:  # soft material without any remanence
-            self._magnetisation, field = None, None
+        if soft:
+            susceptibility = soft.susceptibility_at(inside_cells(r0[0]), self.n0)
+            self.susceptibility = susceptibility[..., None]
+        has_no_remanence = bool(soft and soft.alone)
+        # remanence
+        self._magnetisation = None if has_no_remanence else field or remanence
+        self.Br = np.zeros((*r0.shape[1:-1], 0))
         if self._magnetisation:
             pattern = self._magnetisation.remanent
             self.Br = (
@@ -406,7 +410,10 @@ class PointFields:
                 if callable(pattern)
                 else np.broadcast_to(pattern, r0[0].shape)
             )
-        if field and field.uniform:  # the loads are derived for a uniform field
+        # loads on the remanence, which are derived for a uniform field
+        self.constant: dict[str, Array] = {}
+        self._torque: Torque | None = None
+        if field and field.uniform and not has_no_remanence:
             h = material.h if thickness is None else material.h * thickness
             self.constant, self._torque = magnetic_loads(
                 self._geometry(), field, inside_cells(r0[0]), h
@@ -451,10 +458,10 @@ class PointFields:
         if self._field:
             fields["Ba"] = self._field.field_at(mu, frame.jet[0] + u[0])
         if self._field and self._field.soft:
-            deformed_area_vector = np.cross(frame.jet[1] + u[1], frame.jet[2] + u[2])
-            deformed_normal = deformed_area_vector / np.linalg.norm(
-                deformed_area_vector, axis=-1, keepdims=True
-            )
+            # the vector product of the deformed tangents, and its direction
+            area_vector = np.cross(frame.jet[1] + u[1], frame.jet[2] + u[2])
+            area = np.linalg.norm(area_vector, axis=-1, keepdims=True)
+            deformed_normal = area_vector / area
             fields["J"] = self._field.soft.polarisation(
                 inside_cells(frame.jet[0]), self.n0, deformed_normal, fields["Ba"]
             )

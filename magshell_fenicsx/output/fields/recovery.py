@@ -91,37 +91,40 @@ class Recovery:
     ) -> None:
         """Set the sparse matrix from samples to the coefficients of all polynomials.
 
-        It is filled directly in the form of `scipy.sparse.csr_matrix`: values, columns, starts.
+        A row of the matrix `_coefficients` belongs to one coefficient of one vertex; its columns
+        are the samples around that vertex. The matrix is filled directly in the form of
+        `scipy.sparse.csr_matrix`: `values` and `columns` of all entries, row after row, and
+        `starts` of the rows in both.
         """
         self._cells, self._vertices, self._frames, self._degree = cells, vertices, frames, degree
-        self._coefficient_count = len(_powers(cells.shape[1] - 1, degree))
-        self._size = np.ones(len(vertices))  # of each patch, by which its coordinates are divided
+        self._coefficient_count = count = len(_powers(cells.shape[1] - 1, degree))
+        # extent of each vertex's patch, by which its coordinates are divided; set by the fits
+        self._patch_size = np.ones(len(vertices))
         samples_per_cell = weight.shape[1]
         patches, cell_weights = _patches(cells, len(vertices))
         cells_per_vertex = np.diff(patches.indptr)
         # a row for each coefficient of each vertex
-        row_lengths = np.repeat(cells_per_vertex * samples_per_cell, self._coefficient_count)
+        row_lengths = np.repeat(cells_per_vertex * samples_per_cell, count)
         starts = np.concatenate([[0], np.cumsum(row_lengths)])
         columns, values = np.zeros(starts[-1], np.int32), np.zeros(starts[-1])
         # vertices with equally many cells are fitted together, in one array
         for cell_count in np.unique(cells_per_vertex):
             vertices_alike = np.flatnonzero(cells_per_vertex == cell_count)
             patch_entries = patches.indptr[vertices_alike][:, None] + np.arange(cell_count)
-            cells_around = patches.indices[patch_entries]
+            cells_around = patches.indices[patch_entries]  # (vertices, cells of each)
             sample_weights = weight[cells_around] * cell_weights[patch_entries][..., None]
             fit_matrices = self._fit_matrices(vertices_alike, samples[cells_around], sample_weights)
-            sample_numbers = cells_around[..., None] * samples_per_cell
-            sample_numbers = sample_numbers + np.arange(samples_per_cell)
-            count = self._coefficient_count
-            # places of these vertices' rows in the arrays of the sparse matrix
-            entries = starts[vertices_alike * count][:, None]
-            entries = entries + np.arange(count * sample_numbers[0].size)
-            columns[entries] = np.tile(sample_numbers.reshape(len(vertices_alike), -1), count)
-            # a polynomial of lower degree fills the first rows alone
-            values[entries[:, : fit_matrices[0].size]] = fit_matrices.reshape(
-                len(vertices_alike), -1
-            )
-        shape = len(vertices) * self._coefficient_count, weight.size
+            fits = fit_matrices.reshape(len(vertices_alike), -1)
+            # (vertices, samples of each)
+            sample_numbers = _members(cells_around, samples_per_cell)
+            sample_numbers = sample_numbers.reshape(len(vertices_alike), -1)
+            # the rows of a vertex follow one another in `values` and `columns`
+            first_entries = starts[vertices_alike * count][:, None]
+            entries = first_entries + np.arange(count * sample_numbers[0].size)
+            columns[entries] = np.tile(sample_numbers, count)
+            # a polynomial of lower degree has fewer rows; the values of the others stay zero
+            values[entries[:, : fit_matrices[0].size]] = fits
+        shape = len(vertices) * count, weight.size
         self._coefficients = scipy.sparse.csr_matrix((values, columns, starts), shape)
 
     def coefficients(self, values: Array) -> Array:
@@ -152,20 +155,17 @@ class Recovery:
         barycentric
             (n, d + 1) their barycentric coordinates.
         """
-        vertices_of_cells = self._cells[cell]
+        # a row has an entry for each coefficient of each vertex of the cell
+        vertices_of_cells = self._cells[cell]  # (n, d + 1)
         local_coordinates = np.einsum(
             "nvdk,nvk->nvd",
             self._frames[vertices_of_cells],
             places[:, None] - self._vertices[vertices_of_cells],
         )
+        scaled_coordinates = local_coordinates / self._patch_size[vertices_of_cells][..., None]
         # monomials at the place, times the blend weight of the vertex
-        values = (
-            _monomials(local_coordinates / self._size[vertices_of_cells][..., None], self._degree)
-            * barycentric[..., None]
-        )
-        columns = vertices_of_cells[..., None] * self._coefficient_count + np.arange(
-            self._coefficient_count
-        )
+        values = _monomials(scaled_coordinates, self._degree) * barycentric[..., None]
+        columns = _members(vertices_of_cells, self._coefficient_count)
         starts = np.arange(len(cell) + 1) * columns[0].size
         return scipy.sparse.csr_matrix(
             (values.ravel(), columns.ravel(), starts),
@@ -175,8 +175,8 @@ class Recovery:
     def _fit_matrices(self, vertex: Numbers, samples: Array, weight: Array) -> Array:
         """Return the least-squares fits around vertices, and set the sizes of their patches.
 
-        The degree is lowered until there are enough samples. A small ridge makes fits regular whose
-        samples lie on few lines.
+        The degree is lowered until there are enough samples; there are fewer coefficients then. A
+        small ridge keeps a fit regular even if its samples lie on few lines.
 
         Parameters
         ----------
@@ -192,29 +192,38 @@ class Recovery:
         n = len(vertex)
         offsets = samples.reshape(n, -1, samples.shape[-1]) - self._vertices[vertex][:, None]
         local_coordinates = offsets @ np.swapaxes(self._frames[vertex], 1, 2)
-        self._size[vertex] = np.abs(local_coordinates).max(axis=(1, 2))
-        degree = self._degree
-        # lower until the samples are more than the coefficients
-        while (
-            degree
-            and MIN_SAMPLES_PER_COEFFICIENT * len(_powers(local_coordinates.shape[-1], degree))
-            > local_coordinates.shape[1]
-        ):
-            degree -= 1
-        monomials = _monomials(local_coordinates / self._size[vertex][:, None, None], degree)
+        self._patch_size[vertex] = np.abs(local_coordinates).max(axis=(1, 2))
+        _, sample_count, dimensions = local_coordinates.shape
+        degree = _affordable_degree(self._degree, dimensions, sample_count)
+        scaled_coordinates = local_coordinates / self._patch_size[vertex][:, None, None]
+        monomials = _monomials(scaled_coordinates, degree)  # (n, samples, coefficients)
         weight = weight.reshape(n, -1)
         weight_roots = np.sqrt(weight / weight.sum(axis=1, keepdims=True))[..., None]
+        coefficient_count = monomials.shape[-1]
         ridge = np.broadcast_to(
-            RIDGE * np.eye(monomials.shape[-1]), (n, monomials.shape[-1], monomials.shape[-1])
+            RIDGE * np.eye(coefficient_count), (n, coefficient_count, coefficient_count)
         )
         # rows of the ridge, with values of zero, keep every fit regular; a factorisation by
         # reflections keeps the condition small, where normal equations would square it
         Q, upper_triangle = np.linalg.qr(np.concatenate([weight_roots * monomials, ridge], axis=1))
-        return np.asarray(
-            np.linalg.solve(
-                upper_triangle, np.swapaxes(Q[:, : monomials.shape[1]] * weight_roots, 1, 2)
-            )
-        )
+        Q_of_samples = Q[:, :sample_count]  # the ridge's rows have values of zero
+        fits = np.linalg.solve(upper_triangle, np.swapaxes(Q_of_samples * weight_roots, 1, 2))
+        return np.asarray(fits)
+
+
+def _members(groups: Numbers, group_size: int) -> Numbers:
+    """Return the numbers (..., group_size) of the members of groups, numbered group after group.
+
+    Group 2 of three members has the members 6, 7 and 8.
+    """
+    return np.asarray(groups[..., None] * group_size + np.arange(group_size))
+
+
+def _affordable_degree(degree: int, dimensions: int, sample_count: int) -> int:
+    """Return the degree, lowered until the samples are more than the coefficients."""
+    while degree and MIN_SAMPLES_PER_COEFFICIENT * len(_powers(dimensions, degree)) > sample_count:
+        degree -= 1
+    return degree
 
 
 def _patches(cells: Numbers, count: int) -> tuple["scipy.sparse.csr_matrix", Array]:
@@ -239,11 +248,12 @@ def _patches(cells: Numbers, count: int) -> tuple["scipy.sparse.csr_matrix", Arr
     first_ring = scipy.sparse.csr_matrix(
         (np.ones(cells.size), (cells.ravel(), np.repeat(np.arange(m), corners))), (count, m)
     )
+    # a side has all vertices of a cell but one; a side of a single cell is at an edge
     sides = np.concatenate([np.delete(cells, i, axis=1) for i in range(corners)])
     sides, cells_per_side = np.unique(np.sort(sides, axis=1), axis=0, return_counts=True)
     is_at_edge = np.zeros(count)
     is_at_edge[sides[cells_per_side == 1]] = 1.0
-    # cells that share a vertex with the first ring
+    # cells that share a vertex with the first ring, around vertices at an edge alone
     second_ring = scipy.sparse.diags(is_at_edge) @ (first_ring @ (first_ring.T @ first_ring))
     second_ring.data[:] = SECOND_RING_WEIGHT  # in place of numbers of shared vertices
     patches = (first_ring + second_ring).tocsr()
@@ -307,8 +317,11 @@ class RecoveredShell:
         """Set the recovery around the vertices, and its evaluation at all nodes.
 
         Vertices are the corners of cells, renumbered; the normal at a vertex is the sum of the
-        cells' normals there.
+        cells' normals there. `_recovery` fits polynomials around vertices, and `_to_nodes` is the
+        matrix from their coefficients to values at the nodes (n,). `_numbers`, `_weight` and
+        `_table` are the parameters.
         """
+        # corners are the first three nodes of a cell; here by the numbers of vertices
         vertices, corners = np.unique(numbers[:, :3], return_inverse=True)
         corners = corners.reshape(-1, 3)
         vertex_places, vertex_normals = np.zeros((2, len(vertices), 3))
@@ -317,11 +330,13 @@ class RecoveredShell:
         self._recovery = Recovery(
             corners, samples, weight, vertex_places, frames_across(vertex_normals), degree
         )
-        # each node is evaluated once, in the first cell that has it
+        # each node is evaluated once: as node number `node_in_cell` of the first cell that has it
         _, first_entry = np.unique(numbers, return_index=True)
-        cell, node = np.divmod(first_entry, numbers.shape[1])
-        barycentric = np.column_stack([1 - reference.sum(axis=1), reference])[node]
-        self._to_nodes = self._recovery.evaluation_matrix(cell, nodes[cell, node], barycentric)
+        cell, node_in_cell = np.divmod(first_entry, numbers.shape[1])
+        barycentric = np.column_stack([1 - reference.sum(axis=1), reference])[node_in_cell]
+        self._to_nodes = self._recovery.evaluation_matrix(
+            cell, nodes[cell, node_in_cell], barycentric
+        )
         self._numbers, self._weight, self._table = numbers, weight, table
 
     def fields(
@@ -345,18 +360,15 @@ class RecoveredShell:
         jumps
             Name -> `relative_jump` of the samples and the recovered field.
         """
+        # all tensors are fitted together, side by side, and then split again
         coefficients = self._recovery.coefficients(np.concatenate(list(tensors.values()), axis=-1))
-        at_nodes = dict(
-            zip(
-                tensors, np.split(self._to_nodes @ coefficients, len(tensors), axis=-1), strict=True
-            )
-        )
-        jumps = {
-            name: relative_jump(
-                tensors[name], self._table @ at_nodes[name][self._numbers], self._weight, zero
-            )
-            for name, zero in ROUNDING.items()
-        }
+        values_at_nodes = np.split(self._to_nodes @ coefficients, len(tensors), axis=-1)
+        at_nodes = dict(zip(tensors, values_at_nodes, strict=True))
+        jumps = {}
+        for name, zero in ROUNDING.items():
+            smooth_at_samples = self._table @ at_nodes[name][self._numbers]
+            jumps[name] = relative_jump(tensors[name], smooth_at_samples, self._weight, zero)
+        # from weighted components to tensors (n, 3, 3), and to components in tangent frames
         t = frames_across(n0)
         components = {
             name: in_frame((values / COMPONENT_WEIGHTS)[..., COMPONENT_NUMBERS], t)
@@ -397,8 +409,8 @@ def smooth_parts(
 ) -> Numbers:
     """Return (m,) the number of the smooth part to which each cell belongs.
 
-    Cells are in one part if they are connected across sides where neither a prescribed field nor
-    the normal jumps.
+    Two neighbours are in one part if neither a prescribed field nor the normal jumps at their
+    common side. A part has all cells that such sides connect.
 
     Parameters
     ----------
@@ -412,29 +424,18 @@ def smooth_parts(
         (m, s, 3)
     """
     count = len(corners)
+    # a side of two cells is listed twice, once with each cell
     nodes_of_sides = corners[:, sides].reshape(-1, sides.shape[1])  # cell after cell
     # sorted node numbers identify a side from both of its cells
     order = np.argsort(nodes_of_sides, axis=1)
-    key = np.take_along_axis(nodes_of_sides, order, axis=1)
-    _, first_with_key, key_numbers, sides_with_key = np.unique(
-        key, axis=0, return_index=True, return_inverse=True, return_counts=True
-    )
-    key_numbers = key_numbers.ravel()
-    # sides of two cells, at their second occurrence
-    second_sides = np.flatnonzero(
-        (sides_with_key[key_numbers] == 2)
-        & (first_with_key[key_numbers] != np.arange(len(nodes_of_sides)))
-    )
-    shared_sides = np.column_stack([first_with_key[key_numbers[second_sides]], second_sides])
+    shared_sides = _equal_rows(np.take_along_axis(nodes_of_sides, order, axis=1))
 
     def jumps(field: Array) -> Array:
         """Return the largest jump of a field at the nodes of each shared side."""
-        values = field.reshape(count, corners.shape[1], -1)[:, sides].reshape(
-            *nodes_of_sides.shape, -1
-        )
-        values_here, values_there = np.take_along_axis(values, order[..., None], axis=1)[
-            shared_sides.T
-        ]
+        values_of_cells = field.reshape(count, corners.shape[1], -1)
+        values = values_of_cells[:, sides].reshape(*nodes_of_sides.shape, -1)
+        values_in_order = np.take_along_axis(values, order[..., None], axis=1)
+        values_here, values_there = values_in_order[shared_sides.T]
         return np.asarray(np.abs(values_here - values_there).max(axis=(1, 2)))
 
     kink = jumps(normals)
@@ -443,6 +444,7 @@ def smooth_parts(
         largest = np.abs(field).max() or 1.0
         # a field along the normal turns with facets
         is_split |= jumps(field) > largest * (FIELD_JUMP + 2 * kink)
+    # sides are listed cell after cell, so division gives the cells on both sides
     first_cells, second_cells = (shared_sides[~is_split] // len(sides)).T
     adjacency = scipy.sparse.coo_matrix(
         (np.ones(len(first_cells)), (first_cells, second_cells)), (count, count)
@@ -451,8 +453,25 @@ def smooth_parts(
     return np.asarray(part_numbers, np.int64)
 
 
+def _equal_rows(rows: Numbers) -> Numbers:
+    """Return the pairs (e, 2) of row numbers whose rows are equal; each row equals at most one.
+
+    Rows that occur once, or more than twice, are in no pair.
+    """
+    _, first_with_key, key_numbers, rows_with_key = np.unique(
+        rows, axis=0, return_index=True, return_inverse=True, return_counts=True
+    )
+    key_numbers = key_numbers.ravel()  # of each row
+    occurs_twice = rows_with_key[key_numbers] == 2
+    is_later = first_with_key[key_numbers] != np.arange(len(rows))
+    second_rows = np.flatnonzero(occurs_twice & is_later)
+    return np.column_stack([first_with_key[key_numbers[second_rows]], second_rows])
+
+
 def split(numbers: Numbers, parts: Numbers) -> Numbers:
     """Return the nodes (m, s) of cells, renumbered so that cells of different parts share none.
+
+    `parts` (m,) is the number of each cell's part. If there is one part, nothing changes.
 
     Examples
     --------

@@ -129,14 +129,16 @@ def _ring(surface: Surface, tessellation: Tessellation, crest: Array, height: fl
         return None
     triangles = tessellation.triangles[cut_triangles]
     values = np.column_stack([r, mode_w])
-    # each cut triangle has one line of the ring, with two ends
+    # each cut triangle has one line of a ring, with two ends; `on_ring` are lines of one ring
     ends, w_at_ends = _cuts(triangles, is_above[cut_triangles], values, height)
     on_ring = _connected(ends, crest)
     theta = np.arctan2(ends[on_ring, :, 1], ends[on_ring, :, 0])
     order = np.argsort(theta, axis=None)
     ascending = theta.ravel()[order]
+    # the ring is not closed if it has a wide gap, the one from the last point to the first included
     if np.diff(ascending, append=ascending[0] + 2 * np.pi).max() > MAX_GAP:
         return None
+    # how far neighbouring nodes of the mesh are apart on the ring
     triangles_per_cell = len(tessellation.triangles) // len(tessellation.nodes)
     cells_on_ring = cut_triangles[on_ring] // triangles_per_cell  # triangles are cell after cell
     nodes_of_cells = surface.r0[tessellation.nodes[cells_on_ring]]
@@ -166,13 +168,15 @@ def _cuts(
     w
         (t, 2) w at these ends.
     """
-    # the corner that is alone on its side of the plane
-    single_corner = np.argmax(is_above == (is_above.sum(axis=1) == 1)[:, None], axis=1)
+    # the corner that is alone on its side of the plane, be it above or below
+    single_is_above = is_above.sum(axis=1) == 1
+    single_corner = np.argmax(is_above == single_is_above[:, None], axis=1)
     order = (single_corner[:, None] + np.arange(3)) % 3  # that corner first
     corners = values[np.take_along_axis(triangles, order, axis=1)]
-    tip, base = corners[:, :1], corners[:, 1:]
-    fraction = (height - tip[..., 2]) / (base[..., 2] - tip[..., 2])
-    ends = tip + fraction[..., None] * (base - tip)
+    single, other_two = corners[:, :1], corners[:, 1:]
+    # the plane cuts the two sides from the single corner to the others
+    fraction = (height - single[..., 2]) / (other_two[..., 2] - single[..., 2])
+    ends = single + fraction[..., None] * (other_two - single)
     return ends[..., :2], ends[..., 3]
 
 
@@ -181,16 +185,17 @@ def _connected(ends: Array, place: Array) -> Numbers:
 
     `ends` (t, 2, 2) are x and y of the ends of t lines.
     """
-    points = ends.reshape(-1, 2)
+    points = ends.reshape(-1, 2)  # points 2 i and 2 i + 1 are the ends of line i
     pairs = scipy.spatial.cKDTree(points).query_pairs(ENDPOINT_TOLERANCE, output_type="ndarray")
     # ends at one place, and the two ends of each line
     links = np.concatenate([pairs, np.arange(len(points)).reshape(-1, 2)])
     graph = scipy.sparse.coo_array(
         (np.ones(len(links)), tuple(links.T)), shape=(len(points), len(points))
     )
-    _, number = scipy.sparse.csgraph.connected_components(graph, directed=False)
+    _, ring_number = scipy.sparse.csgraph.connected_components(graph, directed=False)
     nearest = np.argmin(np.linalg.norm(points - place[:2], axis=1))
-    return np.flatnonzero(number[::2] == number[nearest])  # one of the two ends of each line
+    ring_of_line = ring_number[::2]  # that of the line's first end
+    return np.flatnonzero(ring_of_line == ring_number[nearest])
 
 
 def _extent(nodes: Array, theta: Array) -> float:

@@ -125,8 +125,9 @@ class SurfaceGatherer:
     def __init__(self, model: "ShellModel") -> None:
         """Prepare the gathering for all states of a model; collective.
 
-        `_element` has the equidistant nodes at which fields are given; `_recovered` fits fields to
-        samples, on rank 0.
+        `_element` has the equidistant nodes at which fields are given, at `_reference_nodes` in the
+        reference triangle. `_reference_samples` are the places of samples there. Rank 0 has
+        `_recovered`, which fits fields to samples; on other ranks it stays None.
         """
         self._model = model
         domain, degree = model.V.mesh, model.degree
@@ -145,7 +146,7 @@ class SurfaceGatherer:
             basix.CellType.triangle, max(sample_degree, degree)
         )
         self._owned_cells = cells.size_local
-        # this space numbers each shared node once
+        # this space of functions numbers each shared node once: (cells, nodes of a cell)
         V = fem.functionspace(domain, basix.ufl.wrap_element(self._element))
         local_nodes = V.dofmap.list[: self._owned_cells]
         numbers = V.dofmap.index_map.local_to_global(local_nodes.ravel().astype(np.int32))
@@ -159,9 +160,10 @@ class SurfaceGatherer:
     ) -> None:
         """Set all that depends on the undeformed placement: fields, recovery, averages; collective.
 
-        `_fields` and `_stresses` are functions of a displacement at nodes and at samples.
-        `_to_space` maps components in tangent frames to components in space. `_constant` has the
-        fields that no displacement changes.
+        `_fields` computes fields of a displacement at nodes, `_stresses` strains and moments at
+        samples. `_to_space` maps components in tangent frames to components in space. `_constant`
+        has the fields that no displacement changes. `_averaging_matrix` is that of
+        `_weighted_mean`; `_r0` and `_n0` are placement and unit normals at the nodes.
 
         Parameters
         ----------
@@ -180,20 +182,21 @@ class SurfaceGatherer:
         self._fields = PointFields(
             r,
             model.material,
-            loads.magnetic,
-            thickness_at_nodes,
-            loads.contacts,
-            loads.remanence,
-            loads.natural,
-            made_of,
+            field=loads.magnetic,
+            thickness=thickness_at_nodes,
+            contacts=loads.contacts,
+            remanence=loads.remanence,
+            natural=loads.natural,
+            made_of=made_of,
         )
         self._stresses = Stresses(
             r_at_samples, model.material, thickness_at_samples, loads.natural, made_of
         )
         self._to_space = components_in_space(self._stresses.frame)
-        if numbers is not None:
-            self._split_nodes(numbers, r[0], r_at_samples[0])
+        if numbers is not None:  # at the first call: which nodes cells share never changes
+            self._split_nodes(numbers, r=r[0], r_at_samples=r_at_samples[0])
         self._averaging_matrix = self._weighted_mean()
+        # imperfections and shell numbers are constant fields too
         deviation = model.midsurface.deviation(
             self._reference_nodes, deviations_at(loads.growing_imperfections, mu)
         )
@@ -203,24 +206,62 @@ class SurfaceGatherer:
             )
         if self._model.midsurface.shells:
             self._fields.constant[SHELL] = self._shell_numbers()
+        # from the nodes of each cell to the nodes of the surface
         n0 = self._averaged(self._fields.n0)
         self._r0, self._n0 = self._averaged(r[0]), n0 / np.linalg.norm(n0, axis=-1)[..., None]
         self._constant = {
             name: self._averaged(values) for name, values in self._fields.constant.items()
         }
 
-    def _split_nodes(self, numbers: NDArray[np.int64], r: Array, inner: Array) -> None:
+    def _split_nodes(self, numbers: NDArray[np.int64], r: Array, r_at_samples: Array) -> None:
         """Split the nodes of all cells between smooth parts, and set the recovery; collective.
 
-        A smooth part ends where a prescribed field or the normal jumps. Nodes there get several
-        numbers.
+        A smooth part ends where a prescribed field or the normal jumps. A node there gets a number
+        of its own in each part. `_numbers` are the new numbers in dolfinx's order of the nodes of a
+        cell, `_cells` the same in VTK's order.
 
         Parameters
         ----------
         numbers
             (cells, nodes of a cell) global node numbers of all cells.
-        r, inner
+        r, r_at_samples
             Placement (cells, points, 3) of this rank's cells, at the nodes and at the samples.
+        """
+        # what rank 0 needs from the cells of all ranks
+        prescribed_fields = [
+            self._gather_cells(field) for field in self._prescribed_fields(r) if field.size
+        ]
+        sample_area = self._stresses.frame.area * self._sample_weights
+        r, n0, samples, weight = (
+            self._gather_cells(values) for values in (r, self._fields.n0, r_at_samples, sample_area)
+        )
+        self._numbers = numbers
+        if self.comm.rank:  # rank 0 alone recovers fields
+            return
+        # nodes on each side of a cell: of the element's entities of dimension 1
+        sides = np.array(self._element.entity_closure_dofs[1])
+        part_of_cell = smooth_parts(numbers, sides, prescribed_fields, n0)
+        self._numbers = split(numbers, part_of_cell)
+        to_vtk = np.argsort(perm_vtk(mesh.CellType.triangle, numbers.shape[1]))
+        self._cells = self._numbers[:, to_vtk]
+        shape_functions = self._element.tabulate(0, self._reference_samples)[0, :, :, 0]
+        self._recovered = RecoveredShell(
+            self._numbers,
+            self._reference_nodes,
+            nodes=r,
+            normals=n0,
+            samples=samples,
+            weight=weight,
+            table=shape_functions,
+            degree=self._model.degree,
+        )
+
+    def _prescribed_fields(self, r: Array) -> list[Array]:
+        """Return the fields whose jumps end a smooth part, at the nodes of this rank's cells.
+
+        They are remanence, susceptibility, natural shape, number of the shell, number of the law of
+        elasticity, and thickness; each is (cells, nodes of a cell, ...). `r` (cells, nodes of a
+        cell, 3) is the placement.
         """
         loads, fields = self._model.loads, self._fields
         prescribed_fields = [fields.Br, fields.susceptibility]
@@ -235,23 +276,7 @@ class SurfaceGatherer:
             prescribed_fields.append(np.repeat(law_numbers, r.shape[1], axis=1))
         if thickness is not None:
             prescribed_fields.append(thickness)
-        prescribed_fields = [self._gather_cells(field) for field in prescribed_fields if field.size]
-        sample_area = self._stresses.frame.area * self._sample_weights
-        r, n0, inner, weight = (
-            self._gather_cells(values) for values in (r, fields.n0, inner, sample_area)
-        )
-        self._numbers = numbers
-        if self.comm.rank:  # rank 0 alone recovers fields
-            return
-        # nodes of the entities of dimension 1
-        sides = np.array(self._element.entity_closure_dofs[1])
-        self._numbers = split(numbers, smooth_parts(numbers, sides, prescribed_fields, n0))
-        to_vtk = np.argsort(perm_vtk(mesh.CellType.triangle, numbers.shape[1]))
-        self._cells = self._numbers[:, to_vtk]
-        table = self._element.tabulate(0, self._reference_samples)[0, :, :, 0]
-        self._recovered = RecoveredShell(
-            self._numbers, self._reference_nodes, r, n0, inner, weight, table, self._model.degree
-        )
+        return prescribed_fields
 
     def gather(self, u: Vector, mu: Mapping[str, float] | None = None) -> Surface | None:
         """Return the displaced surface with its fields at the amplitudes `mu`; collective.
@@ -277,6 +302,7 @@ class SurfaceGatherer:
         """
         if self._model.growing:  # imperfections that amplitudes multiply move the placement
             self._set_placement(state.mu)
+        # fields that are averaged between the cells at a node
         jet = self._jet(self._model.u, self._reference_nodes, order=1)
         values = self._fields.values_of(jet, state.mu)
         if state.mu:  # of a mode there are no amplitudes, and no contact
@@ -292,7 +318,8 @@ class SurfaceGatherer:
         averaged = {
             name: self._averaged(values_at_cells) for name, values_at_cells in values.items()
         }
-        nodes, law = self._averaged(jet[0]), self._law_at_nodes()
+        u_at_nodes, law = self._averaged(jet[0]), self._law_at_nodes()
+        # fields that are recovered from samples in cells: strains and moments
         stresses = self._stresses.values_of(
             self._jet(self._model.u, self._reference_samples), state.mu
         )
@@ -308,7 +335,7 @@ class SurfaceGatherer:
         names = self._model.midsurface.shells
         return Surface(
             self._r0,
-            nodes,
+            u_at_nodes,
             self._n0,
             self._cells,
             fields,
@@ -425,7 +452,7 @@ def add_contact(
     at_nodes
         Function from a value of each local cell to (cells, nodes of a cell).
     """
-    pressure = model.cell_pressures(state)
+    pressure = model.cell_pressures(state)  # None without contact
     if pressure is not None:
         resolved = at_nodes(model.cells_evenly_pressed(state).astype(np.float64))
         gap_to_bodies = values.get(GAP, np.zeros(resolved.shape))
@@ -459,10 +486,13 @@ def resolved_pressure(cells: NDArray[np.int64], fields: dict[str, Array]) -> dic
         return fields
     auxiliary = {RESOLVED, RESOLVED_PRESSURE, GAP_OPEN}
     shown_fields = {name: values for name, values in fields.items() if name not in auxiliary}
+    # a node is in the zone if one of its cells is evenly pressed
     in_zone = fields[RESOLVED] > 0
+    # the edge of the zone: the other nodes of cells that touch the zone
+    touches_zone = in_zone[cells].any(axis=1)
     in_zone_or_edge = in_zone.copy()
-    # the edge of the zone: all nodes of cells that touch it
-    in_zone_or_edge[cells[in_zone[cells].any(axis=1)]] = True
+    in_zone_or_edge[cells[touches_zone]] = True
+    # the mean over evenly pressed cells alone: both fields are means over all cells at the node
     pressure_in_zone = fields[RESOLVED_PRESSURE] / np.where(in_zone, fields[RESOLVED], 1.0)
     edge_is_open = in_zone_or_edge & (fields[GAP_OPEN] > 0)
     pressure_outside = np.where(edge_is_open, 0.0, shown_fields[PRESSURE])
@@ -517,16 +547,16 @@ def completed(surface: Surface, mirror: Array) -> Surface:
         return np.concatenate([values, values_of_image])
 
     return Surface(
-        with_image(surface.r0, image.r0),
-        with_image(surface.u, image.u),
-        with_image(surface.n0, image.n0),
-        np.concatenate([surface.cells, surface.cells + len(surface.r0)]),
-        {name: with_image(f, image.fields[name]) for name, f in surface.fields.items()},
-        surface.outlines,
-        surface.jump,
-        surface.strain_jump,
-        surface.solids,
-        surface.shells,
+        r0=with_image(surface.r0, image.r0),
+        u=with_image(surface.u, image.u),
+        n0=with_image(surface.n0, image.n0),
+        cells=np.concatenate([surface.cells, surface.cells + len(surface.r0)]),
+        fields={name: with_image(f, image.fields[name]) for name, f in surface.fields.items()},
+        outlines=surface.outlines,
+        jump=surface.jump,
+        strain_jump=surface.strain_jump,
+        solids=surface.solids,
+        shells=surface.shells,
     )
 
 
@@ -560,22 +590,27 @@ def completed_by_symmetry(surface: Surface, mirror: Mirror) -> Surface:
 def on_nodes_of(surface: Surface, target: Surface) -> Surface:
     """Return the surface with displacement and fields at the nodes of another mesh of the shell.
 
-    Values are linear functions fitted to the nearest nodes of `surface`, so that errors are of
-    second order in their distance. On the same mesh `surface` itself is returned.
+    Around each node of `target` a linear function is fitted to the nearest nodes of `surface`; its
+    value at the node is the result. Errors are of second order in the distance of these nodes. If
+    both meshes are the same, `surface` itself is returned.
     """
-    if (
+    has_same_nodes = (
         surface.r0.shape == target.r0.shape
         and np.abs(surface.r0 - target.r0).max() < SAME_PLACE_TOLERANCE
-    ):
+    )
+    if has_same_nodes:
         return surface
     distance, nearest_nodes = scipy.spatial.cKDTree(surface.r0).query(target.r0, NODES_OF_FIT)
     offsets = surface.r0[nearest_nodes] - target.r0[:, None]
     reach = np.maximum(distance.max(axis=1), SAME_PLACE_TOLERANCE)[:, None]
     # from one at the target to exp(-4) at the farthest of these nodes
     weight = np.exp(-((2 * distance / reach) ** 2))[..., None]
-    # row 0 of the pseudo-inverse is the fit's constant, its value at the target node
-    basis = np.concatenate([np.ones((*nearest_nodes.shape, 1)), offsets / reach[..., None]], axis=2)
-    interpolation = np.linalg.pinv(weight * basis, rcond=EXTENT_TOLERANCE)[:, 0] * weight[..., 0]
+    # the functions 1, x, y, z at the nearest nodes, for each target node
+    ones = np.ones((*nearest_nodes.shape, 1))
+    basis = np.concatenate([ones, offsets / reach[..., None]], axis=2)
+    # row 0 of the pseudo-inverse gives the fit's constant, its value at the target node
+    fit = np.linalg.pinv(weight * basis, rcond=EXTENT_TOLERANCE)
+    interpolation = fit[:, 0] * weight[..., 0]
 
     def interpolated(f: Array) -> Array:
         return np.asarray(np.einsum("nk,nk...->n...", interpolation, f[nearest_nodes]))
@@ -594,9 +629,10 @@ def on_nodes_of(surface: Surface, target: Surface) -> Surface:
 def _parity(surface: Surface, normal: Array, offset: float) -> float:
     """Return the sign of a mirror image of Br and Ba: 1 if it continues them, else -1.
 
-    Both fields have the same sign. It follows from the applied field Ba at the plane, which is
-    continuous there. Without Ba it follows from the remanence Br, and is 1 if Br jumps at the
-    plane.
+    Both fields have the same sign. It follows from the nodes at the plane: from the applied field
+    Ba there; where Ba is missing or zero, from the remanence Br. The sign is 1 if the vectors at
+    the plane are mostly tangential to it, and -1 if they are mostly normal. It is 1 too if their
+    length varies much along the plane, or if both fields are zero there.
 
     Parameters
     ----------
@@ -609,10 +645,11 @@ def _parity(surface: Surface, normal: Array, offset: float) -> float:
     for name in ("Ba", "Br"):
         vectors = surface.fields.get(name, np.zeros((len(on_plane), 3)))[on_plane]
         magnitude = np.nan_to_num(np.linalg.norm(vectors, axis=1))
-        if magnitude.max(initial=0.0) > 0:
+        if magnitude.max(initial=0.0) > 0:  # the first of the two fields that is there
             jumps = magnitude.min() < magnitude.max() / 2
             # a tangential vector equals its image, a normal one is the opposite of its image
-            is_tangential = 2 * np.nansum((vectors @ normal) ** 2) <= np.sum(magnitude**2)
+            normal_part = np.nansum((vectors @ normal) ** 2)
+            is_tangential = 2 * normal_part <= np.sum(magnitude**2)
             return 1.0 if jumps or is_tangential else -1.0
     return 1.0
 

@@ -125,6 +125,7 @@ def _divided(
         Points (q, 2) in the reference cell, and triangles (t, 3) between them.
     """
     points, triangles = triangulation
+    # values and derivatives of the shape functions, in the order of a cell's nodes
     table, *slopes = element.tabulate(1, points)[:, :, :, 0][:, :, order]
     # the points of all cells are numbered cell after cell
     numbers = np.arange(len(nodes))[:, None, None] * len(points) + triangles
@@ -137,6 +138,7 @@ def _triangle(n: int) -> tuple[Array, Numbers]:
     """Return points (q, 2) in the reference triangle, and n² triangles (n², 3) between them."""
     places = [(i, j) for j in range(n + 1) for i in range(n + 1 - j)]  # in steps of 1/n
     number = {place: k for k, place in enumerate(places)}
+    # triangles that point up, and those that point down between them
     up = [(number[i, j], number[i + 1, j], number[i, j + 1]) for i, j in places if i + j < n]
     down = [
         (number[i + 1, j], number[i + 1, j + 1], number[i, j + 1])
@@ -149,6 +151,7 @@ def _triangle(n: int) -> tuple[Array, Numbers]:
 def _squares(n: int) -> tuple[Array, Numbers]:
     """Return points (q, 2) in the reference square, and 2 n² triangles between them."""
     x, y = np.meshgrid(np.arange(n + 1), np.arange(n + 1))
+    # numbers of the points at the lower left corner of each of the n² squares, and next to it
     low = (np.arange(n)[:, None] * (n + 1) + np.arange(n)).ravel()
     right, upper = low + 1, low + n + 1
     triangles = np.concatenate(
@@ -174,6 +177,7 @@ def _outer_faces(cells: Numbers) -> Numbers:
         """Return the coordinates of a node of degree two as multiples of a half."""
         return tuple(np.round(2 * point).astype(int))
 
+    # all six faces of all cells, with their nodes in the order of the square
     faces = []
     for axis in range(3):
         other_axes = [i for i in range(3) if i != axis]

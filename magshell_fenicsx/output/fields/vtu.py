@@ -104,25 +104,23 @@ def unstructured_grid(
     # deep copies: VTK must not refer to memory that numpy frees
     points.SetData(numpy_to_vtk(surface.r0 + surface.u if deformed else surface.r0, deep=True))
     cell_count, nodes_per_cell = surface.cells.shape
-    cell_starts, nodes = (
-        np.arange(0, (cell_count + 1) * nodes_per_cell, nodes_per_cell),
-        surface.cells.ravel(),
-    )
+    # VTK's cells: where each begins in one list of nodes, and that list
+    cell_starts = np.arange(0, (cell_count + 1) * nodes_per_cell, nodes_per_cell)
+    nodes = surface.cells.ravel()
     cells.SetData(
         *(numpy_to_vtk(array.astype(np.int64), deep=True) for array in (cell_starts, nodes))
     )
     grid.SetPoints(points)
     cell_type = LAGRANGE_HEXAHEDRON if surface.is_body else LAGRANGE_TRIANGLE
     grid.SetCells(TRIANGLE if nodes_per_cell == 3 else cell_type, cells)
-    data_of_surface = (surface.u, surface.u / h, surface.w / h, surface.r0, surface.n0)
+    # arrays of the nodes: those of every surface, then its fields, of tensors six components
+    values_of_surface = (surface.u, surface.u / h, surface.w / h, surface.r0, surface.n0)
+    data_of_surface = dict(zip(DATA_OF_SURFACE, values_of_surface, strict=True))
     fields = {
         name: values if values.ndim < 3 else values[:, *VTK_TENSOR_INDICES]
         for name, values in surface.fields.items()
     }
-    for name, values in {
-        **dict(zip(DATA_OF_SURFACE, data_of_surface, strict=True)),
-        **fields,
-    }.items():
+    for name, values in {**data_of_surface, **fields}.items():
         add_array(grid.GetPointData(), name, values)
     return grid
 
@@ -222,6 +220,7 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, ShellDat
     """
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
+    # in VTK's data of points, symmetric tensors have six components
     node_numbers = vtk_to_numpy(grid.GetCells().GetConnectivityArray())
     cells = node_numbers.reshape(grid.GetNumberOfCells(), -1)
     point_arrays, file_arrays = arrays(grid.GetPointData()), arrays(grid.GetFieldData())
@@ -232,6 +231,7 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, ShellDat
     }
     if "h_over_R" not in file_arrays:
         raise CaseError(f"{file} is of an earlier version: run the case again")
+    # in VTK's data of the file, each number is an array (1,)
     R = float(file_arrays["R_in_m"][0]) if "R_in_m" in file_arrays else nan
     shell_data = ShellData(
         float(file_arrays["h_over_R"][0]),
@@ -240,34 +240,40 @@ def _surface(grid: "vtkUnstructuredGrid", file: Path) -> tuple[Surface, ShellDat
         R,
     )
     # u is stored over h too, and is multiplied by h below
-    r0, u, n0 = (point_arrays[name] for name in ("r0", "u_over_h", "n0"))
-    if (
-        {r0.shape, u.shape, n0.shape} != {(len(r0), 3)}
-        or not cells.size
-        or not 0 <= cells.min() <= cells.max() < len(r0)
-    ):
-        raise ValueError("its cells have no nodes")
-    if not all(np.isfinite(values).all() for values in (r0, u, n0)):
-        raise ValueError("a node is nowhere")
+    r0, u_over_h, n0 = (point_arrays[name] for name in ("r0", "u_over_h", "n0"))
+    _refuse_unfit_nodes(r0, u_over_h, n0, cells)
     moment_jump, strain_jump = (
         float(file_arrays[name][0]) if name in file_arrays else None for name in JUMPS
     )
-    shell_names = grid.GetFieldData().GetAbstractArray(SHELLS)
-    shells = (
-        tuple(shell_names.GetValue(i) for i in range(shell_names.GetNumberOfValues()))
-        if shell_names
-        else ()
-    )
-    return Surface(
+    surface = Surface(
         r0,
-        u * shell_data.h,
+        u_over_h * shell_data.h,
         n0,
         cells,
         fields,
         jump=moment_jump,
         strain_jump=strain_jump,
-        shells=shells,
-    ), shell_data
+        shells=_shell_names(grid.GetFieldData()),
+    )
+    return surface, shell_data
+
+
+def _refuse_unfit_nodes(r0: Array, u_over_h: Array, n0: Array, cells: NDArray[Any]) -> None:
+    """Raise ValueError if nodes are not (n, 3) and finite, or if cells have other node numbers."""
+    if (
+        {r0.shape, u_over_h.shape, n0.shape} != {(len(r0), 3)}
+        or not cells.size
+        or not 0 <= cells.min() <= cells.max() < len(r0)
+    ):
+        raise ValueError("its cells have no nodes")
+    if not all(np.isfinite(values).all() for values in (r0, u_over_h, n0)):
+        raise ValueError("a node is nowhere")
+
+
+def _shell_names(vtk_data: Any) -> tuple[str, ...]:
+    """Return the names of the shells in VTK's data of a file; empty if there is one shell."""
+    names = vtk_data.GetAbstractArray(SHELLS)
+    return tuple(names.GetValue(i) for i in range(names.GetNumberOfValues())) if names else ()
 
 
 class FieldSeries:
@@ -301,21 +307,19 @@ class FieldSeries:
         rows: Sequence[Mapping[str, Any]] = (),
         grids: Sequence[str] = (),
     ) -> None:
-        """Count the complete points in the folder, and list them in path.pvd."""
-        self._folder, self._shell_data, self._outlines, self._grids = (
-            folder,
-            shell_data,
-            outlines,
-            grids,
-        )
+        """Count the complete points in the folder, and list them in path.pvd.
+
+        `_rows` are the rows of the complete points; without rows of path.csv their numbers alone.
+        """
+        self._folder, self._shell_data = folder, shell_data
+        self._outlines, self._grids = outlines, grids
         folder.mkdir(exist_ok=True)
         self.complete_points = 0
         # all files of points 0, 1, ... until one is missing or cut off
         while all(map(is_whole, self._files(self.complete_points))):
             self.complete_points += 1
-        self.complete_points = (  # a point without a row will be written again
-            min(self.complete_points, len(rows)) if rows else self.complete_points
-        )
+        if rows:  # a point without a row will be written again
+            self.complete_points = min(self.complete_points, len(rows))
         self._rows: list[Mapping[str, Any]] = list(rows[: self.complete_points]) or [
             {"point": n} for n in range(self.complete_points)
         ]
@@ -407,9 +411,10 @@ def pvd_content(times: Sequence[float], files: Sequence[Sequence[str]]) -> bytes
 def abscissae(rows: Sequence[Mapping[str, Any]]) -> list[float]:
     """Return the places of the points of a path on ParaView's time axis, ascending.
 
-    A run with motions has its time, in s if it has units. Points at rest follow one another
-    closely. Otherwise the axis is the amplitude that varied, in the case's unit, if only one did
-    and it rises all the way. Failing that, it is the number of each point.
+    A run with motions has its time, in s if it has units. Several points may have one time; then
+    each is placed 1e-9 after the one before it. Without motions the place is the value of the
+    amplitude that varied, in the case's unit. If several amplitudes varied, or the amplitude does
+    not rise all the way, it is the number of the point.
 
     Examples
     --------
@@ -432,9 +437,12 @@ def abscissae(rows: Sequence[Mapping[str, Any]]) -> list[float]:
         return times
     if len(amplitudes) != 1:
         return numbers
-    column = shown_quantity(amplitude(next(iter(amplitudes))).column, rows[0]).name
+    (varied_amplitude,) = amplitudes
+    # the column of the amplitude, or its column in the case's unit if rows have that
+    column = shown_quantity(amplitude(varied_amplitude).column, rows[0]).name
     loads = [float(row[column]) for row in rows]
-    return loads if all(a < b for a, b in pairwise(loads)) else numbers
+    rises = all(a < b for a, b in pairwise(loads))
+    return loads if rises else numbers
 
 
 def point_file(number: int) -> str:
@@ -455,6 +463,7 @@ def vtu_content(surface: Surface, shell_data: ShellData) -> bytes:
     curved surfaces.
     """
     grid = unstructured_grid(surface, shell_data.h)
+    # numbers and vectors of the whole file; what is None is left out
     file_arrays = {
         "h_over_R": np.array([shell_data.h]),
         "poisson_ratio": np.array([shell_data.nu]),
@@ -466,6 +475,7 @@ def vtu_content(surface: Surface, shell_data: ShellData) -> bytes:
     for name, values in file_arrays.items():
         if values is not None:
             add_array(grid.GetFieldData(), name, values)
+    # texts of the whole file: units of the arrays that are there, and names of shells
     point_data = grid.GetPointData()
     array_names = [
         "points",
@@ -504,9 +514,9 @@ def read_point(folder: Path, number: int) -> tuple[Surface, ShellData]:
     surface, shell_data = read_vtu(folder / point_file(number))
     lines, solids = read_outlines(folder, number)
     surface = replace(surface, outlines=lines, solids=solids)
-    return surface if shell_data.mirror is None else completed(
-        surface, shell_data.mirror
-    ), shell_data
+    if shell_data.mirror is not None:
+        surface = completed(surface, shell_data.mirror)
+    return surface, shell_data
 
 
 def write_whole_shells(folder: Path) -> list[str]:

@@ -96,7 +96,8 @@ def animated(
     with drawing(STYLE):
         views = _views(surfaces, h, factor, camera)
         frames = _composed(views, factor, titles, rows, frame_rows, pole)
-    dither = Pillow.Dither.FLOYDSTEINBERG  # without it 256 colours are contours that are not there
+    # a GIF file has 256 colours; without dither they would look like contours
+    dither = Pillow.Dither.FLOYDSTEINBERG
     # the first, the middle and the last frame stand for the colours of all
     samples = [frames[i] for i in sorted({0, len(frames) // 2, len(frames) - 1})]
     palette = _palette(samples)  # the same for all frames

@@ -81,6 +81,7 @@ class BodiesInView:
     def __init__(
         self, surface: Surface, camera: Camera, window: Window, shell: RenderedSurface
     ) -> None:
+        """Choose the solids that are near enough; they are rendered when they are needed."""
         self._camera, self._window, self._shell = camera, window, shell
         self._solids = near_solids(surface)
 
@@ -117,9 +118,12 @@ class BodiesInView:
             opacity_alone, opacity_over_shell = (
                 OPACITIES_OF_BODIES if solid.poles is None else OPACITIES_OF_MAGNETS
             )
-            opacity = opacity_alone * in_pixels(visible & ~behind) + opacity_over_shell * in_pixels(
-                visible & behind
+            # parts of each pixel that the solid covers, without and with the shell behind it
+            covered_alone, covered_over_shell = (
+                in_pixels(visible & ~behind),
+                in_pixels(visible & behind),
             )
+            opacity = opacity_alone * covered_alone + opacity_over_shell * covered_over_shell
             # a magnet's colours change at pole strength zero, in the middle of the limits
             table = np.array([BODY] if solid.poles is None else [SOUTH, NORTH])
             values = np.zeros(len(solid.points)) if solid.poles is None else solid.poles
@@ -158,9 +162,9 @@ class BodiesInView:
         places = self._camera(points)[:, :2]
         visible = view.shows(points, tolerance) & self._shell.shows(points, tolerance)
         places[~visible] = np.nan
-        places[np.cumsum([len(line) for line in divided_lines]) - 1] = (
-            np.nan
-        )  # lines are not joined
+        # the last place of each line is left out, so that lines are not joined
+        last_places = np.cumsum([len(line) for line in divided_lines]) - 1
+        places[last_places] = np.nan
         return [places]
 
     @property
@@ -175,11 +179,11 @@ class BodiesInView:
             visible = view.shows(centres, 2 * DEPTH_TOLERANCE / self._window.scale)
             for sign, letter in ((1, "N"), (-1, "S")):
                 centres_of_pole = centres[(_poles(solid) * sign > 0) & visible]
-                if (
-                    len(centres_of_pole)
-                    and self._shell.shows(centres_of_pole.mean(axis=0)[None], 0.0)[0]
-                ):
-                    x, y = self._camera(centres_of_pole.mean(axis=0))[:2]
+                if not len(centres_of_pole):
+                    continue
+                middle = centres_of_pole.mean(axis=0)
+                if self._shell.shows(middle[None], 0.0)[0]:  # the shell does not hide it
+                    x, y = self._camera(middle)[:2]
                     letters.append((float(x), float(y), letter))
         return letters
 

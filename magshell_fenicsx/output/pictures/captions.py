@@ -53,9 +53,8 @@ def write_numbers(
     assert figure
     figure_width, figure_height = 72 * figure.get_size_inches()
     font_size, (left, right), (low, high) = rcParams["font.size"], axes.get_xlim(), axes.get_ylim()
-    extent = np.array(
-        [box.width * figure_width, box.height * figure_height]
-    )  # of the axes, in points
+    # of the axes, in points
+    extent = np.array([box.width * figure_width, box.height * figure_height])
 
     def in_points(places: Array) -> Array:
         """Return places (n, 2) of the data in points from the lower left of the axes."""
@@ -109,8 +108,10 @@ def _fault(place: Array, half: Array, marks: Array, line: Array, middle: Array) 
     middle
         (2,) middle of the text; all in points.
     """
-    nearer = np.linalg.norm(marks - middle, axis=1) < np.linalg.norm(place - middle) - ROUNDING
-    return int(nearer.sum()), int((np.abs(line - middle) < half).all(axis=1).sum())
+    distance_from_own_mark = np.linalg.norm(place - middle)
+    is_nearer = np.linalg.norm(marks - middle, axis=1) < distance_from_own_mark - ROUNDING
+    is_covered = (np.abs(line - middle) < half).all(axis=1)
+    return int(is_nearer.sum()), int(is_covered.sum())
 
 
 def _is_inside(middle: Array, half: Array, extent: Array) -> bool:
@@ -159,6 +160,7 @@ def caption(h: float, nu: float, row: Row, amplitudes: Iterable[str] = ()) -> st
     >>> caption(0.01, 0.5, row | {"my_springs": 0.02}, amplitudes=["pressure", "my_springs"])
     '$R/h$ = 100, $\\nu$ = 0.5, $p/p_\\mathrm{c}$ = 0.25, my springs = 0.02'
     """
+    # loads that are zero are left out
     items = [shell_caption(h, nu, row)]
     if row["field_angle"]:
         items.append(rf"turned by ${row['field_angle']:.4g}\degree$")

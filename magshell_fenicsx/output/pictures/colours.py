@@ -228,8 +228,9 @@ def _principal(
     if not captions.keys() <= surface.fields.keys():
         return [], []
     first_name, second_name = captions
-    noise = _noise(surface, first_name, second_name, jump or 0.0)
-    limit = max(_limit(surface, first_name, second_name), noise)
+    # LIMIT_OVER_NOISE times the noise of the mesh: with that limit of colours the noise is pale
+    limit_of_noise = _noise(surface, first_name, second_name, jump or 0.0)
+    limit = max(_limit(surface, first_name, second_name), limit_of_noise)
     fields, notes = list[ColouredField](), list[str]()
     magnitudes = {name: float(np.abs(surface.fields[name]).max()) for name in captions}
     for name, caption in captions.items():
@@ -237,10 +238,11 @@ def _principal(
         if magnitudes[name] < ZERO_FRACTION * max(magnitudes.values()):
             notes.append(f"The {caption.partition(' $')[0]} is zero everywhere.")
             continue
-        # `noise` is that many times the noise itself
-        if float(np.sqrt((values**2).mean())) < noise / LIMIT_OVER_NOISE:
+        rms = float(np.sqrt((values**2).mean()))
+        if rms < limit_of_noise / LIMIT_OVER_NOISE:
             notes.append(f"The {caption.partition(' $')[0]} is zero but for the mesh.")
             continue
+        # the common limit, on the sides of zero on which the field has values
         lowest, highest = from_zero(float(values.min()), float(values.max()), ZERO_FRACTION)
         limits = (-limit if lowest < 0 else 0.0, limit if highest > 0 else 0.0)
         if max(magnitudes.values()) < ZERO_STRESS[first_name]:  # both are zero: white
@@ -270,9 +272,11 @@ def _limit(surface: Surface, first: str, second: str) -> float:
     in_cells = magnitude[surface.cells].mean(axis=1)
     a, b, c = np.moveaxis(surface.r0[surface.cells[:, :3]], 1, 0)  # corners of all cells
     area = np.linalg.norm(np.cross(b - a, c - a), axis=1)
+    # the magnitude that all but a small part of the area does not exceed
     order = np.argsort(in_cells)
-    # magnitude that all but a small part of the area does not exceed
-    quantile = in_cells[order][np.searchsorted(np.cumsum(area[order]), AREA_QUANTILE * area.sum())]
+    area_up_to_cell = np.cumsum(area[order])
+    cell_number = np.searchsorted(area_up_to_cell, AREA_QUANTILE * area.sum())
+    quantile = in_cells[order][cell_number]
     return float(min(largest, max(PEAK * quantile, ZERO_STRESS[first])))
 
 
@@ -363,12 +367,14 @@ def contact_region(surface: Surface) -> Array | None:
     shell.
     """
     r = surface.r0 + surface.u
-    in_contact = r[(surface.fields["contact_pressure"] > 0) | (surface.fields["gap_over_h"] < 1)]
+    is_pressed, is_near = surface.fields["contact_pressure"] > 0, surface.fields["gap_over_h"] < 1
+    in_contact = r[is_pressed | is_near]
     if not len(in_contact):
         return None
     low, high = in_contact.min(axis=0), in_contact.max(axis=0)
     size = float((high - low).max())
     if size > MAX_CONTACT_SIZE * float(np.ptp(r, axis=0).max()):
         return None
+    # of a cube with edges of length one around the origin
     corners = np.array(np.meshgrid(*[[-0.5, 0.5]] * 3)).reshape(3, -1).T
     return np.asarray((low + high) / 2 + CONTACT_MARGIN * size * corners)

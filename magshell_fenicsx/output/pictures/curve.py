@@ -74,39 +74,10 @@ def curve_figure(
     pole
         Name of the point of w_pole_over_h without named points.
     """
-    from matplotlib.figure import Figure
-
     steps = worth_drawing(curve_steps(rows, amplitude))
-    # the last step spans a whole row below the others if it is a motion, or of three or more
-    last_number = len(steps) - 1
-    last_is_wide = steps[-1].amplitude == "time" or len(steps) > 2
-    width = (style.width or (ONE_COLUMN if len(steps) == 1 else TWO_COLUMNS)) / INCH
-    if last_is_wide and last_number:
-        columns = min(last_number, 3)
-        small_row_count = -(-last_number // columns)  # rounded up
-        last_height = 0.45 * width  # wider than the others, so lower over its width
-    else:
-        columns, small_row_count = len(steps), 0
-        last_height = width * (0.75 / columns)
-    small_height = 0.75 * width / max(columns, 2)
     with drawing(style):
-        figure = Figure(
-            figsize=(width, last_height + small_row_count * small_height),
-            dpi=style.dpi,
-            layout="constrained",
-        )
-        grid_of_axes = figure.add_gridspec(
-            small_row_count + 1,
-            columns,
-            height_ratios=[small_height] * small_row_count + [last_height],
-        )
-        for i, step in enumerate(steps):
-            spans_row = last_is_wide and i == last_number
-            cell = (
-                grid_of_axes[small_row_count, :]
-                if spans_row
-                else grid_of_axes[i // columns, i % columns]
-            )
+        figure, cells = _figure_with_cells(steps, style)
+        for cell, step in zip(cells, steps, strict=True):
             axes = figure.add_subplot(cell)
             plot_curve(axes, step, pole)
             axes.set_title(step.title)
@@ -115,6 +86,44 @@ def curve_figure(
         for axes, step in zip(list(figure.axes), steps, strict=True):
             draw_hidden(axes, step)
     return figure
+
+
+def _figure_with_cells(
+    steps: Sequence[CurveStep], style: OutputSection
+) -> tuple["Figure", list[Any]]:
+    """Return an empty figure, and matplotlib's cell of its grid for the axes of each step.
+
+    The last step spans a whole row below the others if it is a motion, or if there are three steps
+    or more. Otherwise all steps are in one row. Lengths in the code are in inches.
+    """
+    from matplotlib.figure import Figure
+
+    last_number = len(steps) - 1
+    last_is_wide = steps[-1].amplitude == "time" or len(steps) > 2
+    width = (style.width or (ONE_COLUMN if len(steps) == 1 else TWO_COLUMNS)) / INCH
+    # rows of small axes, and the last row, which is all if the last step is not wide
+    if last_is_wide and last_number:
+        columns = min(last_number, 3)
+        small_row_count = -(-last_number // columns)  # rounded up
+        last_height = 0.45 * width  # wider than the others, so lower over its width
+    else:
+        columns, small_row_count = len(steps), 0
+        last_height = width * (0.75 / columns)
+    small_height = 0.75 * width / max(columns, 2)
+    figure = Figure(
+        figsize=(width, last_height + small_row_count * small_height),
+        dpi=style.dpi,
+        layout="constrained",
+    )
+    grid = figure.add_gridspec(
+        small_row_count + 1,
+        columns,
+        height_ratios=[small_height] * small_row_count + [last_height],
+    )
+    cells = [grid[i // columns, i % columns] for i in range(last_number)]
+    if last_is_wide:
+        return figure, [*cells, grid[small_row_count, :]]
+    return figure, [*cells, grid[last_number // columns, last_number % columns]]
 
 
 def worth_drawing(parts: Sequence[CurveStep]) -> list[CurveStep]:
@@ -245,13 +254,17 @@ def draw_lines(
         segments = _segments(line, curve, crossings, coordinates)
         # consecutive segments that are all stable or all unstable are one drawn line
         for unstable, group in groupby(segments, key=lambda segment: segment[2]):
-            ends = [(first, last) for first, last, _ in group]
-            part_of_curve = curve[:, ends[0][0] : ends[-1][1] + 1]
+            segments_alike = list(group)
+            first_point, _, _ = segments_alike[0]
+            _, last_point, _ = segments_alike[-1]
+            part_of_curve = curve[:, first_point : last_point + 1]
             axes.plot(*part_of_curve, color=colour, lw=1.2, linestyle=DASHED if unstable else "-")
+        # dots at ordinary points
         dots = [
             coordinates(row) for row in line.rows if row["label"] in ("target", "step", "field")
         ]
         axes.plot([x for x, _ in dots], [y for _, y in dots], ".", color=colour, markersize=3.5)
+    # marks at instabilities
     for row in (row for row in step.rows if row["label"] in LOCATED):
         kind = str(row["label"])
         axes.plot(
@@ -287,13 +300,15 @@ def _segments(
         Coordinates of a row.
     """
     extent = np.ptp(curve, axis=1)[:, None]
-    for i, unstable in enumerate(line.unstable):
+    for i, unstable in enumerate(line.unstable):  # one entry for each interval between two rows
         row, next_row = line.rows[i : i + 2]
+        # points of the curve at both rows, and the rows' numbers on the path
         low, high = i * SEGMENTS_PER_INTERVAL, (i + 1) * SEGMENTS_PER_INTERVAL
-        first, last = int(row["point"]), int(next_row["point"])
+        number, next_number = int(row["point"]), int(next_row["point"])
         crossings_between = [
-            crossing for crossing in crossings if first < int(crossing["point"]) < last
+            crossing for crossing in crossings if number < int(crossing["point"]) < next_number
         ]
+        # the first row has another stability than the interval, and is no instability itself
         changes = row["label"] not in LOCATED and is_unstable(row) != unstable
         if crossings_between and changes:
             # becoming unstable the path changes at the first crossing, becoming stable at the last
@@ -318,19 +333,15 @@ def hidden_box(axes: "Axes", step: CurveStep) -> Array | None:
         places = [curve_coordinates(row, step.amplitude) for row in line.rows]
         load_coordinate = load_axis(step.amplitude)
         curve = line.smooth_curve(*zip(*places, strict=True), load_axis=load_coordinate)
-        for first, last, unstable in line.segments:
-            part_of_curve = curve[
-                :, first * SEGMENTS_PER_INTERVAL : last * SEGMENTS_PER_INTERVAL + 1
-            ]
+        for first_row, last_row, unstable in line.segments:
+            begin, end = first_row * SEGMENTS_PER_INTERVAL, last_row * SEGMENTS_PER_INTERVAL
+            part_of_curve = curve[:, begin : end + 1]
             # points are 1/72 inch
             size_in_points = (
                 np.ptp(axes.transData.transform(part_of_curve.T), axis=0) * 72 / axes.figure.dpi
             )
-            if (
-                unstable
-                and line.rows[last]["label"] in LOCATED
-                and max(size_in_points) < HIDDEN_SIZE
-            ):
+            ends_at_mark = line.rows[last_row]["label"] in LOCATED
+            if unstable and ends_at_mark and max(size_in_points) < HIDDEN_SIZE:
                 low, high = part_of_curve.min(axis=1), part_of_curve.max(axis=1)
                 margin = INSET_MARGIN * (high - low)
                 return np.array([low - margin, high + margin])
@@ -345,24 +356,31 @@ def draw_hidden(axes: "Axes", step: CurveStep) -> None:
     """
     if (box := hidden_box(axes, step)) is None:
         return
-    points = drawn_points(axes)
-    # in units of the axes, from 0 to 1
-    places = axes.transAxes.inverted().transform(axes.transData.transform(points))
-    far_side = 0.97 - INSET_SIZE  # a margin of 0.03
-    corners = [(x, y) for y in (INSET_GAP, far_side) for x in (far_side, INSET_GAP)]
-    covered = list[float]()
-    for corner in np.array(corners) - INSET_GAP:  # with room for numbers, left and below
-        is_covered = (places > corner) & (places < corner + INSET_SIZE + INSET_GAP)
-        covered.append(float(is_covered.all(axis=1).mean()))
-    best = int(np.argmin(covered))
-    if covered[best] > MAX_COVERED:
+    if (corner := _corner_of_inset(axes)) is None:
         return
-    inset = axes.inset_axes((*corners[best], INSET_SIZE, INSET_SIZE))
+    inset = axes.inset_axes((*corner, INSET_SIZE, INSET_SIZE))
     draw_lines(inset, step)
     inset.set(xlim=box[:, 0], ylim=box[:, 1])
     inset.tick_params(labelsize="x-small", length=2)
     inset.locator_params(nbins=3)
     axes.indicate_inset_zoom(inset, edgecolor="0.4", linewidth=0.6)
+
+
+def _corner_of_inset(axes: "Axes") -> tuple[float, float] | None:
+    """Return the lower left corner of an inset that covers few points; None if all cover many.
+
+    It is in units of the axes, from 0 to 1.
+    """
+    points = drawn_points(axes)
+    places = axes.transAxes.inverted().transform(axes.transData.transform(points))
+    far_side = 0.97 - INSET_SIZE  # a margin of 0.03
+    corners = [(x, y) for y in (INSET_GAP, far_side) for x in (far_side, INSET_GAP)]
+    covered = list[float]()  # part of the points that each inset covers
+    for corner in np.array(corners) - INSET_GAP:  # with room for numbers, left and below
+        is_covered = (places > corner) & (places < corner + INSET_SIZE + INSET_GAP)
+        covered.append(float(is_covered.all(axis=1).mean()))
+    best = int(np.argmin(covered))
+    return None if covered[best] > MAX_COVERED else corners[best]
 
 
 def drawn_points(axes: "Axes") -> Array:
@@ -412,22 +430,14 @@ def frequencies_figure(
     over_waves = all(f.wave.isdigit() for f in shown if f.wave != TORSION)
     hertz_per_root = _hertz_per_root(frequencies)
 
-    # (wave, rank of the frequency among those of the wave at its point) -> places of the line
-    lines = defaultdict[tuple[str, int], list[tuple[float, float]]](list)
-    count = defaultdict[tuple[int, str], int](int)
-    for number, frequency in enumerate(shown, 1):
-        omega2 = frequency.omega2
-        value = omega2
-        if hertz_per_root:
-            value = float(np.sign(omega2) * hertz_per_root * np.sqrt(abs(omega2)))
-        abscissa = places[frequency.point]
-        if is_one_point and over_waves:
-            abscissa = int(frequency.wave) if frequency.wave.isdigit() else 0
-        elif is_one_point:
-            abscissa = number
-        rank = count[frequency.point, frequency.wave]
-        lines[frequency.wave, rank].append((abscissa, float(value)))
-        count[frequency.point, frequency.wave] += 1
+    abscissae: Sequence[float]
+    if not is_one_point:
+        abscissae = [places[f.point] for f in shown]
+    elif over_waves:  # torsion has no waves
+        abscissae = [int(f.wave) if f.wave.isdigit() else 0 for f in shown]
+    else:
+        abscissae = range(1, len(shown) + 1)
+    lines = _lines_of_frequencies(shown, abscissae, hertz_per_root)
 
     width = (style.width or ONE_COLUMN) / INCH
     figure = Figure(figsize=(width, 0.75 * width), dpi=style.dpi, layout="constrained")
@@ -456,6 +466,33 @@ def frequencies_figure(
     if waves not in ([""], ["waves"]):  # one wave alone needs no legend
         figure.legend(title="wave", frameon=False, loc="outside right upper", fontsize="small")
     return figure
+
+
+def _lines_of_frequencies(
+    frequencies: Sequence[Frequency], abscissae: Sequence[float], hertz_per_root: float
+) -> dict[tuple[str, int], list[tuple[float, float]]]:
+    """Return (wave, rank) -> the places (x, y) of one line of the figure of frequencies.
+
+    The rank is 0 for the lowest frequency of a wave at a point, 1 for the next one. A line connects
+    frequencies of one wave and one rank at all points.
+
+    Parameters
+    ----------
+    frequencies, abscissae
+        Frequencies, ascending at each point, and the abscissa of each.
+    hertz_per_root
+        See `_hertz_per_root`; if it is 0, values are omega2.
+    """
+    lines = defaultdict[tuple[str, int], list[tuple[float, float]]](list)
+    count = defaultdict[tuple[int, str], int](int)
+    for frequency, abscissa in zip(frequencies, abscissae, strict=True):
+        value = omega2 = frequency.omega2
+        if hertz_per_root:
+            value = float(np.sign(omega2) * hertz_per_root * np.sqrt(abs(omega2)))
+        rank = count[frequency.point, frequency.wave]
+        lines[frequency.wave, rank].append((abscissa, float(value)))
+        count[frequency.point, frequency.wave] += 1
+    return lines
 
 
 def _hertz_per_root(frequencies: Sequence[Frequency]) -> float:

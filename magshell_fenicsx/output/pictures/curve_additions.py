@@ -65,6 +65,7 @@ def runs_figure(runs: Mapping[Path, Sequence[Row]], style: OutputSection) -> "Fi
     """
     from matplotlib.figure import Figure
 
+    # all curves must have the quantities of the first one on their axes
     steps = {folder: _last_step(folder, rows) for folder, rows in runs.items()}
     axes_names = {folder: tuple(q.name for q in axes_for(step)) for folder, step in steps.items()}
     first_folder = next(iter(steps))
@@ -186,6 +187,7 @@ def add_shapes(
         next((i for i in range(len(steps) - 1, -1, -1) if row in steps[i].rows), None)
         for row, _ in shapes
     ]
+    # one factor for the displacements of all shapes; it is in the titles
     factor = magnification([surface for _, surface in shapes])
     magnified = [replace(surface, u=factor * surface.u) for _, surface in shapes]
     if factor > 1:
@@ -195,18 +197,14 @@ def add_shapes(
             axes.set_title(rf"{title}displacements of shapes $\times$ {factor:g}")
     figure.draw_without_rendering()  # sizes of the axes are known only then
     places = camera(np.concatenate([surface.r0 + surface.u for surface in magnified]))
-    occupied = dict[int, list[Array]]()
+    occupied = dict[int, list[Array]]()  # number of a curve -> boxes of the shapes drawn so far
     for number, (row, _), surface in zip(curve_numbers, shapes, magnified, strict=True):
         if number is None:
             continue
         axes = figure.axes[number]
         box = axes.get_window_extent()
-        # of a window of 1000 pixels; all shells have one window, and so one scale
-        height_over_width = Window.around(places, 1000).shape[0] / 1000
-        room = min(MAX_WIDTH * box.width, MAX_HEIGHT * box.height / height_over_width)
-        width = max(int(room), 8)
-        window = Window.around(places, width)
-        image = _cropped(Background(surface, camera, width, window).grey_image(GREY))
+        image = _shell_image(surface, camera, places, (box.width, box.height))
+        # its place near the point of the curve, where other shapes are not
         size_over_axes = np.array([image.shape[1] / box.width, image.shape[0] / box.height])
         point = np.array(curve_coordinates(row, steps[number].amplitude))
         corner = _free_corner(axes, point, size_over_axes, occupied.setdefault(number, []))
@@ -214,6 +212,27 @@ def add_shapes(
         _add_shape(axes, image, point, corner, size_over_axes)
         if row["label"] not in LOCATED:  # those have marks
             axes.plot(*point, "o", color="k", markersize=MARK_SIZE, zorder=5)
+
+
+def _shell_image(
+    surface: Surface, camera: Camera, places: Array, axes_size: tuple[float, float]
+) -> Image:
+    """Return the image of a shell in grey, as large as there is room for it in the axes.
+
+    Parameters
+    ----------
+    places
+        (n, 3) projected places of all shells, whose window is common, and so the scale.
+    axes_size
+        Width and height of the axes in pixels.
+    """
+    axes_width, axes_height = axes_size
+    # of a window of 1000 pixels
+    height_over_width = Window.around(places, 1000).shape[0] / 1000
+    room = min(MAX_WIDTH * axes_width, MAX_HEIGHT * axes_height / height_over_width)
+    width = max(int(room), 8)
+    window = Window.around(places, width)
+    return _cropped(Background(surface, camera, width, window).grey_image(GREY))
 
 
 def _add_shape(axes: "Axes", image: Image, point: Array, corner: Array, size: Array) -> None:
@@ -235,9 +254,12 @@ def _add_shape(axes: "Axes", image: Image, point: Array, corner: Array, size: Ar
         "shrinkA": 0,
         "shrinkB": MARK_SIZE / 2,
     }
+    # the line: from the point of the data to the nearest pixel of the image
     end = _nearest(axes, image, point, corner, size)
-    begin, (x, y) = (float(point[0]), float(point[1])), corner + size / 2
+    begin = (float(point[0]), float(point[1]))
     axes.annotate("", begin, end, textcoords="axes fraction", arrowprops=line_style, zorder=3)
+    # the image: it is placed by its middle
+    x, y = corner + size / 2
     offset_image = OffsetImage(image, zoom=72 / axes.figure.dpi, resample=True)
     options: dict[str, Any] = {"xycoords": "axes fraction", "frameon": False, "pad": 0, "zorder": 3}
     axes.add_artist(AnnotationBbox(offset_image, (float(x), float(y)), **options))
@@ -252,6 +274,7 @@ def _cropped(image: Image) -> Image:
     edge = EDGE_OPACITY * edge_of(opacity)
     lined = image.copy()
     lined[..., :3] = np.rint((1 - edge) * image[..., :3] + edge * 255 * EDGE_GREY)
+    # numbers of the rows and of the columns in which something is drawn
     rows, columns = (np.flatnonzero(opacity[..., 0].any(axis=axis)) for axis in (1, 0))
     return lined[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
 
@@ -268,14 +291,19 @@ def _nearest(
     pixels = corner + size * np.column_stack(
         [(right + 0.5) / image.shape[1], 1 - (down + 0.5) / image.shape[0]]
     )
+    # distances on the screen, in its pixels
     box = axes.get_window_extent()
     target = axes.transAxes.inverted().transform(axes.transData.transform(point))
-    x, y = pixels[np.linalg.norm((pixels - target) * [box.width, box.height], axis=1).argmin()]
+    distances = np.linalg.norm((pixels - target) * [box.width, box.height], axis=1)
+    x, y = pixels[distances.argmin()]
     return float(x), float(y)
 
 
 def _free_corner(axes: "Axes", point: Array, size: Array, occupied: Sequence[Array]) -> Array:
-    """Return the lower left corner (2,), over the axes, of a box that covers little near its point.
+    """Return the lower left corner (2,), over the axes, for a box that belongs to a point.
+
+    Of a grid of corners the one with the least cost is taken. The box costs more if it covers the
+    curve or other boxes, or if it is far from its point.
 
     Parameters
     ----------
@@ -294,15 +322,19 @@ def _free_corner(axes: "Axes", point: Array, size: Array, occupied: Sequence[Arr
         """Return the cost of a box at `low`: what it covers, and its distance from its point."""
         high = low + size
         covered = ((points > low) & (points < high)).all(axis=1).mean()
-        # area that is common with each other box
-        overlap = sum(
-            float(np.prod(np.clip(np.minimum(high, b) - np.maximum(low, a), 0, None)))
-            for a, b in occupied
-        )
+        overlap = sum(_common_area(low, high, other_box) for other_box in occupied)
         distance = np.linalg.norm(low + size / 2 - target)
         return float(COST_OF_CURVE * covered + COST_OF_SHELL * overlap + distance)
 
+    # abscissae and ordinates of the corners that are tried
     positions = (
         np.linspace(MARGIN, max(1 - MARGIN - length, MARGIN), PLACES_PER_SIDE) for length in size
     )
     return np.asarray(min((np.array(corner) for corner in product(*positions)), key=cost))
+
+
+def _common_area(low: Array, high: Array, other_box: Array) -> float:
+    """Return the area that a box with corners `low` and `high` (2,) shares with another (2, 2)."""
+    other_low, other_high = other_box
+    sides = np.minimum(high, other_high) - np.maximum(low, other_low)
+    return float(np.prod(np.clip(sides, 0, None)))

@@ -112,21 +112,18 @@ def section(surface: Surface, grid: MapGrid) -> Array:
     corners, heights = places[tessellation.triangles], height[tessellation.triangles]
     crossed = np.abs(np.sign(heights).sum(axis=1)) < 3  # not three corners on one side
     corners, heights = corners[crossed], heights[crossed]
-    # the corner that is alone on its side of the plane
-    single_corner = np.where(
-        np.sign(heights).sum(axis=1) > 0, heights.argmin(axis=1), heights.argmax(axis=1)
-    )
-    rows, ends = np.arange(len(corners)), list[Array]()
+    # the corner that is alone on its side of the plane: the lowest one if two are above
+    two_are_above = np.sign(heights).sum(axis=1) > 0
+    single_corner = np.where(two_are_above, heights.argmin(axis=1), heights.argmax(axis=1))
+    rows = np.arange(len(corners))
+    single_place, single_height = corners[rows, single_corner], heights[rows, single_corner]
+    # the plane cuts the two sides from that corner to the others
+    ends = list[Array]()
     for shift in (1, 2):
         other_corner = (single_corner + shift) % 3
-        height_of_corner, height_of_other_corner = (
-            heights[rows, single_corner],
-            heights[rows, other_corner],
-        )
-        fraction = (height_of_corner / (height_of_corner - height_of_other_corner))[:, None]
-        ends.append(
-            (1 - fraction) * corners[rows, single_corner] + fraction * corners[rows, other_corner]
-        )
+        other_place, other_height = corners[rows, other_corner], heights[rows, other_corner]
+        fraction = (single_height / (single_height - other_height))[:, None]
+        ends.append((1 - fraction) * single_place + fraction * other_place)
     return np.stack(ends, axis=1)
 
 
@@ -229,7 +226,10 @@ def _thickened(lines: Array, h: float) -> Array:
 
 
 def outlines(lines: Array) -> list[Array]:
-    """Return the closed polygons (k, 2) that lines (n, 2, 2) form, given in any order."""
+    """Return the closed polygons (k, 2) that lines (n, 2, 2) form, given in any order.
+
+    Ends of two lines that are at one point are connected there.
+    """
     from scipy.spatial import cKDTree  # takes long to import
 
     lengths = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1)
@@ -243,7 +243,7 @@ def outlines(lines: Array) -> list[Array]:
     # the same point as an end of another line; ends 2 i and 2 i + 1 belong to line i
     twin = np.where(nearest[:, 0] == numbers, nearest[:, 1], nearest[:, 0])
     remaining, polygons = set(range(len(lines))), list[Array]()
-    while remaining:
+    while remaining:  # a polygon in each turn
         line, polygon = remaining.pop(), list[Array]()
         end = 2 * line + 1
         while True:

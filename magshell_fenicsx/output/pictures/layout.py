@@ -291,6 +291,7 @@ def _draw_arrows(axes: "Axes", arrows: Arrow, extent: float, style: OutputSectio
     An arrow towards the eye is a dot in a circle, an arrow away from it a cross in a circle.
     `extent` is the width of the panel over R.
     """
+    # arrows that are seen nearly from their ends are drawn as circles, the others as arrows
     in_picture, lengths = arrows.vectors[:, :2], np.linalg.norm(arrows.vectors, axis=1)
     is_point = np.linalg.norm(in_picture, axis=1) < MAX_SLOPE_TO_EYE * lengths
     x, y = arrows.feet[:, :2].T
@@ -310,6 +311,7 @@ def _draw_arrows(axes: "Axes", arrows: Arrow, extent: float, style: OutputSectio
         headlength=5,
         headaxislength=4.5,
     )
+    # a dot at the foot of each arrow
     marker_area = (0.9 * style.font_size) ** 2
     axes.scatter(
         x[~is_point],

@@ -171,8 +171,9 @@ class Line:
     def unstable(self) -> list[bool]:
         """Whether each segment between two rows is unstable, (rows - 1).
 
-        A segment is as its last row, or as its first row if the last one is a fold or bifurcation.
-        If both are, the number of unstable directions changes by one at each of them.
+        A segment is as stable as its last row. If that is a fold or bifurcation, it is as stable as
+        its first row. If both are, the numbers of their unstable directions are compared; where
+        they leave it open, stable and unstable segments alternate.
         """
         are_unstable: list[bool] = []
         for first_row, last_row in pairwise(self.rows):
@@ -184,9 +185,9 @@ class Line:
             first_count, last_count = _unstable_count(first_row), _unstable_count(last_row)
             # between the two rows: as many as at each of them, or one more
             possible_counts = {first_count, first_count + 1} & {last_count, last_count + 1}
-            # where the count may be zero: stable after an unstable segment, unstable after others
-            alternates = not (are_unstable and are_unstable[-1])
-            are_unstable.append(min(possible_counts, default=0) > 0 or alternates)
+            # if no direction need be unstable: stable after an unstable segment, else unstable
+            follows_unstable = bool(are_unstable) and are_unstable[-1]
+            are_unstable.append(min(possible_counts, default=0) > 0 or not follows_unstable)
         return are_unstable
 
     @property
@@ -201,9 +202,11 @@ class Line:
     @property
     def level(self) -> list[int]:
         """Ends of the line, 0 or -1, at which its amplitude has an extreme, a fold."""
-        fold = "fold", self.amplitude
+        ends = {end: self.rows[end] for end in (0, -1)}
         return [
-            end for end in (0, -1) if (self.rows[end]["label"], self.rows[end]["amplitude"]) == fold
+            end
+            for end, row in ends.items()
+            if row["label"] == "fold" and row["amplitude"] == self.amplitude
         ]
 
     def smooth_curve(
@@ -241,7 +244,7 @@ def _line(rows: Sequence[Row], amplitude: str) -> list[Row]:
 
     They are the points of the model, and a symmetry-breaking instability after the last one.
     """
-    # the rest are instabilities by modes that the model excludes, found between its points
+    # the other rows are instabilities by modes that the model excludes, found between its points
     rows_of_model = [row for row in rows if row["mode"] in OWN_MODES]
     last_place = curve_coordinates(rows_of_model[-1], amplitude)
     previous_place = curve_coordinates(rows_of_model[max(len(rows_of_model) - 2, 0)], amplitude)
@@ -288,13 +291,14 @@ def smooth(
     scale = np.ptp(xy, axis=1)  # of a picture, in which both axes count equally
     if xy.shape[1] == 1:
         return xy
+    # the parameter at the points, and the slopes there: derivatives by the parameter
     steps = np.hypot(*(np.diff(xy, axis=1) / np.where(scale > 0, scale, 1)[:, None]))
     chord = np.concatenate([[0], np.cumsum(np.sqrt(np.maximum(steps, MIN_CHORD)))])
     is_located = np.array(located, bool) if len(located) else np.zeros(len(chord), bool)
     slopes = np.array([_slopes(chord, values, is_located) for values in xy])
     for coordinate, end in level:
         slopes[coordinate, end] = 0.0
-    # cubics by Horner's rule, with t from 0 to 1 in each interval
+    # in each interval, with t from 0 to 1: value + first t + quadratic t² + cubic t³ (Horner)
     t = np.arange(SEGMENTS_PER_INTERVAL) / SEGMENTS_PER_INTERVAL
     h, rise = np.diff(chord)[:, None], np.diff(xy, axis=1)[..., None]
     first_term, last_term = h * slopes[:, :-1, None], h * slopes[:, 1:, None]
@@ -311,7 +315,9 @@ def _slopes(t: Array, values: Array, located: NDArray[np.bool_]) -> Array:
     h, chords = np.diff(t), np.diff(values) / np.diff(t)  # intervals, and slopes of the chords
     if len(chords) == 1:
         return np.full(2, chords[0])
+    # at each inner point: the chords and the intervals before and after it
     chords_before, chords_after, h1, h2 = chords[:-1], chords[1:], h[:-1], h[1:]
+    # the largest slope in each interval, and so at each inner point
     limits = MAX_SLOPE_RATIO * np.abs(chords)
     limits[1:-1][chords[:-2] * chords[2:] < 0] = np.inf  # it turns between these two points
     max_slopes = np.minimum(limits[:-1], limits[1:])

@@ -103,10 +103,8 @@ def small_panels(
     window = Window.around(np.concatenate(places), pixels)
     image_height = window.shape[0] / style.dpi
     caption_lines = max(caption.count("\n") + 1 for caption in captions)
-    cell_height, height_below = (
-        image_height + caption_lines * line_height + gap / 2,
-        4.4 * line_height,
-    )
+    cell_height = image_height + caption_lines * line_height + gap / 2
+    height_below = 4.4 * line_height  # of the colour bar
     foot_height = line_height if note else 0.0
     height = -(-count // per_row) * cell_height + height_below + foot_height
     figure = Figure(figsize=(width, height), dpi=style.dpi)
@@ -297,7 +295,9 @@ def _occurrences(singular: Sequence[Row]) -> dict[int, list[Row]]:
     displacements = [
         name for name in columns_here if quantity(name).kind in ("displacement", "place")
     ]
-    largest_sizes = {name: max(abs(float(row[name])) for row in singular) for name in displacements}
+    largest_values = {
+        name: max(abs(float(row[name])) for row in singular) for name in displacements
+    }
 
     def are_same(row: Row, other: Row) -> bool:
         """Whether two rows are one instability: of one kind, with equal displacements."""
@@ -305,7 +305,7 @@ def _occurrences(singular: Sequence[Row]) -> dict[int, list[Row]]:
             return False
         return all(
             abs(float(row[name]) - float(other[name])) <= SAME_INSTABILITY_TOLERANCE * largest
-            for name, largest in largest_sizes.items()
+            for name, largest in largest_values.items()
         )
 
     for row in singular:
@@ -348,19 +348,22 @@ def _null_vector(
         details.append(f"m = {waves}")
     details = [detail.replace("m = ", "$m$ = ") for detail in details]
     kind = f" ({', '.join(details)})" if details else ""
-    load_words = ""
-    if row["amplitude"]:
-        column = amplitude(str(row["amplitude"])).column
-        largest = max(abs(float(other_row[column])) for other_row in rows)
-        # the load at the end of a path is zero up to an error only
-        is_zero = abs(float(row[column])) <= ZERO_LOAD * largest
-        rounded = {**row, column: 0.0} if is_zero else row
-        if rounded is not row:  # a copy: its column in units is zero too
-            rounded[shown_quantity(column, row).name] = 0.0
-        load_words = f"\n{named_value(column, rounded, digits=5)}"
+    load_words = f"\n{_load_words(row, rows)}" if row["amplitude"] else ""
     rows_of_same = occurrences[int(row["point"])]
     number_words = ", ".join(str(numbers[int(other_row["point"])]) for other_row in rows_of_same)
     return surface, f"{number_words}: {row['label']}{kind}{load_words}"
+
+
+def _load_words(row: Row, rows: Sequence[Row]) -> str:
+    """Return the load at a row in words; a load that is small among those of all rows is zero."""
+    column = amplitude(str(row["amplitude"])).column
+    largest = max(abs(float(other_row[column])) for other_row in rows)
+    # the load at the end of a path is zero up to an error only
+    is_zero = abs(float(row[column])) <= ZERO_LOAD * largest
+    if not is_zero:
+        return named_value(column, row, digits=5)
+    column_in_units = shown_quantity(column, row).name  # `column` itself without units
+    return named_value(column, {**row, column: 0.0, column_in_units: 0.0}, digits=5)
 
 
 def gradients_figure(

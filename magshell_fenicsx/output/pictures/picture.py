@@ -136,7 +136,9 @@ def figures(
             window = Window.around(camera(content.detail), width)
             view = Background(surface, camera, width, window)
         else:  # panels of one width are all painted on one view
-            view = views[width] = views.get(width) or Background(surface, camera, width)
+            if width not in views:
+                views[width] = Background(surface, camera, width)
+            view = views[width]
         with drawing(style):
             panels = [view.panel(layer, style) for layer in content.layers]
             drawn_figures[name] = panels_figure(panels, style, content.note)
@@ -166,7 +168,11 @@ class Background:
     def __init__(
         self, surface: Surface, camera: Camera, width: int, window: Window | None = None
     ) -> None:
-        """Render the shell, and find the visible parts of all lines."""
+        """Render the shell, and find the visible parts of all lines.
+
+        `_bodies` are the bodies and sources in the picture. `_lines` are pairs of a line (n, 2) in
+        the projection and its pen.
+        """
         self._surface, self._camera = surface, camera
         tessellation, r = tessellate(surface), surface.r0 + surface.u
         self.window = window or Window.around(
@@ -174,23 +180,21 @@ class Background:
         )
         self.seen = RenderedSurface(tessellation, r, camera, self.window)
         self._bodies = BodiesInView(surface, camera, self.window, self.seen)
-        # half of the resolution is enough for a line that is wider than a pixel
+        # for the undeformed shell half of the resolution is enough: its line is wider than a pixel
         coarse = replace(self.window, scale=self.window.scale / 2)
         undeformed_view = RenderedSurface(tessellation, surface.r0, camera, coarse)
         outline = silhouette(self.seen)
-        # it is drawn only where it differs visibly from the deformed outline
-        undeformed = [
+        undeformed_outline = [
             self._not_behind(line, undeformed_view) for line in silhouette(undeformed_view)
         ]
         distance = MIN_OUTLINE_DISTANCE / self.window.scale
         min_length = MIN_OUTLINE_LENGTH / self.window.scale
         edges = [self._visible_part(edge_lines(surface))]
         bare_lines = [self._visible_part(_divided(line)) for line in bare_outlines(surface)]
+        # the undeformed outline and edges are drawn where they differ visibly from the outline
+        undeformed = lines_away_from(undeformed_outline, outline, distance, min_length)
         self._lines = (
-            *(
-                (line, UNDEFORMED)
-                for line in lines_away_from(undeformed, outline, distance, min_length)
-            ),
+            *((line, UNDEFORMED) for line in undeformed),
             *((line, EDGE) for line in outline),
             *((line, EDGE) for line in lines_away_from(edges, outline, distance)),
             *((line, OTHERS) for line in self._bodies.lines),
@@ -207,7 +211,8 @@ class Background:
     def _visible_part(self, line: Array) -> Array:
         """Return the projection (n, 2) of a line (n, 3) in space, nan where the shell hides it."""
         places = self._camera(line)[:, :2]
-        places[~self.seen.shows(np.nan_to_num(line), DEPTH_TOLERANCE / self.window.scale)] = np.nan
+        is_visible = self.seen.shows(np.nan_to_num(line), DEPTH_TOLERANCE / self.window.scale)
+        places[~is_visible] = np.nan
         return places
 
     def panel(self, layer: ColouredField, style: OutputSection) -> Panel:
@@ -251,9 +256,11 @@ class Background:
             return ()
         is_visible, names = self.seen.shows(r, DEPTH_TOLERANCE / self.window.scale), []
         for i, name in enumerate(self._surface.shells):
-            places = self._camera(r[is_visible & (np.rint(shell_numbers) == i)])[:, :2]
+            is_of_shell = np.rint(shell_numbers) == i
+            places = self._camera(r[is_visible & is_of_shell])[:, :2]
             if len(places):
-                x, y = places[np.linalg.norm(places - places.mean(axis=0), axis=1).argmin()]
+                distances = np.linalg.norm(places - places.mean(axis=0), axis=1)
+                x, y = places[distances.argmin()]
                 names.append((float(x), float(y), name))
         return tuple(names)
 
@@ -300,14 +307,22 @@ def lines_away_from(
         distance_to_others, _ = places_of_others.query(np.nan_to_num(line))
         is_far = distance_to_others > distance
         remaining = np.where(is_far[:, None], line, np.nan)
-        # each nan begins a part: places of one part have one number, short parts are removed
-        part_numbers = np.cumsum(np.isnan(remaining[:, 0]))
-        steps = np.diff(remaining, axis=0, prepend=remaining[:1])
-        lengths = np.nan_to_num(np.linalg.norm(steps, axis=1))
-        remaining[np.bincount(part_numbers, lengths)[part_numbers] < min_length] = np.nan
+        remaining[_lengths_of_parts(remaining) < min_length] = np.nan
         if not np.isnan(remaining).all():
             broken.append(remaining)
     return broken
+
+
+def _lengths_of_parts(line: Array) -> Array:
+    """Return (n,) the length of the part to which each place of a line (n, 2) belongs.
+
+    Places of nan divide a line into parts.
+    """
+    # each nan begins a part: places of one part have one number
+    part_numbers = np.cumsum(np.isnan(line[:, 0]))
+    steps = np.diff(line, axis=0, prepend=line[:1])
+    lengths_of_steps = np.nan_to_num(np.linalg.norm(steps, axis=1))
+    return np.asarray(np.bincount(part_numbers, lengths_of_steps)[part_numbers])
 
 
 def edge_lines(surface: Surface) -> Array:
@@ -324,18 +339,21 @@ def edge_lines(surface: Surface) -> Array:
         [k, *range(3 + k * nodes_within_side, 3 + (k + 1) * nodes_within_side), (k + 1) % 3]
         for k in range(3)
     ]
-    edges = surface.cells[:, nodes_of_sides].reshape(-1, nodes_within_side + 2)
-    # nodes of two shells may be double
+    sides = surface.cells[:, nodes_of_sides].reshape(-1, nodes_within_side + 2)
+    # places of nodes have one number, even if nodes of two shells are double there
     rounded = np.round(surface.r0 / SAME_PLACE_TOLERANCE) + 0.0
     _, place_numbers = np.unique(rounded, axis=0, return_inverse=True)
-    ends = np.sort(place_numbers.ravel()[edges[:, [0, -1]]], axis=1)
+    # sides of two triangles have the same two ends
+    ends = np.sort(place_numbers.ravel()[sides[:, [0, -1]]], axis=1)
     _, first_side, count = np.unique(ends, axis=0, return_index=True, return_counts=True)
-    lines = (surface.r0 + surface.u)[edges[first_side[count == 1]]]
+    edges = sides[first_side[count == 1]]
+    nodes_along_edges = (surface.r0 + surface.u)[edges]
+    # values of the shape functions at places along an edge, (places, nodes of a side)
     positions = np.linspace(0, 1, SEGMENTS_PER_INTERVAL * (nodes_within_side + 1) + 1)
     node_positions = np.linspace(0, 1, nodes_within_side + 2)
-    # values of the shape functions along an edge
     table = np.vander(positions, nodes_within_side + 2) @ np.linalg.inv(np.vander(node_positions))
-    lines_with_ends = np.concatenate([table @ lines, np.full((len(lines), 1, 3), np.nan)], axis=1)
+    lines = table @ nodes_along_edges
+    lines_with_ends = np.concatenate([lines, np.full((len(lines), 1, 3), np.nan)], axis=1)
     return np.asarray(lines_with_ends.reshape(-1, 3))
 
 
@@ -352,7 +370,7 @@ def silhouette(view: RenderedSurface) -> list[Array]:
     """
     import contourpy
 
-    left, _, _, high = view.window.box
+    left, _, _, high = view.window.box  # of its upper left corner, where pixels begin
     # a frame of equal values: no line at the border of the window
     padded = np.pad(view.coverage, 1, mode="edge")
     lines: Any = contourpy.contour_generator(z=padded).lines(0.5)
@@ -402,6 +420,7 @@ def field_arrows(
     names = [name for name in FIELDS if name in lengths and lengths[name].max() > 0]
     if camera is None or visible is None:  # only to ask which fields there are
         return tuple(Arrow(np.zeros((0, 3)), np.zeros((0, 3)), *FIELDS[name]) for name in names)
+    # nodes at which arrows begin, and all of their arrows in the projection
     r = surface.r0 + surface.u
     extent = float(np.ptp(r, axis=0).max())
     visible_nodes = np.flatnonzero(visible(r))

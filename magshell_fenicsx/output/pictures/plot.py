@@ -83,7 +83,10 @@ class PicturedRun:
     """
 
     def __init__(self, folder: Path, options: Mapping[str, Any] | None = None) -> None:
-        """Read the rows and the case; surfaces are read when they are needed."""
+        """Read the rows and the case; surfaces are read when they are needed.
+
+        `_points` has the surfaces that have been read, by the number of the point.
+        """
         self.folder = folder
         self.rows = _rows(folder)
         self.on_path = [row for row in self.rows if row["label"] != SOLUTION]
@@ -177,10 +180,11 @@ def plot_folders(
     if len(folders) == 1:
         return f"{', '.join(plot(folders[0], options=options, **options_of_one))} in {folders[0]}/"
     # arguments that are not given are None, False or empty
-    if any(
+    has_options_of_one = any(
         value is not None and value is not False and value != []
         for value in options_of_one.values()
-    ):
+    )
+    if has_options_of_one:
         raise CaseError(
             "plot: of several runs the curves are drawn in one picture: give one folder for more"
         )
@@ -247,8 +251,8 @@ def draw(
         if not 0 <= number < len(run.rows):
             raise CaseError(f"--shapes {number}: {folder} has points 0 to {len(run.rows) - 1}")
     names = []
-    all_pictures = _pictures_of_run(run, shapes)
-    for name, content in all_pictures if point is None else _pictures_of_point(run, point):
+    pictures = _pictures_of_run(run, shapes) if point is None else _pictures_of_point(run, point)
+    for name, content in pictures:  # drawn and written one after the other
         write_whole(folder / name, content)
         names.append(name)
     if run.style.whole:
@@ -275,6 +279,7 @@ def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[
     style, last_row = run.style, run.on_path[-1]
     # pictures for which the run has no data are left out
     surface, shell_data = run.surface_at(run.headline)
+    # over the load: the curve, and what sensors read
     if amplitude := str(last_row["amplitude"]):
         curve = curve_figure(run.rows, amplitude, style, run.pole_name)
         if shapes:
@@ -287,12 +292,14 @@ def _pictures_of_run(run: PicturedRun, shapes: Sequence[int]) -> Iterator[tuple[
         if run.resolved.get("sensors"):
             figure = readings_figure(run.rows, amplitude, run.resolved, style)
             yield from figure_files(figure, style, "sensors")
+    # of the shell at one point, and of the field around it
     shown_surface = without_zero_fields(surface, run.headline, run.rows)
     for name, figure in figures(shown_surface, shell_data.h, style, run.camera).items():
         yield from figure_files(figure, style, name)
     if maps := run.maps_at(run.headline):
         figure = field_maps_figure(maps, surface, shell_data.h, run.resolved, style)
         yield from figure_files(figure, style, "field_maps")
+    # of what the run has computed besides its path
     for name, figure in mode_figures(run.folder, run.rows, style, run.camera):
         yield from figure_files(figure, style, name)
     if frequencies := read_frequencies(run.folder):

@@ -48,9 +48,10 @@ def readings_figure(
 
     readings = [f"{name}_B{axis}" for name in names for axis in "xyz"]
     largest = max(abs(float(row[column])) for column in readings for row in step.rows)
-    columns_of_panels = columns(min(len(names), MAX_SENSORS))
-    # rounded up
-    row_count = -(-min(len(names), MAX_SENSORS) // columns_of_panels)
+    # rows and columns of panels, one panel for each sensor
+    panel_count = min(len(names), MAX_SENSORS)
+    columns_of_panels = columns(panel_count)
+    row_count = -(-panel_count // columns_of_panels)  # rounded up
     width = (style.width or (ONE_COLUMN if columns_of_panels == 1 else TWO_COLUMNS)) / INCH
     with drawing(style):
         figure = Figure(
@@ -70,7 +71,7 @@ def readings_figure(
             axes.axhline(0, color="0.8", linewidth=0.8, zorder=0)
             for axis_of_panel in (axes.xaxis, axes.yaxis):
                 axis_of_panel.set_major_formatter(number_format())
-        for axes in grid[len(names) :]:
+        for axes in grid[len(names) :]:  # panels without a sensor
             axes.set_axis_off()
         legend(figure, max_columns=5)
     return figure

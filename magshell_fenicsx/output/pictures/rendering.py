@@ -124,7 +124,12 @@ class RenderedSurface:
     def __init__(
         self, tessellation: Tessellation, r: Array, camera: Camera, window: Window
     ) -> None:
-        """Draw the triangles: number of the one in front, and depth, at each drawn pixel."""
+        """Draw the triangles, and keep what is in front at each drawn pixel.
+
+        `_index` (height, width) is the number of the triangle in front, and `_depth` its depth
+        towards the eye. `_places` are the points of the tessellation in drawn pixels, and `_r` the
+        nodes.
+        """
         self._tessellation, self.camera, self.window = tessellation, camera, window
         height, width = (FINER * n for n in window.shape)
         left, _, _, high = window.box
@@ -145,9 +150,9 @@ class RenderedSurface:
     def _light(self) -> tuple[NDArray[np.float32], NDArray[np.float32], float]:
         """Cosines of normals with the eye and with the lamp, and the cosine of full light.
 
-        A surface that faces the eye has full light. If nothing faces the lamp that well, the place
-        that faces it best has full light. So a plate that is turned away from the lamp still has
-        the colours of the bar.
+        The last one is a cosine with the lamp: a place with that cosine has the colours of the bar.
+        It is that of a surface that faces the eye. If no place has so large a cosine, it is the
+        largest one; so a plate that is turned away from the lamp still has the colours of the bar.
         """
         normals = self.camera(self._tessellation.normals(self._r))
         lamp = np.array(LAMP) / np.linalg.norm(LAMP)
@@ -224,21 +229,14 @@ class RenderedSurface:
         image = np.empty((height, width, 4), np.uint8)
         numbers, colours = values.astype(np.float32), table.astype(np.float32)
         *cosines, full_light = self._light
+        # in the order of the C function's arguments, see FUNCTIONS
+        triangles = _pointers(self._places, self._tessellation.triangles, self._index)
+        sizes = (width, height, FINER)
+        values_and_cosines = _pointers(numbers, *cosines)
+        light_and_limits = (full_light, RELIEF, RIM, *limits)
+        colours_and_image = (*_pointers(colours), len(colours), *_pointers(image))
         _, lib = library()
-        lib.paint(  # arguments as in FUNCTIONS: triangles, sizes, values, light, colours, image
-            *_pointers(self._places, self._tessellation.triangles, self._index),
-            *(
-                width,
-                height,
-                FINER,
-                *_pointers(numbers, *cosines),
-                full_light,
-                RELIEF,
-                RIM,
-                *limits,
-            ),
-            *(*_pointers(colours), len(colours), *_pointers(image)),
-        )
+        lib.paint(*triangles, *sizes, *values_and_cosines, *light_and_limits, *colours_and_image)
         return image
 
     def shows(self, places: Array, tolerance: float) -> NDArray[np.bool_]:
@@ -401,16 +399,20 @@ def _object_numbers(lines: Sequence[Array], tolerance: float) -> list[int]:
     numbers = list(range(len(lines)))
     for i, line in enumerate(lines):
         for earlier, earlier_line in enumerate(lines[:i]):
-            # distances from the ends of both lines to all places of both
-            ends = np.concatenate([line[[0, -1]], earlier_line[[0, -1]]])
-            distances = np.linalg.norm(
-                ends[:, None] - np.concatenate([earlier_line, line])[None], axis=2
-            )
-            distances[:2, len(earlier_line) :] = distances[2:, : len(earlier_line)] = (
-                np.inf
-            )  # of a line from itself
-            if distances.min() < tolerance:  # all lines of one number get the other number
+            if _end_distance(line, earlier_line) < tolerance:
+                # all lines of one number get the other number
                 numbers = [
                     numbers[earlier] if number == numbers[i] else number for number in numbers
                 ]
     return numbers
+
+
+def _end_distance(line: Array, earlier_line: Array) -> float:
+    """Return the least distance of an end of one line (n, 3) from the places of the other line."""
+    ends = np.concatenate([line[[0, -1]], earlier_line[[0, -1]]])
+    places = np.concatenate([earlier_line, line])
+    distances = np.linalg.norm(ends[:, None] - places[None], axis=2)
+    # the distances of a line's ends from its own places do not count
+    count = len(earlier_line)
+    distances[:2, count:] = distances[2:, :count] = np.inf
+    return float(distances.min())

@@ -64,7 +64,8 @@ def colour_map(name: str, limits: tuple[float, float] = (-1.0, 1.0)) -> "Colorma
         return ListedColormap(colours, name).with_extremes(over=FAR_GREY)
     if name != SIGNED:
         return colormaps[name].resampled(COLOURS)
-    # zero is at 0.5, the limit that is larger in size at an end of matplotlib's map
+    # matplotlib's map has positions from 0 to 1: zero is at 0.5, and the limit with the larger
+    # magnitude is at one of its ends
     positions = 0.5 + np.linspace(*limits, COLOURS) / (2 * max(map(abs, limits)))
     colours = colormaps["RdBu_r"](positions)[:, :3]
     # the middle of matplotlib's map is a light grey, which is made white

@@ -97,9 +97,11 @@ def simplify(surface: Surface, max_vertices: int) -> SimplifiedSurface:
     while len(vertices) > max_vertices:
         vertices, triangles = _merge_vertices(r, tessellation.triangles, edge)
         edge *= GROWTH_OF_CUBES
+    # normals of the surface and of the flat triangles; both have any length
     outwards = tessellation.at_points(surface.n0)[vertices][triangles].sum(axis=1)
     corners = r[vertices][triangles]
-    normals = np.cross(*np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 0))
+    two_sides = np.moveaxis(corners[:, 1:] - corners[:, :1], 1, 0)
+    normals = np.cross(*two_sides)
     # the mirror image of a half shell has the other orientation
     is_inverted = np.einsum("ij,ij->i", normals, outwards) < 0
     triangles[is_inverted] = triangles[is_inverted][:, ::-1]
@@ -107,9 +109,9 @@ def simplify(surface: Surface, max_vertices: int) -> SimplifiedSurface:
 
 
 def _merge_vertices(
-    r: Array, triangles: NDArray[np.int32], size: float
+    r: Array, triangles: NDArray[np.int32], edge: float
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Merge the points within each cube of edge `size`, and return what remains.
+    """Merge the points within each cube of an edge, and return what remains.
 
     Parameters
     ----------
@@ -117,7 +119,7 @@ def _merge_vertices(
         (n, 3) points over R.
     triangles
         (m, 3) numbers of points.
-    size
+    edge
         Edge of the cubes, over R.
 
     Returns
@@ -127,15 +129,16 @@ def _merge_vertices(
     triangles
         (k, 3) positions in `vertices`, of the triangles whose corners remain distinct.
     """
-    cubes = np.rint((r - r.min(axis=0)) / size).astype(np.int64)
-    # three cube numbers as one: those of large cubes have so few bits that shifts and exclusive or,
-    # which are fast, keep them apart
-    if size > EXACT_SIZE:
+    cubes = np.rint((r - r.min(axis=0)) / edge).astype(np.int64)
+    # the cube of each point as one value: the three numbers of a large cube have so few bits that
+    # they fit side by side into one integer, which is fast
+    if edge > EXACT_SIZE:
         key = (cubes[:, 0] * (1 << 42)) ^ (cubes[:, 1] * (1 << 21)) ^ cubes[:, 2]
     else:
         key = _rows_as_values(cubes)
-    _, vertices, number = np.unique(key, return_index=True, return_inverse=True)
-    corners = number[triangles]
+    # the first point of each cube remains
+    _, vertices, vertex_of_point = np.unique(key, return_index=True, return_inverse=True)
+    corners = vertex_of_point[triangles]
     is_proper = (
         (corners[:, 0] != corners[:, 1])
         & (corners[:, 1] != corners[:, 2])
@@ -200,7 +203,7 @@ def interactive(folder: Path, case: Mapping[str, Any]) -> InteractivePart | None
     # vertices times frames are limited: at least MIN_FRAMES, more of a small mesh
     mesh = simplify(surface, MAX_VALUES // MIN_FRAMES)
     frames = chosen_frames(rows, min(MAX_FRAMES, MAX_VALUES // mesh.count))
-    # read_point gives a surface and the shell's data
+    # the shells of all frames, on the nodes of the headline's shell
     frame_surfaces = (read_point(fields, int(row["point"]))[0] for row in frames)
     surfaces_on_nodes = [on_nodes_of(deformed, surface) for deformed in frame_surfaces]
     number_type = np.uint16 if mesh.count < 2**16 else np.uint32
@@ -257,10 +260,11 @@ def chosen_frames(rows: Sequence[Row], max_rows: int) -> list[Row]:
     ordinary_count = min(len(ordinary_rows), max(max_rows - len(marked_rows), 2))
     change = _change_of_shape(ordinary_rows)
     equal_changes = np.linspace(0, change[-1], ordinary_count)
+    # for each of these amounts the row that is nearest to it
     frame_numbers = {int(np.abs(change - value).argmin()) for value in equal_changes}
     frame_numbers |= {0, len(ordinary_rows) - 1}
+    # several amounts may choose one row; then some of the other rows, evenly spread, are added
     unused_numbers = [i for i in range(len(ordinary_rows)) if i not in frame_numbers]
-    # several amounts may choose one row: rows at equal distances make up for it
     missing_count = ordinary_count - len(frame_numbers)
     spacing = (len(unused_numbers) - 1) / max(missing_count - 1, 1)
     frame_numbers |= {
@@ -276,7 +280,7 @@ def _change_of_shape(rows: Sequence[Row]) -> Array:
     """Return (n,) how far the shape has changed from the first row to each row.
 
     It is the sum of the changes of all displacements over their ranges, plus an equal share for
-    each row. All shares together are half of that sum.
+    each row. All shares together are half of the sum of all changes.
     """
     columns = [name for name in rows[0] if quantity(name).kind in ("displacement", "place")]
     values = np.array([[float(row[name]) for name in columns] for row in rows]).reshape(
@@ -306,6 +310,7 @@ def _path(rows: Sequence[Row], last: Row, pole: str) -> dict[str, Any]:
         (str(row["amplitude"]) for row in [last, *reversed(rows)] if row["amplitude"]), ""
     )
     steps = _steps_of_curve(rows, amplitude_name) if amplitude_name else []
+    # all columns that an axis may show: those of the curves first, then those that vary
     quantities = _quantities(rows[0])
     axes = list[str]()  # columns of the curves' axes, those of the last step first
     for step in reversed(steps):  # a quantity of an axis says whose displacement it is
@@ -436,17 +441,7 @@ def _fields(
         ]
         if len(nodal_values) < len(shells):
             continue
-        # one scale of colours for all frames
-        low = min(float(values_of_shell.min()) for values_of_shell in nodal_values)
-        high = max(float(values_of_shell.max()) for values_of_shell in nodal_values)
-        if high - low < MIN_RANGE:
-            low, high = low - 1.0, low + 1.0
-        colours: list[tuple[float, str]] = []  # plotly's own map
-        if name == "gap_over_h":  # what is farther than one thickness is grey
-            low, high, colours = 0.0, 1.0, _stops(DISTANCE)
-        elif name in WITH_SIGN:
-            low, high = from_zero(low, high)
-            colours = _stops(SIGNED, (low, high))
+        low, high, colours = _colour_scale(name, nodal_values)
         if name == SHELL:
             names = [f"{i} {shell_name}" for i, shell_name in enumerate(shells[0].shells)]
             caption = f"{caption}: {', '.join(names)}"
@@ -468,6 +463,26 @@ def _fields(
             }
         )
     return fields
+
+
+def _colour_scale(
+    name: str, nodal_values: Sequence[Array]
+) -> tuple[float, float, list[tuple[float, str]]]:
+    """Return the limits of a field over all frames, and its colours, see `_stops`.
+
+    `nodal_values` are the field's values at each frame. Without colours the page takes Plotly's own
+    colour map.
+    """
+    low = min(float(values_of_shell.min()) for values_of_shell in nodal_values)
+    high = max(float(values_of_shell.max()) for values_of_shell in nodal_values)
+    if high - low < MIN_RANGE:
+        low, high = low - 1.0, low + 1.0
+    if name == "gap_over_h":  # what is farther than one thickness is grey
+        return 0.0, 1.0, _stops(DISTANCE)
+    if name in WITH_SIGN:
+        low, high = from_zero(low, high)
+        return low, high, _stops(SIGNED, (low, high))
+    return low, high, []
 
 
 def _stops(name: str, limits: tuple[float, float] = (-1.0, 1.0)) -> list[tuple[float, str]]:
@@ -500,7 +515,10 @@ def _values(surface: Surface, name: str, h: float) -> Array | None:
 
 
 class _Packed:
-    """Arrays in one block of bytes, each beginning at a multiple of four bytes."""
+    """Arrays in one block of bytes, each beginning at a multiple of four bytes.
+
+    `_parts` are the bytes of each array, `_length` is the length of all of them.
+    """
 
     def __init__(self) -> None:
         self._parts: list[bytes] = []

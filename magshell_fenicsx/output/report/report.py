@@ -137,7 +137,7 @@ def _content(folder: Path, playable: bool) -> dict[str, Any]:
     pole = pole_of(case)
     first_line = lines[0] if lines else {}
     interactive_part = interactive(folder, case) if playable else None  # it replaces the animation
-    # p_c is the pressure of a sphere; on a flat shell it is only the unit of a pressure
+    # whether p_c means something: it is the pressure of a sphere, on a flat shell only a unit
     classical = not is_flat(case) or any(float(line["p_over_pc"]) for line in lines)
     length_unit = "m" if summary["dimensions"]["units"] == "SI" else ""
     path = path_table(lines, length_unit, pole)

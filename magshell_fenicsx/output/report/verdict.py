@@ -99,7 +99,8 @@ def column(
     exponent = 0 if MIN_PLAIN <= largest < MAX_PLAIN or not largest else order
     decimals = max(0, DIGITS - 1 - order + exponent)  # the largest number has DIGITS digits
     texts = [f"{value / 10.0**exponent:.{decimals}f}" for value in values]
-    if largest and "." in texts[0]:  # zeros that end all cells are dropped
+    # zeros that end all cells are dropped, as in 0.50 and 0.20
+    if largest and "." in texts[0]:
         trailing_zeros = min(
             len(text) - len(text.rstrip("0"))
             for text, value in zip(texts, values, strict=True)
@@ -200,36 +201,12 @@ def path_table(lines: Sequence[Line], length_unit: str, pole: str = POLE) -> lis
         Name of the point of w_pole_over_h in a case without named points.
     """
     first_line = lines[0] if lines else {}
-    # columns that are shown in place of another one, in units
-    columns_in_units = {
-        column_quantity.name
-        for name in first_line
-        if (column_quantity := shown_quantity(name, first_line)).name != name
-    }
-    names = [name for name in first_line if name != "point" and name not in columns_in_units]
-    ordered_names = [
-        "point",
-        *sorted(names, key=lambda name: COLUMN_ORDER.index(quantity(name).kind)),
-    ]
-    varying_columns: dict[str, list[str]] = {}
-    for name in ordered_names:
-        values = [line.get(name, "") for line in lines]
-        displacements = [
-            earlier_values
-            for key, earlier_values in varying_columns.items()
-            if key.startswith("w_")
-        ]
-        is_repeated = name.startswith("w_") and any(
-            _are_equal(values, earlier_values) for earlier_values in displacements
-        )
-        if name in ("point", "label") or (len(set(values)) > 1 and not is_repeated):
-            varying_columns[name] = values
+    names = _varying_columns(lines)
     # all energies have one power of ten, so that they can be compared
-    energies = _energies(
-        lines, [name for name in varying_columns if quantity(name).kind == "energy"]
-    )
+    energies = _energies(lines, [name for name in names if quantity(name).kind == "energy"])
     table = {}
-    for name in varying_columns:
+    for name in names:
+        # the column in units, if the path has it; otherwise the column itself
         column_quantity = shown_quantity(name, first_line)
         all_energies = energies if column_quantity.kind == "energy" else ()
         table[name] = _column(
@@ -241,6 +218,36 @@ def path_table(lines: Sequence[Line], length_unit: str, pole: str = POLE) -> lis
     if at_pole := table.get("w_pole_over_h"):
         table["w_pole_over_h"] = replace(at_pole, head=pole_head(lines[0], pole))
     return list(table.values())
+
+
+def _varying_columns(lines: Sequence[Line]) -> list[str]:
+    """Return the names of the columns whose values vary, and of "point" and "label", in order.
+
+    Columns in units and displacements that equal an earlier one are left out.
+    """
+    first_line = lines[0] if lines else {}
+    # columns that are shown in place of another one, in units
+    columns_in_units = {
+        column_quantity.name
+        for name in first_line
+        if (column_quantity := shown_quantity(name, first_line)).name != name
+    }
+    names = [name for name in first_line if name != "point" and name not in columns_in_units]
+    names_by_kind = sorted(names, key=lambda name: COLUMN_ORDER.index(quantity(name).kind))
+    varying_columns: dict[str, list[str]] = {}
+    for name in ("point", *names_by_kind):
+        values = [line.get(name, "") for line in lines]
+        displacements = [
+            earlier_values
+            for key, earlier_values in varying_columns.items()
+            if key.startswith("w_")
+        ]
+        is_repeated = name.startswith("w_") and any(
+            _are_equal(values, earlier_values) for earlier_values in displacements
+        )
+        if name in ("point", "label") or (len(set(values)) > 1 and not is_repeated):
+            varying_columns[name] = values
+    return list(varying_columns)
 
 
 def _energies(lines: Sequence[Line], names: Sequence[str]) -> list[float]:
@@ -318,9 +325,8 @@ def verdict(summary: Summary, lines: Sequence[Line]) -> Markup:
     until = last_step.get("until", "target")  # the event at which the run was to end
     first_instability = next((line for line in located(lines) if line["branch"] == "0"), None)
     # the end is of interest unless the run was to find the instability
-    sentences = (
-        [_end(summary, lines)] if not first_instability or until in ("target", "points") else []
-    )
+    tells_end = not first_instability or until in ("target", "points")
+    sentences = [_end(summary, lines)] if tells_end else []
     if first_instability:
         # one entry for each instability, in their order; a summary without them has one empty entry
         points = summary.get("limit_points") or [{}]
@@ -360,7 +366,7 @@ def _snaps(summary: Summary) -> list[Markup]:
     if not snaps or "jump" not in snaps[0]:  # of an earlier version
         return []
     in_ms = "snap_jump_ms" in summary
-    times = list[Markup]()
+    times = list[Markup]()  # in ms if the snap has a time in units
     for key in ("jump", "departure"):
         if in_ms:
             times.append(Markup("{} ms").format(number(summary[f"snap_{key}_ms"], digits=4)))
@@ -485,7 +491,7 @@ def _instability(
     mode_at
         Place (3,) over R at which the mode is largest; None if unknown.
     """
-    kind = line["label"]
+    kind = line["label"]  # "fold" or "bifurcation", then the mode in brackets
     if line["mode"]:  # a number of waves, or a symmetry in words
         is_wave = line["mode"] not in (*OWN_MODES, "antisymmetric")
         kind += f" ({line['mode']}{' waves' if is_wave else ''})"
@@ -603,7 +609,9 @@ def _displacement(line: Line, pole: str, lines: Sequence[Line]) -> Markup:
     # the load has been said already; if a displacement is prescribed, the force is of interest
     if force_axes and varied_amplitude.column != "force":
         return Markup("{}, {}").format(_amount(force_axes[0], line, lines), at_pole)
-    if varied_amplitude.conjugate == "w_over_h" and line["w_over_h"] != line["w_pole_over_h"]:
+    # at the load, if that is not at the pole
+    is_elsewhere = line["w_over_h"] != line["w_pole_over_h"]
+    if varied_amplitude.conjugate == "w_over_h" and is_elsewhere:
         return Markup("{} {}").format(
             _amount(shown_quantity("w_over_h", line), line, lines), varied_amplitude.place
         )

@@ -105,7 +105,11 @@ class Ordering:
     """
 
     def __init__(self, V: fem.FunctionSpace, comm: MPI.Comm, places: Array | None = None) -> None:
-        """Number the nodes of all ranks; collective."""
+        """Number the nodes of all ranks; collective.
+
+        `_space_comm` has the ranks over which the space is distributed. `_own_numbers` are the
+        numbers of this rank's nodes in the order in use, `_numbers_of_ranks` those of each rank.
+        """
         self._space_comm, self._comm = V.mesh.comm, comm
         self._values_per_node = V.dofmap.index_map_bs
         own_places = V.tabulate_dof_coordinates()[: V.dofmap.index_map.size_local]
@@ -153,7 +157,7 @@ class Ordering:
 
         On rank 0 of the space; empty on other ranks. `u` has this rank's values.
         """
-        vectors_of_ranks = self._space_comm.gather(u)
+        vectors_of_ranks = self._space_comm.gather(u)  # None on other ranks than 0
         values = np.empty((len(self.places) if vectors_of_ranks else 0, self._values_per_node))
         for numbers, vector in zip(self._numbers_of_ranks, vectors_of_ranks or [], strict=False):
             values[numbers] = vector.reshape(-1, self._values_per_node)
@@ -252,9 +256,9 @@ def belongs_to(saved: dict[str, Any], document: Document) -> bool:
 
     `saved` is the `identity` of their run.
     """
-    return _without_program(_without_appearance(saved)) == _without_program(
-        _without_appearance(identity(document))
-    )
+    saved_case = _without_program(_without_appearance(saved))
+    present_case = _without_program(_without_appearance(identity(document)))
+    return saved_case == present_case
 
 
 def _without_program(data: dict[str, Any]) -> dict[str, Any]:
@@ -294,6 +298,12 @@ class Checkpoint:
     """
 
     def __init__(self, file: Path, V: fem.FunctionSpace, comm: MPI.Comm) -> None:
+        """Open the file, and read the places of the nodes of `V`, or append them; collective.
+
+        `_replaying` is whether the file may have further elements; all ranks have the same.
+        `_reading` is the file as it is read, on rank 0. `_writing` is the file as it is appended
+        to, on rank 0; None before the first element is appended.
+        """
         self._file, self._comm, self.replayed = file, comm, 0
         self._writing: AppendedFile | None = None
         self._replaying = True
@@ -354,6 +364,7 @@ class Checkpoint:
         if content := self._next_content():
             return self._read(content)
         finding = find()
+        # on rank 0 the parts of all ranks; none if the finding has no vector
         vectors_of_ranks = self._comm.gather(finding.vector)
         vectors = [vector for vector in vectors_of_ranks or () if vector is not None]
         head = json.dumps(
@@ -372,12 +383,11 @@ class Checkpoint:
         text, _, data = content.partition(b"\n")
         decoded = json.loads(text)
         self._refuse_other_kind(is_other="values" not in decoded)  # only a finding has values
-        sizes, rank = decoded["parts"], self._comm.rank
+        sizes = decoded["parts"]  # numbers of values of the ranks
         if len(sizes) != self._comm.size or not self._ordering.is_present:
             return RecordedValues(decoded["values"])
-        return RecordedValues(
-            decoded["values"], np.split(np.frombuffer(data), np.cumsum(sizes[:-1]))[rank]
-        )
+        parts_of_ranks = np.split(np.frombuffer(data), np.cumsum(sizes[:-1]))
+        return RecordedValues(decoded["values"], parts_of_ranks[self._comm.rank])
 
     def _refuse_other_kind(self, *, is_other: bool) -> None:
         """Check that an element is a result where a result is due, and a finding where one is due.

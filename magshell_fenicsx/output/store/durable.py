@@ -139,7 +139,11 @@ class AppendedFile:
     """
 
     def __init__(self, file: Path, length: int | None = None) -> None:
-        """Open the file, and cut it off after `length` bytes."""
+        """Open the file, and cut it off after `length` bytes.
+
+        `_length` is the number of bytes of all complete pieces, `_synced_length` that at the last
+        sync.
+        """
         self._file = file
         self._stream = file.open("ab", buffering=0)
         self._length = self._stream.seek(0, os.SEEK_END) if length is None else length

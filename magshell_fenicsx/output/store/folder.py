@@ -105,8 +105,7 @@ def refuse_other_tables(
         On the calling rank.
     """
     content = _object(folder / names[0])
-    # known tables are replaced; unknown ones only if they are empty, or the folder has the points
-    # of a study that was interrupted before it wrote its tables
+    # known tables are replaced, if they are not of another case
     if content.keys() >= set(keys):
         name = content.get("case")
         is_of_other_case = isinstance(name, str) and Path(name).stem != Path(case).stem
@@ -114,9 +113,13 @@ def refuse_other_tables(
             raise CaseError(
                 f"--out {folder}: has {new_files} of {name}, which is kept; give another folder"
             )
-    elif not any(
+        return
+    # unknown ones are replaced only if they are empty, or if the folder has the points of a study
+    # that was interrupted before it wrote its tables
+    has_points = any(
         _object(file).keys() & KEYS_OF_POINTS for file in (folder / "points").glob("*.json")
-    ):
+    )
+    if not has_points:
         refuse_foreign(folder, (name for name in names if _is_filled(folder / name)), new_files)
 
 
@@ -164,7 +167,8 @@ def prepare_folder(out: Path, comm: "MPI.Comm", make: Callable[[Path], None]) ->
 def locked_folder(out: Path, comm: "MPI.Comm", make: bool) -> Iterator[None]:
     """Lock a folder against other runs inside `with`; collective.
 
-    Rank 0 alone holds the lock, also a rank 0 that a killed mpirun has left behind.
+    Rank 0 alone holds the lock, also a rank 0 that a killed mpirun has left behind. A folder that
+    was created here and is still empty at the end is removed.
 
     Parameters
     ----------

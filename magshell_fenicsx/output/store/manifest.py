@@ -76,14 +76,17 @@ def files_of_runs(folder: Path) -> set[str]:
     regular_names = {
         name for name in files_with_run_names(folder) if not _irregular_kind(folder / name)
     }
-    names = {name for name in regular_names if name.endswith(".unfinished")}  # left by a kill
-    text = read_result(folder / NAME).decode(errors="replace") if NAME in regular_names else ""
+    # files that a killed run has left
+    names = {name for name in regular_names if name.endswith(".unfinished")}
     if is_replacement_unfinished(folder):
         names.add(NEW_CHECKPOINT)
+    # files in the manifest
+    text = read_result(folder / NAME).decode(errors="replace") if NAME in regular_names else ""
     if text.startswith(HEADER):
         names |= regular_names & {NAME, *text.splitlines()}
     elif _is_of_run(lambda: read_object(folder / "summary.json")):  # of an earlier version
         return regular_names
+    # files of a path; the manifest's own name is in `names` if there is a manifest
     has_checkpoint = _is_of_run(lambda: checkpoint.identity_in(folder / checkpoint.NAME))
     if has_checkpoint or (NAME not in names and is_path(folder / "path.csv")):
         names |= {

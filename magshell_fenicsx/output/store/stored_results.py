@@ -99,7 +99,10 @@ def read_summary(folder: Path) -> dict[str, Any]:
 
 
 def _first_error(value: Any, kind: Any, key: str = "") -> str:
-    """Return in words the first place where a value is none that a run writes; empty without one.
+    """Return in words the first key whose value no run writes; empty if there is none.
+
+    A value is wrong if it has another type than `kind`, or lacks a key. Dictionaries and lists are
+    searched entry by entry.
 
     Parameters
     ----------
@@ -110,15 +113,15 @@ def _first_error(value: Any, kind: Any, key: str = "") -> str:
     key
         Key path of the value; empty for all of summary.json.
     """
-    entries: list[tuple[Any, Any, str]] = []
+    entries: list[tuple[Any, Any, str]] = []  # (value, its kind, its key path)
     if isinstance(kind, list) and isinstance(value, list):
         entries = [(entry, kind[0], f"{key}.{i}") for i, entry in enumerate(value)]
     elif isinstance(kind, dict) and isinstance(value, dict):
         types_of_keys = dict.fromkeys(value, kind["*"]) if "*" in kind else kind
         # a name that ends with ? may be absent
         missing = [name for name in types_of_keys if not name.endswith("?") and name not in value]
-        for name in missing:  # the first one is enough
-            return f"it has no {key}.{name}".replace(" .", " ")
+        if missing:
+            return f"it has no {key}.{missing[0]}".replace(" .", " ")
         names = {name: name.removesuffix("?") for name in types_of_keys}
         entries = [
             (value[inner_key], types_of_keys[name], f"{key}.{inner_key}")
@@ -126,6 +129,7 @@ def _first_error(value: Any, kind: Any, key: str = "") -> str:
             if inner_key in value
         ]
     elif isinstance(kind, list | dict) or not isinstance(value, kind):
+        # no list or dictionary where one is due, or a single value of another type
         return f"its {key.removeprefix('.')} is {json.dumps(value)[:40]}"
     errors = (_first_error(*entry) for entry in entries)
     return next((error for error in errors if error), "")

@@ -51,17 +51,12 @@ def stability(row: Mapping[str, object]) -> str:
     )
     if not model_pivots + excluded_pivots:
         return "stable"
-    beginning = (
-        f"unstable in {model_pivots} direction{'s' * (model_pivots != 1)}"
-        if model_pivots
-        else "unstable in"
-    )
-    # " and" only where the model is unstable too
-    return beginning + (
-        f"{' and' * bool(model_pivots)} {excluded_pivots} that the model excludes"
-        if excluded_pivots
-        else ""
-    )
+    counts = []
+    if model_pivots:
+        counts.append(f"{model_pivots} direction{'s' * (model_pivots != 1)}")
+    if excluded_pivots:
+        counts.append(f"{excluded_pivots} that the model excludes")
+    return f"unstable in {' and '.join(counts)}"
 
 
 class PathTable:
@@ -86,7 +81,10 @@ class PathTable:
     """
 
     def __init__(self, file: Path, extra: Sequence[str] = ()) -> None:
-        """Open the file after its complete rows, or begin it with its header."""
+        """Open the file after its complete rows, or begin it with its header.
+
+        `_columns` are the names of the columns, and `_file` is the file as it is appended to.
+        """
         self._columns = (*COLUMNS, *extra)
         header = table_text([self._columns])
         content = read_result(file) if file.exists() else b""
@@ -186,7 +184,8 @@ def read_lines(file: Path) -> list[dict[str, str]]:
     """
     try:
         text = read_result(file).decode()
-        lines = list(csv.reader(io.StringIO(text[: text.rfind("\n") + 1], newline=""), strict=True))
+        complete_lines = text[: text.rfind("\n") + 1]  # a killed run may leave a part of a line
+        lines = list(csv.reader(io.StringIO(complete_lines, newline=""), strict=True))
     except (UnicodeDecodeError, csv.Error) as e:
         raise Damaged(f"{file}: is damaged: no table in UTF-8: {e}") from None
     head = lines[0] if lines else []
@@ -194,6 +193,7 @@ def read_lines(file: Path) -> list[dict[str, str]]:
         raise Damaged(
             f"{file}: is damaged, or of an earlier version: it has no column {missing[0]}"
         )
+    # columns of whole numbers; lines are numbered from 1, the header's number
     counts = {name for name in head if quantity(name).kind == "count"}
     rows = []
     for number, values in enumerate(lines[1:]):

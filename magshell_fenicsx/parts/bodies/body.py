@@ -112,9 +112,9 @@ class PlacedBody:
         """
         v = self.Q @ unit(np.array(axis))
         v = v - (v @ self.direction) * self.direction
-        if (size := float(np.linalg.norm(v))) < AXIS_TOLERANCE:
+        if (length := float(np.linalg.norm(v))) < AXIS_TOLERANCE:
             raise CaseError(f"{self.key}.axis: is along the approach; give an axis across it")
-        return np.asarray(v / size)
+        return np.asarray(v / length)
 
     def axes(self, axis: list[float]) -> Array:
         """Return the body's orthonormal axes as rows (3, 3), in the model's frame.
@@ -213,12 +213,15 @@ def place_body(
         The length by which lengths are divided.
     """
     outward = normal if section.side == "outside" else -normal  # from the shell to the body
+    # the direction in the case's frame, then in the model's
     direction = unit(-outward if section.direction is None else np.array(section.direction))
     direction, front_offset = Q @ direction, section.front_offset / R
-    front = Q @ (place + half * outward)  # on the shell's face
-    if section.position is not None:  # which is that of the reference point, behind the front
+    # the front is on the shell's face, or ahead of a reference point with a given position
+    front = Q @ (place + half * outward)
+    if section.position is not None:
         front = Q @ (np.array(section.position) / R) + front_offset * direction
-    return PlacedBody(key, front, front - front_offset * direction, direction, Q, R)
+    centre = front - front_offset * direction
+    return PlacedBody(key, front, centre, direction, Q, R)
 
 
 class RigidBodies(KeyAbility[Mapping[str, BodySection]]):
@@ -268,18 +271,17 @@ def rounded(q: Array, edge: float) -> tuple[Array, Array, Array]:
     distance, n, H
         (n,) the distance, with its gradient (n, m) and Hessian (n, m, m) by q.
     """
+    # outside the core: the vector from its nearest place, and its length
     outside_part = np.maximum(q, 0.0)
-    distance = np.linalg.norm(outside_part, axis=1)
-    is_outside = distance > 0
+    core_distance = np.linalg.norm(outside_part, axis=1)
+    is_outside = core_distance > 0
+    divisor = np.maximum(core_distance, 1e-300)  # finite inside the core too
     # inside the core the nearest face is that of the largest coordinate
-    nearest = np.eye(q.shape[1])[q.argmax(axis=1)]
-    # 1e-300 only keeps the division finite where the other branch is taken
-    n = np.where(is_outside[:, None], outside_part / np.maximum(distance, 1e-300)[:, None], nearest)
+    face_normal = np.eye(q.shape[1])[q.argmax(axis=1)]
+    n = np.where(is_outside[:, None], outside_part / divisor[:, None], face_normal)
     # curved only in the directions of positive coordinates, as a circle, a sphere or a plane
     active = (outside_part > 0)[:, :, None] * np.eye(q.shape[1])
-    H = (active - n[:, :, None] * n[:, None, :]) / np.maximum(distance, 1e-300)[:, None, None]
-    return (
-        np.where(is_outside, distance, q.max(axis=1)) - edge,
-        n,
-        np.where(is_outside[:, None, None], H, 0.0),
-    )
+    H = (active - n[:, :, None] * n[:, None, :]) / divisor[:, None, None]
+    # inside the core the signed distance is the largest coordinate; the rounding is around both
+    distance = np.where(is_outside, core_distance, q.max(axis=1)) - edge
+    return distance, n, np.where(is_outside[:, None, None], H, 0.0)

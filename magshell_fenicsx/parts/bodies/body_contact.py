@@ -137,7 +137,10 @@ def contact_energy(r0: Jet, u: Jet, P: Expr, motion: Expr, approach: Expr, *face
     # r0 is an argument of all densities, and not needed here
     s = _off_expansion_point(u, P, motion, approach)
     psi = _polynomial(P, s)
-    return psi + _face_term(face[0], face[1][0], s) if face else psi
+    if not face:
+        return psi
+    F, thickness = face
+    return psi + _face_term(F, thickness[0], s)
 
 
 def thinned_energy(
@@ -169,6 +172,7 @@ def thinned_energy(
         1 where the shell keeps its volume, else 0.
     """
     s, t = _off_expansion_point(u, P, motion, approach), thickness_ratio(r0, u, natural, thins)
+    # t is the deformed over the undeformed thickness; times `factor` it is over h
     return _polynomial(P, s) + _face_term(F, factor[0][0] * t if factor else t, s)
 
 
@@ -288,7 +292,7 @@ class _ActivePenalty:
         is_pressed, coefficients
             (points,) the flags, and (m, 10) the coefficients of `_flattened` at pressed points.
         """
-        # derivatives by the place, of which the penetration has the gradient -n
+        # derivatives of psi by the place: the penetration has the gradient -n and the Hessian -N
         H = (
             self.second[..., None] * self.n[:, :, None] * self.n[:, None, :]
             - self.first[..., None] * self.N
@@ -309,6 +313,37 @@ def _flattened(value: Array, gradient: Array, H: Array) -> Array:
     """
     pairs = H[:, *INDEX_PAIRS] * np.where(INDEX_PAIRS[0] == INDEX_PAIRS[1], 0.5, 1.0)
     return np.concatenate([value, gradient, pairs], axis=1)
+
+
+def _thickness_factor(
+    thickness: fem.Function | None, ratio_memo: "Memo[Array] | None", points: Array
+) -> tuple[Callable[[], float | Array], Callable[[], tuple[Array, ...]]]:
+    """Return two functions: one gives the thickness over h, the other the arrays it depends on.
+
+    The thickness is that at all points of all cells, in one array; 1 where it neither varies nor
+    changes.
+
+    Parameters
+    ----------
+    thickness
+        The undeformed thickness over h; None where it is h.
+    ratio_memo
+        The deformed over the undeformed thickness at the points; None where it is 1.
+    points
+        Points of the rule in a reference cell.
+    """
+
+    def factor() -> float | Array:
+        factor: float | Array = 1.0
+        if thickness is not None:
+            factor = at_quadrature(thickness, points)[..., 0].ravel()
+        return factor if ratio_memo is None else factor * ratio_memo.renew()
+
+    def thicknesses() -> tuple[Array, ...]:
+        undeformed_thickness = () if thickness is None else (thickness.x.array,)
+        return (*undeformed_thickness, ratio_memo.renew()) if ratio_memo else undeformed_thickness
+
+    return factor, thicknesses
 
 
 class BodyContact:
@@ -341,6 +376,12 @@ class BodyContact:
         (cells, points, `POLYNOMIAL_SIZE`) coefficients at quadrature points.
     stiffness
         Stiffness k of the penalty, over E h/R^2.
+
+    The field `_points` has the points of the rule in a reference cell, and `_owned` is the number
+    of cells that are not ghosts. `_face_field` has the derivatives by the thickness as `polynomial`
+    has those by the place; None where the thickness is h. `_step_derivatives` are the forces of a
+    step in time, see `average`, and `_expansion_gap` the gaps of `expand_about`; both are empty
+    tuples without.
     """
 
     def __init__(
@@ -365,20 +406,7 @@ class BodyContact:
         self._placement_memo = Memo(lambda: at_quadrature(r0, self._points), lambda: (r0.x.array,))
         # the deformed over the undeformed thickness at the points; None where it is 1
         ratio_memo = ratio_at_points and ratio_at_points(self._points)
-
-        def factor() -> float | Array:
-            # thickness over h at all points, in one array; 1 where it neither varies nor changes
-            factor: float | Array = 1.0
-            if thickness is not None:
-                factor = at_quadrature(thickness, self._points)[..., 0].ravel()
-            return factor if ratio_memo is None else factor * ratio_memo.renew()
-
-        def thicknesses() -> tuple[Array, ...]:
-            undeformed_thickness = () if thickness is None else (thickness.x.array,)
-            return (
-                (*undeformed_thickness, ratio_memo.renew()) if ratio_memo else undeformed_thickness
-            )
-
+        factor, thicknesses = _thickness_factor(thickness, ratio_memo, self._points)
         self._factor_memo = Memo(factor, thicknesses)
         self._face_field: PointField | None = None
         motion = fem.Constant(V.mesh, h * contact.direction)
@@ -440,8 +468,8 @@ class BodyContact:
     def _active_penalty(self) -> "_ActivePenalty":
         """Return the penalty at the points whose gap is closed, which are few of all.
 
-        After `expand_about` the closed points are those of its gap, about which the penalty is
-        expanded. Else a penalty about the present gap is exact.
+        The penalty is expanded about the gap that `expand_about` has set, and the points are those
+        where that gap is closed. Without one it is expanded about the present gap, and exact.
         """
         gap, n, N = self._gap_memo.renew()
         expansion_gap = self._expansion_gap[0] if self._expansion_gap else gap
@@ -450,7 +478,7 @@ class BodyContact:
         penalties = expanded_penalty(
             -gap[is_pressed], -expansion_gap[is_pressed], k, SOFT_PENETRATION * self._h
         )
-        value, first, second = (a[:, None] for a in penalties)
+        value, first, second = (derivative[:, None] for derivative in penalties)
         return _ActivePenalty(is_pressed, value, first, second, n[is_pressed], N[is_pressed])
 
     def _compute_polynomials(self) -> Array:
@@ -461,10 +489,10 @@ class BodyContact:
         y = self.place
         polynomials = np.zeros((*y.shape[:2], POLYNOMIAL_SIZE))
         polynomials[..., :3] = y  # the expansion point; other coefficients are zero at open points
-        is_pressed, psi = (
+        is_pressed, coefficients = (
             self._step_mean() if self._step_derivatives else self._penalty_memo.renew().penalty()
         )
-        polynomials.reshape(-1, POLYNOMIAL_SIZE)[is_pressed, 3:] = psi
+        polynomials.reshape(-1, POLYNOMIAL_SIZE)[is_pressed, 3:] = coefficients
         return polynomials
 
     def _step_mean(self) -> tuple[NDArray[np.bool_], Array]:
@@ -473,10 +501,8 @@ class BodyContact:
         They are in the form of `_ActivePenalty.penalty`, with zero for the value of psi.
         """
         gradient, H, _ = self._step_derivatives
-        # psi itself does not enter the forces
-        return np.ones(len(gradient), dtype=bool), _flattened(
-            np.zeros((len(gradient), 1)), gradient, H
-        )
+        no_values = np.zeros((len(gradient), 1))  # of psi, which does not enter the forces
+        return np.ones(len(gradient), dtype=bool), _flattened(no_values, gradient, H)
 
     def _compute_face_terms(self) -> Array:
         """Return the thickness factor t and derivatives of psi by t: (cells, points, `FACE_SIZE`).
@@ -487,7 +513,8 @@ class BodyContact:
         by_t = np.zeros((len(active.is_pressed), FACE_SIZE))
         by_t[:, 0] = self.factor
         if self._step_derivatives:
-            by_t[:, 1:] = self._step_derivatives[2]
+            *_, step_by_t = self._step_derivatives
+            by_t[:, 1:] = step_by_t
         else:
             # the penetration grows by h/2 with t, and by -n with the place
             by_t[active.is_pressed, 1:] = half * np.concatenate(
@@ -545,28 +572,27 @@ class BodyContact:
         part
             Position within the step, from 0 to 1, at which the system takes its forces.
         """
-        k, soft_penetration, half = (
-            float(self.stiffness.value),
-            SOFT_PENETRATION * self._h,
-            self._h / 2,
-        )
-        # normals by Simpson's rule; the middle depends on the end of the step by half, so that the
-        # derivative of the mean normal has the weights 4/6/2 and 1/6
+        k, half = float(self.stiffness.value), self._h / 2
+        soft_penetration = SOFT_PENETRATION * self._h
+        # gaps with gradients n and Hessians N, each at the begin (0), middle (1) and end (2)
         (y_begin, factor_begin), (y_end, factor_end) = begin, end
         middle = (y_begin + y_end) / 2, (factor_begin + factor_end) / 2
         gaps, n, N = zip(*(self._gap_at(*state) for state in (begin, middle, end)), strict=True)
         s0, _, s1 = (-gap for gap in gaps)  # penetrations at the begin and the end
-        mean_slope, mean_curvature = mean_pressure(s0, s1, k, soft_penetration)
+        # the mean normal by Simpson's rule; the middle depends on the end of the step by half, so
+        # that the derivative of the mean normal has the weights 4/6/2 and 1/6
         normal, mean_hessian = (n[0] + 4 * n[1] + n[2]) / 6, (2 * N[1] + N[2]) / 6
-        (_, p0, _), (_, p1, k1) = (
-            penalty(s0, k, soft_penetration),
-            penalty(s1, k, soft_penetration),
-        )
+        # the mean pressure with its derivative by s1, then the pressures at both ends
+        mean_slope, mean_curvature = mean_pressure(s0, s1, k, soft_penetration)
+        _, p0, _ = penalty(s0, k, soft_penetration)
+        _, p1, k1 = penalty(s1, k, soft_penetration)
 
         def outer(a: Array) -> Array:
+            """Return the products (points, 3, 3) of the components of vectors (points, 3)."""
             return a[:, :, None] * a[:, None, :]
 
         def times(c: Array, a: Array) -> Array:
+            """Return numbers (points,) times arrays (points, ...)."""
             return c.reshape(-1, *[1] * (a.ndim - 1)) * a
 
         # the terms with off_middle are the dissipative force; only the end of the step is varied
@@ -628,18 +654,14 @@ class BodyContact:
         """
         # points of owned cells alone: ghosts belong to other ranks
         owned = slice(0, self._owned * len(self._points))
-        gap, from_front = (
-            self.gap[owned],
-            (self._placement_memo.renew() + self.place).reshape(-1, 3)[owned] - self.contact.front,
-        )
-        pressure, d = (
-            penalty(-gap, float(self.stiffness.value), SOFT_PENETRATION * self._h)[1],
-            self.contact.direction,
-        )
+        gap = self.gap[owned]
+        x, d = (self._placement_memo.renew() + self.place).reshape(-1, 3), self.contact.direction
+        _, pressure, _ = penalty(-gap, float(self.stiffness.value), SOFT_PENETRATION * self._h)
         largest = comm.allreduce(float(pressure.max(initial=0.0)), MPI.MAX)
-        from_axis = np.linalg.norm(from_front - (from_front @ d)[:, None] * d, axis=1)[
-            pressure > PRESSURE_THRESHOLD * largest
-        ]
+        # distances of the pressed points from the axis through the front, along the approach
+        from_front = x[owned] - self.contact.front
+        distance_from_axis = np.linalg.norm(from_front - (from_front @ d)[:, None] * d, axis=1)
+        from_axis = distance_from_axis[pressure > PRESSURE_THRESHOLD * largest]
         penetration = comm.allreduce(float(-gap.min(initial=np.inf)), MPI.MAX)
         inner = comm.allreduce(float(from_axis.min(initial=np.inf)), MPI.MIN)
         outer = comm.allreduce(float(from_axis.max(initial=0.0)), MPI.MAX)

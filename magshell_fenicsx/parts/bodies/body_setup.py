@@ -84,10 +84,11 @@ def _contact(
 ) -> ContactBody:
     """Return one rigid body of a case at its place, with the stiffness of its penalty.
 
-    The body is placed so that it touches the shell at the section's `at`. With a `position` alone
-    the nearest place of the shell counts if the direction is given too, or on a mesh; else the
-    default of `at` gives the direction. The default stiffness is that of a plane for a plane, and
-    larger for a body of finite radius.
+    By default the body touches the shell at the section's `at`, with the shell's normal there as
+    its direction. A body with a `position` and no `at` has the default of `at`. But where that
+    normal is not needed, as the direction is given, the nearest place of the shell stands for `at`;
+    so it does on a mesh. The default stiffness is larger for a body of finite radius than for a
+    plane.
 
     Parameters
     ----------
@@ -106,47 +107,51 @@ def _contact(
     # the nearest sample, unless the normal at the default `at` is to give the direction
     if has_own_place and (reference.geometry == "mesh" or section.direction is not None):
         places = reference.perfect.sample()
-        place = places[
-            np.linalg.norm(places - np.array(section.position) / reference.R, axis=1).argmin()
-        ]
+        from_body = places - np.array(section.position) / reference.R
+        place = places[np.linalg.norm(from_body, axis=1).argmin()]
     else:
         place, _ = locate(section.at, reference, key)
     chart = reference.perfect.inverse(place)
-    # the chart of a mesh file is the place itself (3,): there is no map from a chart to the surface
+    # where the body touches: on the imperfect shell, with the normal of the perfect one. The chart
+    # of a mesh file is the place itself (3,): there is no map from a chart to the surface
     normal = reference.perfect.normal_near(chart)
     start = place if len(chart) == 3 else reference.imperfect.embedding(chart[None])[0]
     half_thickness = float(reference.half_thickness(start[None])[0])
     placed_body = place_body(
         section, key, start, normal / np.linalg.norm(normal), half_thickness, Q, reference.R
     )
-    # D over E h R^2, from which the default is a number times D/(R h)^2; a radius over R
+    # the default stiffness is a number times D/(R h)^2; D is over E h R^2, the radius over R
     D, body_radius = h**2 / (12 * (1 - reference.nu**2)), section.blunt_radius / placed_body.R
-    stiffness = section.stiffness or DEFAULT_STIFFNESS * D / h**2 * (
-        1.0 if body_radius == inf else POINTED_STIFFNESS_FACTOR * (1 + 1 / body_radius)
-    )
+    stiffness = section.stiffness or DEFAULT_STIFFNESS * D / h**2 * _stiffness_ratio(body_radius)
+    starts_at_shell = section.position is None
     contact = ContactBody(
-        name,
-        approach,
-        section.distance(placed_body),
-        placed_body.direction,
-        placed_body.front,
-        stiffness,
-        section.penetration,
-        body_radius,
-        section.stiffness is not None,  # has_given_stiffness
-        # start and lift, of a body without a position of its own
-        *((Q @ start, placed_body.front - Q @ start) if section.position is None else ()),
+        body=name,
+        amplitude=approach,
+        distance=section.distance(placed_body),
+        direction=placed_body.direction,
+        front=placed_body.front,
+        stiffness=stiffness,
+        max_penetration=section.penetration,
+        size=body_radius,
+        has_given_stiffness=section.stiffness is not None,
+        start=Q @ start if starts_at_shell else None,
+        lift=placed_body.front - Q @ start if starts_at_shell else None,
     )
     depth = -least_gap(contact, reference)
     if depth > PENETRATION_TOLERANCE * h:
         position_key, hint = "position", "move it back"
-        if section.position is None:
+        if starts_at_shell:
             position_key, hint = "at", "give a place `at` that it reaches first, or its `position`"
         raise CaseError(
             f"{key}.{position_key}: the body penetrates the undeformed shell by {depth / h:.4g} h "
             f"at approach 0; {hint}"
         )
     return contact
+
+
+def _stiffness_ratio(body_radius: float) -> float:
+    """Return the default stiffness of a body with a radius (over R), over that of a plane."""
+    return 1.0 if body_radius == inf else POINTED_STIFFNESS_FACTOR * (1 + 1 / body_radius)
 
 
 @dataclass(frozen=True)
@@ -178,7 +183,8 @@ class ContactZone:
         ten thicknesses are assumed.
         """
         h, size = reference.h, contact.size
-        ring_radius = 1.1 * sqrt(2 * (largest_approach(loads) or 10.0) * h)
+        approach = largest_approach(loads) or 10.0
+        ring_radius = 1.1 * sqrt(2 * approach * h)
         reach = min(ring_radius + 0.5 * sqrt(h), size + sqrt(h))
         return cls(reference.imperfect.inverse(contact.front), reach, size)
 
@@ -192,28 +198,16 @@ class ContactZone:
         """
         x, y = map(float, self.place)
         ring_width, size = sqrt(sizing.h), self.size
-        # three elements per radius, but no finer than h/10; the numbers are rules of thumb
-        small_body = (
-            [
-                DiscFeature(
-                    (x, y),
-                    radius=1.5 * size,
-                    size=max(size / 3, 0.1 * sizing.h),
-                    growth=0.4,
-                )
-            ]
-            if size < ring_width
-            else []
-        )
-        return [
-            DiscFeature(
-                (x, y),
-                radius=self.reach,
-                size=RING_SIZE * ring_width / sizing.refinement,
-                growth=growth,
-            ),
-            *small_body,
+        # here `size` is the radius of the body, in a feature the size of elements
+        ring_elements = RING_SIZE * ring_width / sizing.refinement
+        features: list[Feature] = [
+            DiscFeature((x, y), radius=self.reach, size=ring_elements, growth=growth)
         ]
+        if size < ring_width:
+            # three elements per radius, but no finer than h/10; the numbers are rules of thumb
+            body_elements = max(size / 3, 0.1 * sizing.h)
+            features.append(DiscFeature((x, y), radius=1.5 * size, size=body_elements, growth=0.4))
+        return features
 
 
 def largest_approach(loads: Iterable[Step]) -> float:
@@ -237,18 +231,17 @@ def body_symmetry(contact: ContactBody) -> SymmetryConstraint:
 
     def is_image(S: Array, image: Array) -> bool:
         """Return whether a map S preserves the direction, and distances at the places' images."""
-        image_distances = contact.distance(image)[0]
-        return bool(
-            np.abs(S @ direction - direction).max() < SYMMETRY_TOLERANCE
-            and np.abs(image_distances - distances).max()
-            < SYMMETRY_TOLERANCE * (1 + np.abs(distances).max())
-        )
+        keeps_direction = np.abs(S @ direction - direction).max() < SYMMETRY_TOLERANCE
+        change = np.abs(contact.distance(image)[0] - distances).max()
+        tolerance = SYMMETRY_TOLERANCE * (1 + np.abs(distances).max())
+        return bool(keeps_direction and change < tolerance)
 
     # two turns by angles (rad) that no symmetry of finite order has
     is_turned = all(is_image(Q, random_places @ Q.T) for Q in (rotation(1.0), rotation(2.5)))
-    # which a mirror plane must contain
+    # vectors that a mirror plane of the body must contain
     held_vectors = [contact.front, direction, *contact.distance.mirror_vectors]
-    # of planes through e3 and a vector; one along e3 gives no plane
+    # azimuths of possible mirror planes: each goes through e3 and a vector, which must not be along
+    # e3
     azimuths = tuple(
         atan2(v[1], v[0])
         for v in contact.distance.possible_mirror_vectors
@@ -281,7 +274,7 @@ def least_gap(contact: ContactBody, reference: ReferenceShell) -> float:
     chart = outline.chart_samples()
     if chart is None:  # of a mesh file, where samples alone are compared
         return float(gap(outline.sample()).min())
-    # half the box around the best sample in which the search goes on: a tenth of the chart
+    # the search goes on in a box around the best sample; half its side is a tenth of the chart
     reach = np.full(2, 0.1 * float(np.ptp(chart, axis=0).max()))
 
     def on_chart(x: Array) -> Array:

@@ -83,8 +83,9 @@ class Box(Distance):
         """Return signed distance (n,), gradient (n, 3), Hessian (n, 3, 3) at places x (n, 3)."""
         # by symmetry in the octant of positive coordinates, where the core's corner is half - edge
         y = (x - self.centre) @ self.axes.T
-        g, n, N = rounded(np.abs(y) - self.half + self.edge, self.edge)
-        # the axes with the signs of the place's own octant
+        from_corner = np.abs(y) - self.half + self.edge
+        g, n, N = rounded(from_corner, self.edge)
+        # back to space: the axes with the signs of the place's own octant
         basis = np.where(y < 0, -1.0, 1.0)[:, :, None] * self.axes
         return g, np.einsum("na,nai->ni", n, basis), np.einsum("nai,nab,nbj->nij", basis, N, basis)
 

@@ -92,9 +92,8 @@ class ContactSection(PathStep):
         """
         bodies: Mapping[str, object] = context.sections["bodies"]
         # only a single body need not be named
-        if (self.body is None and len(bodies) != 1) or (
-            self.body is not None and self.body not in bodies
-        ):
+        is_known = len(bodies) == 1 if self.body is None else self.body in bodies
+        if not is_known:
             allowed = ", ".join(bodies) or "none: give it in bodies"
             raise ValueError(f"{step.key}.body: {self.body or 'is missing'}; allowed: {allowed}")
 
@@ -228,23 +227,15 @@ class BodiesObservables(Observables):
         """
         model, h, values = view.model, view.h, dict[str, float]()
         for name in model.contacts:
-            # dPi/da, the force on the body over the unit below
-            region, force = model.region(state, name), view.potential(state, name)
-            approach_force_penetration = (
-                state.mu[name],
-                -force / self._unit(view),
-                region.penetration / h,
-            )
+            # the potential of an approach is dPi/da, which over the unit is the force on the body
+            region, potential = model.region(state, name), view.potential(state, name)
+            force = -potential / self._unit(view)
             radii = (view.length * radius for radius in (region.radius, region.inner, region.outer))
             body_contact, _ = model.contacts[name]
             stiffness = float(body_contact.stiffness.value)
-            values |= dict(
-                zip(
-                    contact_columns(name),
-                    (*approach_force_penetration, *radii, stiffness),
-                    strict=True,
-                )
-            )
+            # in the order of `contact_columns`
+            numbers = state.mu[name], force, region.penetration / h, *radii, stiffness
+            values |= dict(zip(contact_columns(name), numbers, strict=True))
         return values
 
     def conjugate_unit(self, view: ModelView, name: str) -> float | None:

@@ -86,13 +86,11 @@ class Ellipsoid(Distance):
         normal_length = np.linalg.norm(normal, axis=1)  # of half the gradient of sum (y_i/a_i)²
         n = normal / normal_length[:, None]
         g = np.einsum("ni,ni->n", y - foot, n)
-        # projection onto the tangent plane, and the curvatures of the surface as a tensor
+        # the curvatures of the surface as a tensor: the second derivative of sum (y_i/a_i)²/2 over
+        # the length of the first, projected onto the tangent plane
         tangent_projection = np.eye(3) - n[:, :, None] * n[:, None, :]
-        S = (
-            tangent_projection
-            @ (np.eye(3) / self.semi**2 / normal_length[:, None, None])
-            @ tangent_projection
-        )
+        second_derivative = np.eye(3) / self.semi**2 / normal_length[:, None, None]
+        S = tangent_projection @ second_derivative @ tangent_projection
         curvatures, directions = np.linalg.eigh(S)
         parallel = curvatures / np.maximum(1 + g[:, None] * curvatures, MIN_CURVATURE_FACTOR)
         N = np.einsum("nia,na,nja->nij", directions, parallel, directions)
@@ -104,17 +102,19 @@ class Ellipsoid(Distance):
         Both are coordinates along the ellipsoid's axes, from its centre.
         """
         a = self.semi
-        size = np.maximum(np.abs(y), PLANE_OFFSET * a)  # in the octant of positive coordinates
+        size = np.maximum(np.abs(y), PLANE_OFFSET * a)  # |y|: in the octant of positive coordinates
         # the start: the largest of the three terms of F + 1 is then 1, so that 0 <= F <= 2
         t = (a * size - a**2).max(axis=1)
         for _ in range(MAX_NEWTON_ITERATIONS):
             ratio = a * size / (t[:, None] + a**2)
-            F, slope = (ratio**2).sum(axis=1) - 1, -2 * (ratio**2 / (t[:, None] + a**2)).sum(axis=1)
+            F = (ratio**2).sum(axis=1) - 1
+            slope = -2 * (ratio**2 / (t[:, None] + a**2)).sum(axis=1)
             step = -F / slope
             t = t + step
             if np.abs(step).max(initial=0.0) <= PARAMETER_TOLERANCE * a.max() ** 2:
                 break
-        return np.asarray(np.where(y < 0, -1.0, 1.0) * a**2 * size / (t[:, None] + a**2))
+        signs = np.where(y < 0, -1.0, 1.0)  # of the place's own octant
+        return np.asarray(signs * a**2 * size / (t[:, None] + a**2))
 
     @property
     def lines(self) -> list[Array]:

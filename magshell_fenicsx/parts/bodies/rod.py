@@ -73,18 +73,19 @@ class Rod(Distance):
         radius less `edge`, and its end is as much behind. In space the Hessian also has n_rho/rho
         around the axis.
         """
+        # cylinder coordinates from the end, and those from the corner of the core
         r, d = x - self.end, self.along
         radial = r - (r @ d)[:, None] * d
         from_axis = np.linalg.norm(radial, axis=1)
         e_rho = radial / np.maximum(from_axis, 1e-300)[:, None]  # zero on the axis
         q = np.column_stack([from_axis - self.radius + self.edge, r @ d + self.edge])
         g, n, N = rounded(q, self.edge)
+        # back to space; around the axis the Hessian has n_rho/rho, which counts as 0 on the axis
         basis = np.stack([e_rho, np.broadcast_to(d, e_rho.shape)], axis=1)  # d(rho, z)/dx
         circumferential = np.eye(3) - np.outer(d, d) - e_rho[:, :, None] * e_rho[:, None, :]
         by_rotation = (n[:, 0] / np.maximum(from_axis, 1e-300))[:, None, None] * circumferential
-        H = np.einsum("nai,nab,nbj->nij", basis, N, basis) + np.where(
-            from_axis[:, None, None] > 0, by_rotation, 0.0
-        )
+        H = np.einsum("nai,nab,nbj->nij", basis, N, basis)
+        H = H + np.where(from_axis[:, None, None] > 0, by_rotation, 0.0)
         return g, np.einsum("na,nai->ni", n, basis), H
 
     @property

@@ -79,6 +79,11 @@ class ClosestPointSearch:
     ----------
     half_thickness
         (nodes,) undeformed, over R.
+
+    A key i * cells + j stands for the pair of cells i and j. The field `_near_keys` has those of
+    cells that are near within the surface, in ascending order. `_undeformed_points` has the contact
+    points that were searched last, and their undeformed places. `_tracked` has for each reach the
+    near pairs of the last search, see `_near_pairs`.
     """
 
     def __init__(
@@ -106,7 +111,7 @@ class ClosestPointSearch:
         undeformed_points = self.places_of_points(rule, self._undeformed_nodes)
         self._undeformed_points: tuple[ContactPoints, Array] = rule, undeformed_points
         self._own_cells = np.unique(rule.cell)  # of this rank, that are modelled
-        # reach -> displacement, margin and near pairs of the last search, see `_near_pairs`
+        # reach -> displacement, reach with a margin, and near pairs of the last search
         self._tracked = dict[float, tuple[Array, float, tuple[Longs, Longs]]]()
 
     def places_of_nodes(self, u: Array, *, to_faces: bool = True) -> Array:
@@ -149,11 +154,12 @@ class ClosestPointSearch:
         u, v
             (nodes, 3) displacements over R.
         """
-        spheres = [self._bounding_spheres(self._r0 + displacement) for displacement in (u, v)]
+        centres_at_u, radii_at_u = self._bounding_spheres(self._r0 + u)
+        centres_at_v, radii_at_v = self._bounding_spheres(self._r0 + v)
         # one sphere around each cell's way: at the middle, larger by half of the motion
-        centres = (spheres[0][0] + spheres[1][0]) / 2
-        half_motion = np.linalg.norm(spheres[1][0] - spheres[0][0], axis=1) / 2
-        radii = np.maximum(spheres[0][1], spheres[1][1]) + half_motion
+        centres = (centres_at_u + centres_at_v) / 2
+        half_motion = np.linalg.norm(centres_at_v - centres_at_u, axis=1) / 2
+        radii = np.maximum(radii_at_u, radii_at_v) + half_motion
         reach = self._largest_thickness
         sphere_pairs = near_spheres(centres, radii, reach, self._own_cells)
         pairs = self._select_pairs(*sphere_pairs, reach, self._r0 + u, self._r0 + v)
@@ -183,9 +189,9 @@ class ClosestPointSearch:
         allowed = self._may_touch(i, j)
         i, j = i[allowed], j[allowed]
         is_selected = ~self._are_near_in_surface(i * len(self._cells.nodes) + j)
-        neighbours = np.flatnonzero(~is_selected)  # near within the surface
+        near_pairs = np.flatnonzero(~is_selected)  # within the surface
         for r in surfaces:
-            is_selected[neighbours] |= self._are_folded(i[neighbours], j[neighbours], r, reach)
+            is_selected[near_pairs] |= self._are_folded(i[near_pairs], j[near_pairs], r, reach)
         return i[is_selected], j[is_selected]
 
     def _are_near_in_surface(self, keys: Longs) -> Flags:
@@ -193,7 +199,8 @@ class ClosestPointSearch:
 
         The keys (n,) are i * cells + j.
         """
-        # beyond the last key the last one is compared, which differs
+        # where each key would stand among those of near cells; one beyond the last of them is
+        # compared with the last, from which it differs
         position = np.minimum(np.searchsorted(self._near_keys, keys), len(self._near_keys) - 1)
         return np.asarray(self._near_keys[position] == keys)
 
@@ -219,20 +226,20 @@ class ClosestPointSearch:
         spacing = LATTICE_RADIUS_FACTOR / self._cells.element.degree
         chunks = 1 + len(i) * nodes.shape[1] ** 2 // MAX_DISTANCES_AT_ONCE  # which limits memory
         for chunk in np.array_split(np.arange(len(i)), chunks):
+            # a fold brings corners nearer to each other; most pairs are left out here
             corners = nodes[i[chunk], :3, None], nodes[j[chunk], None, :3]
-            # a fold brings corners nearer to each other: most pairs end here
             has_shrunk = _distances_of_nodes(r, *corners) < (
                 FOLD_SHRINKAGE * _distances_of_nodes(self._r0, *corners)
             )
             pairs = chunk[has_shrunk.any(axis=(1, 2))]
-            own_nodes, other_nodes = nodes[i[pairs], :, None], nodes[j[pairs], None, :]
-            margin = spacing * (radii[i[pairs]] + radii[j[pairs]])
-            is_close = (
-                _distances_of_nodes(r, own_nodes, other_nodes) < reach + margin[:, None, None]
-            )
-            margin = spacing * (undeformed_radii[i[pairs]] + undeformed_radii[j[pairs]])
+            # all nodes of the cells of the other pairs: whether two are close now, and were apart
+            own, other = i[pairs], j[pairs]
+            own_nodes, other_nodes = nodes[own, :, None], nodes[other, None, :]
+            margin = spacing * (radii[own] + radii[other])[:, None, None]
+            is_close = _distances_of_nodes(r, own_nodes, other_nodes) < reach + margin
+            margin = spacing * (undeformed_radii[own] + undeformed_radii[other])[:, None, None]
             thickness = self.half_thickness[own_nodes] + self.half_thickness[other_nodes]
-            least_separation = SELF_CONTACT_DISTANCE * thickness - margin[:, None, None]
+            least_separation = SELF_CONTACT_DISTANCE * thickness - margin
             was_apart = _distances_of_nodes(self._r0, own_nodes, other_nodes) > least_separation
             is_folded[pairs] = (is_close & was_apart).any(axis=(1, 2))
         return is_folded
@@ -240,8 +247,8 @@ class ClosestPointSearch:
     def _near_pairs(self, u: Array, reach: float) -> tuple[Longs, Longs]:
         """Return pairs (i, j) of cells that are near each other; i are modelled cells of this rank.
 
-        The pairs are searched with a margin and cached, for each reach, until nodes have moved
-        that far: the result may have pairs that are a little farther.
+        The pairs are searched with a margin, and kept for each reach until nodes have moved that
+        far. So the result may have pairs that are a little farther than the reach.
 
         Parameters
         ----------
@@ -251,24 +258,24 @@ class ClosestPointSearch:
             Distance between the cells over R.
         """
         if reach in self._tracked:
-            tracked_u, margin, pairs = self._tracked[reach]
+            tracked_u, searched_reach, pairs = self._tracked[reach]
             # twice, since two cells may move towards each other
             motion = 2 * float(np.linalg.norm(u - tracked_u, axis=1).max(initial=0.0))
-            if motion + reach <= margin:
+            if motion + reach <= searched_reach:
                 return pairs
         centres, radii = self._bounding_spheres(self._r0 + u)
-        margin = reach + TRACKING_MARGIN * float(radii.mean())
-        sphere_pairs = near_spheres(centres, radii, margin, self._own_cells)
-        pairs = self._select_pairs(*sphere_pairs, margin, self._r0 + u)
-        self._tracked[reach] = np.array(u), margin, pairs
+        searched_reach = reach + TRACKING_MARGIN * float(radii.mean())
+        sphere_pairs = near_spheres(centres, radii, searched_reach, self._own_cells)
+        pairs = self._select_pairs(*sphere_pairs, searched_reach, self._r0 + u)
+        self._tracked[reach] = np.array(u), searched_reach, pairs
         return pairs
 
     def gap_at_supports(self, supported_nodes: Longs, u: Array) -> float:
         """Return the least gap over R between the faces at supported nodes, where faces overlap.
 
-        Only nodes count that may touch and are not near within the undeformed surface. The gap is
-        negative. It is infinite if no faces overlap there, and if the thickness depends on the
-        displacement, which is then not looked at.
+        Only nodes count that may touch and are not near within the undeformed surface. The result
+        is negative if faces overlap there, and infinite if none do. It is also infinite if the
+        thickness depends on the displacement: such a displacement is not looked at.
 
         Parameters
         ----------
@@ -313,7 +320,8 @@ class ClosestPointSearch:
         """
         points = points or self._rule
         r = self.places_of_nodes(u, to_faces=to_faces)
-        # the nearest place in each cell, of which those stay from which none is nearer
+        # a point has one place in each near cell; those stay from which the surface goes on to no
+        # nearer one
         places = self.projections_in_cells(points, u, r, reach, least_only=least_only)
         return self._select_nearest(points, places)
 
@@ -342,37 +350,33 @@ class ClosestPointSearch:
 
     @cached_property
     def _separate_surfaces(self) -> tuple[Longs, Flags]:
-        """The number of each cell's connected surface, and which surfaces face each other wholly.
+        """The number of each cell's connected surface, and which surfaces are separate.
 
-        The first array is (cells,). The flags (m, m) say of two surfaces whether each place of one
-        may touch each place of the other. Then the nearest place of each point counts: the surface
-        goes on from there to none that is nearer, and no place of it is near the point in the
-        point's own surface.
+        The numbers are (cells,). The flags (m, m) say of two of the m surfaces whether they are
+        separate: each place of one may touch each place of the other, and no cell of one is near
+        one of the other within the surface. Then the nearest place of each point counts, since the
+        surface goes on from there to no nearer one.
         """
+        # cells that share a side are connected; surfaces are the connected parts
         cell, side = np.nonzero(self._cells.neighbours >= 0)
         n, neighbour = len(self._cells.nodes), self._cells.neighbours[cell, side]
-        # cells that share a side are connected
         adjacency = scipy.sparse.coo_array((np.ones(len(cell)), (cell, neighbour)), (n, n))
         count, surface_of_cell = scipy.sparse.csgraph.connected_components(
             adjacency, directed=False
         )
-        sizes, (_, first_cells) = (
-            np.bincount(surface_of_cell),
-            np.unique(surface_of_cell, return_index=True),
-        )
-        # one cell stands for its surface; `faces_all.T` below looks from the other surface
-        # numbers of cells of one surface that another faces
+        # faced[a, b]: how many cells of surface b surface a may touch; one cell stands for a
         faced = np.zeros((count, count), dtype=np.int64)
-        for surface, cell in enumerate(first_cells):
-            faced_cells = self._may_touch(np.full(n, cell), np.arange(n))
+        _, first_cells = np.unique(surface_of_cell, return_index=True)
+        for surface, first_cell in enumerate(first_cells):
+            faced_cells = self._may_touch(np.full(n, first_cell), np.arange(n))
             faced[surface] = np.bincount(surface_of_cell[faced_cells], minlength=count)
+        # whether any cells of two surfaces are near within the surface
         is_near = np.zeros((count, count), dtype=bool)
-        is_near[
-            surface_of_cell[self._near_keys // n],
-            surface_of_cell[self._near_keys % n],
-        ] = True
-        faces_all = faced == sizes
-        return surface_of_cell, faces_all & faces_all.T & ~is_near & ~np.eye(count, dtype=bool)
+        near_cells, other_cells = self._near_keys // n, self._near_keys % n
+        is_near[surface_of_cell[near_cells], surface_of_cell[other_cells]] = True
+        faces_all = faced == np.bincount(surface_of_cell)
+        is_other = ~np.eye(count, dtype=bool)  # a surface is not separate from itself
+        return surface_of_cell, faces_all & faces_all.T & ~is_near & is_other
 
     def _limits(
         self,
@@ -386,7 +390,7 @@ class ClosestPointSearch:
         """Return bounds of the distance from points to their nearest places on separate surfaces.
 
         The nearest node of such a surface bounds the distance, since it is a place of the surface.
-        A surface is separate from a point's own if the nearest place on it is the one that counts.
+        See `_separate_surfaces`: on a separate surface only the nearest place counts.
 
         Parameters
         ----------
@@ -400,24 +404,29 @@ class ClosestPointSearch:
             Distance over R beyond which nodes are not looked for.
         """
         surface_of_cell, are_separate = self._separate_surfaces
-        variation = 0.0  # of half the thickness, by which distances of faces differ from nodes'
+        # range of half the thickness: by that the distance of faces may exceed that of a node
+        variation = 0.0
         if r.shape[1] > 3:
             variation = self._bound(r[:, 3]) + self._bound(-r[:, 3])
-        reach, surface_of_point = np.full(len(x), np.inf), surface_of_cell[cell]
+        own_cells, faced_cells = pairs
         is_near = np.zeros(len(self._cells.nodes), dtype=bool)
-        is_near[pairs[1]] = True
-        for number_of_surface in np.unique(surface_of_point):
-            near_separate_cells = is_near & are_separate[number_of_surface][surface_of_cell]
+        is_near[faced_cells] = True
+        # the points of each surface together: their distances from near nodes of all surfaces that
+        # are separate from it
+        reach, surface_of_point = np.full(len(x), np.inf), surface_of_cell[cell]
+        for surface in np.unique(surface_of_point):
+            near_separate_cells = is_near & are_separate[surface][surface_of_cell]
             nodes = np.unique(self._cells.nodes[near_separate_cells])
             if len(nodes):
-                own_points = searched[surface_of_point == number_of_surface]
-                # infinite distances, beyond the largest one, leave the points without a bound
+                points_of_surface = searched[surface_of_point == surface]
+                # a node beyond the largest distance has an infinite one: the point has no bound
                 tree = scipy.spatial.cKDTree(r[nodes, :3])
-                distance, _ = tree.query(x[own_points, :3], distance_upper_bound=max_distance)
-                reach[own_points] = distance + variation + 2 * DISTANCE_TOLERANCE * self._h
-        return ProjectionLimits(
-            are_separate[surface_of_cell[pairs[0]], surface_of_cell[pairs[1]]], reach
-        )
+                distance, _ = tree.query(
+                    x[points_of_surface, :3], distance_upper_bound=max_distance
+                )
+                reach[points_of_surface] = distance + variation + 2 * DISTANCE_TOLERANCE * self._h
+        is_bounded = are_separate[surface_of_cell[own_cells], surface_of_cell[faced_cells]]
+        return ProjectionLimits(is_bounded, reach)
 
     def projections_in_cells(
         self, points: ContactPoints, u: Array, r: Array, reach: float, *, least_only: bool = False
@@ -441,23 +450,26 @@ class ClosestPointSearch:
         # mid-surfaces may be farther apart than faces, by both offsets
         face_reach, reach = reach, reach + 2 * largest_offset
         i, j = self._near_pairs(u, reach)
-        # points of cell i are order[first_position : first_position + count]
+        # contact points in the order of cells: those of cell i are
+        # order[first_position : first_position + count]
         order, cell_in_order = points.by_cell
         first_position = np.searchsorted(cell_in_order, i)
         count = np.searchsorted(cell_in_order, i, "right") - first_position
+        # places of the points that are searched, now and undeformed
         searched = order[np.isin(cell_in_order, i)]
         x = np.zeros((len(order), r.shape[1]))
         x[searched] = self.places_of_points(points, r, searched)
         if self._undeformed_points[0] is not points:  # undeformed places are kept for one set
             self._undeformed_points = points, self.places_of_points(points, self._undeformed_nodes)
+        _, undeformed_x = self._undeformed_points
         is_near = self._are_near_in_surface(i * len(self._cells.nodes) + j)
         undeformed = UndeformedPairs(
-            is_near, self._undeformed_nodes, self._undeformed_points[1], SELF_CONTACT_DISTANCE
+            is_near, self._undeformed_nodes, undeformed_x, SELF_CONTACT_DISTANCE
         )
         limits = None
         if least_only:
             limits = self._limits(searched, x, r, (i, j), points.cell[searched], reach)
-        pairs = j, first_position, count, order
+        pairs = j, first_position, count, order  # cell j with the points of cell i
         _, places = nearest_places(self._cells, r, x, pairs, reach, face_reach, undeformed, limits)
         return places
 
@@ -486,35 +498,52 @@ class ClosestPointSearch:
         before its edge. Places at the same distance in neighbouring cells all stay, to be joined as
         one by `JoinedPlaces`. The result is in the order of points, directions and distances.
         """
-        cells, cell_count = self._cells, len(self._cells.nodes)
-        keys = places.point * cell_count + places.cell
-        order = np.argsort(keys, kind="stable")
-        places, keys = places.select(order), keys[order]
-        # a barycentric coordinate is zero on the side opposite to its corner
+        # in the order of points, then of cells, so that a point's place in a cell can be looked up
+        keys = places.point * len(self._cells.nodes) + places.cell
+        places = places.select(np.argsort(keys, kind="stable"))
+        # a place on a side counts unless the surface goes on across the side to a nearer one;
+        # barycentric coordinate k is zero on side k
         on_sides = np.column_stack([1 - places.X.sum(axis=1), places.X]) == 0.0
-        key_of_point_cell = points.cell[places.point] * cell_count
-        is_nearest = np.ones(len(keys), dtype=bool)
-        # a place on a side counts unless the neighbour across the side has a nearer one
+        is_nearest = np.ones(len(places.point), dtype=bool)
         for side in range(3):
-            neighbour = cells.neighbours[places.cell, side]
+            neighbour = self._cells.neighbours[places.cell, side]
             is_on_side = on_sides[:, side] & (neighbour >= 0)
-            neighbour_key = places.point * cell_count + neighbour
-            neighbour_row = np.minimum(np.searchsorted(keys, neighbour_key), max(len(keys) - 1, 0))
-            is_listed = keys[neighbour_row] == neighbour_key
-            is_nearer = (
-                places.distance[neighbour_row] < places.distance - DISTANCE_TOLERANCE * self._h
-            )
-            # at a fold: beyond the side is material around the point, which is not searched
-            is_folded = places.is_above & self._are_near_in_surface(key_of_point_cell + neighbour)
-            # elsewhere the neighbour's place must be known, and no nearer
-            is_nearest &= ~is_on_side | (is_listed & ~is_nearer) | is_folded
+            is_nearest &= ~is_on_side | self._are_nearest_across(points, places, neighbour)
         places = places.select(is_nearest)
         if not len(places.point):
             return places
+        # in each direction the nearest place stays, with those at the same distance
         places = _number_directions(places.select(np.lexsort((places.distance, places.point))))
         first = places.firsts
         least_distance = np.repeat(places.distance[first], np.diff([*first, len(places.point)]))
         return places.select(places.distance < least_distance + DISTANCE_TOLERANCE * self._h)
+
+    def _are_nearest_across(
+        self, points: ContactPoints, places: Projections, neighbour: Longs
+    ) -> Flags:
+        """Return flags (n,): whether places on a side are no farther than those across the side.
+
+        The point must have a place in the neighbour that is not nearer. Or the surface is folded at
+        the side, and the neighbour is material around the point, which is not searched.
+
+        Parameters
+        ----------
+        places
+            In the order of points and cells.
+        neighbour
+            (n,) the cell across the side of each place. Of places without one the flag has no
+            meaning.
+        """
+        cell_count = len(self._cells.nodes)
+        keys = places.point * cell_count + places.cell
+        # the row of the point's place in the neighbour, if that is listed; else any row
+        neighbour_key = places.point * cell_count + neighbour
+        row = np.minimum(np.searchsorted(keys, neighbour_key), max(len(keys) - 1, 0))
+        is_listed = keys[row] == neighbour_key
+        is_nearer = places.distance[row] < places.distance - DISTANCE_TOLERANCE * self._h
+        key_of_cells = points.cell[places.point] * cell_count + neighbour
+        is_folded = places.is_above & self._are_near_in_surface(key_of_cells)
+        return np.asarray((is_listed & ~is_nearer) | is_folded)
 
     def are_left_to_edges(
         self, points: ContactPoints, places: Projections, normals: Array
@@ -570,14 +599,14 @@ class ClosestPointSearch:
         normals
             (cells, 3) unit normals.
         """
+        # (n, 3): a barycentric coordinate is zero on the side opposite to its corner
         on_side = np.column_stack([1 - nearest.X.sum(axis=1), nearest.X]) == 0.0
-        # one free direction: the second column of each matrix is zero
-        moves_along_side = nearest.free_directions.any(axis=(1, 2)) & (
-            nearest.free_directions[:, :, 1] == 0
-        ).all(axis=1)
-        is_boundary = self._cells.neighbours[nearest.cell] < 0
-        is_on_edge = moves_along_side & (on_side & is_boundary).any(axis=1)
-        # in a corner an edge goes on from one cell to another, or turns
+        # one free direction: the second column of each matrix is zero, and the first is not
+        has_direction = nearest.free_directions.any(axis=(1, 2))
+        has_no_second = (nearest.free_directions[:, :, 1] == 0).all(axis=1)
+        is_open = self._cells.neighbours[nearest.cell] < 0
+        is_on_edge = has_direction & has_no_second & (on_side & is_open).any(axis=1)
+        # a place in a corner is on two sides, and on an edge if that corner is
         in_corner = on_side.sum(axis=1) == 2
         is_on_edge |= in_corner & (~on_side & self._cells.is_on_edge[nearest.cell]).any(axis=1)
         cosine = np.abs(np.sum(normals[points.cell[nearest.point]] * normals[nearest.cell], axis=1))
@@ -590,10 +619,12 @@ def _distances_of_nodes(r: Array, nodes: Longs, others: Longs) -> Array:
 
 
 def _number_directions(places: Projections) -> Projections:
-    """Return the places with a number `side` for each direction from their point, in that order.
+    """Return the places with the number of their direction from their point as `side`.
 
-    Places whose directions differ by less than an angle have one number. It is 0 for the direction
-    of the nearest place, then 1, and `MAX_DIRECTIONS` - 1 for all others.
+    Number 0 has the nearest place of a point, with all places in about the same direction. Number 1
+    has the nearest of the others, with those in about its direction. The last number,
+    `MAX_DIRECTIONS` - 1, has all that remain. The result is in the order of points, directions and
+    distances.
 
     Parameters
     ----------
@@ -601,9 +632,9 @@ def _number_directions(places: Projections) -> Projections:
         In the order of points and distances.
     """
     direction_numbers = np.full(len(places.point), MAX_DIRECTIONS - 1)
-    remaining = np.arange(len(places.point))
-    # the nearest place that remains of each point gives a direction, to those within an angle
+    remaining = np.arange(len(places.point))  # rows without a number
     for direction in range(MAX_DIRECTIONS - 1):
+        # the nearest place of each point that remains, for each of that point's rows
         first = np.flatnonzero(np.diff(places.point[remaining], prepend=-1))
         nearest = np.repeat(remaining[first], np.diff([*first, len(remaining)]))
         cosine = np.sum(places.direction[remaining] * places.direction[nearest], axis=1)
@@ -622,10 +653,10 @@ def gap_between_supports(
     half_thickness: Array,
     may_touch: Callable[[Longs, Longs], Flags],
 ) -> float:
-    """Return the least gap over R between faces at supported nodes, where it is negative.
+    """Return the least gap over R between faces at supported nodes, where faces overlap.
 
-    It is infinite if no faces overlap. Only nodes count that are a thickness apart undeformed: the
-    others are the same material.
+    Where they do it is negative; it is infinite if no faces overlap. Only pairs of nodes count that
+    are a thickness apart undeformed: the others are the same material.
 
     Parameters
     ----------
@@ -645,6 +676,7 @@ def gap_between_supports(
     cell_of[nodes.ravel()] = np.repeat(np.arange(len(nodes)), nodes.shape[1])
     cells, undeformed = cell_of[supported_nodes], r0[supported_nodes]
     deformed, half = (r0 + u)[supported_nodes], half_thickness[supported_nodes]
+    # (n, n) of each pair: the thickness between its mid-surfaces, and the undeformed distance
     thickness = half[:, None] + half
     distance = scipy.spatial.distance.cdist(undeformed, undeformed)
     i, j = np.nonzero(distance > (1 - DISTANCE_TOLERANCE) * thickness)

@@ -100,6 +100,7 @@ class ContactObservables(Observables):
             evaluation = model.system.at_state(state)
             # the model evaluates both with this state as its present one
             force, gap = evaluation.evaluate(contact.force), evaluation.evaluate(contact.least_gap)
+            # in the order of `quantities`
             numbers_of_pair = force / model.force_unit, gap / view.h, contact.stiffness.value
             values |= dict(zip(_columns(contact.pair), numbers_of_pair, strict=True))
         return values

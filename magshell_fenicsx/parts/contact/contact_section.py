@@ -194,11 +194,10 @@ def refuse_unfit_pairs(sections: Sequence[GivenPair], context: Context) -> None:
             )
         earlier_pairs.add(frozenset(pair))
         for name in pair:
-            if (
-                shells
-                and name not in (WHOLE_SHELL, *shells)
-                and not name.startswith(tuple(f"{shell}_" for shell in shells))
-            ):
+            # of several shells a name is that of one, or of a patch of one
+            is_shell = name in (WHOLE_SHELL, *shells)
+            is_patch = name.startswith(tuple(f"{shell}_" for shell in shells))
+            if shells and not is_shell and not is_patch:
                 raise ValueError(
                     f"contact.{i}: {name}: there is no such shell, only {', '.join(shells)}"
                 )
@@ -207,7 +206,7 @@ def refuse_unfit_pairs(sections: Sequence[GivenPair], context: Context) -> None:
                     f"contact.{i}: {name}: allowed: {WHOLE_SHELL}; parts are the patches of a "
                     "mesh file"
                 )
-    # both members of the pair of the whole shell and itself are one name
+    # as a set of names, the pair of the whole shell and itself has one
     if len(earlier_pairs) > 1 and frozenset({WHOLE_SHELL}) in earlier_pairs:
         raise ValueError(f"contact: {WHOLE_SHELL} and itself has all other pairs: give it alone")
     context.needs("contact", "a mid-surface")

@@ -88,6 +88,11 @@ class FaceOffsets:
     ----------
     undeformed_half_thickness
         (nodes,) over R, before anything grows.
+
+    The field `_place_numbers` (cells, functions) has the node that stands for all copies at a
+    place. `_volume_coefficients` (powers, nodes) are (h/2) sum V at nodes by powers of the growth;
+    `_fixed_area` (nodes,) is the part of sum A that does not change. `_volume_per_factor` is h/2
+    times V over t J0 in each cell.
     """
 
     def __init__(
@@ -193,14 +198,17 @@ class FaceOffsets:
         by_volume, by_area
             (nodes,) derivatives of the same function by the volumes and the areas at nodes.
         """
+        # (cells, functions): copies of a node share volume and area, so derivatives are added
         by_place_volume, by_place_area = (
             np.bincount(self._same_place, f, len(f))[self._place_numbers]
             for f in (by_volume, by_area)
         )
+        # by J0 of each cell: V is volume_per_factor times t J0, and A is J0 or does not have it
         volume_per_factor = np.polynomial.polynomial.polyval(self.growth, self._volume_per_factor)
         by_J0 = by_place_volume * volume_per_factor * self._thickness_factor
         by_J0 += by_place_area * ~self._keeps_volume[:, None]
-        # others have no part; at zero displacement the slopes of J are those of J0
+        # by places, in the cells that have a part; without displacement the slopes of J are those
+        # of J0
         loaded_cells = np.flatnonzero((by_J0 != 0).any(axis=1))
         forces = np.zeros(self._r0.size)
         by_place = np.einsum(
@@ -226,20 +234,23 @@ class FaceOffsets:
         loaded_cells, areas = self._cells_around(f != 0), self._areas_at_nodes(u)
         area_jacobian = self._area_jacobian(u, f != 0)
         weight = -f * self._half_volumes() / areas**2
-        at_places = np.bincount(self._same_place, weight, len(weight)).astype(float)
-        of_areas = area_jacobian.T @ scipy.sparse.diags_array(-2 * weight / areas) @ area_jacobian
-        H = self._area_hessians(u, loaded_cells, at_places[self._place_numbers[loaded_cells]])
+        # the products A,u A,u
+        of_slopes = area_jacobian.T @ scipy.sparse.diags_array(-2 * weight / areas) @ area_jacobian
+        # the Hessian of A: a block for each cell, where copies of a node have the sum of weights
+        weight_of_places = np.bincount(self._same_place, weight, len(weight)).astype(float)
+        weight_in_cells = weight_of_places[self._place_numbers[loaded_cells]]
+        H = self._area_hessians(u, loaded_cells, weight_in_cells)
         dofs = self._unknowns_of_cells(loaded_cells)
         rows, columns = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
         blocks = H.ravel(), (rows.ravel(), columns.ravel())
-        return of_areas + scipy.sparse.coo_array(blocks, of_areas.shape).tocsr()
+        return of_slopes + scipy.sparse.coo_array(blocks, of_slopes.shape).tocsr()
 
     def entries(self, u: Array, entries: Entries, f: Array) -> Entries:
         """Return the entries of a second derivative by the displacement u alone.
 
-        Those given are by the places and offsets H of nodes, as if both were independent. By the
-        chain rule the result is T^T K T, with the derivative T of places and H by u, plus the
-        Hessian of H times f.
+        The given entries are those of K, by places and by offsets H of nodes: two kinds of
+        unknowns. With the derivative T of both by u, the result is T^T K T plus the Hessian of
+        sum f H (the chain rule).
 
         Parameters
         ----------
@@ -256,20 +267,22 @@ class FaceOffsets:
         if self.is_constant:  # H does not depend on u: entries by places remain
             is_of_places = (rows < count) & (columns < count)
             return rows[is_of_places], columns[is_of_places], values[is_of_places]
-        is_coupled = np.zeros(size, dtype=bool)
-        is_coupled[rows] = True
-        # derivative of all places and offsets by the displacement
-        unknowns_by_u = scipy.sparse.vstack(
-            [scipy.sparse.eye_array(count), self.jacobian(u, is_coupled[count:])]
+        # only offsets that have entries need a derivative
+        has_entries = np.zeros(size, dtype=bool)
+        has_entries[rows] = True
+        # T: places have the identity, offsets follow
+        T = scipy.sparse.vstack(
+            [scipy.sparse.eye_array(count), self.jacobian(u, has_entries[count:])]
         ).tocsr()
         K = scipy.sparse.coo_array((values, (rows, columns)), (size, size)).tocsr()
-        i, j, v = scipy.sparse.find(unknowns_by_u.T @ K @ unknowns_by_u + self.hessian(u, f))
+        i, j, v = scipy.sparse.find(T.T @ K @ T + self.hessian(u, f))
         return i.astype(np.int64), j.astype(np.int64), v
 
     def coupled_pairs(self, rows: Longs, columns: Longs) -> tuple[Longs, Longs]:
-        """Return the pairs of nodes whose displacements are coupled where places and H are.
+        """Return the pairs of nodes whose displacements are coupled, for pairs by places and H.
 
-        H at a node depends on the displacement of all nodes of the cells around.
+        H at a node depends on the displacement of all nodes of the cells around. So a coupling of
+        two nodes couples all nodes around the one with all nodes around the other.
 
         Parameters
         ----------
@@ -278,26 +291,17 @@ class FaceOffsets:
         """
         if self.is_constant:
             return rows, columns
-        nodes, count = self._place_numbers, len(self._r0)
-        cell_rows = np.repeat(np.arange(len(nodes)), nodes.shape[1])
-        cells_to_places = scipy.sparse.coo_array(
-            (np.ones(nodes.size), (cell_rows, nodes.ravel())), (len(nodes), count)
-        ).tocsr()
-        cells_to_nodes = scipy.sparse.coo_array(
-            (np.ones(nodes.size), (cell_rows, self._cells.nodes.ravel())), cells_to_places.shape
-        ).tocsr()
-        to_place_numbers = scipy.sparse.coo_array(
-            (np.ones(count), (np.arange(count), self._same_place)), (count, count)
-        ).tocsr()
-        # nonzero entries of the products are what matters, not their values;
-        # (nodes, nodes): nodes on whose displacement the place and H of each node depend
-        nodes_of_thickness = (
-            scipy.sparse.eye_array(count) + to_place_numbers @ cells_to_places.T @ cells_to_nodes
-        )
-        couplings = scipy.sparse.coo_array(
-            (np.ones(len(rows)), (rows, columns)), (count, count)
-        ).tocsr()
-        i, j = (nodes_of_thickness.T @ couplings @ nodes_of_thickness).nonzero()
+        places, count = self._place_numbers, len(self._r0)
+        # sparse flags: which place a node has, and which places and nodes a cell has
+        cell_rows = np.repeat(np.arange(len(places)), places.shape[1])
+        has_place = _sparse_flags(np.arange(count), self._same_place, (count, count))
+        cell_has_place = _sparse_flags(cell_rows, places.ravel(), (len(places), count))
+        cell_has_node = _sparse_flags(cell_rows, self._cells.nodes.ravel(), (len(places), count))
+        # where products are not zero: (nodes, nodes), on whose displacement the place and H of each
+        # node depend, that is on its own and on those of nodes in the cells around
+        depends_on = scipy.sparse.eye_array(count) + has_place @ cell_has_place.T @ cell_has_node
+        couplings = _sparse_flags(rows, columns, (count, count))
+        i, j = (depends_on.T @ couplings @ depends_on).nonzero()
         return i.astype(np.int64), j.astype(np.int64)
 
     def _half_volumes(self, order: int = 0) -> Array:
@@ -344,10 +348,10 @@ class FaceOffsets:
         rows, columns = np.broadcast_arrays(
             places[:, :, None], self._unknowns_of_cells(cells)[:, None, :]
         )
-        size = len(self._r0), self._components * len(self._r0)
-        return scipy.sparse.coo_array(
-            (slope.ravel(), (rows.ravel(), columns.ravel())), size
-        ).tocsr()[self._same_place]
+        shape = len(self._r0), self._components * len(self._r0)
+        entries = slope.ravel(), (rows.ravel(), columns.ravel())
+        by_place = scipy.sparse.coo_array(entries, shape).tocsr()
+        return by_place[self._same_place]  # each copy of a node has the row of its place
 
     def _unknowns_of_cells(self, cells: Longs) -> Longs:
         """Return numbers (n, dofs) of the displacement's unknowns in n cells."""
@@ -383,10 +387,11 @@ class FaceOffsets:
             (nodes, 3) displacement, and weights (cells, places).
         """
         vectors = self._area_vectors(u, cells)
-        T, slope = vectors.by_node, vectors.slope
-        H = np.einsum("cqmi,cqni->cmn", T * (w / vectors.J)[..., None, None], T)
+        by_node, slope = vectors.by_node, vectors.slope
+        # a,u . a,u and J,u J,u: sums over the places q of a cell, by its unknowns m and n
+        H = np.einsum("cqmi,cqni->cmn", by_node * (w / vectors.J)[..., None, None], by_node)
         H -= np.einsum("cqm,cqn->cmn", slope * (w / vectors.J)[..., None], slope)
-        # the second derivative of a_1 x a_2 by components i and j of nodes is along e_k
+        # n . a,uu: the second derivative of a by components i and j of two nodes is along e_k
         for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):  # even permutations
             twist = np.einsum("cq,qm,qn->cmn", w * vectors.normal[..., k], *self._slope_table)
             twist -= np.swapaxes(twist, 1, 2)
@@ -399,13 +404,20 @@ class FaceOffsets:
         a1, a2 = np.einsum(
             "dqk,cki->dcqi", self._slope_table, (self._r0 + u)[self._cells.nodes[cells]]
         )
-        n = np.cross(a1, a2)
-        J = np.linalg.norm(n, axis=-1)
+        area_vectors = np.cross(a1, a2)
+        J = np.linalg.norm(area_vectors, axis=-1)
+        # where a node moves along e, with its shape function N, a_1 x a_2 changes by
+        # e x (N,1 a_2 - N,2 a_1)
         slopes1, slopes2 = self._slope_table[..., None]
-        # the derivative along e is e x rotation_vectors
-        rotation_vectors = slopes1 * a2[:, :, None] - slopes2 * a1[:, :, None]
-        by_node = np.cross(np.eye(3), rotation_vectors[..., None, :])
-        return _AreaVectors(J, n / J[..., None], by_node.reshape(*J.shape, 3 * J.shape[1], 3))
+        factors = slopes1 * a2[:, :, None] - slopes2 * a1[:, :, None]
+        by_node = np.cross(np.eye(3), factors[..., None, :])
+        by_unknowns = by_node.reshape(*J.shape, 3 * J.shape[1], 3)
+        return _AreaVectors(J, area_vectors / J[..., None], by_unknowns)
+
+
+def _sparse_flags(rows: Longs, columns: Longs, shape: tuple[int, int]) -> Any:
+    """Return a sparse matrix that is not zero at the given entries."""
+    return scipy.sparse.coo_array((np.ones(len(rows)), (rows, columns)), shape).tocsr()
 
 
 def unknown_numbers(nodes: Longs, count: int, components: int = 3, dim: int = 3) -> Longs:
@@ -415,5 +427,6 @@ def unknown_numbers(nodes: Longs, count: int, components: int = 3, dim: int = 3)
     all of them, one for each node, if `components` is dim + 1.
     """
     of_place = dim * nodes[:, :, None] + np.arange(dim)
-    dofs = np.concatenate([of_place, dim * count + nodes[:, :, None]], axis=2)[..., :components]
+    of_offset = dim * count + nodes[:, :, None]
+    dofs = np.concatenate([of_place, of_offset], axis=2)[..., :components]
     return np.asarray(dofs.reshape(len(nodes), components * nodes.shape[1]))

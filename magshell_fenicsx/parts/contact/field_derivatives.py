@@ -128,10 +128,10 @@ class ContactState:
         """
         rows, columns, values = self.find_entries_by_place_and_offset()
         # all places come first, then H of all nodes, as in `unknown_numbers`
-        flat = np.concatenate([rates[:, :-1].ravel(), rates[:, -1]])
-        product = np.bincount(rows, values * flat[columns], len(flat))
-        count = self.r0.size
-        return np.column_stack([product[:count].reshape(self.r0.shape), product[count:]])
+        flat_rates = np.concatenate([rates[:, :-1].ravel(), rates[:, -1]])
+        product = np.bincount(rows, values * flat_rates[columns], len(flat_rates))
+        by_place, by_offset = product[: self.r0.size], product[self.r0.size :]
+        return np.column_stack([by_place.reshape(self.r0.shape), by_offset])
 
     def unknown_rates(self, w: Array) -> Array:
         """Return the rates (nodes, 3 or 4) of places and H along a motion w (nodes, 3)."""
@@ -153,10 +153,12 @@ class ContactState:
         places
             (3, n, 3) the undeformed places, and their derivatives a_1 and a_2.
         """
-        n = np.cross(*places[1:])
-        n = n / np.sum(n * n, axis=1)[:, None]  # the normal over J0, for relative derivatives
-        by_first = np.cross(places[2], n)[:, None]
-        by_second = np.cross(n, places[1])[:, None]
+        _, a1, a2 = places
+        area_vector = np.cross(a1, a2)
+        n = area_vector / np.sum(area_vector * area_vector, axis=1)[:, None]  # the normal over J0
+        # relative derivatives of J0 by a_1 and by a_2
+        by_first = np.cross(a2, n)[:, None]
+        by_second = np.cross(n, a1)[:, None]
         return np.asarray(tables[1][..., None] * by_first + tables[2][..., None] * by_second)
 
     def penetration_rates(self, w: Array) -> Array:
@@ -235,7 +237,7 @@ def with_growth(
     """
 
     def second_derivatives(q: object) -> Sequence[Derivative]:
-        # of all parameters only growth itself is in the contact
+        # the contact has a second derivative by growth twice; no other parameter is in it
         of_contact = [GrowthDerivative(find_state, add, order=2)] if q is growth.constant else []
         return [*growth.differentiate_slopes(q), *of_contact]
 
@@ -283,7 +285,8 @@ def _by_volumes(state: ContactState, weights: EnergyWeights) -> tuple[Array, Arr
     By V they are g_V of the module's formula. As H = V/A and H,u w = -V A,u w/A^2, those by A are
     -(V/A^2) g - 2 f Pi,H (H,u w)/A.
     """
-    H_w = state.required_offsets.change(state.u, weights.w)
+    H_w = state.required_offsets.change(state.u, weights.w)  # H,u w
+    # the last component of forces is by H: Pi,H, and its rate Pi,Hu w + Pi,HH H,u w
     force_rates = state.force_rates(np.column_stack([weights.w, H_w]))
     g = weights.energy * state.forces[:, -1] + weights.force * force_rates[:, -1]
     volume, area = state.required_offsets.volumes_and_areas(state.u)
@@ -301,14 +304,18 @@ def _by_weights(state: ContactState, weights: EnergyWeights) -> Array:
         return forces
     value, pressure, _ = state.penalties
     points, point = state.points, state.places.point[state.joined_places.first]
+    # the weighted sum per area: along w the penalty changes by the pressure times the rate of the
+    # penetration; half, since both surfaces have points
     rates = state.penetration_rates(weights.w)
-    # half, since both surfaces have points; by w the penalty changes by the pressure times the rate
-    value_of_places = (weights.energy * value + weights.force * pressure * rates) / 2
-    per_weight = np.bincount(point, value_of_places, len(points.cell))
+    value_of_joined = (weights.energy * value + weights.force * pressure * rates) / 2
+    per_weight = np.bincount(point, value_of_joined, len(points.cell))
+    # relative derivatives of the weights of points in contact, times their part of the sum
     pressed_points = np.unique(point)
     element, nodes = state.cells.element, state.cells.nodes[points.cell[pressed_points]]
-    tables = element.tabulate(1, points.shape[pressed_points] @ element.points)[..., 0]
-    slopes = state.weight_slopes(tables, np.einsum("dnk,nki->dni", tables, state.r0[nodes]))
+    X = points.shape[pressed_points] @ element.points  # in the reference cell
+    tables = element.tabulate(1, X)[..., 0]
+    undeformed_places = np.einsum("dnk,nki->dni", tables, state.r0[nodes])
+    slopes = state.weight_slopes(tables, undeformed_places)
     value_of_points = per_weight[pressed_points] * points.weight[pressed_points]
     np.add.at(forces, nodes, value_of_points[:, None, None] * slopes)
     return forces

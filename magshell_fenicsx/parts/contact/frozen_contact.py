@@ -104,33 +104,35 @@ class FrozenContact:
         soft_penetration = SOFT_PENETRATION * h
         if not len(places.point):  # no contact at the frozen state, nor now
             return places, joined_places, penalty(self.penetration, k, soft_penetration)
+        # where the points project now, each in the same cell
         r = search.places_of_nodes(u)
         x = search.places_of_points(self.points, r, places.point)
         nodal = r[cells.nodes[places.cell]]
         X = follow_places(cells, x, nodal, places.X, places.free_directions)
         (_, y), *_ = jets(cells.element, X, nodal, 0)
         off, distance = (x - y)[:, :3], distances(x - y)
+        direction = off / np.linalg.norm(off, axis=1)[:, None]
+        moved_places = replace(places, X=X, distance=distance, direction=direction)
+        # joined places: their distances change by the weighted mean of those of their places
         change = distance - places.distance
         mean_change = np.bincount(
             joined_places.group, joined_places.weight * change, len(joined_places.first)
         )
-        # weights exp(-d/e) over their sum, to first order in the changes of distances d
+        # weights are exp(-d/e) over their sum, here to first order in the changes of distances d
         weight = joined_places.weight * (
             1 - (change - mean_change[joined_places.group]) / (BLUR_DISTANCE * h)
         )
-        joined_places = replace(
+        moved_joined = replace(
             joined_places, distance=joined_places.distance + mean_change, weight=weight
         )
-        direction = off / np.linalg.norm(off, axis=1)[:, None]
-        places = replace(places, X=X, distance=distance, direction=direction)
         penalties = expanded_penalty(
-            h - joined_places.distance,
+            h - moved_joined.distance,
             self.penetration,
             k,
             soft_penetration,
             with_third_order=with_third_order,
         )
-        return places, joined_places, penalties
+        return moved_places, moved_joined, penalties
 
 
 def _area_ratio(cells: Cells, r0: Array, points: ContactPoints) -> Array:

@@ -8,6 +8,8 @@ d, its direction n. The second derivative is, see `surface_contact`,
     d,uu = [beta beta (I - n n) - C^T A^-1 C]/d,   C_a = -beta y_a - d n (0, N_y,a).
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 import scipy
 from numpy.typing import NDArray
@@ -69,10 +71,11 @@ def distance_slopes(n: Array, beta: Array, components: int) -> Array:
         Unknowns of a node: dim, or dim + 1 with the offset H as the last one. The derivative by H
         is -1 times the shape function, of the point and of the place.
     """
-    half = beta.shape[1] // 2
+    half = beta.shape[1] // 2  # functions of the point, before those of the place
     by_offset = np.concatenate([-beta[:, :half], beta[:, half:]], axis=1)
     by_place = beta[:, :, None] * n[:, None, :]
-    return np.asarray(np.concatenate([by_place, by_offset[..., None]], axis=2)[..., :components])
+    by_all_unknowns = np.concatenate([by_place, by_offset[..., None]], axis=2)
+    return np.asarray(by_all_unknowns[..., :components])  # without H where it is no unknown
 
 
 def gap_hessians(
@@ -85,8 +88,8 @@ def gap_hessians(
     """Return the Hessians (n, dofs, dofs) of the weighted penalty by the nodes of both cells.
 
     With the penalty psi they are the weight times psi'' d,u d,u - psi' d,uu. They are computed as
-    V^T c V, where the rows of V are d,u, its part by places, C_1 and C_2, and c is a 4 by 4 matrix.
-    The term beta beta I of d,uu is subtracted at last.
+    V^T c V with a 4 by 4 matrix c. The rows of V are d,u by all unknowns, d,u by places alone, C_1
+    and C_2. At last the term beta beta I of d,uu is subtracted.
 
     Parameters
     ----------
@@ -98,9 +101,10 @@ def gap_hessians(
         (n,) weights, and first and second derivatives of the penalty by the penetration.
     """
     (d, n, beta, nodes), (weight, first, second) = geometry, penalties
-    half, components = nodes.shape[1] // 2, r.shape[1]
+    half, components = nodes.shape[1] // 2, r.shape[1]  # the second half belongs to the place
+    # shape functions at the places with their derivatives, and y with its derivatives
     shapes, place_jets = zip(*jets(cells.element, places.X, r[nodes[:, half:]]), strict=True)
-    # vectors with a fourth component for H: 0 of the normal n, and d of d n
+    # n and d n, with a fourth component for H: 0 of n, and d of d n
     normal = np.column_stack([n, 0 * d])[:, None, :components]
     off = d[:, None, None] * np.column_stack([n, np.ones_like(d)])[:, None, :components]
     _, A = slopes(off[:, 0], *place_jets[1:])  # the Hessian of d^2/2 by the place
@@ -112,23 +116,13 @@ def gap_hessians(
         inverse_in_free_directions(free_directions, A),
         free_directions,
     )
-    # rows C_a: how a change of the nodes moves the closest place along y_a
-    place_motion = np.zeros((len(d), 2, *beta.shape[1:], components))
-    for a in range(2):
-        # y_a without its component of H and without its part along the normal
-        tangential = place_jets[1 + a][:, None] * (COMPONENT_SIGNS[:components] > 0)
-        tangential -= np.sum(normal * tangential, axis=2, keepdims=True) * normal
-        place_motion[:, a] = -beta[:, :, None] * tangential
-        place_motion[:, a, half:] -= shapes[1 + a][:, :, None] * off
-    pressure_over_distance = weight * first / d
-    along_normal = beta[:, :, None] * normal
-    row_groups = [
-        distance_slopes(n, beta, components)[:, None],
-        along_normal[:, None],
-        place_motion,
-    ]
+    # the four rows of V
+    by_all, by_places = distance_slopes(n, beta, components), beta[:, :, None] * normal
+    place_motion = _place_motion(beta, normal, off, shapes[1:3], place_jets[1:3])
+    row_groups = [by_all[:, None], by_places[:, None], place_motion]
     row_vectors = np.concatenate(row_groups, axis=1).reshape(len(d), 4, -1)
-    # rows: d,u by all unknowns, d,u by places, and C_1, C_2
+    # the matrix c
+    pressure_over_distance = weight * first / d
     coefficients = np.zeros((len(d), 4, 4))
     coefficients[:, 0, 0] = weight * second
     coefficients[:, 1, 1] = pressure_over_distance
@@ -138,6 +132,38 @@ def gap_hessians(
     for i in range(3):  # components of places
         H[:, i::components, i::components] -= isotropic_part
     return np.asarray(H)
+
+
+def _place_motion(
+    beta: Array,
+    normal: Array,
+    off: Array,
+    shape_slopes: Sequence[Array],
+    tangents: Sequence[Array],
+) -> Array:
+    """Return the rows C_1 and C_2 (n, 2, functions of both cells, components) of n places.
+
+    They say how a change of the nodes moves the closest place along y_1 and y_2.
+
+    Parameters
+    ----------
+    beta
+        (n, functions of both cells), see `gap_geometry`.
+    normal, off
+        (n, 1, components) n and d n, with 0 and d in the fourth component.
+    shape_slopes, tangents
+        For both directions the derivatives (n, functions) of shape functions at the places, and
+        (n, components) of the places, y_1 and y_2.
+    """
+    components, half = normal.shape[2], beta.shape[1] // 2
+    rows = np.zeros((len(beta), 2, *beta.shape[1:], components))
+    for a, (shape_slope, tangent) in enumerate(zip(shape_slopes, tangents, strict=True)):
+        # y_a without its component of H and without its part along the normal
+        tangential = tangent[:, None] * (COMPONENT_SIGNS[:components] > 0)
+        tangential -= np.sum(normal * tangential, axis=2, keepdims=True) * normal
+        rows[:, a] = -beta[:, :, None] * tangential
+        rows[:, a, half:] -= shape_slope[:, :, None] * off
+    return rows
 
 
 def joint_entries(
@@ -162,10 +188,10 @@ def joint_entries(
     """
     components = slopes_of_places.shape[2]
     dofs = unknown_numbers(nodes, count, components)
+    # derivatives D,u (m, all unknowns) of the joined distances: sums over their places
     rows = np.repeat(group, dofs.shape[1])
-    values = slopes_of_places.ravel(), (rows, dofs.ravel())
-    # derivatives of the joined distances by all unknowns
-    G = scipy.sparse.coo_array(values, (len(weight), components * count)).tocsr()
+    entries = slopes_of_places.ravel(), (rows, dofs.ravel())
+    G = scipy.sparse.coo_array(entries, (len(weight), components * count)).tocsr()
     hessian = (G.T @ scipy.sparse.diags_array(weight) @ G).tocoo()
     return hessian.row.astype(np.int64), hessian.col.astype(np.int64), hessian.data
 

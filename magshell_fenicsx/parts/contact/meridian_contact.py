@@ -165,6 +165,11 @@ class MeridianContact(ContactTerm):
         The meridians of the model.
     sides
         (cells,) flags of the cells of the first shell, and of the second.
+
+    Private fields keep the last active set: `_at` is its displacement, `_growth` the natural
+    stretch there, and `_places` are its places. `_frozen` is a frozen contact that replaces the
+    search. `_half` is half the undeformed thickness at nodes, `_reach` the largest distance that is
+    looked for. `_material` is the material around points of a shell that may touch itself.
     """
 
     def __init__(self, pair: Pair, model: ModelMeridian, sides: tuple[Flags, Flags]) -> None:
@@ -288,8 +293,9 @@ class MeridianContact(ContactTerm):
         if self._meridian_offsets:
             offsets, by_offset = self._meridian_offsets.waves(m), self._forces()[:, -1]
             rows, columns, values = offsets.entries(self._at, (rows, columns, values), by_offset)
-        # with P = U + V, U is P - V: an entry of U is one of P, less one of V, the next unknown;
-        # each round does so for the columns, and exchanges them with the rows
+        # from (U, V, W) to (P, V, W) with P = U + V. The derivative by V at fixed P is that by V
+        # less that by U: each entry of U stays as one of P, and is subtracted from V, the next
+        # unknown. Each round does so for the columns, and exchanges them with the rows
         for _ in range(2):
             is_U = columns % 3 == 0
             values = np.concatenate([values, -values[is_U]])
@@ -336,13 +342,23 @@ class MeridianContact(ContactTerm):
         On a meridian each place stands alone: joined places have one place each.
         """
         places = self._active_set()
-        # groups of one place each, with the weight one; none has several places
         numbers, ones = np.arange(len(places.point)), np.ones(len(places.point))
-        joined_places = JoinedPlaces(numbers, numbers, places.distance, ones, ones == 0)
-        geometry = self._curves, self._r0, self._at, self._offsets, self._points
-        derivatives = self._entries_by_place_and_offset, self._entries, self._geometry
+        joined_places = JoinedPlaces(
+            first=numbers, group=numbers, distance=places.distance, weight=ones, several=ones == 0
+        )
         return MeridianContactState(
-            *geometry, places, joined_places, self._penalty(places), self._forces(), *derivatives
+            cells=self._curves,
+            r0=self._r0,
+            u=self._at,
+            offsets=self._offsets,
+            points=self._points,
+            places=places,
+            joined_places=joined_places,
+            penalties=self._penalty(places),
+            forces=self._forces(),
+            find_entries_by_place_and_offset=self._entries_by_place_and_offset,
+            find_entries=self._entries,
+            geometry=self._geometry,
         )
 
     # what is observed
@@ -373,8 +389,9 @@ class MeridianContact(ContactTerm):
         r = self._places_of_nodes(u)
         x, is_first = self._places_of_points(r), self._points.is_first
         first, second = (np.unique(self._nodes[side]) for side in self._sides)
-        offsets = x[is_first][:, None] - r[second], x[~is_first][:, None] - r[first]
-        return min(float(distances(offset).min()) for offset in offsets)
+        # points of the first shell from nodes of the second, and the other way round
+        differences = x[is_first][:, None] - r[second], x[~is_first][:, None] - r[first]
+        return min(float(distances(off).min()) for off in differences)
 
     def penetration(self) -> float:
         """Return the largest penetration over R, 0 without contact."""
@@ -395,18 +412,18 @@ class MeridianContact(ContactTerm):
     def gap_at_supports(self, supported_nodes: Longs, u: Array) -> float:
         """Return the least gap over R at nodes that supports hold, where faces overlap.
 
-        It is infinite if none overlap there at the displacement u (nodes, 2). It is also infinite
-        if the thickness depends on the displacement, which is then not looked at.
+        It is infinite if no faces overlap there at the displacement u (nodes, 2). It is also
+        infinite if the thickness depends on the displacement: u is then not looked at.
         """
         if self._offsets and not self._offsets.is_constant:
             return np.inf
         first, second = self._sides
 
         def may_touch(i: Longs, j: Longs) -> Flags:
-            is_pair = first[i] & second[j] | second[i] & first[j]
-            return np.asarray(
-                is_pair & ~self._material.are_near(i, j) if self._material else is_pair
-            )
+            is_pair = (first[i] & second[j]) | (second[i] & first[j])
+            if self._material:  # of one shell: not the same material
+                is_pair = is_pair & ~self._material.are_near(i, j)
+            return np.asarray(is_pair)
 
         return gap_between_supports(
             supported_nodes, self._nodes, self._r0, u, self._half, may_touch
@@ -450,16 +467,19 @@ class MeridianContact(ContactTerm):
         """
         places, count = self._active_set(), len(self._nodes)
         cell, weight = self._points.cell, self._points.weight
+        # the area and the force of each cell: of a free end alone on a face, half of the force acts
+        # on the cell of the face
         area = np.bincount(cell, weight, count)
         force_of_places = weight[places.point] * self._penalty(places)[1]
         at_end, is_steep = self._end_and_steepness(places)
-        # of a free end alone on a face, half of the force acts on the cell of the face
         own_share = np.where(is_steep & ~at_end, 0.5, 1.0)
         force = np.bincount(cell[places.point], own_share * force_of_places, count)
         force = force + np.bincount(places.cell, (1 - own_share) * force_of_places, count)
+        # the least gap in each cell
         gap = np.full(count, self._reach - self._h)
         near_places = self._projections(self._displacement(), self._reach)
         np.minimum.at(gap, cell[near_places.point], near_places.distance - self._h)
+        # the area that belongs to the points in contact
         pressed_points = np.unique(places.point)
         pressed_area = np.bincount(cell[pressed_points], weight[pressed_points], count)
         is_full = (area > 0) & (pressed_area > FULL_CONTACT_SHARE * area)
@@ -513,12 +533,12 @@ class MeridianContact(ContactTerm):
         # increase of the penetration over the step
         closing = -np.einsum("nki,nki->n", by_unknowns, motion[nodes])
         return SampleRates.sum_over_points(
-            len(self._points.weight),
-            places.point,
-            self._h - places.distance,
-            closing,
-            self.stiffness.value,
-            SOFT_PENETRATION * self._h,
+            count=len(self._points.weight),
+            point=places.point,
+            penetration=self._h - places.distance,
+            closing=closing,
+            k=self.stiffness.value,
+            soft_penetration=SOFT_PENETRATION * self._h,
         )
 
     # geometry
@@ -558,8 +578,9 @@ class MeridianContact(ContactTerm):
         if self._frozen:
             # a held contact serves differences of tangents, which need the third order
             is_held = self.held is not None
+            _, frozen_penetration = self._frozen
             return expanded_penalty(
-                penetration, self._frozen[1], k, soft_penetration, with_third_order=is_held
+                penetration, frozen_penetration, k, soft_penetration, with_third_order=is_held
             )
         penalties = penalty(penetration, k, soft_penetration)
         return self.sample.weigh(places.point, penalties) if self.sample else penalties
@@ -608,6 +629,7 @@ class MeridianContact(ContactTerm):
         The third component has the other sign, see `distances`.
         """
         nodal = r[self._nodes[self._points.cell]] * COMPONENT_SIGNS[: r.shape[1]]
+        # shape functions k of each point n times the components i at the nodes of its cell
         return np.asarray(np.einsum("nk,nki->ni", self._points.shape, nodal))
 
     def _projections(
@@ -689,39 +711,61 @@ class MeridianContact(ContactTerm):
         places = self._active_set()
         _, first, second = self._penalty(places)
         d, n, beta, nodes = self._geometry(places)
-        off, (count, functions) = d[:, None] * n, beta.shape
-        # `half` columns belong to the point, the others to the place
-        half, weight = functions // 2, self._points.weight[places.point] / 2
+        off, (count, functions) = d[:, None] * n, beta.shape  # off is x - y
+        # the places y with their derivatives along the curve, and A of the module's formula
         r = self._places_of_nodes(self._at)
         jets = self._curves.jets(places.X, r[self._nodes[places.cell]])
-        shape, shape_slope = self._curves.table(1, places.X)
         _, A, _ = slopes(self._places_of_points(r)[places.point], jets)
         y, tangent = jets[0], jets[1, :, :2]
-        tangential = tangent - np.sum(tangent * n, axis=1)[:, None] * n
-        # rows: change of the distance, its part n . D by places, C_s, and C_theta
+        # the four row vectors of each place: d,u, its part n . D by places, C_s, and C_theta
+        shape, shape_slope = self._curves.table(1, places.X)
         rows = np.zeros((4, *beta.shape, 4))
         normal, closing, slide, circumferential = rows
+        half = functions // 2  # columns of the point, before those of the place
         normal[..., IN_PLANE] = closing[..., IN_PLANE] = beta[..., None] * n[:, None]
         normal[..., 3] = np.concatenate([-beta[:, :half], beta[:, half:]], axis=1)
+        tangential = tangent - np.sum(tangent * n, axis=1)[:, None] * n
         slide[..., IN_PLANE] = -beta[..., None] * tangential[:, None]
         slide[:, half:, IN_PLANE] -= shape_slope[..., None] * off[:, None]
         slide[:, half:, 3] -= shape_slope * d[:, None]
-        circumferential[..., 1] = -beta * y[:, :1]
-        circumferential[:, half:, 0] += m * off[:, :1] * shape
-        circumferential[:, half:, 1] += off[:, :1] * shape
-        circumferential[:, half:, 2] += m * off[:, 1:] * shape
-        circumferential[:, half:, 3] += m * d[:, None] * shape
+        _fill_circumferential(circumferential, m, beta, y[:, :1], off, d, shape)
         # factors of the squared rows; the terms of d,uu have the tension over the distance
+        weight = self._points.weight[places.point] / 2
         B, tension = y[:, 0] * (y[:, 0] + off[:, 0]), -weight * first / d
         # a place that is not free does not move along the curve, and one on the axis not around it
         by_A, by_B = _inverse_where(places.is_free, A), _inverse_where(B > 0, B)
-        flat = rows.reshape(4, count, 4 * functions).swapaxes(0, 1)
         factors = np.column_stack([weight * second, -tension, -tension * by_A, -tension * by_B])
+        flat = rows.reshape(4, count, 4 * functions).swapaxes(0, 1)  # (places, 4, dofs)
         H = flat.transpose(0, 2, 1) @ (factors[..., None] * flat)
+        # the term D . D, which is the same for U, V and W
         isotropic_part = tension[:, None, None] * beta[:, :, None] * beta[:, None]
         for i in range(3):
             H[:, i::4, i::4] += isotropic_part
         return H, nodes
+
+
+def _fill_circumferential(
+    row: Array, m: float, beta: Array, rho_y: Array, off: Array, d: Array, shape: Array
+) -> None:
+    """Set C_theta of the module's formula in a row vector of zeros, by (U, V, W, H) of nodes.
+
+    Parameters
+    ----------
+    row
+        (n, functions of both cells, 4) the row of each place.
+    m
+        Number of waves.
+    beta, shape
+        Shape functions of the point, minus those of the place; and those of the place alone.
+    rho_y, off, d
+        (n, 1) rho of the places, (n, 2) x - y, and (n,) its length.
+    """
+    half = beta.shape[1] // 2  # columns of the point, before those of the place
+    row[..., 1] = -beta * rho_y
+    row[:, half:, 0] += m * off[:, :1] * shape
+    row[:, half:, 1] += off[:, :1] * shape
+    row[:, half:, 2] += m * off[:, 1:] * shape
+    row[:, half:, 3] += m * d[:, None] * shape
 
 
 def _inverse_where(condition: Flags, values: Array) -> Array:
@@ -740,6 +784,7 @@ class MeridianContactState(ContactState):
         tangent = places[1]  # r'; the relative derivative of |r'| is along r'/|r'|^2
         direction = tangent / np.sum(tangent**2, axis=1)[:, None]
         by_place = tables[1][..., None] * direction[:, None]
+        # that of rho, by the first component of places alone
         by_place[..., 0] += tables[0] / places[0, :, :1]
         return np.asarray(by_place)
 

@@ -42,6 +42,10 @@ class MeridianOffsets(FaceOffsets):
         (nodes, 2) undeformed rho and z.
     h, volume_factors, keeps_volume, amplitude
         See `FaceOffsets`.
+
+    The field `_slopes` (places, functions) has derivatives of shape functions at the nodes of a
+    cell. `_value_table` (cells, places, functions) has shape functions of rho there, and on the
+    axis those of |rho'|; `_on_axis` (cells, places) says where that is.
     """
 
     _wave_number: float | None = None  # m; None for displacements that are the same all around
@@ -56,14 +60,13 @@ class MeridianOffsets(FaceOffsets):
         amplitude: SettableNumber | None = None,
     ) -> None:
         """Tabulate shape functions at nodes; on the axis those of |rho'| stand for rho's."""
-        # elsewhere a shape function is one at its own node: the identity
         self._slopes, rho = curves.slopes_at_nodes, r0[curves.nodes, 0]
-        slope = np.einsum("qk,ck->cq", self._slopes, rho)
-        on_axis = (np.abs(rho) < AXIS_TOLERANCE)[..., None]
-        self._value_table = np.where(
-            on_axis, np.sign(slope)[..., None] * self._slopes, np.eye(rho.shape[1])
-        )
-        self._on_axis = on_axis[..., 0]
+        self._on_axis = np.abs(rho) < AXIS_TOLERANCE
+        # |rho'| is the sign of rho' times rho'; off the axis a shape function is one at its own
+        # node, and zero at the others: the identity
+        rho_slope = np.einsum("qk,ck->cq", self._slopes, rho)
+        axis_table = np.sign(rho_slope)[..., None] * self._slopes
+        self._value_table = np.where(self._on_axis[..., None], axis_table, np.eye(rho.shape[1]))
         same_place = np.arange(len(r0))  # there are no images, so no two nodes are at one place
         super().__init__(curves, r0, h, volume_factors, keeps_volume, same_place, amplitude)
 
@@ -72,9 +75,10 @@ class MeridianOffsets(FaceOffsets):
 
         The displacement stays (U, W). H changes as cos m theta.
         """
-        other = copy(self)
-        other._wave_number, other._components = m, 3
-        return other
+        offsets_of_waves = copy(self)
+        offsets_of_waves._wave_number = m
+        offsets_of_waves._components = 3  # U, V and W
+        return offsets_of_waves
 
     def undeformed_tangents(self) -> Array:
         """Return undeformed tangents (2, cells, nodes, 3): along the meridian, and around the axis.
@@ -82,8 +86,10 @@ class MeridianOffsets(FaceOffsets):
         The second has the length rho.
         """
         rho, tangent = self._radius_and_tangent(self._r0, slice(None))
-        tangents = np.zeros((2, *rho.shape, 3))
-        tangents[0, ..., IN_PLANE], tangents[1, ..., 1] = np.moveaxis(tangent, -1, 0), rho
+        tangents = np.zeros((2, *rho.shape, 3))  # components along rho, theta and z
+        # an index list after another index puts its axis first
+        tangents[0, ..., IN_PLANE] = np.moveaxis(tangent, -1, 0)
+        tangents[1, ..., 1] = rho
         return tangents
 
     def _radius_and_tangent(self, r: Array, cells: Any) -> tuple[Array, Array]:
@@ -116,10 +122,9 @@ class MeridianOffsets(FaceOffsets):
         rho, tangent = self._radius_and_tangent(self._r0 + u, cells)
         a, b = np.zeros((2, *rho.shape, rho.shape[1], 3))
         a[..., IN_PLANE] = self._slopes[..., None] * tangent[:, :, None]
-        b[..., 0], b[..., 1] = (
-            self._value_table[cells],
-            (self._wave_number or 0.0) * self._value_table[cells],
-        )
+        # b = U + m V
+        b[..., 0] = self._value_table[cells]
+        b[..., 1] = (self._wave_number or 0.0) * self._value_table[cells]
         return rho, np.linalg.norm(tangent, axis=-1), a, b
 
     def _by_unknowns(self, rows: Array) -> Array:
@@ -150,20 +155,26 @@ class MeridianOffsets(FaceOffsets):
             (nodes, 2) displacement, and weights (cells, places).
         """
         rho, speed, a, b = self._area_rows(u, cells)
-        m, tangent = self._wave_number or 0.0, self._radius_and_tangent(self._r0 + u, cells)[1]
-        rho1, z1 = np.moveaxis(tangent, -1, 0)[..., None]
-        # rows q, p, c, f, v of q, P, m W, f and V' in the module's formula
-        q, p, c, f, v = np.zeros((5, *a.shape))
+        m, (_, tangent) = (
+            self._wave_number or 0.0,
+            self._radius_and_tangent(self._r0 + u, cells),
+        )
+        rho1, z1 = np.moveaxis(tangent, -1, 0)[..., None]  # rho' and z'
         value = self._value_table[cells]
+        # rows q, p, c, f, v of q, P, m W, f and V' in the module's formula, by (U, V, W): index 0,
+        # 1 or 2 in the last axis
+        q, p, c, f, v = np.zeros((5, *a.shape))
         q[..., 0], q[..., 2] = (row * self._slopes / speed[..., None] for row in (-z1, rho1))
         p[..., 0], p[..., 1] = m * value, value
-        c[..., 2], v[..., 1] = m * value, self._slopes
+        c[..., 2] = m * value
+        v[..., 1] = self._slopes
         f[..., :] = rho[..., None, None] * v - rho1[..., None] * p
         f[..., 2] -= m * z1 * value
         a, b, q, p, c, f, v = (self._by_unknowns(row) for row in (a, b, q, p, c, f, v))
         # factors of the squares of q and V', of P and m W, and of f
         w_stretch, w_turn = w * rho / speed, w * speed / rho
         w_shear = -w / (rho * speed)
+        # sums over the nodes q of a cell, by its unknowns m and n: of squares, and of 2 a b/|r'|
         squares = (w_stretch, q), (w_stretch, v), (w_turn, p), (w_turn, c), (w_shear, f)
         H = sum(np.einsum("cqm,cqn->cmn", weight[..., None] * row, row) for weight, row in squares)
         mixed = np.einsum("cqm,cqn->cmn", (w / speed)[..., None] * a, b)

@@ -102,12 +102,14 @@ def neighbours_of(nodes: Longs) -> Longs:
         (cells, functions) node numbers, those of the ends first.
     """
     neighbours = np.full((len(nodes), 2), -1, dtype=np.int64)
-    end_at_vertex = dict[int, tuple[int, int]]()  # vertex -> cell and end that came to it first
+    end_at_vertex = dict[int, tuple[int, int]]()  # vertex -> cell and end that came to it last
     for cell, end in np.ndindex(len(nodes), 2):
         vertex = int(nodes[cell, end])
         earlier_end = end_at_vertex.get(vertex)
-        if earlier_end:
-            neighbours[cell, end], neighbours[earlier_end] = earlier_end[0], cell
+        if earlier_end:  # two cells end there, and are beyond each other's ends
+            earlier_cell, _ = earlier_end
+            neighbours[cell, end] = earlier_cell
+            neighbours[earlier_end] = cell
         end_at_vertex[vertex] = cell, end
     return neighbours
 
@@ -129,12 +131,13 @@ class NeighbouringMaterial:
 
     def __init__(self, points: Array, cells: Array, nodes: Longs, cells_of_points: Longs) -> None:
         """Find the cells that are near each other along the undeformed curve."""
-        self._points, self._cells, self.cells_of_points = points, cells, cells_of_points
+        self._points, self._nodal, self.cells_of_points = points, cells, cells_of_points
         count = len(nodes)
         r0 = np.zeros((int(nodes.max()) + 1, 3))
         r0[nodes] = cells
         is_near: Flags = np.zeros(count * count, dtype=bool)
         reach = 2 * SELF_CONTACT_DISTANCE * r0[:, 2]  # a number of thicknesses
+        # the numbers of near pairs are cell * count + other cell
         is_near[near_along_surface(nodes[:, :2], r0[:, :2], reach)] = True
         self._near = is_near.reshape(count, count)
 
@@ -159,9 +162,10 @@ class NeighbouringMaterial:
         may_touch = ~self._near[cell, other]
         near_pairs = np.flatnonzero(~may_touch & (cell != other))
         i, j = cell[near_pairs], other[near_pairs]
+        # (pairs, functions, functions): distances between the nodes of both cells
         deformed, undeformed = (
             np.linalg.norm(r[i][:, :, None] - r[j][:, None], axis=3)
-            for r in (nodal, self._cells[..., :2])
+            for r in (nodal, self._nodal[..., :2])
         )
         may_touch[near_pairs] = (deformed < FOLD_SHRINKAGE * undeformed).any(axis=(1, 2))
         return may_touch
@@ -169,8 +173,8 @@ class NeighbouringMaterial:
     def are_distinct(self, places: MeridianProjections, shape: Array, is_above: Flags) -> Flags:
         """Return flags (n,): which places count, as they are not the material around their point.
 
-        Either their cell is far from the point's along the curve. Or the place was far from the
-        point undeformed, and the point is now above or below it.
+        A place counts if its cell is far from the point's cell along the curve. It also counts if
+        the place was far from the point undeformed, and the point is now above or below it.
 
         Parameters
         ----------
@@ -180,7 +184,7 @@ class NeighbouringMaterial:
             (n,) whether points are above or below their places, not beside them.
         """
         is_near = self.are_near(self.cells_of_points[places.point], places.cell)
-        undeformed = np.einsum("nk,nki->ni", shape, self._cells[places.cell])
+        undeformed = np.einsum("nk,nki->ni", shape, self._nodal[places.cell])
         off = self._points[places.point] - undeformed
         distance = np.linalg.norm(off[:, :2], axis=1)
         # the third component is minus the sum of both halves of the thickness
@@ -205,6 +209,10 @@ class CandidateSearch:
         The basix element of the curves.
     material
         For a shell that may touch itself; both sides are then the same. Else None.
+
+    The fields `_starts` and `_counts` (cells,) are the number of the first point of each cell, and
+    how many it has. `_bulge` bounds the distance of a curve from its chord, over the largest one of
+    its inner nodes, which have the parameters `_inner_nodes`.
     """
 
     def __init__(
@@ -219,14 +227,14 @@ class CandidateSearch:
         self._first_cells, self._second_cells = (np.flatnonzero(side) for side in sides)
         self._material = material
         self._counts = np.bincount(points.cell, minlength=len(nodes))
-        self._starts = np.zeros_like(self._counts)  # points of a cell follow each other
+        # points of a cell follow each other; in reversed order its first one is set last, and stays
+        self._starts = np.zeros_like(self._counts)
         self._starts[points.cell[::-1]] = np.arange(len(points.cell))[::-1]
-        # a fine lattice
+        # shape functions of inner nodes at a fine lattice; the factor covers places between those
+        # of the lattice
         X = np.linspace(0.0, 1.0, 20 * element.degree + 1, dtype=np.float64)[:, None]
-        inner = np.abs(element.tabulate(0, X)[0, :, 2:, 0])
-        # the largest distance of a curve from its chord, over that of its inner nodes; the factor
-        # covers places between those of the lattice
-        self._bulge = CELL_RADIUS_FACTOR * float(inner.sum(axis=1).max(initial=0.0))
+        inner_shapes = np.abs(element.tabulate(0, X)[0, :, 2:, 0])
+        self._bulge = CELL_RADIUS_FACTOR * float(inner_shapes.sum(axis=1).max(initial=0.0))
         self._inner_nodes = element.points[2:, :1]
 
     def __call__(self, x: Array, nodal: Array, reach: float) -> tuple[Longs, Longs]:
@@ -247,41 +255,48 @@ class CandidateSearch:
             (m,) numbers.
         """
         point, cell = self._in_circles(nodal, reach)
+        # of each cell: how far its curve is at most from its chord, by its inner nodes less the
+        # places of the chord at the same parameters
         begins, chord = nodal[:, 0], nodal[:, 1] - nodal[:, 0]
-        # inner nodes less the places of the chord at the same parameters
         off_chord = nodal[:, 2:] - begins[:, None] - self._inner_nodes * chord[:, None]
         bulge = self._bulge * np.linalg.norm(off_chord, axis=2).max(axis=1, initial=0.0)
-        offset, chords = x[point] - begins[cell], chord[cell]
+        # of each pair: the distance of the point from the chord, whose nearest place is at a share
+        # of its length
+        offset, chord_of_pair = x[point] - begins[cell], chord[cell]
         squares = np.sum(chord * chord, axis=1)
-        # distance from the chord, less the largest distance of the curve from its chord
-        chord_share = np.clip(np.sum(offset * chords, axis=1) / squares[cell], 0.0, 1.0)
-        distance = np.linalg.norm(offset - chord_share[:, None] * chords, axis=1)
+        chord_share = np.clip(np.sum(offset * chord_of_pair, axis=1) / squares[cell], 0.0, 1.0)
+        distance = np.linalg.norm(offset - chord_share[:, None] * chord_of_pair, axis=1)
         is_near = distance - bulge[cell] < reach
         return point[is_near], cell[is_near]
 
     def _in_circles(self, nodal: Array, reach: float) -> tuple[Longs, Longs]:
         """Return pairs of points and cells whose circles are nearer than the reach.
 
-        The circle of a point is that of its cell. Points of both shells are paired with cells of
-        the other shell. For a shell and itself both sides are the same, and one direction has all.
+        The circle of a point is that of its cell. Points of each shell are paired with cells of the
+        other. For a shell and itself both sides are the same: they have each pair of cells in both
+        orders already.
         """
+        # circles around all cells
         first, second, centres = self._first_cells, self._second_cells, nodal.mean(axis=1)
         squares = np.sum((nodal - centres[:, None]) ** 2, axis=2)
         radii = CELL_RADIUS_FACTOR * np.sqrt(squares.max(axis=1))
+        # pairs of cells of the first and the second side that are near
         offset = centres[first][:, None] - centres[second]
         limit = (radii[first][:, None] + radii[second] + reach) ** 2
         i, j = np.nonzero(np.sum(offset * offset, axis=2) < limit)
+        # cells of the points, and cells that these may face
         own_cell, cell = first[i], second[j]
         if self._material:
             may_touch = self._material.may_touch(own_cell, cell, nodal)
             own_cell, cell = own_cell[may_touch], cell[may_touch]
         else:
             own_cell, cell = np.concatenate([own_cell, cell]), np.concatenate([cell, own_cell])
+        # the points of all own cells, one cell after the other: of each pair they count up from
+        # the cell's first point, while `np.arange` counts on from pair to pair
         count = self._counts[own_cell]
-        # numbers of all points of the own cells, one cell after the other: each cell's points count
-        # up from its start
-        start = np.repeat(self._starts[own_cell] - np.cumsum(count) + count, count)
-        return start + np.arange(len(start)), np.repeat(cell, count)
+        count_before = np.cumsum(count) - count
+        shift = np.repeat(self._starts[own_cell] - count_before, count)
+        return np.arange(len(shift)) + shift, np.repeat(cell, count)
 
 
 def no_projections() -> MeridianProjections:
@@ -293,29 +308,31 @@ def no_projections() -> MeridianProjections:
 
 
 def slopes(x: Array, jets: Array) -> tuple[Array, Array, Array]:
-    """Return derivatives of the distance by the place along the curve, times |x - y|.
+    """Return derivatives of the distance by the coordinate X of the place, times |x - y|.
 
     Parameters
     ----------
     x
         (n, 3) the points.
     jets
-        (3, n, 3) the places and their two derivatives along the curve.
+        (3, n, 3) the places and their two derivatives by X.
 
     Returns
     -------
-    pull
+    descent
         (n,) minus the first derivative.
     curvature
         (n,) the second derivative, A of `meridian_contact`.
-    speed
-        (n,) A of a straight line, as if the curve had no second derivative.
+    squared_speed
+        (n,) the second derivative on a straight line, without the second derivative of the places.
     """
     y, first, second = jets
     offset = (x - y)[:, :2]
     off = np.column_stack([offset, np.linalg.norm(offset, axis=1)])
-    speed = np.sum(first * first * COMPONENT_SIGNS, axis=1)
-    return np.sum(off * first, axis=1), speed - np.sum(off * second, axis=1), speed
+    descent = np.sum(off * first, axis=1)
+    squared_speed = np.sum(first * first * COMPONENT_SIGNS, axis=1)
+    curvature = squared_speed - np.sum(off * second, axis=1)
+    return descent, curvature, squared_speed
 
 
 def distances(off: Array) -> Array:
@@ -388,27 +405,52 @@ class MeridianCurves:
         # an end on the axis is a pole, where the surface goes on
         off_axis = np.abs(self._r0[self.nodes[:, :2], 0]) > AXIS_TOLERANCE
         is_free_end = (self.neighbours < 0) & off_axis
-        point_groups = list[tuple[Longs, Array, Array, Flags, Array, Flags]]()
+        point_groups = list[MeridianPoints]()
         # cells are in groups: with a free end at neither side, at one, or at both
         for begins, ends in ((False, False), (True, False), (False, True), (True, True)):
             has_ends = (is_free_end == [begins, ends]).all(axis=1)
             cells = np.flatnonzero(np.any(sides, axis=0) & has_ends)
-            X, w = line_rule(count, begins, ends)
-            table = self.table(1, X)
-            x, tangent = np.einsum("dqk,cki->dcqi", table, self._r0[self.nodes[cells]])
-            speed = np.linalg.norm(tangent, axis=2)
-            area = 2 * np.pi * x[..., 0] * speed * w
-            normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1) / speed[..., None]
-            # the rule's point next to an end is `EDGE_OFFSET` from it
-            at_begin, at_end = (X < 2 * EDGE_OFFSET) & begins, (X > 1 - 2 * EDGE_OFFSET) & ends
-            is_on_edge = np.tile(at_begin | at_end, len(cells))
-            cell, shape = np.repeat(cells, len(X)), np.tile(table[0], (len(cells), 1))
-            flat_normal = normal.reshape(-1, 2)
-            point_groups.append(
-                (cell, shape, area.ravel(), sides[0][cell], flat_normal, is_on_edge)
-            )
+            point_groups.append(self._points_of_cells(cells, count, begins, ends, sides[0]))
         return MeridianPoints(
-            *(np.concatenate(arrays) for arrays in zip(*point_groups, strict=True))
+            *(
+                np.concatenate([getattr(group, attribute.name) for group in point_groups])
+                for attribute in fields(MeridianPoints)
+            )
+        )
+
+    def _points_of_cells(
+        self, cells: Longs, count: int, begins: bool, ends: bool, is_first: Flags
+    ) -> MeridianPoints:
+        """Return the quadrature points in some cells, whose free ends are at the same sides.
+
+        Parameters
+        ----------
+        cells
+            Numbers of the cells.
+        count
+            Number of points in a cell.
+        begins, ends
+            Whether the begin of these cells is a free end, and their end.
+        is_first
+            Flags of the cells of the first shell, among all.
+        """
+        X, w = line_rule(count, begins, ends)
+        table = self.table(1, X)
+        # (cells, points, 2): the points, and the derivative r' there
+        x, tangent = np.einsum("dqk,cki->dcqi", table, self._r0[self.nodes[cells]])
+        speed = np.linalg.norm(tangent, axis=2)
+        area = 2 * np.pi * x[..., 0] * speed * w
+        normal = np.stack([-tangent[..., 1], tangent[..., 0]], axis=-1) / speed[..., None]
+        # the rule's point next to an end is `EDGE_OFFSET` from it
+        at_begin, at_end = (X < 2 * EDGE_OFFSET) & begins, (X > 1 - 2 * EDGE_OFFSET) & ends
+        cell = np.repeat(cells, len(X))
+        return MeridianPoints(
+            cell=cell,
+            shape=np.tile(table[0], (len(cells), 1)),
+            weight=area.ravel(),
+            is_first=is_first[cell],
+            normal=normal.reshape(-1, 2),
+            is_on_edge=np.tile(at_begin | at_end, len(cells)),
         )
 
     def project(self, x: Array, nodal: Array, point: Longs, cell: Longs) -> MeridianProjections:
@@ -423,15 +465,17 @@ class MeridianCurves:
         point, cell
             (m,) numbers of points and cells to pair.
         """
+        # each place begins at the nearest of some starts in its cell
         shape = self.table(0, self._starts)[0]
         start_offsets = x[point][:, None] - np.einsum("mk,nki->nmi", shape, nodal[cell])
         X = self._starts[distances(start_offsets).argmin(axis=1)]
-        moving = np.arange(len(X))
+        moving = np.arange(len(X))  # rows of the places that are not exact yet
         for _ in range(MAX_NEWTON_ITERATIONS):
             jets = self.jets(X[moving], nodal[cell[moving]])
-            descent, curvature, speed = slopes(x[point[moving]], jets)
-            # where the distance is not convex a step as of a straight line goes downhill
-            step = descent / np.where(curvature > MIN_CURVATURE_RATIO * speed, curvature, speed)
+            descent, curvature, squared_speed = slopes(x[point[moving]], jets)
+            # where the distance is not convex, a step as on a straight line still goes downhill
+            is_convex = curvature > MIN_CURVATURE_RATIO * squared_speed
+            step = descent / np.where(is_convex, curvature, squared_speed)
             previous = X[moving]
             # no step is longer than a quarter of the cell, and none leaves the cell
             X[moving] = np.clip(previous + np.clip(step, -0.25, 0.25), 0.0, 1.0)
@@ -440,8 +484,8 @@ class MeridianCurves:
                 break
         jets = self.jets(X, nodal[cell])
         descent, *_ = slopes(x[point], jets)
-        # at an end from which the distance falls beyond the cell
-        is_fixed = (X == 0.0) & (descent <= 0) | (X == 1.0) & (descent >= 0)
+        # a place at an end is fixed if the distance falls on beyond the cell
+        is_fixed = ((X == 0.0) & (descent <= 0)) | ((X == 1.0) & (descent >= 0))
         return MeridianProjections(point, cell, X, ~is_fixed, distances(x[point] - jets[0]))
 
     def select_nearest(
@@ -462,45 +506,72 @@ class MeridianCurves:
         material
             The material around points of a shell that may touch itself; else None.
         """
-        cell_count = len(self.nodes)
-        places = places.select(np.argsort(places.point * cell_count + places.cell))
+        # in the order of points, then of cells, so that a point's place in a cell can be looked up
+        places = places.select(np.argsort(places.point * len(self.nodes) + places.cell))
         is_above: Flags = np.ones(len(places.point), dtype=bool)
         if material:
             is_above = self._are_above(places, x, nodal)
             shape = self.table(0, places.X)[0]
             is_distinct = material.are_distinct(places, shape, is_above)
             places, is_above = places.select(is_distinct), is_above[is_distinct]
-        keys = places.point * cell_count + places.cell
-        is_nearest: Flags = np.ones(len(keys), dtype=bool)
-        # a place at an end counts if the cell beyond has no nearer one, or is not searched
+        # a place at an end counts if the cell beyond has one that is no nearer, or is not searched
+        is_nearest: Flags = np.ones(len(places.point), dtype=bool)
         for end, X in enumerate((0.0, 1.0)):
             neighbour = self.neighbours[places.cell, end]
-            neighbour_key = places.point * cell_count + neighbour
-            row = np.minimum(np.searchsorted(keys, neighbour_key), max(len(keys) - 1, 0))
-            is_listed = keys[row] == neighbour_key
-            tolerance = DISTANCE_TOLERANCE * self._h
-            is_nearer = is_listed & (places.distance[row] < places.distance - tolerance)
-            is_inside = ~((places.X == X) & (neighbour >= 0))
+            is_at_end = (places.X == X) & (neighbour >= 0)
             is_nearest &= (
-                is_inside
-                | (is_listed & ~is_nearer)
+                ~is_at_end
+                | self._are_nearest_beyond(places, neighbour)
                 | self._are_folded(places, neighbour, is_above, material)
             )
         places = places.select(is_nearest)
         places = places.select(np.lexsort((places.distance, places.point)))
         if not len(places.point):
             return places
+        return places.select(self._are_nearest_of_sides(places, x, nodal))
+
+    def _are_nearest_beyond(self, places: MeridianProjections, neighbour: Longs) -> Flags:
+        """Return flags (n,): whether points have a place in another cell that is not nearer.
+
+        Parameters
+        ----------
+        places
+            In the order of points and cells.
+        neighbour
+            (n,) the other cell: that beyond an end of each place's cell, -1 for none.
+        """
+        cell_count = len(self.nodes)
+        keys = places.point * cell_count + places.cell
+        # the row of the point's place in the other cell, if that is listed; else any row
+        neighbour_key = places.point * cell_count + neighbour
+        row = np.minimum(np.searchsorted(keys, neighbour_key), max(len(keys) - 1, 0))
+        is_listed = keys[row] == neighbour_key
+        is_nearer = places.distance[row] < places.distance - DISTANCE_TOLERANCE * self._h
+        return np.asarray(is_listed & ~is_nearer)
+
+    def _are_nearest_of_sides(self, places: MeridianProjections, x: Array, nodal: Array) -> Flags:
+        """Return flags (n,): the nearest place of each point, and the nearest on its other side.
+
+        Parameters
+        ----------
+        places
+            In the order of points and distances.
+        x, nodal
+            See `project`.
+        """
+        # unit vectors from places to points, and for each place the row of its point's nearest one
         offset = (x[places.point] - self.jets(places.X, nodal[places.cell])[0])[:, :2]
         offset = offset / np.maximum(np.linalg.norm(offset, axis=1), 1e-300)[:, None]
         first_of_point = np.flatnonzero(np.diff(places.point, prepend=-1))
         nearest = np.repeat(first_of_point, np.diff([*first_of_point, len(offset)]))
-        # besides the nearest place of a point, the nearest one on its other side is chosen
-        is_opposite = np.sum(offset * offset[nearest], axis=1) < SAME_DIRECTION_COSINE
         is_chosen = np.zeros(len(offset), dtype=bool)
         is_chosen[first_of_point] = True
+        # the others in another direction, of which the first of each point is chosen too
+        is_opposite = np.sum(offset * offset[nearest], axis=1) < SAME_DIRECTION_COSINE
         opposite = np.flatnonzero(is_opposite)
-        is_chosen[opposite[np.flatnonzero(np.diff(places.point[opposite], prepend=-1))]] = True
-        return places.select(is_chosen)
+        first_opposite = np.flatnonzero(np.diff(places.point[opposite], prepend=-1))
+        is_chosen[opposite[first_opposite]] = True
+        return is_chosen
 
     def _are_folded(
         self,

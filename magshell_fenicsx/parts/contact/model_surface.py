@@ -117,16 +117,17 @@ class ModelSurface:
             factor = self.thickness.x.array[dofs]
         if not (self.natural and self.grows):
             return np.array([factor])
+        # (2, local cells, nodes, 3): undeformed tangents at the nodes of cells
         V = self.space
-        # tangents at the nodes of cells, from which the natural shape has its volume
         element = V.element.basix_element
         slopes = element.tabulate(1, element.points)[1:, ..., 0]
         nodal = self.r0.x.array.reshape(-1, 3)[V.dofmap.list]
         tangents = np.einsum("dqk,nki->dnqi", slopes, nodal)
+        # volumes of the natural shape over J0, by powers of the growth from 0 to 3
         coefficients = self.natural.volume_coefficients(tangents, element.points)
         # elsewhere the volume does not grow: 1, and zero for the three higher powers
         coefficients[:, ~self.keeps_volume] = np.eye(4)[0][:, None, None]
-        return np.asarray(factor * coefficients[:, : len(factor)])
+        return np.asarray(factor * coefficients[:, : len(factor)])  # of own cells, which come first
 
 
 @dataclass(frozen=True)
@@ -216,7 +217,7 @@ def surface_contacts(pairs: Sequence[Pair], surface: ModelSurface) -> list[Surfa
     """
     if not pairs:
         return []
-    # of cells, vertices and edges, which the gathering below needs
+    # vertices of cells, cells of vertices, and vertices of edges, which the gathering below needs
     for dims in ((2, 0), (0, 2), (1, 0)):
         surface.topology.create_connectivity(*dims)
     global_cells, index_map = GlobalCells.gather(surface.space), surface.space.dofmap.index_map
@@ -273,16 +274,16 @@ def _contact_geometry(
     segments = Segments(cells, own_cells, r0, degrees, surface.h, surface.planes)
     own_rows = slice(first_cell, global_cells.own_range.stop)
     return ContactGeometry(
-        cells,
-        r0,
-        _displacement_of(surface, images),
-        surface.h,
-        segments,
-        ContactFields(surface.r0, surface.thickness, global_cells.nodes, own_rows),
-        offsets,
-        own_dofs,
-        (first_cell, len(surface.keeps_volume)),
-        surface.space.mesh.comm,
+        cells=cells,
+        r0=r0,
+        displacement=_displacement_of(surface, images),
+        h=surface.h,
+        segments=segments,
+        fields=ContactFields(surface.r0, surface.thickness, global_cells.nodes, own_rows),
+        offsets=offsets,
+        owned_dofs=own_dofs,
+        local_cells=(first_cell, len(surface.keeps_volume)),
+        comm=surface.space.mesh.comm,
     )
 
 

@@ -82,22 +82,25 @@ class Cells:
     @cached_property
     def neighbours(self) -> Longs:
         """(cells, 3): the cell across the side opposite to each corner; -1 at the boundary."""
+        # a key for each side, the same in both cells that share it: its vertices, the lower first
         sides = [self.corners[:, [1, 2]], self.corners[:, [0, 2]], self.corners[:, [0, 1]]]
         pairs = np.sort(np.stack(sides, axis=1), axis=2)
         keys = pairs[..., 0] * (self.corners.max() + 1) + pairs[..., 1]
+        # two cells share a side if its key comes twice, that is next to itself in ascending order
         order = np.argsort(keys.ravel(), kind="stable")
-        is_shared_with_next = np.flatnonzero(np.diff(keys.ravel()[order]) == 0)
-        # two cells share a side if its key comes twice; number 3 cell + k stands for side k
+        shared = np.flatnonzero(np.diff(keys.ravel()[order]) == 0)
+        # number 3 cell + k stands for side k of a cell
+        first_sides, second_sides = order[shared], order[shared + 1]
         neighbours = np.full(keys.size, -1)
-        first_sides, second_sides = order[is_shared_with_next], order[is_shared_with_next + 1]
-        neighbours[first_sides], neighbours[second_sides] = second_sides // 3, first_sides // 3
+        neighbours[first_sides] = second_sides // 3
+        neighbours[second_sides] = first_sides // 3
         return np.asarray(neighbours.reshape(-1, 3))
 
     @cached_property
     def is_on_edge(self) -> NDArray[np.bool_]:
         """(cells, 3): whether each corner is on an edge of the surface."""
         cell, side = np.nonzero(self.neighbours < 0)
-        is_on_edge = np.zeros(self.corners.max() + 1, dtype=bool)
+        is_on_edge = np.zeros(self.corners.max() + 1, dtype=bool)  # of vertices
         for corner in ((side + 1) % 3, (side + 2) % 3):
             is_on_edge[self.corners[cell, corner]] = True
         return np.asarray(is_on_edge[self.corners])
@@ -114,14 +117,16 @@ class Cells:
         """
         cell, side = np.nonzero(self.neighbours < 0)
         slopes = self.element.tabulate(1, CORNERS)[1:, :, :, 0]  # of shape functions at corners
-        # where an edge is even the two tangents away from a vertex cancel
+        # sums at vertices of the unit tangents of both sides, each away from the vertex: where the
+        # edge is even they cancel
         turn = np.zeros((int(self.corners.max()) + 1, 3))
-        sides = CORNERS[(side + 2) % 3] - CORNERS[(side + 1) % 3]
-        for corner, sign in (((side + 1) % 3, 1.0), ((side + 2) % 3, -1.0)):
+        begin, end = (side + 1) % 3, (side + 2) % 3  # corners of each side on an edge
+        sides = CORNERS[end] - CORNERS[begin]
+        for corner, sign in ((begin, 1.0), (end, -1.0)):
             tangent = np.einsum("kd,dkn,kni->ki", sides, slopes[:, corner], r0[self.nodes[cell]])
             tangent /= np.linalg.norm(tangent, axis=1)[:, None]
             np.add.at(turn, self.corners[cell, corner], sign * tangent)
-        # the difference of two unit vectors at that angle
+        # the length of the difference of two unit vectors with this cosine
         is_turn = np.linalg.norm(turn, axis=1) > np.sqrt(2 * (1 - cosine))
         return np.asarray(is_turn[self.corners])
 
@@ -198,44 +203,61 @@ def near_along_surface(corners: Longs, x: Array, reach: Array) -> Longs:
         Numbers i * cells + j of pairs of cells, ascending.
     """
     vertex_count, (cell_count, per_cell) = len(x), corners.shape
+    i, j = _near_vertices(_graph_of_sides(corners, x), x, reach)
+    # sparse flags: which vertices are near each other, and which vertices a cell has
+    is_near = scipy.sparse.coo_array((np.ones(len(i)), (i, j)), (vertex_count, vertex_count))
+    cell_of_corner = np.repeat(np.arange(cell_count), per_cell)
+    flags = np.ones(len(cell_of_corner)), (cell_of_corner, corners.ravel())
+    has_vertex = scipy.sparse.coo_array(flags, (cell_count, vertex_count)).tocsr()
+    # cells are near if any of their vertices are: there the product is not zero
+    i, j = (has_vertex @ is_near.tocsr() @ has_vertex.T).nonzero()
+    return np.asarray(np.unique(i.astype(np.int64) * cell_count + j))
+
+
+def _graph_of_sides(corners: Longs, x: Array) -> scipy.sparse.csr_array:
+    """Return the graph (vertices, vertices) of the sides of cells, with their lengths.
+
+    Parameters are those of `near_along_surface`.
+    """
+    shape = len(x), len(x)
+    begins, ends = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
+    lower_and_higher = np.minimum(begins, ends), np.maximum(begins, ends)
+    sides = scipy.sparse.coo_array((np.ones(len(begins)), lower_and_higher), shape)
+    sides = sides.tocsr().tocoo()  # which sums entries: each side once
+    lengths = np.linalg.norm(x[sides.row] - x[sides.col], axis=1)
+    return scipy.sparse.coo_array((lengths, (sides.row, sides.col)), shape).tocsr()
+
+
+def _near_vertices(graph: scipy.sparse.csr_array, x: Array, reach: Array) -> tuple[Longs, Longs]:
+    """Return the pairs (i, j) of vertices between which the way along sides is short enough.
+
+    Parameters
+    ----------
+    graph
+        See `_graph_of_sides`.
+    x, reach
+        See `near_along_surface`.
+    """
     farthest = float(reach.max())
-    starts, ends = corners.ravel(), np.roll(corners, -1, axis=1).ravel()
-    vertex_numbers = np.minimum(starts, ends), np.maximum(starts, ends)
-    edges = scipy.sparse.coo_array(
-        (np.ones(len(starts)), vertex_numbers), (vertex_count, vertex_count)
-    )
-    edges = edges.tocsr().tocoo()  # which sums entries: each edge once
-    lengths = np.linalg.norm(x[edges.row] - x[edges.col], axis=1)
-    graph = scipy.sparse.coo_array(
-        (lengths, (edges.row, edges.col)), (vertex_count, vertex_count)
-    ).tocsr()
     # strips of vertices along the longest axis keep the matrices of ways small
     axis = int(np.ptp(x, axis=0).argmax())
     order = np.argsort(x[:, axis], kind="stable")
-    near_pairs = list[tuple[Longs, Longs]]()
     sorted_x = x[order, axis]
-    for strip_vertices in np.array_split(order, max(1, vertex_count // VERTICES_PER_STRIP)):
-        # ways that short leave a strip by no more than their length
-        low, high = x[strip_vertices[0], axis] - farthest, x[strip_vertices[-1], axis] + farthest
+    near_pairs = list[tuple[Longs, Longs]]()
+    for strip in np.array_split(order, max(1, len(x) // VERTICES_PER_STRIP)):
+        # a way from the strip that is short enough ends within this length of the strip
+        low, high = x[strip[0], axis] - farthest, x[strip[-1], axis] + farthest
         begin, end = np.searchsorted(sorted_x, low), np.searchsorted(sorted_x, high, "right")
         candidates = order[begin:end]
-        rows = np.flatnonzero(np.isin(candidates, strip_vertices))
-        strip_graph = graph[candidates][:, candidates]  # has all ways that are short enough
-        lengths = dijkstra(strip_graph, directed=False, indices=rows, limit=farthest)
+        # from the strip's vertices (rows) to all candidates (columns)
+        rows = np.flatnonzero(np.isin(candidates, strip))
+        graph_of_candidates = graph[candidates][:, candidates]
+        ways = dijkstra(graph_of_candidates, directed=False, indices=rows, limit=farthest)
         mean_reach = (reach[candidates[rows], None] + reach[candidates]) / 2
-        row, column = np.nonzero(lengths <= mean_reach)
+        row, column = np.nonzero(ways <= mean_reach)
         near_pairs.append((candidates[rows[row]], candidates[column]))
-    i, j = (np.concatenate(vertex_numbers) for vertex_numbers in zip(*near_pairs, strict=True))
-    # cells are near if any of their vertices are
-    vertex_pairs = scipy.sparse.coo_array(
-        (np.ones(len(i)), (i, j)), (vertex_count, vertex_count)
-    ).tocsr()
-    cell_of_corner = np.repeat(np.arange(cell_count), per_cell)
-    # nonzero entries of the product below: cells with a near pair of vertices
-    flags = np.ones(len(cell_of_corner)), (cell_of_corner, corners.ravel())
-    vertices_of_cells = scipy.sparse.coo_array(flags, (cell_count, vertex_count)).tocsr()
-    i, j = (vertices_of_cells @ vertex_pairs @ vertices_of_cells.T).nonzero()
-    return np.asarray(np.unique(i.astype(np.int64) * cell_count + j))
+    i, j = (np.concatenate(vertices) for vertices in zip(*near_pairs, strict=True))
+    return i, j
 
 
 @dataclass(frozen=True)
@@ -327,7 +349,8 @@ class ProjectionLimits:
 def polynomial_bound(values: Array, lebesgue_constant: float) -> float:
     """Return an upper bound of polynomials with values (cells, functions) at nodes.
 
-    It is the middle of a cell's nodal values plus half their range times Lebesgue's constant.
+    In each cell it is the middle of the nodal values, (max + min)/2, plus half their range times
+    Lebesgue's constant. The result is the largest of all cells; of no cells it is minus infinity.
 
     Parameters
     ----------
@@ -335,11 +358,8 @@ def polynomial_bound(values: Array, lebesgue_constant: float) -> float:
         Lebesgue's constant of the element: it bounds how far a polynomial exceeds its nodal values.
     """
     nodal_max, nodal_min = values.max(axis=1, initial=-np.inf), values.min(axis=1, initial=np.inf)
-    return float(
-        ((nodal_max + nodal_min + lebesgue_constant * (nodal_max - nodal_min)) / 2).max(
-            initial=-np.inf
-        )
-    )
+    bounds = (nodal_max + nodal_min + lebesgue_constant * (nodal_max - nodal_min)) / 2
+    return float(bounds.max(initial=-np.inf))
 
 
 def jets(element: Any, X: Array, nodal: Array, order: int = 2) -> Iterator[tuple[Array, Array]]:
@@ -402,31 +422,31 @@ def nearest_places(
     cell, first, number, order = pairs
     used_cells, row_of_cell = np.unique(cell, return_inverse=True)
     nodal = r[cells.nodes[used_cells]]
-    no_flags = np.zeros(len(cell), dtype=bool)
+    positions = nodal[..., :3]
     # stand-ins for missing arguments: without flags the C function does not read them
-    positions, reference = nodal[..., :3], undeformed or UndeformedPairs(no_flags, r, x, 0.0)
+    no_flags = np.zeros(len(cell), dtype=bool)
+    reference = undeformed or UndeformedPairs(no_flags, r, x, 0.0)
     search_limits = limits or ProjectionLimits(no_flags, np.zeros(len(x)))
-    # spheres around cells, and the distance of a cell's places from each lattice
-    centres = positions.mean(axis=1)
-    radii = CELL_RADIUS_FACTOR * np.linalg.norm(positions - centres[:, None], axis=2).max(axis=1)
-    bounds = np.column_stack(
-        [centres, radii, *(LATTICE_RADIUS_FACTOR / parts * radii for parts in LATTICE_DIVISIONS)]
-    )
+    bounds = _bounds_of_cells(positions)
     lattice_places = [np.matmul(positions.swapaxes(1, 2), shape.T) for _, shape in cells.lattices]
     # coefficients of each cell's polynomials, deformed and undeformed
     monomials = [
         cells.monomials @ _as_four_components(array)
         for array in (nodal, reference.r[cells.nodes[used_cells]])
     ]
+    # the fields of `Cells` in C, in their order: sizes, then arrays, which must stay in memory
     c_sizes = cells.element.degree, *(len(X) for X, _ in cells.lattices)
     (ffi, lib), pointers = library(), _pointers
     c_cells = ffi.new(
         "Cells *", [*c_sizes, *pointers(*monomials, *lattice_places, cells.lattices[-1][0], bounds)]
     )
+    # arrays for the results
     capacity = int(number.sum())  # each pair of point and cell has at most one place
     point, pair = np.empty((2, capacity), dtype=np.int64)
     floats = [np.empty((capacity, *shape)) for shape in PLACE_SHAPES]
-    results = point, pair, *floats, np.empty(capacity, dtype=bool)
+    is_above = np.empty(capacity, dtype=bool)
+    results = point, pair, *floats, is_above
+    # the call; arguments have the order of `nearest` in C
     pair_arguments = row_of_cell.ravel(), first, number, reference.is_near, search_limits.is_bounded
     point_arguments = order, _as_four_components(x), _as_four_components(reference.x)
     arguments = pointers(*pair_arguments, search_limits.reach, *point_arguments)
@@ -440,12 +460,29 @@ def nearest_places(
         *pointers(*results),
     )
     # the first `count` rows have results
-    X, free_directions, distance, direction = (array[:count] for array in results[2:6])
-    point, pair, is_above = point[:count], pair[:count], results[6][:count]
+    X, free_directions, distance, direction = (array[:count] for array in floats)
+    point, pair, is_above = point[:count], pair[:count], is_above[:count]
     side = np.zeros(count, dtype=np.int64)
     return pair, Projections(
         point, cell[pair], X, free_directions, distance, side, direction, is_above
     )
+
+
+def _bounds_of_cells(positions: Array) -> Array:
+    """Return the sphere around each cell, and how far its places are from each lattice at most.
+
+    The result (cells, 6) has the sphere's centre and radius, and then the distances from the coarse
+    and from the fine lattice.
+
+    Parameters
+    ----------
+    positions
+        (cells, functions, 3) places of nodes.
+    """
+    centres = positions.mean(axis=1)
+    radii = CELL_RADIUS_FACTOR * np.linalg.norm(positions - centres[:, None], axis=2).max(axis=1)
+    lattice_distances = (LATTICE_RADIUS_FACTOR / parts * radii for parts in LATTICE_DIVISIONS)
+    return np.column_stack([centres, radii, *lattice_distances])
 
 
 def points_in_cells(cells: Cells, r: Array, cell: Longs, shape: Array) -> Array:
@@ -509,8 +546,9 @@ def follow_places(cells: Cells, x: Array, nodal: Array, X: Array, free_direction
         Places before the motion, and where they can move: see `Projections`.
     """
     for _ in range(FOLLOW_ITERATIONS):
+        # the places, and their derivatives y1, y2, y11, y12, y22; shape functions are not needed
         (_, y), *derivatives = jets(cells.element, X, nodal)
-        g, A = slopes(with_length(x - y), *(each for _, each in derivatives))
+        g, A = slopes(with_length(x - y), *(derivative for _, derivative in derivatives))
         X = X - _solve_in_free_directions(free_directions, A, g)
     return X
 
@@ -562,17 +600,10 @@ def slopes(
 
 def _solve_in_free_directions(free_directions: Array, A: Array, g: Array) -> Array:
     """Return A^-1 g (n, 2) in the free directions, for A (n, 2, 2) and g (n, 2)."""
-    return np.asarray(
-        np.einsum(
-            "nij,nj->ni",
-            free_directions,
-            np.einsum(
-                "nij,nj->ni",
-                inverse_in_free_directions(free_directions, A),
-                _in_free_directions(free_directions, g),
-            ),
-        )
-    )
+    inverse = inverse_in_free_directions(free_directions, A)
+    # components of the result along the free directions, then in the reference cell
+    components = np.einsum("nij,nj->ni", inverse, _in_free_directions(free_directions, g))
+    return np.asarray(np.einsum("nij,nj->ni", free_directions, components))
 
 
 def _in_free_directions(free_directions: Array, g: Array) -> Array:
@@ -583,9 +614,9 @@ def _in_free_directions(free_directions: Array, g: Array) -> Array:
 def inverse_in_free_directions(free_directions: Array, A: Array) -> Array:
     """Return the inverse (n, 2, 2) of A (n, 2, 2), in components along the free directions.
 
-    Along a direction that is not free the matrix is taken as one, so that it can be inverted.
+    Where a direction is not free, 1 stands on the diagonal, so that the matrix can be inverted.
     """
-    is_fixed = np.asarray(~free_directions.any(axis=1))
+    is_fixed = np.asarray(~free_directions.any(axis=1))  # (n, 2): a column that is zero
     reduced = np.einsum("nji,njk,nkl->nil", free_directions, A, free_directions)
     reduced[:, 0, 0] += is_fixed[:, 0]
     reduced[:, 1, 1] += is_fixed[:, 1]
@@ -615,24 +646,26 @@ def near_spheres(
     own_spheres
         Numbers of the spheres from which i is taken; j is any sphere.
     """
-    # classes by powers of two
-    size_class = np.floor(np.log2(np.maximum(radii, 1e-300) / radii.max())).astype(int)
-    classes = [np.flatnonzero(size_class == k) for k in np.unique(size_class)]
-    own_classes = [own_spheres[size_class[own_spheres] == k] for k in np.unique(size_class)]
+    # classes by powers of two; `classes` has all spheres, `own_classes` those for i
+    radius_class = np.floor(np.log2(np.maximum(radii, 1e-300) / radii.max())).astype(int)
+    classes = [np.flatnonzero(radius_class == k) for k in np.unique(radius_class)]
+    own_classes = [own_spheres[radius_class[own_spheres] == k] for k in np.unique(radius_class)]
     classes_with_trees = [(spheres, scipy.spatial.cKDTree(centres[spheres])) for spheres in classes]
     pairs = list[tuple[Longs, Longs]]()
     for own_class in filter(len, own_classes):
         own_tree = scipy.spatial.cKDTree(centres[own_class])
         for other_class, other_tree in classes_with_trees:
-            distance = radii[own_class].max() + radii[other_class].max() + reach
-            near_in_trees = own_tree.sparse_distance_matrix(
-                other_tree, distance, output_type="ndarray"
+            # pairs of centres that are near for the largest radii of both classes: i and j are rows
+            # of the classes, v distances
+            farthest = radii[own_class].max() + radii[other_class].max() + reach
+            near_centres = own_tree.sparse_distance_matrix(
+                other_tree, farthest, output_type="ndarray"
             )
-            i, j = own_class[near_in_trees["i"]], other_class[near_in_trees["j"]]
-            # the trees' distance is that of the largest radii: each pair has its own
-            is_near = (near_in_trees["v"] < radii[i] + radii[j] + reach) & (i != j)
+            i, j = own_class[near_centres["i"]], other_class[near_centres["j"]]
+            # of these the pairs that are near for their own radii
+            is_near = (near_centres["v"] < radii[i] + radii[j] + reach) & (i != j)
             pairs.append((i[is_near], j[is_near]))
-    no_numbers = np.zeros(0, dtype=np.int64)
+    no_numbers = np.zeros(0, dtype=np.int64)  # for the case that there are no pairs
     i, j = (
         np.concatenate([no_numbers, *spheres]).astype(np.int64)
         for spheres in zip((no_numbers, no_numbers), *pairs, strict=True)
@@ -677,12 +710,14 @@ class JoinedPlaces:
         blur
             Length e over R of the smoothed minimum; small against all distances.
         """
+        # each point and direction has one group of places, the nearest first
         first = places.firsts
         counts = np.diff([*first, len(places.point)])
         group = np.repeat(np.arange(len(first)), counts)
-        nearest = places.distance[first]
+        least_distance = places.distance[first]
         # relative to the nearest place, so that nothing overflows
-        exponential = np.exp((nearest[group] - places.distance) / blur)
+        exponential = np.exp((least_distance[group] - places.distance) / blur)
         sum_of_exponentials = np.bincount(group, exponential, len(first))
-        distance = nearest - blur * np.log(sum_of_exponentials)
-        return cls(first, group, distance, exponential / sum_of_exponentials[group], counts > 1)
+        distance = least_distance - blur * np.log(sum_of_exponentials)
+        weight = exponential / sum_of_exponentials[group]
+        return cls(first, group, distance, weight, several=counts > 1)

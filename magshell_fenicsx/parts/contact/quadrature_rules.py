@@ -52,7 +52,7 @@ def edge_rule(degree: int, turning_ends: int = 0, corner: float = 0.0) -> tuple[
     last_line = _rule_with_points((degree + 2 - len(fixed_points)) // 2, fixed_points, power=0)
     places, weights = list[Array](), list[Array]()
     for position, weight in zip(t, weights_t, strict=True):
-        # the last line is next to the side
+        # s goes along the side; the last line is next to the side
         s, weights_s = last_line if position == t[-1] else inner_line
         places.append(np.stack([position * (1 - s), position * s], axis=1))
         weights.append(weight * weights_s)
@@ -73,10 +73,11 @@ def line_rule(count: int, begins: bool, ends: bool) -> tuple[Array, Array]:
     """
     from scipy.special import roots_jacobi  # takes long to import
 
+    # inner points on [-1, 1]: roots of the polynomial for the weight (1 - x) and (1 + x) of the
+    # ends that are points; these factors are then divided out
     x, w = roots_jacobi(count - begins - ends, float(ends), float(begins))
-    # Jacobi's rule has the factors of the fixed ends as weight, which are divided out
     w = w / ((1 - x) ** int(ends) * (1 + x) ** int(begins))
-    # weights of the end points on [-1, 1]: Lobatto's, else Radau's
+    # the weight of an end point on [-1, 1]: Lobatto's, else Radau's
     end_weight = 2 / (count * (count - 1)) if begins and ends else 2 / count**2
     x = np.concatenate([[-1 + 2 * EDGE_OFFSET] * begins, x, [1 - 2 * EDGE_OFFSET] * ends])
     w = np.concatenate([[end_weight] * begins, w, [end_weight] * ends])
@@ -99,17 +100,17 @@ def _rule_with_points(count: int, fixed_points: Sequence[float], power: int) -> 
     power
         Exponent of the weight.
     """
-    # Gauss's rule on [-1, 1], with enough points for all integrals below
+    legendre = np.polynomial.legendre.legvander  # Legendre's polynomials at places, as columns
+    point_count = count + len(fixed_points)
+    # Gauss's rule on [-1, 1], with enough points for all integrals below; `weight` has that of the
+    # rule on [0, 1] times x^power
     x, w = scipy.special.roots_legendre(2 * count + 4)
-    legendre, point_count = np.polynomial.legendre.legvander, count + len(fixed_points)
     weight = w / 2 * ((1 + x) / 2) ** power
     # the weight times the polynomial that is zero at the fixed points
-    weighted_polynomials = weight * np.prod([(1 + x) / 2 - point for point in fixed_points], axis=0)
+    weight_of_roots = weight * np.prod([(1 + x) / 2 - point for point in fixed_points], axis=0)
+    # its integral is made positive, as the eigenvalue problem needs
     polynomials = legendre(x, count - 1)
-    # made positive on the whole, as the eigenvalue problem needs
-    weighted_polynomials = (
-        np.sign(weighted_polynomials.sum()) * weighted_polynomials[:, None] * polynomials
-    )
+    weighted_polynomials = np.sign(weight_of_roots.sum()) * weight_of_roots[:, None] * polynomials
     # the roots are eigenvalues of the multiplication by x among polynomials of lower degree
     free_points = scipy.linalg.eigh(
         polynomials.T @ (x[:, None] * weighted_polynomials),

@@ -141,9 +141,19 @@ class Triangles:
     e2: Array
     ends: Longs
 
+    @classmethod
+    def concatenate(cls, parts: Sequence["Triangles"]) -> "Triangles":
+        """Return the triangles of several sets as one set."""
+        return cls(
+            *(
+                np.concatenate([getattr(part, attribute.name) for part in parts])
+                for attribute in fields(cls)
+            )
+        )
+
     @property
     def size(self) -> Array:
-        """Twice their areas (n,) in the reference cell."""
+        """Twice their areas (n,) in the reference cell: 1 for a whole cell."""
         return np.asarray(self.e1[:, 0] * self.e2[:, 1] - self.e1[:, 1] * self.e2[:, 0])
 
     def select(self, is_selected: Flags) -> "Triangles":
@@ -158,12 +168,15 @@ class Triangles:
         They are at the first corner, at both ends of the third side, and in the middle. Only the
         quarters at the third side can be on an edge.
         """
-        half1, half2, middle = self.e1 / 2, self.e2 / 2, self.first + (self.e1 + self.e2) / 2
+        half1, half2 = self.e1 / 2, self.e2 / 2
+        middle = self.first + (self.e1 + self.e2) / 2  # of the third side
+        # `ends` of the quarters: a quarter at one end of the third side has the turn at that end
+        # alone, which is flag 1 of its begin or flag 2 of its end
         not_on_edge = np.full_like(self.ends, NOT_ON_EDGE)
-        # a quarter at one end of the third side has the turn at that end alone: flag 1 or flag 2
         at_begin, at_end = (
-            np.where(self.ends == NOT_ON_EDGE, NOT_ON_EDGE, self.ends & corner) for corner in (1, 2)
+            np.where(self.ends == NOT_ON_EDGE, NOT_ON_EDGE, self.ends & flag) for flag in (1, 2)
         )
+        # first corner, both sides from there, and `ends` of each quarter
         quarters = (
             (self.first, half1, half2, not_on_edge),
             (self.first + half1, half1, half2, at_begin),
@@ -237,40 +250,55 @@ class Polygons:
             (cells, 3) whether the edge turns in the corner.
         """
         corners, next_corners = self.corners, np.roll(self.corners, -1, axis=1)
+        # a repeated corner begins a side of no length, which does not count
         has_side = np.linalg.norm(corners - next_corners, axis=2) > SAME_CORNER_TOLERANCE
-        # barycentric coordinates, of which one is zero on each side of the cell
-        coordinates = np.stack([1 - corners.sum(axis=2), corners[..., 0], corners[..., 1]], axis=2)
+        ends = self._ends_of_sides(has_side, open_sides, edge_turns)
+        edge_count = (ends != NOT_ON_EDGE).sum(axis=1)
+        is_whole = (has_side.sum(axis=1) == 3) & (edge_count <= 1)
+        single = self.select(is_whole)._single_triangles(has_side[is_whole], ends[is_whole])
+        # the other polygons become fans: one triangle from the centroid to each side
+        centre = np.zeros((len(corners), 2))
+        centre[~is_whole] = centroid(corners[~is_whole])
+        polygon, side = np.nonzero(has_side & ~is_whole[:, None])
+        fans = Triangles(
+            cell=self.cell[polygon],
+            faces=self.faces[polygon],
+            first=centre[polygon],
+            e1=corners[polygon, side] - centre[polygon],
+            e2=next_corners[polygon, side] - centre[polygon],
+            ends=ends[polygon, side],
+        )
+        return Triangles.concatenate([single, fans])
+
+    def _ends_of_sides(self, has_side: Flags, open_sides: Flags, edge_turns: Flags) -> Longs:
+        """Return the `ends` (n, m) of all sides of the polygons, see `Triangles`.
+
+        Side k goes from corner k to the next one.
+
+        Parameters
+        ----------
+        has_side
+            (n, m) whether the side that begins at a corner has a length.
+        open_sides, edge_turns
+            See `triangles`.
+        """
+        # barycentric coordinates: number k is zero on side k of the cell, opposite to its corner k
+        x, y = self.corners[..., 0], self.corners[..., 1]
+        coordinates = np.stack([1 - self.corners.sum(axis=2), x, y], axis=2)
         on_side = np.abs(coordinates) < SAME_CORNER_TOLERANCE
-        # side k of a polygon is on an edge if both its ends are on the same open side of the cell
+        # a polygon's side is on an edge if both its ends are on the same open side of the cell
         on_open_side = on_side & np.roll(on_side, -1, axis=1) & open_sides[self.cell][:, None]
         is_edge = has_side & on_open_side.any(axis=2)
         # a corner of the cell is on the two sides that are not opposite to it
-        at_turn = on_side[..., [1, 2, 0]] & on_side[..., [2, 0, 1]]
-        turns_at_corner = (at_turn & edge_turns[self.cell][:, None]).any(axis=2)
-        ends = np.where(
-            is_edge, turns_at_corner + 2 * np.roll(turns_at_corner, -1, axis=1), NOT_ON_EDGE
-        )
-        is_whole = (has_side.sum(axis=1) == 3) & (is_edge.sum(axis=1) <= 1)
-        centre = np.zeros((len(corners), 2))
-        centre[~is_whole] = centroid(corners[~is_whole])
-        # the other polygons become fans of triangles about their centroids
-        polygon, side = np.nonzero(has_side & ~is_whole[:, None])
-        sides = (
-            corners[polygon, side] - centre[polygon],
-            next_corners[polygon, side] - centre[polygon],
-        )
-        fans = Triangles(
-            self.cell[polygon], self.faces[polygon], centre[polygon], *sides, ends[polygon, side]
-        )
-        single = self.select(is_whole)._single_triangles(has_side[is_whole], ends[is_whole])
-        arrays = [
-            [getattr(triangle_set, attribute.name) for triangle_set in (single, fans)]
-            for attribute in fields(fans)
-        ]
-        return Triangles(*(np.concatenate(attribute) for attribute in arrays))
+        at_cell_corner = on_side[..., [1, 2, 0]] & on_side[..., [2, 0, 1]]
+        turns_at_begin = (at_cell_corner & edge_turns[self.cell][:, None]).any(axis=2)
+        turns_at_end = np.roll(turns_at_begin, -1, axis=1)
+        return np.where(is_edge, turns_at_begin + 2 * turns_at_end, NOT_ON_EDGE)
 
     def _single_triangles(self, has_side: Flags, ends: Longs) -> Triangles:
         """Return these polygons of three sides as triangles; a side on an edge becomes the third.
+
+        They have at most one side on an edge.
 
         Parameters
         ----------
@@ -283,13 +311,20 @@ class Polygons:
         corners = np.take_along_axis(self.corners, side_numbers[..., None], axis=1)
         side_ends = np.take_along_axis(ends, side_numbers, axis=1)
         has_edge = (side_ends != NOT_ON_EDGE).any(axis=1)
-        # the corner opposite to the side on an edge becomes the first
-        apex = np.where(has_edge, (side_ends.argmax(axis=1) + 2) % 3, 0)[:, None]
+        # the side on an edge, if there is one, has the largest of the three `ends`
+        edge_side = side_ends.argmax(axis=1)
+        # the corner opposite to that side becomes the first: side k goes from corner k to k + 1
+        apex = np.where(has_edge, (edge_side + 2) % 3, 0)[:, None]
         first, second, third = (
             np.take_along_axis(corners, ((apex + i) % 3)[..., None], axis=1)[:, 0] for i in range(3)
         )
         return Triangles(
-            self.cell, self.faces, first, second - first, third - first, side_ends.max(axis=1)
+            self.cell,
+            self.faces,
+            first,
+            e1=second - first,
+            e2=third - first,
+            ends=side_ends.max(axis=1),
         )
 
     def clip(self, a: Array, b: Array) -> "Polygons":
@@ -298,20 +333,24 @@ class Polygons:
         Each polygon has a line of its own (the algorithm of Sutherland and Hodgman). The result may
         have polygons without an area.
         """
-        # heights of corners above the line, times its length, whose sign changes at crossings
+        # heights of corners above the line, times its length; a side is crossed if its two corners
+        # have heights of different signs
         normal = np.stack([a[:, 1] - b[:, 1], b[:, 0] - a[:, 0]], axis=1)
         height = np.einsum("nki,ni->nk", self.corners - a[:, None], normal)
         height[np.abs(height) < AREA_TOLERANCE] = 0.0
         next_height, next_corner = np.roll(height, -1, axis=1), np.roll(self.corners, -1, axis=1)
         is_crossed = height * next_height < 0
+        # where the line crosses a side: its share of the way to the next corner
         crossing_share = height / np.where(is_crossed, height - next_height, 1.0)
-        count, m = height.shape
         crossing = self.corners + crossing_share[..., None] * (next_corner - self.corners)
-        # each corner, followed by the crossing on the side that begins there
+        # candidates: each corner, followed by the crossing on the side that begins there
+        count, m = height.shape
         candidates = np.stack([self.corners, crossing], axis=2).reshape(count, 2 * m, 2)
-        has_side = (next_corner != self.corners).any(axis=2)
-        is_kept = np.stack([(height >= 0) & has_side, is_crossed], axis=2).reshape(count, 2 * m)
-        # kept corners and crossings move to the front; the rest repeats the first of them
+        has_side = (next_corner != self.corners).any(axis=2)  # the corner is not a repeated one
+        is_kept_corner = (height >= 0) & has_side
+        is_kept = np.stack([is_kept_corner, is_crossed], axis=2).reshape(count, 2 * m)
+        # kept candidates move to the front, in their order; a polygon with fewer of them than the
+        # others repeats its first one
         corner_count = max(3, int(is_kept.sum(axis=1).max(initial=0)))
         kept_first = np.argsort(~is_kept, axis=1, kind="stable")[:, :corner_count]
         corners = np.take_along_axis(candidates, kept_first[..., None], axis=1)
@@ -363,7 +402,11 @@ class Segments:
     rule
         The points of this rank's cells, uncut.
     cover_distance
-        (cells,) over R: no place of a cell is farther from all points of the rule.
+        (cells,) over R: no place of a cell is farther than that from the nearest of its points of
+        the rule.
+
+    The field `_edge_turns` (cells, 3) says whether the edge turns at each corner. `_corner_offset`
+    is the distance of a point next to such a turn from it.
     """
 
     def __init__(
@@ -376,24 +419,21 @@ class Segments:
         planes: Sequence[Mirror] = (),
     ) -> None:
         """Find turning edges, the cover distances and the uncut points."""
-        self._cells, self._r0, self._degrees, self._corner_offset = (
-            cells,
-            r0,
-            degrees,
-            CORNER_OFFSET * h,
-        )
+        self._cells, self._r0, self._degrees = cells, r0, degrees
+        self._corner_offset = CORNER_OFFSET * h
         corners = self._corners(r0, np.arange(len(cells.nodes)))
         self._edge_turns = cells.edge_turns(r0, TURN_COSINE)
         # no corner on a plane of symmetry counts: the edge goes on in the image
         for plane in planes:
             self._edge_turns &= np.abs(plane.signed_distance(corners)) > SAME_CORNER_TOLERANCE
-        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
-        # of an equilateral triangle of side one; points of uncut cells have the first degree
+        # cover distances of both rules in an equilateral triangle of side one; whole cells have the
+        # first degree
         (inner_points, _), (points_at_edge, _) = triangle_rule(degrees[0]), edge_rule(degrees[0])
-        inner_cover, at_edge = cover_distance(inner_points), cover_distance(points_at_edge)
+        inner_cover, edge_cover = cover_distance(inner_points), cover_distance(points_at_edge)
         has_edge = (cells.neighbours < 0).any(axis=1)
-        relative_cover = np.where(has_edge, max(inner_cover, at_edge), inner_cover)
-        self.cover_distance: Array = CELL_RADIUS_FACTOR * sides * relative_cover
+        relative_cover = np.where(has_edge, max(inner_cover, edge_cover), inner_cover)
+        longest_side = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+        self.cover_distance: Array = CELL_RADIUS_FACTOR * longest_side * relative_cover
         self.rule = ContactPoints.concatenate(
             self._points_on(self._triangles(Polygons.cells(own_cells)))
         )
@@ -421,17 +461,18 @@ class Segments:
         cell_count, rule = len(self._cells.nodes), self.rule
         if not len(near_places.point):
             return rule
+        # each pair of a cell and a cell that it faces once
         keys = np.unique(rule.cell[near_places.point] * cell_count + near_places.cell)
         cell, faced_cell = keys // cell_count, keys % cell_count
         # an order of faced cells by undeformed places: rounding is the same on any ranks
         centres = self._corners(self._r0, faced_cell).mean(axis=1)
         order = np.argsort(centres @ ORDERING_DIRECTION, kind="stable")
         cell, faced_cell = cell[order], faced_cell[order]
-        segments = cut_by_triangles(
-            Polygons(cell, faced_cell, self._projected_corners(cell, faced_cell, r))
-        )
-        # uncut cells keep the points of the rule
-        points, triangles = [rule.select(~np.isin(rule.cell, cell))], self._triangles(segments)
+        faced_triangles = Polygons(cell, faced_cell, self._projected_corners(cell, faced_cell, r))
+        triangles = self._triangles(cut_by_triangles(faced_triangles))
+        # cells that face none are not cut, and keep the points of the rule
+        points = [rule.select(~np.isin(rule.cell, cell))]
+        # triangles with an open gap have their points now; the others are divided further
         for level in range(divisions):
             is_closing = self._may_close(triangles, gaps)
             points += self._points_on(triangles.select(~is_closing), level)
@@ -441,8 +482,8 @@ class Segments:
     def _may_close(self, triangles: Triangles, gaps: Callable[[ContactPoints], Array]) -> Flags:
         """Return flags (n,): whether the gap in each triangle may be closed somewhere.
 
-        From its values at the corners and the centroid the gap is taken to fall by at most their
-        range.
+        The gap is taken at the corners and the centroid. It is assumed to be nowhere lower than the
+        least of these values by more than their range (the largest less the least).
         """
         X = CORNERS_AND_CENTROID
         # weights and divisions of these points have no meaning: only their gaps are needed
@@ -461,31 +502,37 @@ class Segments:
         Triangles of one kind have one rule: kinds differ in whether they are small, in `ends`, and
         in how far the point next to a turn of the edge is from the turn.
         """
+        # the kind of each triangle: whether it is small, its `ends`, and the distance of a point
+        # from a turn; it is small by the size that it had before divisions, which is twice its area
+        is_small = triangles.size * 4**divisions <= 2 * LARGE_AREA
+        has_turn = triangles.ends > 0
+        turn_distance = np.where(has_turn, self._corner_shares(triangles), 0)
+        keys = np.stack([is_small, triangles.ends, turn_distance], axis=1)
+        kinds, kind_of_triangle = np.unique(keys, axis=0, return_inverse=True)
+        # all triangles of a kind have their points together
+        points = list[ContactPoints]()
+        for k, (is_small_kind, ends, distance_from_turn) in enumerate(kinds):
+            degree = self._degrees[int(is_small_kind)]  # the second one for small triangles
+            X, weights = (
+                triangle_rule(degree)
+                if ends == NOT_ON_EDGE
+                else edge_rule(degree, turning_ends=int(ends), corner=float(distance_from_turn))
+            )
+            same_kind = triangles.select(kind_of_triangle.ravel() == k)
+            points.append(self._points_by_rule(same_kind, X, weights, divisions))
+        return points
+
+    def _corner_shares(self, triangles: Triangles) -> Array:
+        """Return the distances (n,) of points from turns of the edge, over the third side's length.
+
+        They are limited on short sides, and rounded to powers of two so that there are few rules.
+        """
         corners, third_side = self._corners(self._r0, triangles.cell), triangles.e2 - triangles.e1
         side_length = np.linalg.norm(
             np.einsum("na,nai->ni", third_side, corners[:, 1:] - corners[:, :1]), axis=1
         )
-        # the offset over the side's length, limited on short sides, and rounded to powers of two so
-        # that there are few rules
-        corner_share = np.minimum(
-            np.exp2(np.round(np.log2(self._corner_offset / side_length))), 1 / 64
-        )
-        # by the size that it had before divisions, which is twice the area
-        is_small = triangles.size * 4**divisions <= 2 * LARGE_AREA
-        has_turn = triangles.ends > 0
-        keys = np.stack([is_small, triangles.ends, np.where(has_turn, corner_share, 0)], axis=1)
-        kinds, kind_of_triangle = np.unique(keys, axis=0, return_inverse=True)
-        points = list[ContactPoints]()
-        for k, (is_small_kind, ends, offset) in enumerate(kinds):
-            degree = self._degrees[int(is_small_kind)]  # the second one for small triangles
-            rule = (
-                triangle_rule(degree)
-                if ends == NOT_ON_EDGE
-                else edge_rule(degree, int(ends), float(offset))
-            )
-            same_kind = triangles.select(kind_of_triangle.ravel() == k)
-            points.append(self._points_by_rule(same_kind, *rule, divisions))
-        return points
+        rounded_share = np.exp2(np.round(np.log2(self._corner_offset / side_length)))
+        return np.minimum(rounded_share, 1 / 64)
 
     def _points_by_rule(
         self, triangles: Triangles, X: Array, weights: Array, divisions: int
@@ -499,9 +546,11 @@ class Segments:
         divisions
             How often the triangles have been divided.
         """
+        # (n, m, 2): the rule's points in the reference cell of each triangle
         X_in_cells = triangles.first[:, None] + X[:, :1] * triangles.e1[:, None]
         X_in_cells = X_in_cells + X[:, 1:] * triangles.e2[:, None]
         cell, faces = (np.repeat(numbers, len(X)) for numbers in (triangles.cell, triangles.faces))
+        # undeformed area per area of the reference cell, |a_1 x a_2|
         table = self._cells.element.tabulate(1, X_in_cells.reshape(-1, 2))[..., 0]
         a1, a2 = np.einsum("dnk,nki->dni", table[1:], self._r0[self._cells.nodes[cell]])
         area_ratio = np.linalg.norm(np.cross(a1, a2), axis=1)
@@ -573,6 +622,9 @@ class Cuts:
         Returns the gaps (n,) over R of points at a displacement.
     r0
         (nodes, 3) undeformed places over R.
+
+    The field `_displacements` has number -> displacement of the cuts, of all numbers that are
+    known. `_latest_points` has number -> points and normals, of the last two that were asked for.
     """
 
     def __init__(
@@ -595,11 +647,10 @@ class Cuts:
         """
         if number not in self._latest_points:
             cut_u = self._displacements.setdefault(number, np.array(u))
+            # the last number of before stays, and the new one comes after it
             last_item = [*self._latest_points.items()][-1:]
-            self._latest_points = {
-                **dict(last_item),
-                number: self.points_at(cut_u, divisions_of(number)),
-            }
+            points_and_normals = self.points_at(cut_u, divisions_of(number))
+            self._latest_points = {**dict(last_item), number: points_and_normals}
         return self._latest_points[number]
 
     def displacement(self, number: float) -> Array:
@@ -659,30 +710,41 @@ def cut_by_triangles(triangles: Polygons) -> Polygons:
         cell.
     """
     cells, row_of_cell = np.unique(triangles.cell, return_inverse=True)
-    a, b = oriented_sides(triangles.corners)
-    common = Polygons.cells(triangles.cell).with_faces(triangles.faces)
-    for k in range(3):
-        common = common.clip(a[:, k], b[:, k])
-    overlaps = np.abs(area(triangles.corners)) > AREA_TOLERANCE
-    overlaps &= area(common.corners) > AREA_TOLERANCE
-    common, row_of_cell = common.select(overlaps), row_of_cell[overlaps]
+    # the common part of each pair of a cell and a triangle
+    common = _common_parts(Polygons.cells(triangles.cell), triangles)
+    is_common = np.abs(area(triangles.corners)) > AREA_TOLERANCE
+    is_common &= area(common.corners) > AREA_TOLERANCE
+    common, row_of_cell = common.select(is_common), row_of_cell[is_common]
     # the sum of the parts is the cell's area if triangles cover it without an overlap
     covered = np.bincount(row_of_cell, area(common.corners), len(cells))
     is_partial = np.abs(covered - REFERENCE_AREA) > AREA_TOLERANCE
     if not is_partial.any():
         return common
-    partial_triangles = triangles.select(overlaps).select(is_partial[row_of_cell])
+    # the other cells are cut again; `common_once` counts what several triangles cover once
+    partial_triangles = triangles.select(is_common).select(is_partial[row_of_cell])
     common_once, remainder = _cut_one_by_one(partial_triangles, cells[is_partial])
     # common parts and the rest make the whole cell if no triangles overlap
     uncovered = np.bincount(
         np.searchsorted(cells, remainder.cell), area(remainder.corners), len(cells)
     )
     is_complete = np.abs(covered + uncovered - REFERENCE_AREA) <= AREA_TOLERANCE
-    # where triangles overlap, the later ones count without the earlier ones
+    # only cells in which triangles overlap take the parts of the second cutting
     overlapped = cells[is_partial & ~is_complete]
     without_overlap = common.select(~np.isin(common.cell, overlapped))
-    overlapping = common_once.select(np.isin(common_once.cell, overlapped))
-    return without_overlap.concatenate_with(overlapping).concatenate_with(remainder)
+    with_overlap = common_once.select(np.isin(common_once.cell, overlapped))
+    return without_overlap.concatenate_with(with_overlap).concatenate_with(remainder)
+
+
+def _common_parts(polygons: Polygons, triangles: Polygons) -> Polygons:
+    """Return what each of n polygons has in common with the triangle in the same row.
+
+    The parts face the cells of the triangles. Some may have no area.
+    """
+    common = polygons.with_faces(triangles.faces)
+    a, b = oriented_sides(triangles.corners)
+    for k in range(3):
+        common = common.clip(a[:, k], b[:, k])
+    return common
 
 
 def _cut_one_by_one(triangles: Polygons, cells: Longs) -> tuple[Polygons, Polygons]:
@@ -698,27 +760,29 @@ def _cut_one_by_one(triangles: Polygons, cells: Longs) -> tuple[Polygons, Polygo
     cells
         Numbers of the cells, ascending.
     """
+    # triangles of row k of `cells` are first[k], first[k] + 1, ... as many as the count says
     triangles = triangles.select(np.argsort(triangles.cell, kind="stable"))
     first = np.searchsorted(triangles.cell, cells)
     triangle_count = np.searchsorted(triangles.cell, cells, "right") - first
-    remainder = Polygons.cells(cells)
-    common_parts = remainder.select(np.zeros(0, dtype=np.int64))
+    remainder = Polygons.cells(cells)  # all that is left of the cells: at first whole cells
+    common_parts = remainder.select(np.zeros(0, dtype=np.int64))  # at first none
     # in each round one more triangle of each cell cuts all that is left of the cell
     for triangle_number in range(int(triangle_count.max(initial=0))):
         cell_row = np.searchsorted(cells, remainder.cell)
         has_triangle = triangle_count[cell_row] > triangle_number
         cutting = triangles.select(first[cell_row[has_triangle]] + triangle_number)
-        cut_cells, (a, b) = remainder.select(has_triangle), oriented_sides(cutting.corners)
-        common = cut_cells.with_faces(cutting.faces)
+        cut_polygons = remainder.select(has_triangle)
+        common = _common_parts(cut_polygons, cutting)
+        is_cut = area(common.corners) > AREA_TOLERANCE
+        common_parts = common_parts.concatenate_with(common.select(is_cut))
+        # what no triangle of this round cuts remains as it is
+        remainder = remainder.select(~has_triangle).concatenate_with(cut_polygons.select(~is_cut))
+        # of the others the parts outside the triangle remain: one outside its first side, one
+        # inside that but outside the second, one inside both but outside the third
+        a, b = oriented_sides(cutting.corners[is_cut])
+        inside = cut_polygons.select(is_cut)
         for k in range(3):
-            common = common.clip(a[:, k], b[:, k])
-        overlaps = area(common.corners) > AREA_TOLERANCE
-        common_parts = common_parts.concatenate_with(common.select(overlaps))
-        remainder = remainder.select(~has_triangle).concatenate_with(cut_cells.select(~overlaps))
-        remaining = cut_cells.select(overlaps)
-        # a part outside the first side, a part inside it but outside the second, and so on
-        for k in range(3):
-            outer_part = remaining.clip(b[overlaps, k], a[overlaps, k])
+            outer_part = inside.clip(b[:, k], a[:, k])
             remainder = remainder.concatenate_with(outer_part.with_area())
-            remaining = remaining.clip(a[overlaps, k], b[overlaps, k])
+            inside = inside.clip(a[:, k], b[:, k])
     return common_parts, remainder

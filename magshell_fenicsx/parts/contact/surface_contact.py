@@ -139,6 +139,12 @@ class SurfaceContact(ContactTerm):
     ----------
     cuts
         The number of the cuts at present; 0 stands for those of the undeformed surfaces.
+
+    Private fields keep the last active set: `_at` is its displacement, `_growth` the natural
+    stretch there, and `_points` are the contact points with the present cuts. `_places` and
+    `_joined` have the places in contact, and `_places_left_to_edges` those that do not count.
+    `_cuts` makes and remembers cuts, and `_frozen` is a frozen contact that replaces the search.
+    `_reach` is the largest distance that is looked for.
     """
 
     def __init__(self, pair: Pair, geometry: ContactGeometry, sides: tuple[Flags, Flags]) -> None:
@@ -201,7 +207,8 @@ class SurfaceContact(ContactTerm):
             return cached
         entries = self._entries_by_place_and_offset()
         if self._offsets:  # to derivatives by the displacement alone, on which offsets depend
-            entries = self._offsets.entries(self._at, entries, self._forces()[:, 3])
+            by_offset = self._forces()[:, 3]
+            entries = self._offsets.entries(self._at, entries, by_offset)
         if not self.sample:
             self._cached_entries = places, self.stiffness.value, entries
         return entries
@@ -219,11 +226,13 @@ class SurfaceContact(ContactTerm):
         """
         self._active_set()
         u = self._cuts.displacement(self.cuts.value)
-        # the quotient is the largest thickness of the pair, see `_reach`
+        # the quotient is the largest thickness of the pair, since `_reach` is h plus
+        # (`SEARCH_REACH` - 1) times that
         reach = self._h + PATTERN_REACH * (self._reach - self._h) / (SEARCH_REACH - 1)
         places = self._search.projections_in_cells(
             self._points, u, self._search.places_of_nodes(u), reach
         )
+        # each pair of a point's cell and the cell of its place once
         keys = np.unique(self._pair_keys(places))
         cell, faced_cell = np.divmod(keys, len(self._cells.nodes))
         nodes = np.concatenate([self._cells.nodes[cell], self._cells.nodes[faced_cell]], axis=1)
@@ -256,6 +265,7 @@ class SurfaceContact(ContactTerm):
             return None
         state = self._state()
         weights = EnergyWeights(self._of_copies(global_values(direction)), energy, force)
+        # derivatives in modelled cells or on modelled nodes, summed over all ranks
         if name == "thickness":
             by_thickness = self._comm.allreduce(self._in_modelled(by_factor(state, weights)))
             return field, by_thickness[self._fields.own, :, None]
@@ -265,10 +275,19 @@ class SurfaceContact(ContactTerm):
     def _state(self) -> ContactState:
         """Return the contact at the present state, for derivatives by fields; collective."""
         places, joined_places, penalties = self._active_set()
-        geometry = self._cells, self._r0, self._at, self._offsets, self._points
-        derivatives = self._entries_by_place_and_offset, self._entries, self._geometry
         return ContactState(
-            *geometry, places, joined_places, penalties, self._forces(), *derivatives
+            cells=self._cells,
+            r0=self._r0,
+            u=self._at,
+            offsets=self._offsets,
+            points=self._points,
+            places=places,
+            joined_places=joined_places,
+            penalties=penalties,
+            forces=self._forces(),
+            find_entries_by_place_and_offset=self._entries_by_place_and_offset,
+            find_entries=self._entries,
+            geometry=self._geometry,
         )
 
     def _add(self, b: Array, forces: Array) -> None:
@@ -286,8 +305,9 @@ class SurfaceContact(ContactTerm):
         places, joined_places, (_, slope, curvature) = active_set
         if not len(places.point):
             return no_entries()
-        # the smooth minimum gives each of its places (psi'/e) d,u d,u, with the blur e; products of
-        # different places are in `_entries_of_joints`
+        # derivatives of the penalty for each place. With the blur e the smooth minimum gives joined
+        # places (psi'/e) d,u d,u instead of psi'' d,u d,u; what products of different places add
+        # is in `_entries_of_joints`
         is_blurred = joined_places.several[joined_places.group]
         first = slope[joined_places.group]
         second = np.where(
@@ -295,6 +315,7 @@ class SurfaceContact(ContactTerm):
         )
         # half, since the points of the other surface have the same contact
         weight = joined_places.weight * self._points.weight[places.point] / 2
+        # places in the same pair of cells follow one another
         order = np.argsort(self._pair_keys(places), kind="stable")
         blocks = self._blocks(places.select(order), weight[order], first[order], second[order])
         rows, columns, values = (
@@ -316,10 +337,10 @@ class SurfaceContact(ContactTerm):
         places
             Places ordered by pairs of cells, see `_pair_keys`.
         weight, first, second
-            (n,) weights, and derivatives of the penalty by the penetration.
+            (n,) weights, and first and second derivatives of the penalty by the penetration.
         """
         keys = self._pair_keys(places)
-        starts = np.flatnonzero(np.diff(keys, prepend=-1))
+        starts = np.flatnonzero(np.diff(keys, prepend=-1))  # first row of each pair of cells
         positions = self._search.places_of_nodes(self._at)
         blocks = list[Entries]()
         for starts_of_chunk in np.array_split(starts, max(1, len(keys) // BLOCKS_PER_CHUNK)):
@@ -328,13 +349,14 @@ class SurfaceContact(ContactTerm):
             # a chunk ends where the first pair of cells of the next one begins
             later = starts[np.searchsorted(starts, starts_of_chunk[-1]) + 1 :]
             chunk = slice(starts_of_chunk[0], later[0] if len(later) else len(keys))
+            # a Hessian for each place of the chunk
             chunk_places = places.select(chunk)
             geometry = self._geometry(chunk_places)
             *_, nodes = geometry
             penalties = weight[chunk], first[chunk], second[chunk]
             H = gap_hessians(self._cells, chunk_places, geometry, positions, penalties)
+            # their sum for each pair of cells, and the unknowns of its rows and columns
             begins = starts_of_chunk - starts_of_chunk[0]
-            # one block for each pair of cells
             sums = np.add.reduceat(H, begins, axis=0)
             dofs = unknown_numbers(nodes[begins], len(self._r0), self._components)
             i, j = np.broadcast_arrays(dofs[:, :, None], dofs[:, None, :])
@@ -448,8 +470,9 @@ class SurfaceContact(ContactTerm):
         places, joined_places, (_, slope, _) = self._active_set()
         points, (first_cell, count) = self._points, self._local_cells
         nearest = places.select(joined_places.first)
-        _, normals = self._cuts.points(self.cuts.value, self._displacement())
-        # half of the force of an edge acts on the cell that it faces, maybe on another rank
+        _, normals = self._cuts.points(self.cuts.value, self._displacement())  # of cells at cuts
+        # half of the force of an edge alone acts on the cell that it faces; this cell may be on
+        # another rank, so its forces are summed over all ranks
         is_edge_alone = self._search.are_edges_alone(points, nearest, normals)
         force = points.weight[nearest.point] * slope  # in full: the mean pressure of this face
         force_of_edges = np.bincount(
@@ -457,24 +480,27 @@ class SurfaceContact(ContactTerm):
         )
         force_on_modelled = self._in_modelled(force_of_edges.astype(np.float64)[:, None])[:, 0]
         force_on_faced = self._comm.allreduce(force_on_modelled)[self._fields.own]
-        # an area of one for cells without points, which are ghosts and follow the own cells
-        area, pressure = np.ones(count), np.zeros(count)
-        np.add.at(area, points.cell - first_cell, points.weight)
+        # local numbers of the points' cells: own cells come first, then ghosts, without points
+        local_cell = points.cell - first_cell
+        # the area of each cell; one of ghosts, as a divisor
+        area = np.ones(count)
+        np.add.at(area, local_cell, points.weight)
         area[: len(np.unique(points.cell))] -= 1.0
-        pressure[: len(force_on_faced)] = force_on_faced
-        own_share = force * (1 - is_edge_alone / 2)
-        np.add.at(pressure, points.cell[nearest.point] - first_cell, own_share)
+        # the forces on each cell: from edges that it faces, and of its own points
+        force_on_cells = np.zeros(count)
+        force_on_cells[: len(force_on_faced)] = force_on_faced
+        own_force = force * (1 - is_edge_alone / 2)
+        np.add.at(force_on_cells, local_cell[nearest.point], own_force)
+        # the least gap in each cell
         gap = np.full(count, self._reach - self._h)
         near_places = self._search.projections(
             self._displacement(), self._reach, points, least_only=True
         )
-        np.minimum.at(
-            gap, points.cell[near_places.point] - first_cell, near_places.distance - self._h
-        )
+        np.minimum.at(gap, local_cell[near_places.point], near_places.distance - self._h)
+        # the area that belongs to the points in contact
         pressed_area, pressed_points = np.zeros(count), np.unique(nearest.point)
-        pressed_cells = points.cell[pressed_points] - first_cell
-        np.add.at(pressed_area, pressed_cells, points.weight[pressed_points])
-        return pressure / area, gap, pressed_area > FULL_CONTACT_SHARE * area
+        np.add.at(pressed_area, local_cell[pressed_points], points.weight[pressed_points])
+        return force_on_cells / area, gap, pressed_area > FULL_CONTACT_SHARE * area
 
     def halves(self) -> tuple[Array, Array]:
         """Return half the thickness (nodes,) over R, undeformed and at present; collective."""
@@ -569,18 +595,19 @@ class SurfaceContact(ContactTerm):
             motion = np.column_stack([motion, self._offsets.change(self._at, motion)])
         _, n, beta, nodes = self._geometry(places)
         slopes = distance_slopes(n, beta, self._components)
-        # increase of the penetration over the step, of each place and then of each joined place
-        closing = -np.einsum("nki,nki->n", slopes, motion[nodes])
+        # increase of the penetration over the step: of each place, then the weighted mean of the
+        # places that are joined
+        closing_of_places = -np.einsum("nki,nki->n", slopes, motion[nodes])
         closing = np.bincount(
-            joined_places.group, joined_places.weight * closing, len(joined_places.first)
+            joined_places.group, joined_places.weight * closing_of_places, len(joined_places.first)
         )
         return SampleRates.sum_over_points(
-            len(self._points.weight),
-            places.point[joined_places.first],
-            self._h - joined_places.distance,
-            closing,
-            self.stiffness.value,
-            SOFT_PENETRATION * self._h,
+            count=len(self._points.weight),
+            point=places.point[joined_places.first],
+            penetration=self._h - joined_places.distance,
+            closing=closing,
+            k=self.stiffness.value,
+            soft_penetration=SOFT_PENETRATION * self._h,
         )
 
     # the cuts of cells
@@ -595,7 +622,10 @@ class SurfaceContact(ContactTerm):
         """
         u = self._displacement()
         places, *_ = self._active_set()
-        normals, left_places = self._segments.normals(self._r0 + u), self._places_left_to_edges
+        left_places = self._places_left_to_edges
+        # what would count if steepness were judged by the present normals, not those of the cuts:
+        # some places would no more, and some that are left to edges would
+        normals = self._segments.normals(self._r0 + u)
         is_left = self._search.are_left_to_edges(self._points, places, normals)
         stays_left = self._search.are_left_to_edges(self._points, left_places, normals)
         changed_force = self._force(self._points, places.select(is_left))
@@ -603,15 +633,16 @@ class SurfaceContact(ContactTerm):
         astray = self._astray_share(self._points, places, changed_force)
         if astray <= MAX_ASTRAY_FORCE:
             return None
+        # new cuts here are better if they at least halve the share
         points, counted = self._with_cuts_at(u, self._divisions)
-        # only cuts count that at least halve the share
         is_better = self._astray_share(points, counted) < astray / 2
         return self._cuts.number_of_displacement(u, self._divisions) if is_better else None
 
     def finer_cuts(self) -> float | None:
-        """Return the number of cuts here whose triangles in contact are divided once more.
+        """Return the number of cuts at the present displacement, divided once more; collective.
 
-        It is None without contact, and after `MAX_DIVISIONS`. Collective.
+        Triangles in contact are then divided once more than at present. The result is None without
+        contact, and after `MAX_DIVISIONS`.
         """
         u, divisions = self._displacement(), self._divisions
         places, *_ = self._active_set()
@@ -652,10 +683,11 @@ class SurfaceContact(ContactTerm):
     def _astray_share(
         self, points: ContactPoints, places: Projections, changed: float = 0.0
     ) -> float:
-        """Return the share of the force, from 0 to 1, on points that went astray; collective.
+        """Return the share of the force on points that went astray; collective.
 
         They face another cell than where the cuts were made, or their triangle is divided less
-        often than those in the zone of contact.
+        often than those in the zone of contact. Without any force on counted places the share is 1
+        if some force is astray, else 0.
 
         Parameters
         ----------
@@ -745,6 +777,7 @@ class SurfaceContact(ContactTerm):
         state, or at the sample of a step. They are cached while the state stays. Collective.
         """
         soft_penetration = SOFT_PENETRATION * self._h
+        # a frozen contact replaces the search
         if self._frozen:
             self._at, self._points = np.array(self._displacement()), self._frozen.points
             # a held contact serves differences of tangents, which need the third order
@@ -752,6 +785,7 @@ class SurfaceContact(ContactTerm):
             return self._frozen.evaluate(
                 self._search, self._at, self.stiffness.value, self._h, with_third_order=is_held
             )
+        # the places are found again where the displacement, the growth or the cuts have changed
         u, growth = self._displacement(), self._offsets.growth if self._offsets else 0.0
         points, normals = self._cuts.points(self.cuts.value, u)
         has_moved = growth != self._growth or not np.array_equal(u, self._at)
@@ -761,12 +795,14 @@ class SurfaceContact(ContactTerm):
             self._places, self._places_left_to_edges, self._joined = self._active_sets.get(
                 (u, self.cuts.value, growth), lambda: self._find_places(points, normals, u)
             )
+        # the penalty also changes with the stiffness, and with the sample of a step in time
         joined_places = self._joined
         penalties = penalty(
             self._h - joined_places.distance, self.stiffness.value, soft_penetration
         )
         if self.sample:
-            penalties = self.sample.weigh(self._places.point[joined_places.first], penalties)
+            point_of_joined = self._places.point[joined_places.first]
+            penalties = self.sample.weigh(point_of_joined, penalties)
         return self._places, joined_places, penalties
 
     def _find_places(

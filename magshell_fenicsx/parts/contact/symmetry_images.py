@@ -104,9 +104,10 @@ class Images:
         """
         images = [image.apply(x[on_planes]) for image in self.images]
         tolerance = SAME_PLACE_TOLERANCE * np.ptp(x, axis=0).max()
+        # at first place i of copy k has the number k n + i
         numbers = np.arange(len(self.images) * len(x)).reshape(-1, len(x))
         for k, places in enumerate(images):
-            # the first copy comes last, so that its number counts where several coincide
+            # the first of all copies is compared last: its number stays where several coincide
             for earlier in range(k - 1, -1, -1):
                 is_same = np.linalg.norm(places - images[earlier], axis=1) < tolerance
                 numbers[k, on_planes[is_same]] = numbers[earlier, on_planes[is_same]]

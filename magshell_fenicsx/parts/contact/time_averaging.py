@@ -133,7 +133,10 @@ class SampleRates:
 
 
 class SampleCache(Generic[Value]):
-    """A cache of values at the samples of the last step, as many as Simpson's rule has points."""
+    """A cache of values at the samples of the last step, as many as Simpson's rule has points.
+
+    The field `_samples` has pairs of a state and its value. The next one to be dropped comes first.
+    """
 
     def __init__(self) -> None:
         self._samples = list[tuple[Sequence[Any], Value]]()
@@ -154,7 +157,7 @@ class SampleCache(Generic[Value]):
                 self._samples.append(self._samples.pop(i))
                 return value
         value = compute()
-        # the oldest value makes room
+        # two values stay, one less than the rule has points, and the new one comes after them
         copied_state = [np.array(item) for item in state]
         self._samples = [*self._samples[1 - len(SIMPSON_RULE) :], (copied_state, value)]
         return value
@@ -212,50 +215,53 @@ def samples_of_step(
     part
         Position within the step, from 0 to 1, at which the system takes its forces.
     """
-    ends = [begin + position * (end - begin) for position, _ in SIMPSON_RULE]
+    # the penalty of each point at the begin, in the middle and at the end of the way
+    displacements = [begin + position * (end - begin) for position, _ in SIMPSON_RULE]
     rates = list[SampleRates]()
-    for u in ends:
+    for u in displacements:
         contact.sample = StepSample(u)  # without factors
         rates.append(contact.sample_rates(end - begin))
     contact.sample = None
-    positions, weights = np.transpose(SIMPSON_RULE)
     # work of Simpson's mean force, and its derivative by the end of the way
+    positions, weights = np.transpose(SIMPSON_RULE)
     work = weights @ [sample_rates.rate for sample_rates in rates]
     curvature = (positions * weights) @ [sample_rates.curvature for sample_rates in rates]
+    # what both are to be at points that pass a kink, and the factors that make them so
     is_kink = np.any(
         [earlier.segment != later.segment for earlier, later in pairwise(rates)], axis=0
     )
     energy_change = rates[-1].value - rates[0].value
-    # targets: the change of energy, and the derivative of the mean force by the end
-    end_slope, off_middle = rates[-1].rate - energy_change, part - 0.5
+    end_slope = rates[-1].rate - energy_change
     force_factor = _factor(energy_change, work, is_kink)
     slope_factor = _factor(end_slope, curvature, is_kink)
-    # of a point that opens the force depends on the end of the way by the length of the way alone
+    # a point that opens has no contact in the middle and at the end. Its force depends on the end
+    # of the way only by the length of the way; the sample at the begin has this derivative
     is_opening = is_kink & (curvature == 0)
     opening_factor = (
         np.where(is_opening, _factor(end_slope, rates[0].curvature, is_kink), 0.0) / part
     )
+    off_middle = part - 0.5
     samples = list[StepSample]()
-    for u, (position, weight) in zip(ends, SIMPSON_RULE, strict=True):
-        # the dissipative force is at the end less that at the begin; the middle has none
+    for u, (position, weight) in zip(displacements, SIMPSON_RULE, strict=True):
+        # the dissipative force is that at the end less that at the begin; the middle has none
         dissipative = {0.0: -off_middle, 1.0: off_middle}.get(position, 0.0)
         slope = position * (weight * force_factor + dissipative) / part
         second = position * (weight * slope_factor + dissipative) / part
         samples.append(
             StepSample(
                 u,
-                np.asarray(weight * force_factor + dissipative),
-                np.asarray(second if position else opening_factor),
-                np.asarray(slope),
+                first=np.asarray(weight * force_factor + dissipative),
+                second=np.asarray(second if position else opening_factor),
+                slope=np.asarray(slope),
             )
         )
     return samples
 
 
 def _factor(target: Array, computed: Array, is_kink: Flags) -> Array:
-    """Return factors (points,) with which computed numbers are the target at points with a kink.
+    """Return factors (points,): at points with a kink the factor times `computed` is the target.
 
-    They are 1 elsewhere, and where the computed number is zero. Factors are limited to 0 and
+    Elsewhere, and where the computed number is zero, the factor is 1. It is at least 0 and at most
     `MAX_FACTOR`, for computed numbers that nearly vanish.
     """
     is_changed = is_kink & (computed != 0)
@@ -309,6 +315,10 @@ class ContactTerm:
         The two members, and the name of the term, which is also that of its group.
     amplitude, column
         None and "": no load parameter multiplies the energy, which has no column in results.
+
+    The field `_at` is the displacement of the last active set. `_fields` are the fields of the case
+    on which gaps depend, and `_offsets` is half the thickness at nodes; None where it is h/2.
+    `_frozen` is the frozen contact that replaces the search, if there is one.
     """
 
     amplitude = None

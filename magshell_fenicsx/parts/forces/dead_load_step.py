@@ -72,11 +72,9 @@ def _or_formula(unit: str) -> Any:
         if isinstance(value, str) and is_formula(value):
             return value
         number = in_units(unit)(value)
-        if (
-            isinstance(number, bool)
-            or not isinstance(number, int | float)
-            or not abs(number) <= MAX_COMPONENT
-        ):
+        is_number = isinstance(number, int | float) and not isinstance(number, bool)
+        # `not <=` also refuses nan
+        if not is_number or not abs(number) <= MAX_COMPONENT:
             raise ValueError(
                 f"{value!r}: allowed are numbers up to {MAX_COMPONENT:g} in size, with a unit, "
                 "and formulas"
@@ -140,6 +138,7 @@ class DeadLoadSection(Section):
                 "a load is at a point, on an edge, or on a part of the surface: give one of at, "
                 "edge, over"
             )
+        # one quantity, and one that goes with the place
         quantities = {key for keys in quantities_of_place.values() for key in keys}
         given_keys = sorted(key for key in quantities if getattr(self, key) is not None)
         if len(given_keys) != 1 or given_keys[0] not in quantities_of_place[places[0]]:
@@ -239,8 +238,8 @@ class DeadSection(PathStep):
     def warning(self, step: ProgrammeStep, outline: "Outline", length: float) -> str | None:
         """Return a warning that a pressure by formula keeps its direction, unlike that of a fluid.
 
-        Components along the normals of a curved surface are such a pressure. None without such a
-        load.
+        Formulas of components are such a pressure too if they are along the normals of a curved
+        surface. Without such a load the result is None.
 
         Parameters
         ----------
@@ -256,6 +255,7 @@ class DeadSection(PathStep):
                 key = "per_area"
             else:
                 continue
+            # one warning for all such loads: the first of them is named
             return (
                 f"{step.key}.loads.{i}.{key}: dead: per undeformed area, fixed to the material and "
                 "along the undeformed normal; a live one, as of a fluid, turns with the surface (a "
@@ -285,7 +285,7 @@ class DeadSection(PathStep):
         Loads along e3, on the axis or all around it, preserve rotations about e3. A mirror plane
         must map the loads to each other.
         """
-        length, meridian = context.shell.reference, outline.meridian
+        length = context.shell.reference
         constant_loads = [load for load in self.loads if not load.varies]
         # vectors and places that a mirror plane must contain
         forces = [
@@ -296,22 +296,10 @@ class DeadSection(PathStep):
         ]
         places = [np.array(context.points[load.at]) / length for load in self.loads if load.at]
         vectors = [unit(v) for v in (*forces, *places)]
+        # only formulas are compared at sampled places
         potentials = [load.potential for load in self.loads if load.potential]
-        sampled_places = (
-            outline.sample()
-            if potentials or len(constant_loads) < len(self.loads)
-            else np.zeros((0, 3))
-        )
-        # parts that are the same all around e3: all, and each shell of several on meridians
-        all_patches = {
-            None,
-            "all",
-            *(
-                shell_meridian.name
-                for shell_meridian in (meridian.shell_meridians if meridian else ())
-            ),
-        }
-        has_patches = any(load.over not in all_patches for load in self.loads)
+        has_formulas = potentials or len(constant_loads) < len(self.loads)
+        sampled_places = outline.sample() if has_formulas else np.zeros((0, 3))
 
         def mirrors(mirror: Mirror) -> bool:
             """Return whether a mirror plane maps the loads to each other."""
@@ -324,20 +312,7 @@ class DeadSection(PathStep):
                 for a in self.loads
             )
 
-        # why rotations about e3 are not preserved; None if they are
-        reason = "a patch is loaded" if has_patches else None
-        if any(tilted(v) for v in vectors):
-            reason = "a load is not along e3, or off the axis"
-        is_axisymmetric = (
-            all(load_turns(load, meridian, length) for load in self.loads if load.varies)
-            if meridian
-            else True
-        )
-        if meridian and not (
-            is_axisymmetric
-            and all(scalar_is_axisymmetric(text, meridian, length) for text in potentials)
-        ):
-            reason = reason or "a load differs around e3"
+        reason = self._reason_against_turns(vectors, outline.meridian, length)
         # each potential finds its symmetry by itself, as an energy of the case's frame
         energies = [
             potential(f"potential_{i}", text, np.eye(3), context.scales)
@@ -347,6 +322,37 @@ class DeadSection(PathStep):
             SymmetryConstraint(reason, vectors, mirrors),
             *(energy.symmetry_constraint(outline) for energy in energies),
         ]
+
+    def _reason_against_turns(
+        self, vectors: Sequence[Array], meridian: MeridianChart | None, length: float
+    ) -> str | None:
+        """Return why the loads do not preserve rotations about e3; None if they do.
+
+        Parameters
+        ----------
+        vectors
+            Unit vectors of the constant loads, and directions to loaded points.
+        meridian
+            The meridian of a shell of revolution; None of other shells.
+        length
+            Length R in the unit of the formulas' places.
+        """
+        # formulas are looked at on a meridian alone
+        is_axisymmetric = not meridian or (
+            all(load_turns(load, meridian, length) for load in self.loads if load.varies)
+            and all(
+                scalar_is_axisymmetric(load.potential, meridian, length)
+                for load in self.loads
+                if load.potential
+            )
+        )
+        if any(tilted(v) for v in vectors):
+            return "a load is not along e3, or off the axis"
+        # parts that are the same all around e3: all, and each shell of several on meridians
+        shell_names = [shell.name for shell in meridian.shell_meridians] if meridian else []
+        if any(load.over not in (None, "all", *shell_names) for load in self.loads):
+            return "a patch is loaded"
+        return None if is_axisymmetric else "a load differs around e3"
 
     def named_points(self) -> list[str]:
         return [load.at for load in self.loads if load.at]
@@ -383,10 +389,9 @@ class DeadSection(PathStep):
             for name in ("per_length", "per_area", "pressure"):
                 value = getattr(load, name)
                 values = value if isinstance(value, list) else [value]
-                # a load of the model, per E h and per E h/R, in the case's units
-                largest = MAX_COMPONENT * (
-                    scales.E * scales.h / (scales.R if name != "per_length" else 1.0)
-                )
+                # the model's largest load in the case's units: of E h on an edge, else of E h/R
+                divisor = scales.R if name != "per_length" else 1.0
+                largest = MAX_COMPONENT * (scales.E * scales.h / divisor)
                 yield Formulas(
                     f"{key}.loads.{i}.{name}", values, -largest, largest, scales.R, load=True
                 )
@@ -469,6 +474,7 @@ def is_image(
     """
     if load.varies or other.varies:  # values of formulas are compared at places
         return _mirrored_formula(load, other, mirror, R * x, R * mirror.image(x))
+    # what has no direction must be the same, and edges must be images of each other
     edge = load.edge and mirror.image_of_edge(load.edge)
     if (edge, load.at, load.over, load.moment, load.pressure, load.potential is None) != (
         other.edge,
@@ -479,16 +485,15 @@ def is_image(
         other.potential is None,
     ):
         return False
-    for vector, other_vector in (
-        (getattr(x, key) for x in (load, other)) for key in ("force", "per_length", "per_area")
-    ):
+    # vectors must be images of each other, to rounding
+    for key in ("force", "per_length", "per_area"):
+        vector, other_vector = getattr(load, key), getattr(other, key)
         if (vector is None) != (other_vector is None):
             return False
-        # to rounding
-        if vector and np.abs(
-            mirror.reflection @ vector - other_vector
-        ).max() > 1e-10 * np.linalg.norm(vector):
-            return False
+        if vector:
+            difference = np.abs(mirror.reflection @ vector - other_vector).max()
+            if difference > 1e-10 * np.linalg.norm(vector):
+                return False
     return True
 
 
@@ -505,21 +510,16 @@ def _mirrored_formula(
     edge = load.edge and mirror.image_of_edge(load.edge)
     if (edge, load.over, load.vector is None) != (other.edge, other.over, other.vector is None):
         return False
-    values_at_places, values_at_images = (
-        np.stack(
-            [
-                formula_function(v)(*places.T)
-                for v in (one_load.vector or [one_load.pressure or 0.0])
-            ],
-            axis=-1,
-        )
-        for one_load, places in ((load, x), (other, image))
-    )
+    values, image_values = _values_at(load, x), _values_at(other, image)
     # a pressure has no direction to reflect
-    return equal_to_rounding(
-        values_at_places if load.vector is None else values_at_places @ mirror.reflection,
-        values_at_images,
-    )
+    mirrored_values = values if load.vector is None else values @ mirror.reflection
+    return equal_to_rounding(mirrored_values, image_values)
+
+
+def _values_at(load: DeadLoadSection, places: Array) -> Array:
+    """Return the components (n, 3) of a load at places (n, 3), or its pressure (n, 1)."""
+    components = load.vector or [load.pressure or 0.0]
+    return np.stack([formula_function(v)(*places.T) for v in components], axis=-1)
 
 
 def potential(name: str, text: str, Q: Array, scales: Scales) -> OwnTerm:
@@ -541,14 +541,14 @@ def potential(name: str, text: str, Q: Array, scales: Scales) -> OwnTerm:
     """
 
     def energy_at(r: "Expr", scale: "Expr", energy_scale: "Expr") -> "Expr":
-        # coordinates in the case's frame and unit, of a place r over R in the model's frame
+        # x = R Q^T r: coordinates in the case's frame and unit, of a place r in the model's frame
         x = [scale * sum(float(Q[j, i]) * r[j] for j in range(3) if Q[j, i]) for i in range(3)]
         return energy_scale * symbolic(text, symbolic_functions(), *x)
 
     def density(r0: Jet, u: Jet, scale: "Expr", energy_scale: "Expr") -> "Expr":
         return energy_at(r0.r + u.r, scale, energy_scale) - energy_at(r0.r, scale, energy_scale)
 
-    # numbers as parameters of the density: other values of them need no new kernel
+    # `scale` and `energy_scale` are parameters of the density: other values need no new kernel
     return OwnTerm(name, density, parameters=(scales.R, 1 / (scales.E * scales.h)))
 
 

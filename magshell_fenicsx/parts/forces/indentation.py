@@ -122,6 +122,7 @@ class IndentationSection(PathStep):
         at, geometry, key = self.at, context.shell.geometry, step.key
         if at.point is not None:
             return np.asarray(np.array(context.points[at.point]) / context.shell.reference)
+        # of shells that are no spheres only the pole, centre or tip is a direction
         polar = radians(at.polar)
         if not outline.sphere and polar:
             allowed_places = "at its centre or tip, polar: 0, or at a point of points"
@@ -137,7 +138,8 @@ class IndentationSection(PathStep):
             raise CaseError(
                 f"{key}.at.polar: {at.polar:g}: 0, or more than a thickness from the pole"
             )
-        # 1e-300: at the pole itself, where the azimuth has no meaning, the quotient is zero
+        # in the chart: the polar angle along the azimuth. 1e-300 is for the pole itself, where the
+        # azimuth has no meaning: the quotient is zero
         chart = polar * at.vector()[:2] / max(np.hypot(*at.vector()[:2]), 1e-300)
         return np.asarray(outline.embedding(chart[None])[0])
 
@@ -166,7 +168,8 @@ class IndentationSection(PathStep):
         CaseError
             With the radii that are allowed, over h.
         """
-        # lengths are over R; but on a sphere the edge is taken to be 1 away, or a strip's width
+        # over R: on a sphere it is known; elsewhere the edge is taken to be 1 away, of a strip its
+        # width if that is less
         width = getattr(context.shell, "width", None) if context.shell.geometry == "strip" else None
         distance_to_edge = (
             outline.edge - float(np.hypot(*chart_place[:2]))
@@ -199,7 +202,7 @@ class IndentationSection(PathStep):
         # the smallest patch and the largest dent; ten thicknesses are assumed without a depth
         patch = min(load.patch for load in loads)
         depth = max(abs(load.depth) if load.depth else 10.0 for load in loads)
-        # the ridge's radius times a factor by experience, and a margin
+        # the radius of the dent: the ridge's radius times a factor by experience, and a margin
         dent = (1.0 if sizing.solid else 0.85) * sqrt(2 * depth * h) + 0.5 * sqrt(h)
         growth = loads[0].growth(sizing)
         # finer than h the point force's logarithmic stretch would be resolved, which has no limit

@@ -143,17 +143,22 @@ def averaged(
         On every rank, if the mesh is too coarse for the patch.
     """
     weight_integral = measure.total(V, log, "patch weight")
-    # pi radius^2/3 is the integral of `smooth` on a plane
-    if (
-        radius is not None
-        and not MIN_PATCH_SHARE <= weight_integral / (np.pi * radius**2 / 3) <= 1 / MIN_PATCH_SHARE
-    ):
+    if radius is not None and not _is_resolved(weight_integral, radius):
         raise MeshError(
             f"loading.patch: its radius is {radius:.3g} R, which the mesh is too coarse for: "
             "choose a smaller mesh.size, or 0 for a force at a point"
         )
     dofs, values = load_entries(V, fem.Constant(V.mesh, direction), measure, log, "patch load")
     return dofs, np.asarray(values / weight_integral)
+
+
+def _is_resolved(weight_integral: float, radius: float) -> bool:
+    """Return whether the integral of a `smooth` weight is about that on a plane.
+
+    On a plane it is pi radius^2/3; a share of that is allowed, see `MIN_PATCH_SHARE`.
+    """
+    share = weight_integral / (np.pi * radius**2 / 3)
+    return bool(MIN_PATCH_SHARE <= share <= 1 / MIN_PATCH_SHARE)
 
 
 def point_entries(
@@ -268,10 +273,11 @@ def by_vertex_normal(r0: fem.Function, x: Array, v: Array, cells: Inside | None 
         np.cross(a1[is_at_vertex], a2[is_at_vertex]).sum(axis=0)
     )
     area = np.linalg.norm(area_vector)
-    # n = t/|t| of the sum t of area vectors: v . n has the gradient p by t
+    # n is t/|t|, with the sum t of area vectors a1 x a2; v . n has the gradient p by t
     p = (v - area_vector * (area_vector @ v) / area**2) / area
     # p . (a1 x a2) has the gradients a2 x p by a1, and p x a1 by a2
     by_tangents = np.stack([np.cross(a2, p), np.cross(p, a1)]) * is_at_vertex[..., None]
+    # by nodes k: sums over both tangents d and all corners v of cell c
     return np.asarray(np.einsum("dvk,dcvi->cki", table, by_tangents))
 
 
@@ -292,10 +298,11 @@ def _corners(r0: fem.Function, x: Array, cells: Inside | None) -> tuple[Array, I
     gradients = V.element.basix_element.tabulate(1, corners)[1:, :, :, 0]
     owned = V.mesh.topology.index_map(2).size_local
     nodes = r0.x.array.reshape(-1, 3)[V.dofmap.list[:owned]]
-    is_at_vertex = (
-        np.linalg.norm(V.mesh.geometry.x[compat.geometry_dofs(V.mesh)[:owned]] - x, axis=2) < 1e-9
-    )
-    is_at_vertex = is_at_vertex if cells is None else is_at_vertex & cells[:owned, None]
+    # corners in the mesh's geometry
+    corner_places = V.mesh.geometry.x[compat.geometry_dofs(V.mesh)[:owned]]
+    is_at_vertex = np.linalg.norm(corner_places - x, axis=2) < 1e-9
+    if cells is not None:
+        is_at_vertex = is_at_vertex & cells[:owned, None]
     return gradients, is_at_vertex, np.einsum("dvk,cki->dcvi", gradients, nodes)
 
 
@@ -315,12 +322,14 @@ def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Mode
         The case around the load, and the part of the shell that is modelled.
     """
     mirror = modelled.mirror
-    # not an edge with an image of its own: each copy has a part of the load
+    # the copies share a force, but not on an edge whose image is another edge: there each copy has
+    # a force of its own
     is_shared = mirror is not None and (
         load.edge is None or mirror.image_of_edge(load.edge) == load.edge
     )
     Q, scales = rotation(modelled.turn), context.scales
     E, thickness, R = scales.E, scales.h, scales.R
+    # loads by formula: of the deformed place, or of the undeformed one
     if load.potential is not None:
         return Potential(potential(name, load.potential, Q, scales))
     if load.varies:
@@ -331,12 +340,9 @@ def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Mode
             if load.edge
             else AreaForce(_patch_of_load(load), pattern)
         )
-    # only of a load with `force`; else zero, and not used
-    force = np.asarray(
-        (1 / mirror.copies if mirror and is_shared else 1.0)
-        * (Q @ (load.force or np.zeros(3)))
-        / (E * thickness * R)
-    )
+    # at a point or on an edge: only a load with `force` has it, else it is zero and not used
+    share = 1 / mirror.copies if mirror and is_shared else 1.0
+    force = np.asarray(share * (Q @ (load.force or np.zeros(3))) / (E * thickness * R))
     if load.at is not None:
         return PointForce(load.at, force)
     if load.edge is not None and load.moment is not None:
@@ -345,19 +351,15 @@ def dead_load(load: DeadLoadSection, name: str, context: Context, modelled: Mode
         return EdgeForce(load.edge, force, total=True)
     if load.edge is not None:
         assert load.per_length is not None
-        return EdgeForce(
-            load.edge,
-            np.asarray(Q @ np.array(load.per_length, dtype=float) / (E * thickness)),
-            total=False,
-        )
+        per_length = np.asarray(Q @ np.array(load.per_length, dtype=float) / (E * thickness))
+        return EdgeForce(load.edge, per_length, total=False)
+    # over the surface
     if load.pressure is not None:
         assert isinstance(load.pressure, float | int)
         return AreaForce(_patch_of_load(load), load.pressure * R / (E * thickness))
     assert load.per_area is not None
-    return AreaForce(
-        _patch_of_load(load),
-        np.asarray(Q @ np.array(load.per_area, dtype=float) * R / (E * thickness)),
-    )
+    per_area = np.asarray(Q @ np.array(load.per_area, dtype=float) * R / (E * thickness))
+    return AreaForce(_patch_of_load(load), per_area)
 
 
 def _patch_of_load(load: DeadLoadSection) -> str | None:
@@ -388,7 +390,11 @@ def _pattern(load: DeadLoadSection, Q: Array, length: float, factor: float) -> P
 
 
 def account(context: Context, loads: Loads) -> Account:
-    """Return the lines of `magshell check` on forces and dead loads."""
+    """Return the lines of `magshell check` on forces and dead loads.
+
+    Without forces it lists them as left out.
+    """
+    # radii over h
     patches = [force.patch * context.shell.R_over_h for force in loads.forces.values()]
     lines = [
         f"force on a patch of radius {patch:g} h" if patch else "force at a point"
@@ -396,7 +402,7 @@ def account(context: Context, loads: Loads) -> Account:
     ]
     if dead := loads.all_dead:
         lines.append(f"{len(dead)} dead load{'s' * (len(dead) > 1)}")
-    return Account(lines, [] if loads.forces else ["force: none"])
+    return Account(lines, left_out=[] if loads.forces else ["force: none"])
 
 
 class Measures(Protocol):
@@ -593,12 +599,8 @@ class SurfaceMeasures:
 
     def __init__(self, r0: fem.Function, midsurface: Midsurface, degree: int) -> None:
         """Take the undeformed placement, whose jet gives normals and areas."""
-        self._V, self._midsurface, self._degree, self._r0 = (
-            r0.function_space,
-            midsurface,
-            degree,
-            r0,
-        )
+        self._V, self._r0 = r0.function_space, r0
+        self._midsurface, self._degree = midsurface, degree
         self._j0 = kin.jet(r0, midsurface.mesh)
         self.normal = kin.normal(self._j0)
 

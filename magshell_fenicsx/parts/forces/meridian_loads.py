@@ -76,7 +76,7 @@ class RevolutionIntegrals:
         return replace(self, parts=parts, measures=self.domain.measures_on(parts) if parts else [])
 
     def _ds(self, facets: Facets) -> ufl.Measure:
-        """Return the measure of facets: of the part that has them, else one of their own."""
+        """Return the measure of facets: that of the part with them, or else one of their own."""
         pairs = zip(self.parts, self.measures, strict=True)
         return next(
             (ds for part, ds in pairs if np.array_equal(part, facets)), None
@@ -109,10 +109,8 @@ class RevolutionIntegrals:
         d is the distance from a named point on the axis.
         """
         parameter = np.array([self.meridian.points[point][0]])  # along the meridian
-        a, pole = (
-            self.domain.constant(radius),
-            self.domain.constant(self.meridian.section(parameter)[0]),
-        )
+        a = self.domain.constant(radius)
+        pole = self.domain.constant(self.meridian.section(parameter)[0])
         depth = 1 - ufl.dot(self.domain.r0 - pole, self.domain.r0 - pole) / a**2
         weight, integral = ufl.conditional(ufl.gt(depth, 0), depth**2, 0), self.domain.over_area()
         return lambda f: integral(weight * f)
@@ -134,41 +132,38 @@ def dead_loads(
     loads
         The dead loads, of which moments and potentials are passed over.
     """
-    terms, size, sizes, integrals = (
-        list[tuple[Expr, Integral]](),
-        0.0,
-        list[ufl.Form](),
-        integrals.with_parts(loads),
-    )
+    integrals = integrals.with_parts(loads)
+    domain = integrals.domain
+    # density and integral of each load, the sum of sizes, and forms of the sizes
+    terms, size, sizes = list[tuple[Expr, Integral]](), 0.0, list[ufl.Form]()
     for load in forces(loads):
-        if isinstance(load, PointForce):
-            integral = integrals.pole(load.point)
-        elif isinstance(load, EdgeForce):
-            integral = integrals.end(load.edge, mean=load.total)
-        else:
-            integral = integrals.area(load)
-        if not isinstance(load, PointForce) and callable(load.force):  # a pattern
-            direction, total = pattern_field(load.force, integrals.domain.r0, ADDED_LOAD_DEGREE)
+        integral = _integral_of_load(load, integrals)
+        # a pattern: the size is the integral of the density's length
+        if not isinstance(load, PointForce) and callable(load.force):
+            direction, known_size = pattern_field(load.force, domain.r0, ADDED_LOAD_DEGREE)
             terms.append((direction, integral))
+            density_length = ufl.sqrt(ufl.dot(direction, direction))
             # the pattern's own integral is over all of the surface
-            is_known = total is not None and isinstance(load, AreaForce) and load.patch is None
-            density = ufl.sqrt(ufl.dot(direction, direction))
-            size += total if is_known and total is not None else _integral(density, integral, log)
-            sizes.append(2 * np.pi * integral(density))
-            continue
-        # length, area, or 1 of a total force and of a point
-        total = _circumferential_integral(integral, integrals, log)
-        if isinstance(load, AreaForce) and isinstance(load.force, float):
-            direction, strength = (
-                -kin.normal(integrals.domain.j0) * integrals.domain.constant(load.force),
-                abs(load.force),
+            is_everywhere = isinstance(load, AreaForce) and load.patch is None
+            size += (
+                known_size
+                if known_size is not None and is_everywhere
+                else _integral(density_length, integral, log)
             )
+            sizes.append(2 * np.pi * integral(density_length))
+            continue
+        # else the size is the density's length times a measure: the length of an end, an area, or 1
+        # of a total force and of a point
+        measure = _circumferential_integral(integral, integrals, log)
+        if isinstance(load, AreaForce) and isinstance(load.force, float):  # a pressure
+            direction = -kin.normal(domain.j0) * domain.constant(load.force)
+            strength = abs(load.force)
         else:
             vector = np.asarray(load.force)
-            direction, strength = integrals.domain.constant(vector), float(np.linalg.norm(vector))
+            direction, strength = domain.constant(vector), float(np.linalg.norm(vector))
         terms.append((direction, integral))
-        size += strength * total
-        sizes.append(2 * np.pi * integral(integrals.domain.constant(strength)))
+        size += strength * measure
+        sizes.append(2 * np.pi * integral(domain.constant(strength)))
 
     def energy(u: Jet) -> ufl.Form:
         # a sum of forms needs a form to begin with, not 0
@@ -179,6 +174,17 @@ def dead_loads(
         )
 
     return Energy(name, energy, name, linear=True), size, sizes
+
+
+def _integral_of_load(
+    load: PointForce | EdgeForce | AreaForce, integrals: RevolutionIntegrals
+) -> Integral:
+    """Return the integral over what a load acts on; of a total force on an end it is the mean."""
+    if isinstance(load, PointForce):
+        return integrals.pole(load.point)
+    if isinstance(load, EdgeForce):
+        return integrals.end(load.edge, mean=load.total)
+    return integrals.area(load)
 
 
 def pole_force(
@@ -200,9 +206,9 @@ def pole_force(
     integral = (
         integrals.patch(force.patch, force.point) if force.patch else integrals.pole(force.point)
     )
-    is_begin = np.isclose(
-        integrals.meridian.cells[:, 0], integrals.meridian.points[force.point][0]
-    ).any()  # the normal is e3 there, and -e3 at an end of the meridian
+    # the normal is e3 where a cell begins at the point, and -e3 at an end of the meridian
+    parameter = integrals.meridian.points[force.point][0]
+    is_begin = np.isclose(integrals.meridian.cells[:, 0], parameter).any()
     # divided by the weight's integral, so that the total force is exact on any mesh
     density = integrals.domain.constant(
         (1.0 if is_begin else -1.0) * unit / _circumferential_integral(integral, integrals, log)

@@ -87,20 +87,20 @@ class BodyMeasures:
         The pattern is taken on the mid-surface under each node. The integral of its size is not
         known, hence None.
         """
+        # nodes of each cell with their normals, their heights over the mid-surface, and the places
+        # of the mid-surface under them
         nodes, normals = body_positions_and_normals(self._V)
-        # of each cell's nodes over the mid-surface, along the normal
-        height = self._body.at_nodes(
-            self._V, (self._body.heights - MIDSURFACE_HEIGHT) * self._body.thickness
-        )[self._V.dofmap.list]
+        heights = (self._body.heights - MIDSURFACE_HEIGHT) * self._body.thickness
+        height = self._body.at_nodes(self._V, heights)[self._V.dofmap.list]
+        feet = nodes - height[..., None] * normals
+        # vectors of the pattern at these places
         field = fem.Function(
             fem.functionspace(self._V.mesh, ("DG", self._V.element.basix_element.degree, (3,)))
         )
-        vectors = pattern(nodes - height[..., None] * normals, normals)
+        vectors = pattern(feet, normals)
         refuse_unbounded(vectors, nodes, self._V.mesh.comm, "loading.loads")
         if edge is None:  # over the surface moments are exact; on an edge the values at nodes count
-            midsurface_cells = replace(
-                body_cell_geometry(self._V), nodal=nodes - height[..., None] * normals
-            )
+            midsurface_cells = replace(body_cell_geometry(self._V), nodal=feet)
             vectors = project_pattern(
                 pattern, midsurface_cells, vectors, field.function_space.element.basix_element
             ).nodal
@@ -118,16 +118,11 @@ class BodyMeasures:
         from_point = ufl.SpatialCoordinate(domain) - centre
         height, h = ufl.dot(from_point, normal), thickness_at(self._body, x)
         radius = fem.Constant(domain, max(h, self._reach(x, n)))
-        is_in_shell = ufl.conditional(
-            ufl.lt(abs(height), fem.Constant(domain, h)), 1.0, 0.0
-        )  # and not through a closed shell
+        # 1 in the shell at the point, 0 on the far side of a closed shell
+        is_in_shell = ufl.conditional(ufl.lt(abs(height), fem.Constant(domain, h)), 1.0, 0.0)
+        weight = is_in_shell * smooth(from_point - height * normal, radius)
         dx = ufl.Measure("dx", domain=domain, metadata={"quadrature_degree": WEIGHT_DEGREE})
-        return averaged(
-            self._V,
-            force,
-            Weighted(is_in_shell * smooth(from_point - height * normal, radius), dx),
-            self._log,
-        )
+        return averaged(self._V, force, Weighted(weight, dx), self._log)
 
     def _reach(self, x: Array, n: Array) -> float:
         """Return the largest distance over R of nodes around a point from the normal line there.
@@ -139,14 +134,13 @@ class BodyMeasures:
         x, n
             (3,) place of the point, and unit normal.
         """
+        # (cells, nodes, 3): nodes of all cells from the point, and those of the cells that have it
         from_x = self._body.mesh.geometry.x[compat.geometry_dofs(self._body.mesh)] - x
-        cells_at_x = from_x[(np.linalg.norm(from_x, axis=2) < 1e-9).any(axis=1)]
-        from_normal = cells_at_x - (cells_at_x @ n)[..., None] * n
-        return float(
-            self._V.mesh.comm.allreduce(
-                np.linalg.norm(from_normal, axis=2).max(initial=0.0), MPI.MAX
-            )
-        )
+        has_x = (np.linalg.norm(from_x, axis=2) < 1e-9).any(axis=1)
+        nodes_around = from_x[has_x]
+        from_normal = nodes_around - (nodes_around @ n)[..., None] * n
+        own_largest = np.linalg.norm(from_normal, axis=2).max(initial=0.0)
+        return float(self._V.mesh.comm.allreduce(own_largest, MPI.MAX))
 
 
 def thickness_at(body: BodyMesh, x: Array) -> float:
@@ -169,9 +163,8 @@ def outer_patch(
     """
     x, normal = body.points[point], body.normals[point]
     # the centre on the outer face, half a thickness from the mid-surface
-    values = x + thickness_at(body, x) / 2 * normal, radius
-    centre, a = (fem.Constant(body.mesh, value) for value in values)
+    centre = fem.Constant(body.mesh, x + thickness_at(body, x) / 2 * normal)
+    a = fem.Constant(body.mesh, radius)
+    weight = smooth(ufl.SpatialCoordinate(body.mesh) - centre, a)
     ds = face_measure(body.mesh, [body.faces[OUTER_FACE]])(1)
-    return averaged(
-        V, -normal, Weighted(smooth(ufl.SpatialCoordinate(body.mesh) - centre, a), ds), log, radius
-    )
+    return averaged(V, -normal, Weighted(weight, ds), log, radius)

@@ -181,15 +181,14 @@ def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
         If the file cannot be read, or lacks the columns.
     """
     columns, units = read_table(file, files or Files())
-    # without w0 only x, y, z do: they are then on the real surface
-    place_columns = next(
-        (
-            names
-            for names in PLACES
-            if set(names) <= columns.keys() and ("w0" in columns or len(names) == 3)
-        ),
-        None,
-    )
+    # the first kind of places that the file has; without w0 only x, y, z will do, which are then
+    # on the real surface
+    place_columns = None
+    for names_of_kind in PLACES:
+        is_complete = set(names_of_kind) <= columns.keys()
+        if is_complete and ("w0" in columns or len(names_of_kind) == 3):
+            place_columns = names_of_kind
+            break
     if place_columns is None:
         raise TableError(
             f"has the columns {shorten(', '.join(map(repr, columns)), 200)}; needed are x, y, z, "
@@ -197,12 +196,9 @@ def read_scan(file: Path, lengths: Lengths, files: Files | None = None) -> Scan:
             "z, w0 of a cylinder"
         )
     names = [*place_columns, *(["w0"] if "w0" in columns else [])]
-    # w0 alone without a unit would be over h, which is most likely a mistake
-    if (
-        "w0" in units
-        and units["w0"] is None
-        and any(units[name] for name in place_columns if name not in ANGLES)
-    ):
+    # if lengths have units and w0 has none, it would be over h, which is most likely a mistake
+    lengths_have_units = any(units[name] for name in place_columns if name not in ANGLES)
+    if "w0" in units and units["w0"] is None and lengths_have_units:
         raise TableError(
             "column w0: has no unit, but the places have one: write w0 [h] or a length, such as "
             "w0 [um]"
@@ -283,19 +279,11 @@ def _fit_of_scan(standard: float | None, scan: Scan, reference: ReferenceShell) 
 
     h, surface = reference.h, reference.perfect.sample()
     places, w0 = _on_surface(scan, reference, surface)
-    if not np.abs(w0).max() <= min(MAX_DEPTH_OVER_H * h, MAX_DEPTH_OVER_R):
-        unit = (
-            "; without a unit in the header, w0 is over h"
-            if scan.w0 is not None
-            else ": are they in the shell's frame?"
-        )
-        raise TableError(
-            f"w0 reaches {np.abs(w0).max() / h:.4g} h; allowed at most "
-            f"{min(MAX_DEPTH_OVER_H, MAX_DEPTH_OVER_R / h):.4g}{unit}"
-        )
+    _refuse_too_deep(w0, h, measured=scan.w0 is not None)
     count = len(w0)
     tree = scipy.spatial.cKDTree(places)
-    # the eighth neighbour of a place is taken to be 1.7 spacings away
+    # typical distance of neighbours; the first of nine results is the place itself, and its eighth
+    # neighbour is taken to be 1.7 spacings away
     spacing = float(np.median(tree.query(places, [9])[0])) / 1.7
     distances = tree.query(surface)[0]  # from places of the surface to the nearest value
     if distances.max() > max(MAX_HOLE * sqrt(h), MAX_HOLE_OVER_SPACING * spacing):
@@ -304,31 +292,56 @@ def _fit_of_scan(standard: float | None, scan: Scan, reference: ReferenceShell) 
             f"no value lies within {distances.max():.3g} R of the place {place} over R, where the "
             "hole is too large to guess; give values there, w0 = 0 where the shell is perfect"
         )
+    # the fit, through means of values that lie close together
     places, w0 = _averaged_in_cubes(places, w0, MERGE_DISTANCE * spacing)
     noise = None if standard is None else standard * h  # None: the fit estimates it
     function = fit_scattered(places, w0, surface, noise=noise)
+    # words about it
     estimated = "estimated" if noise is None else "given"
     account = (
         f"{count} values, w0 from {w0.min() / h:.4g} to {w0.max() / h:.4g} h, residual of the fit "
         f"{function.residual / h:.3g} h, noise {function.noise / h:.3g} h ({estimated}), largest "
         f"gap {distances.max():.3g} R"
     )
-    # elements resolve the sharpest bend, but need not be smaller than for the shell's own waves
     lost_rows = f", {scan.lost} rows without a number left out" if scan.lost else ""
-    return _Fit(
-        function,
-        max(
-            SIZE_OVER_BEND * _sharpest_bend(function, surface, sqrt(h)), MIN_ELEMENT_SIZE * sqrt(h)
-        ),
-        account + lost_rows,
-    )
+    # elements resolve the sharpest bend, but need not be smaller than for the shell's own waves
+    size_for_bend = SIZE_OVER_BEND * _sharpest_bend(function, surface, sqrt(h))
+    return _Fit(function, max(size_for_bend, MIN_ELEMENT_SIZE * sqrt(h)), account + lost_rows)
+
+
+def _refuse_too_deep(w0: Array, h: float, *, measured: bool) -> None:
+    """Refuse deviations w0 over R that are too large, or no numbers.
+
+    Parameters
+    ----------
+    h
+        Thickness over R.
+    measured
+        Whether the file has w0; else the places are on the real surface.
+
+    Raises
+    ------
+    TableError
+        With the largest deviation and the limit.
+    """
+    if not np.abs(w0).max() <= min(MAX_DEPTH_OVER_H * h, MAX_DEPTH_OVER_R):
+        unit = (
+            "; without a unit in the header, w0 is over h"
+            if measured
+            else ": are they in the shell's frame?"
+        )
+        raise TableError(
+            f"w0 reaches {np.abs(w0).max() / h:.4g} h; allowed at most "
+            f"{min(MAX_DEPTH_OVER_H, MAX_DEPTH_OVER_R / h):.4g}{unit}"
+        )
 
 
 def _on_surface(scan: Scan, reference: ReferenceShell, surface: Array) -> tuple[Array, Array]:
     """Return places (n, 3) on the perfect surface and deviations w0 (n,) of a scan, both over R.
 
-    Columns of angles give places on a sphere or a cylinder. Other places are moved to the feet of
-    their normals; without measured deviations, w0 is their height above the surface.
+    Columns of angles give places on a sphere or a cylinder. Places x, y, z are replaced by the
+    nearest points of the surface, their feet. Without measured deviations, w0 is the height of x,
+    y, z above the surface.
 
     Parameters
     ----------
@@ -345,19 +358,7 @@ def _on_surface(scan: Scan, reference: ReferenceShell, surface: Array) -> tuple[
     columns, w0 = scan.columns, scan.w0
     if "x" not in columns:
         assert w0 is not None
-        polar = columns.get("polar")
-        if reference.geometry not in (("cylinder",) if polar is None else ("hemisphere", "cap")):
-            angles = (
-                "azimuth and z are of a cylinder"
-                if polar is None
-                else "polar and azimuth are of a sphere"
-            )
-            raise TableError(f"{angles}; on geometry: {reference.geometry} give x, y, z")
-        # distance from the axis and height, over R: of a cylinder, or of a sphere
-        rho, z = (1.0, columns["z"]) if polar is None else (np.sin(polar), np.cos(polar))
-        return np.column_stack(
-            [rho * np.cos(columns["azimuth"]), rho * np.sin(columns["azimuth"]), z]
-        ), w0
+        return _places_of_angles(columns, reference.geometry), w0
     x = np.column_stack([columns[name] for name in "xyz"])
     distance = scipy.spatial.cKDTree(surface).query(x)[0]
     if distance.max() > MAX_DISTANCE_OVER_R:
@@ -369,7 +370,7 @@ def _on_surface(scan: Scan, reference: ReferenceShell, surface: Array) -> tuple[
     places, heights = feet(reference.perfect, x)
     if w0 is None:
         return places, heights
-    # places may be measured on either surface: their heights are then about w0, or zero
+    # x, y, z may be on the real surface, at the height w0, or on the perfect one, at zero
     if np.abs(heights).max() > 0.02 + 2 * np.abs(w0).max():
         row = int(np.argmax(np.abs(heights)))
         raise TableError(
@@ -380,6 +381,29 @@ def _on_surface(scan: Scan, reference: ReferenceShell, surface: Array) -> tuple[
     return places, w0
 
 
+def _places_of_angles(columns: dict[str, Array], geometry: str) -> Array:
+    """Return the places (n, 3) over R of columns of angles: on a cylinder, or on a sphere.
+
+    Columns without `polar` have azimuth and z, of a cylinder.
+
+    Raises
+    ------
+    TableError
+        If the geometry of the shell is another one.
+    """
+    polar = columns.get("polar")
+    if geometry not in (("cylinder",) if polar is None else ("hemisphere", "cap")):
+        angles = (
+            "azimuth and z are of a cylinder"
+            if polar is None
+            else "polar and azimuth are of a sphere"
+        )
+        raise TableError(f"{angles}; on geometry: {geometry} give x, y, z")
+    # distance from the axis and height, over R: of a cylinder, or of a sphere
+    rho, z = (1.0, columns["z"]) if polar is None else (np.sin(polar), np.cos(polar))
+    return np.column_stack([rho * np.cos(columns["azimuth"]), rho * np.sin(columns["azimuth"]), z])
+
+
 def _averaged_in_cubes(places: Array, w0: Array, distance: float) -> tuple[Array, Array]:
     """Return the means of places (n, 3) and of w0 (n,) over cubes, so that no two places are equal.
 
@@ -388,17 +412,18 @@ def _averaged_in_cubes(places: Array, w0: Array, distance: float) -> tuple[Array
     # number of the cube of each place
     _, cube = np.unique(np.floor(places / distance).astype(np.int64), axis=0, return_inverse=True)
     cube = cube.ravel()
+    # sums over cubes divided by their numbers of places
     count = np.bincount(cube)
-    return np.column_stack([np.bincount(cube, c) / count for c in places.T]), np.bincount(
-        cube, w0
-    ) / count
+    mean_places = np.column_stack([np.bincount(cube, c) / count for c in places.T])
+    return mean_places, np.bincount(cube, w0) / count
 
 
 def _sharpest_bend(function: "ScatteredSpline", x: Array, length: float) -> float:
     """Return 1/k of the shortest wave sin(k x) that a function resembles; infinite for a constant.
 
-    A wave a sin(k x) has the range 2 a and the largest second derivative a k². The derivatives are
-    taken as second differences at places `x` (n, 3), over 0.7 times `length`, which is over R.
+    A wave a sin(k x) has the range 2 a and the largest second derivative a k², so that 1/k is the
+    root of half the range over this derivative. The derivatives are sums of second differences
+    along the three axes, at places `x` (n, 3). Their step is 0.7 times `length`, which is over R.
     """
     x = x[:: max(1, len(x) // 2000)]  # some 2000 places are enough
     w, d = function(x), 0.7 * length
@@ -422,24 +447,25 @@ def feet(perfect: "Outline", x: Array) -> tuple[Array, Array]:
     if perfect.sphere:
         r = np.linalg.norm(x, axis=1)
         return x / r[:, None], r - 1
-    # Newton's method begins at the nearest place of a sample; each of these is inverted once
+    # the iteration begins at the nearest places of a sample; each of these is inverted only once
     sample = perfect.sample()
     nearest, row_of_place = np.unique(
         scipy.spatial.cKDTree(sample).query(x)[1], return_inverse=True
     )
     chart = np.array([perfect.inverse(place) for place in sample[nearest]])[row_of_place]
-    for _ in range(
-        NEWTON_STEPS
-    ):  # Gauss and Newton's, which converges as fast as w0 is small against the radius of curvature
-        tangents = [
+    # the method of Gauss and Newton for the least distance; it converges fast where w0 is small
+    # against the radius of curvature
+    for _ in range(NEWTON_STEPS):
+        # tangents (n, 3, 2) of the surface, by central differences
+        differences = [
             (perfect.perfect(chart + e) - perfect.perfect(chart - e)) / (2 * CHART_STEP)
             for e in CHART_STEP * np.eye(2)
         ]
-        tangents_matrix = np.stack(tangents, axis=-1)
-        residual = np.einsum("nij,ni->nj", tangents_matrix, x - perfect.perfect(chart))
-        step = np.linalg.solve(
-            np.einsum("nij,nik->njk", tangents_matrix, tangents_matrix), residual[..., None]
-        )[..., 0]
+        tangents = np.stack(differences, axis=-1)
+        # the step in the chart: the metric of the surface times it is the residual
+        residual = np.einsum("nij,ni->nj", tangents, x - perfect.perfect(chart))
+        metric = np.einsum("nij,nik->njk", tangents, tangents)
+        step = np.linalg.solve(metric, residual[..., None])[..., 0]
         chart = chart + np.clip(step, -0.2, 0.2)  # a long step could leave the chart
         if np.abs(step).max() < 1e-12:
             break
@@ -461,28 +487,32 @@ def _on_quadrics(nodes: Array, x: Array) -> tuple[Array, Array]:
     """
     import scipy
 
-    # a node twice would count twice
+    # a node that is given twice would count twice
     nodes = np.unique(nodes.round(14), axis=0)
+    # the nearest nodes (n, NODES_PER_QUADRIC) of each place, and the first one's place and normal
     tree = scipy.spatial.cKDTree(nodes[:, :3])
     nearest = tree.query(x, NODES_PER_QUADRIC)[1]
     centre, normal = nodes[nearest[:, 0], :3], nodes[nearest[:, 0], 3:]
     normal = normal / np.linalg.norm(normal, axis=1)[:, None]
-    # a tangent: normal to the axis that is farthest from the normal
+    # frame (n, 3 vectors, 3 components); the first tangent is normal to the normal, and to the axis
+    # that makes the largest angle with the normal
     first_tangent = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal), axis=1)])
     first_tangent /= np.linalg.norm(first_tangent, axis=1)[:, None]
     frame = np.stack([first_tangent, np.cross(normal, first_tangent), normal], axis=1)
-    # coordinates of the neighbours in the frames, and the coefficients of z(s, t) by least squares
+    # coordinates (n, NODES_PER_QUADRIC) of the neighbours in the frame of each place
     s, t, z = np.moveaxis(
         np.einsum("nkj,nij->nki", nodes[nearest, :3] - centre[:, None], frame), -1, 0
     )
-    quadric = (
-        np.linalg.pinv(np.stack([0 * s + 1, s, t, s * s, s * t, t * t], axis=-1)) @ z[..., None]
-    )
-    # z = a + b s + c t + d s^2 + e s t + f t^2; p, q and height are the place's coordinates
+    # coefficients of z = a + b s + c t + d s^2 + e s t + f t^2 by least squares
+    terms = np.stack([0 * s + 1, s, t, s * s, s * t, t * t], axis=-1)
+    quadric = np.linalg.pinv(terms) @ z[..., None]
     a, b, c, d, e, f = quadric[..., 0].T
+    # coordinates of the place itself are p, q and height; slopes of the quadric at (p, q), and the
+    # vertical distance from there to the place
     p, q, height = np.einsum("nj,nij->ni", x - centre, frame).T
     slope_s, slope_t = b + 2 * d * p + e * q, c + e * p + 2 * f * q
     gap = height - (a + b * p + c * q + d * p * p + e * p * q + f * q * q)
+    # unit normal of the quadric in the frame; the distance along it is the part of the gap
     upwards = np.stack([-slope_s, -slope_t, 0 * p + 1], axis=-1)
     upwards /= np.linalg.norm(upwards, axis=1)[:, None]
     w0 = gap * upwards[:, 2]

@@ -52,6 +52,7 @@ class FormulaSection(ImperfectionSection):
         """
         x = reference.perfect.sample()
         deviation = ByFormula(self.w0, self.amplitude / reference.R_over_h)
+        # places where the value is no number, or too large
         bad_places = x[~(np.abs(deviation(x)) <= MAX_DEPTH)]
         if len(bad_places):
             place = ", ".join(f"{c:.3g}" for c in bad_places[0])
@@ -59,14 +60,15 @@ class FormulaSection(ImperfectionSection):
                 f"{key}.w0: {shown_value(self.w0)}: has no finite value, or one above half a "
                 f"radius, at (x, y, z)/R = ({place})"
             )
-        # without the factor, so that the size does not depend on the amplitude
-        range_of_formula, formula_derivatives = (
-            np.ptp(deviation(x)) / abs(deviation.factor or 1.0),
-            formula_with_derivatives(self.w0),
-        )
+        # the formula without its factor, so that the size does not depend on the amplitude
+        range_of_formula = np.ptp(deviation(x)) / abs(deviation.factor or 1.0)
+        formula_derivatives = formula_with_derivatives(self.w0)
 
         def sizes(places: Array) -> Array:
-            """Return 2.5/k (n,) of a wave with the whole range and the curvature at each place."""
+            """Return 2.5/k (n,) of a wave with the whole range and the curvature at each place.
+
+            From the range 2 a and the curvature a k^2 follows 1/k, the root of half their quotient.
+            """
             taylor = formula_derivatives(places)
             curvature = np.nan_to_num(np.linalg.norm(taylor.hessian, axis=(0, 1)))
             depth = max(range_of_formula, float(np.ptp(np.nan_to_num(taylor.value))))
@@ -75,12 +77,12 @@ class FormulaSection(ImperfectionSection):
                 2.5 * np.sqrt(depth / 2 / np.maximum(curvature, 1e-300 + 1e-12 * depth))
             )
 
+        # the least size; infinite for a formula that is flat
         at_sample = sizes(x)
-        size = (
-            float(at_sample.min())
-            if range_of_formula > 0 and at_sample.min() < MAX_ELEMENT_SIZE
-            else np.inf
-        )
+        size = np.inf
+        if range_of_formula > 0 and at_sample.min() < MAX_ELEMENT_SIZE:
+            size = float(at_sample.min())
+        # sizes differ from place to place if few places need about the least size
         is_local = not (at_sample < 2 * size).mean() > MAX_LOCAL_SHARE
         return ImperfectionGeometry(deviation, size, sizes=sizes if is_local else None)
 

@@ -170,8 +170,8 @@ def note_sizes(
     """Note in the context of a validation by which sizes lengths of imperfections are divided.
 
     They are sizes in metres of the shell without its imperfections, and none without units. Nothing
-    is noted for a wrong shell, whose own message says what is wrong, or if no imperfection has a
-    text, so that the shell need not be validated twice.
+    is noted for a wrong shell: its own message says what is wrong. Nothing is noted either if no
+    imperfection has a length as text: then the shell need not be validated twice.
 
     Parameters
     ----------
@@ -182,11 +182,9 @@ def note_sizes(
     with_units
         Whether lengths of the case have units.
     """
-    if (
-        not isinstance(info.context, dict)
-        or not isinstance(data, dict)
-        or not any(map(_has_text, _imperfections(data)))
-    ):
+    if not isinstance(info.context, dict) or not isinstance(data, dict):
+        return
+    if not any(map(_has_text, _imperfections(data))):
         return
     info.context.pop(CONTEXT, None)  # of an earlier shell of the case
     try:
@@ -317,13 +315,18 @@ class LocalSection(ImperfectionSection):
         """
         profile_class, width = self.deviation, self.half_width(reference.R_over_h, reference.nu)
         place, distance = locate(self.at, reference, key)
-        # the shell's own bending length, or the profile where that is narrower
+        # elements resolve the shell's own bending length, and a profile that is narrower
         size = min(
             DIMPLE_ELEMENT_SIZE / sqrt(reference.R_over_h), profile_class.element_widths * width
         )
         deviation = profile_class(self.amplitude / reference.R_over_h, width, distance)
         return ImperfectionGeometry(
-            deviation, size, place, distance, profile_class.reach * width, profile_class.rim
+            deviation,
+            size,
+            centre=place,
+            distance=distance,
+            reach=profile_class.reach * width,
+            rim=profile_class.rim,
         )
 
 

@@ -122,11 +122,11 @@ class ModesSection(FileKeys, ImperfectionSection):
             return PlacedMode(mode.parts[name], place) if place and name in mode.parts else None
 
         parts = [part_of(mode) for mode in modes[: len(self.amplitudes)]]
-        # of modes with an amplitude, at least one must move this shell
-        moving_parts = [
+        # if there are modes with an amplitude, at least one of them must move this shell
+        requested_parts = [
             part for amplitude, part in zip(self.amplitudes, parts, strict=True) if amplitude
         ]
-        if moving_parts and not any(moving_parts):
+        if requested_parts and not any(requested_parts):
             raise ValueError(
                 f"amplitudes: of the {len(parts)} lowest modes of all shells together those with "
                 "an amplitude do not move it: give more, and 0 for those of other shells"
@@ -143,10 +143,12 @@ class ModesSection(FileKeys, ImperfectionSection):
         """
         h = reference.h
         if self.file is not None and self.shapes is None:
-            self.become((_read(self, reference.perfect.sample(), f"{key}.file: {self.file}"),))
+            mode = _read(self, reference.perfect.sample(), f"{key}.file: {self.file}")
+            self.become((mode,))
         shapes = self.shapes or ()
         amplitudes = tuple(a * h for a in self.amplitudes[: len(shapes)])
-        waves = [getattr(shape, "m", None) for shape in shapes]  # around e3, if it is such a wave
+        # words such as "0.1 h of mode 1 (m = 3)"; a wave around e3 has its number as m
+        waves = [getattr(shape, "m", None) for shape in shapes]
         names = [f"mode {i}{'' if m is None else f' (m = {m})'}" for i, m in enumerate(waves, 1)]
         words = [
             f"{a:g} h of {self.file or name}"
@@ -285,12 +287,10 @@ def on_meridian(places: Array, f: Array, m: int) -> Round:
     """
     from magshell_fenicsx.mesh.scattered_data import fit_scattered
 
-    # a meridian that begins on the axis is continued beyond it, with the parity of the wave
+    # a meridian that begins on the axis is continued beyond it: waves of odd m change their sign
     if places[:, 0].min() < ON_AXIS:
-        places, f = (
-            np.vstack([places, places * [-1.0, 1.0, 1.0]]),
-            np.concatenate([f, (-1) ** m * f]),
-        )
+        places = np.vstack([places, places * [-1.0, 1.0, 1.0]])
+        f = np.concatenate([f, (-1) ** m * f])
     return Round(fit_scattered(places, f, places, noise=0), m)
 
 
@@ -319,7 +319,8 @@ def _read(section: ModesSection, sample: Array, key: str) -> "ScatteredSpline":
         raise CaseError(
             f"{key}: is no mode file that a run writes (fields/mode_*.vtu): {message}"
         ) from None
-    if r0.shape != (len(w), 3) or not (
+    has_places = r0.shape == (len(w), 3)
+    if not has_places or not (
         np.isfinite(r0).all() and np.isfinite(w).all() and np.abs(w).max() > 0
     ):
         raise CaseError(f"{key}: the mode has no finite displacement")
@@ -333,10 +334,12 @@ def _read(section: ModesSection, sample: Array, key: str) -> "ScatteredSpline":
 def over_largest(places: Array, w: Array) -> Array:
     """Return values (n,) over the largest of them, with its sign.
 
-    Of equally large values that at the highest place (n, 3) counts, whatever their order.
+    Of several equally large values, the one at the highest of the places (n, 3) gives the sign.
+    The order of the values does not matter.
     """
-    size = np.abs(w)
-    largest_places = np.flatnonzero(size > (1 - CREST_TOLERANCE) * size.max())
-    # lexsort sorts by its last key first, z; places count as equal if six decimals are
-    chosen_row = largest_places[np.lexsort(places[largest_places].round(6).T)[-1]]
-    return np.asarray(w / np.copysign(size.max(), w[chosen_row]))
+    magnitude = np.abs(w)
+    largest_rows = np.flatnonzero(magnitude > (1 - CREST_TOLERANCE) * magnitude.max())
+    # lexsort sorts by its last key first, which is z; the last row is the highest. Coordinates
+    # count as equal if six decimals are.
+    highest_row = largest_rows[np.lexsort(places[largest_rows].round(6).T)[-1]]
+    return np.asarray(w / np.copysign(magnitude.max(), w[highest_row]))

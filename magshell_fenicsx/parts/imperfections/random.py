@@ -53,9 +53,9 @@ class RandomSection(ImperfectionSection):
     @model_validator(mode="after")
     def _one_way(self, info: ValidationInfo) -> Self:
         """Check that either a random field or dimples are given, and that dimples have room."""
-        if (self.amplitude is None) != (self.length is None) or (self.amplitude is None) == (
-            self.dimples is None
-        ):
+        is_half_given = (self.amplitude is None) != (self.length is None)
+        has_field, has_dimples = self.amplitude is not None, self.dimples is not None
+        if is_half_given or has_field == has_dimples:
             raise ValueError("give amplitude and length of a random field, or dimples")
         if self.dimples:
             self._sizes = sizes_noted(info)  # the dimples are validated once more, when drawn
@@ -67,11 +67,9 @@ class RandomSection(ImperfectionSection):
 
     def listed(self) -> Mapping[str, ImperfectionSection]:
         """Return the random dimples by their keys below the section's, or the section itself."""
-        return (
-            {f".{key}": dimple for key, dimple in self.random_dimples.items()}
-            if self.dimples
-            else {"": self}
-        )
+        if not self.dimples:
+            return {"": self}
+        return {f".{key}": dimple for key, dimple in self.random_dimples.items()}
 
     @cached_property
     def random_dimples(self) -> Mapping[str, DimpleSection | GaussianSection]:
@@ -81,7 +79,7 @@ class RandomSection(ImperfectionSection):
         """
         if self.dimples is None:
             return {}
-        # a stream of its own: number 0, with the name of this list
+        # a stream of random numbers of its own: sample 0, with the name of this list
         items = self.dimples.draw(generator(self.seed, 0, "shell.imperfections"))
         section_class = DimpleSection if self.dimples.kind == "dimple" else GaussianSection
         try:

@@ -77,7 +77,7 @@ class _Numbers:
         """
         centres, widths = self.rows[:, :3], self.rows[:, 3]
         distance = np.linalg.norm(x[:, None] - centres, axis=-1)
-        if self.angles:  # of unit vectors, exact also for small angles
+        if self.angles:  # between unit vectors; the half-angle formula is exact for small angles
             distance = 2 * np.arctan2(distance, np.linalg.norm(x[:, None] + centres, axis=-1))
         squared = (distance / widths) ** 2
         w0 = np.zeros(len(x))
@@ -103,29 +103,29 @@ class _Sum:
         None also for a mixture of angular and straight distances. There may be thousands of
         deviations.
         """
+        # centres: unit vectors of angular distances, or else places of straight distances
         local_deviations = [d for d in self.deviations if isinstance(d, Local)]
-        classes = list(dict.fromkeys(type(d) for d in local_deviations))
-        angles = [
+        axes = [
             d.distance.axis for d in local_deviations if isinstance(d.distance, AngularDistance)
         ]
-        places = angles or [
+        centres = axes or [
             d.distance.place for d in local_deviations if isinstance(d.distance, StraightDistance)
         ]
-        # some are not local, or their distances are of both kinds
-        if not places or len(places) < len(self.deviations):
+        # fewer centres than deviations: some are not local, or their distances are of both kinds
+        if not centres or len(centres) < len(self.deviations):
             return None
+        # a row of each deviation: centre, width and number of the profile; a class has one profile
+        classes = list(dict.fromkeys(type(d) for d in local_deviations))
         shapes = [(d.width, classes.index(type(d))) for d in local_deviations]
-        rows = np.round(np.column_stack([places, shapes]) / IMAGE_TOLERANCE) * IMAGE_TOLERANCE
-        # deviations with equal rows, but rounding, become one with the sum of their depths
+        rows = np.round(np.column_stack([centres, shapes]) / IMAGE_TOLERANCE) * IMAGE_TOLERANCE
+        # deviations with equal rows become one with the sum of their depths, unless that is zero
         rows, row_of_deviation = np.unique(rows, axis=0, return_inverse=True)
         depths = np.bincount(row_of_deviation.ravel(), [d.depth for d in local_deviations])
         is_kept = np.abs(depths) > IMAGE_TOLERANCE * np.abs(depths).max()
+        if not is_kept.any():
+            return None
         profiles = [profile_class.profile for profile_class in classes]
-        return (
-            _Numbers(rows[is_kept], depths[is_kept], bool(angles), profiles)
-            if is_kept.any()
-            else None
-        )
+        return _Numbers(rows[is_kept], depths[is_kept], angles=bool(axes), profiles=profiles)
 
     def mirrored(self, mirror: Mirror) -> bool | None:
         """Return whether a plane mirrors the sum onto itself; None if the numbers do not decide it.
@@ -136,16 +136,18 @@ class _Sum:
         # the image of a unit vector is one only under a plane through the origin
         if numbers is None or (numbers.angles and mirror.offset):
             return None
+        # the deviation that lies nearest to the mirror image of each one
         rows, depths = numbers.rows, numbers.depths
-        distance, image = numbers.tree.query(
-            np.column_stack([mirror.image(rows[:, :3]), rows[:, 3:]])
-        )
-        has_no_image = (distance > 4 * IMAGE_TOLERANCE) | (
-            np.abs(depths[image] - depths) > IMAGE_TOLERANCE * np.abs(depths).max()
-        )
-        if not has_no_image.any():  # two that share an image are not decided
-            return True if len(np.unique(image)) == len(image) else None
-        # others may still make up for those without an image: values at some centres show it
+        mirrored_rows = np.column_stack([mirror.image(rows[:, :3]), rows[:, 3:]])
+        distance, nearest = numbers.tree.query(mirrored_rows)
+        # it is the image if place, width, profile and depth agree
+        depth_differs = np.abs(depths[nearest] - depths) > IMAGE_TOLERANCE * np.abs(depths).max()
+        has_no_image = (distance > 4 * IMAGE_TOLERANCE) | depth_differs
+        if not has_no_image.any():
+            # not decided if two deviations have the same image
+            return True if len(np.unique(nearest)) == len(nearest) else None
+        # several deviations together may make up for a missing image. The values at some centres
+        # without one show that they do not; if they do not show it, nothing is decided.
         centres = rows[np.flatnonzero(has_no_image)[:FIRST_COMPARED], :3]
         differs = np.abs(numbers(centres) - numbers(mirror.image(centres))).max()
         return False if differs > 2 * EQUALITY_TOLERANCE * np.abs(depths).sum() else None
@@ -163,21 +165,20 @@ def imperfection_constraints(
     perfect
         The perfect shell.
     one_by_one
-        Whether each must be its own image, as patches with names are.
+        Whether each imperfection must be its own image, as where it is a patch with a name. Else
+        an imperfection may be the image of another: only their sum is compared.
     """
     if not imperfections:
         return []
-    grouped = (
-        [[imperfection] for imperfection in imperfections.values()]
-        if one_by_one
-        else [list(imperfections.values())]
-    )
-    groups = [_Sum([imperfection.deviation for imperfection in group]) for group in grouped]
-
+    deviations = [imperfection.deviation for imperfection in imperfections.values()]
+    groups = [_Sum([deviation]) for deviation in deviations] if one_by_one else [_Sum(deviations)]
     sample = cache(lambda: _sample(imperfections, perfect))  # costly, and often not needed
 
     def mirrors(mirror: Mirror) -> bool:
-        """Return whether a plane is a plane of symmetry of all groups of imperfections."""
+        """Return whether a plane is a plane of symmetry of all groups of imperfections.
+
+        Groups that their numbers do not decide are compared by values at the sample.
+        """
         undecided = []
         for group in groups:
             if (answer := group.mirrored(mirror)) is False:
@@ -188,31 +189,30 @@ def imperfection_constraints(
             _are_equal(group(sample()), group(mirror.image(sample()))) for group in undecided
         )
 
-    centres = [
-        imperfection.centre
-        for imperfection in imperfections.values()
-        if imperfection.centre is not None
-    ]
+    # why the shell is not axisymmetric; None if it is
+    centres = [i.centre for i in imperfections.values() if i.centre is not None]
     centres_off_axis = [centre for centre in centres if np.hypot(*centre[:2]) > AXIS_TOLERANCE]
     reason = None
     if centres_off_axis and perfect.round:
         reason = "an imperfection is off the axis"
-    elif perfect.meridian:
-        places = perfect.meridian.interior_sample()
-        w0_at_angles = [
-            np.concatenate([group(places @ rotation(a)) for group in groups]) for a in ANGLES[:24]
-        ]
-        if not all(_are_equal(w0_at_angles[0], w0) for w0 in w0_at_angles):
-            reason = "an imperfection differs around e3"
-    # candidates for planes: of a shell that is not round it has its own; of a round one they go
-    # through the centres, or between centres that have no azimuth in common
+    elif perfect.meridian and _differ_around_e3(groups, perfect.meridian.interior_sample()):
+        reason = "an imperfection differs around e3"
+    # a shell that is not round has its own candidates for planes
     if not perfect.round:
         return [SymmetryConstraint(reason, (), mirrors)]
+    # those of a round shell go through all centres, or between centres of different azimuths
     if common_azimuth(centres_off_axis) is None:
-        return [
-            SymmetryConstraint(reason, (), mirrors, azimuths=_azimuths_of_planes(centres_off_axis))
-        ]
+        azimuths = _azimuths_of_planes(centres_off_axis)
+        return [SymmetryConstraint(reason, (), mirrors, azimuths=azimuths)]
     return [SymmetryConstraint(reason, centres_off_axis, mirrors)]
+
+
+def _differ_around_e3(groups: Sequence[_Sum], places: Array) -> bool:
+    """Return whether a sum of deviations changes where places (n, 3) turn about e3."""
+    w0_at_angles = [
+        np.concatenate([group(places @ rotation(a)) for group in groups]) for a in ANGLES[:24]
+    ]
+    return not all(_are_equal(w0_at_angles[0], w0) for w0 in w0_at_angles)
 
 
 def _azimuths_of_planes(centres: Sequence[Array]) -> tuple[float, ...]:
@@ -228,7 +228,8 @@ def _azimuths_of_planes(centres: Sequence[Array]) -> tuple[float, ...]:
         if abs(np.hypot(*x[:2]) - np.hypot(*first_place[:2])) < AXIS_TOLERANCE
         and abs(x[2] - first_place[2]) < AXIS_TOLERANCE
     ]
-    # the plane of the mean azimuth maps one to the other; of the first alone it contains that place
+    # the plane at the mean of two azimuths maps one place to the other; with the first place in
+    # both roles it contains that place
     return tuple(
         (atan2(x[1], x[0]) + atan2(first_place[1], first_place[0])) / 2
         for x in (first_place, *at_same_distance)
@@ -260,11 +261,8 @@ def _sample(imperfections: Mapping[str, ImperfectionGeometry], perfect: Outline)
 
 def _are_equal(w0: Array, image: Array) -> bool:
     """Return whether deviations and those at the images of their places are equal but rounding."""
-    return bool(
-        (
-            np.abs(w0 - image) <= EQUALITY_TOLERANCE * max(np.abs(w0).max(), np.abs(image).max())
-        ).all()
-    )
+    largest = max(np.abs(w0).max(), np.abs(image).max())
+    return bool((np.abs(w0 - image) <= EQUALITY_TOLERANCE * largest).all())
 
 
 @dataclass(frozen=True)
@@ -400,6 +398,7 @@ def contour(
     """
     assert imperfection.distance
     distance, Q, reach = imperfection.distance, rotation(turn), part * imperfection.reach
+    # unit vectors (corners, 2) of the rays
     angles = np.arange(CONTOUR_CORNERS) * 2 * np.pi / CONTOUR_CORNERS
     rays = np.column_stack([np.cos(angles), np.sin(angles)])
 
@@ -408,6 +407,7 @@ def contour(
         chart = centre + t[..., None] * rays
         return distance(perfect.perfect(chart.reshape(-1, 2)) @ Q).reshape(t.shape) - reach
 
+    # equal intervals of each ray, and whether each (interval, ray) ends at the distance or beyond
     ray_lengths = np.linspace(0, MAX_CHART_STRETCH * reach, CONTOUR_STEPS + 1)[1:]
     is_outside = distance_beyond(np.tile(ray_lengths[:, None], CONTOUR_CORNERS)) >= 0
     if not is_outside.any(axis=0).all():
@@ -415,26 +415,33 @@ def contour(
             f"shell.{key}.width: its width over R, {imperfection.reach:.3g}, is too much for this "
             "place: it would reach around the shell or its axis"
         )
-    # the wanted point of a ray is between low and high: the first interval that ends outside
+    # the wanted point of each ray is in its first interval that ends outside, from low to high
     high = ray_lengths[is_outside.argmax(axis=0)]
-    low, distance_low, distance_high = (
-        high - ray_lengths[0],
-        distance_beyond(high - ray_lengths[0]),
-        distance_beyond(high),
-    )
-    for _ in range(
-        FALSE_POSITION_ROUNDS
-    ):  # of the rule of false position, where the end that stays counts half
-        middle = high - distance_high * (high - low) / (distance_high - distance_low)
-        distance_at_middle = distance_beyond(middle)
-        is_crossed = distance_at_middle * distance_high < 0
-        low, distance_low = (
-            np.where(is_crossed, high, low),
-            np.where(is_crossed, distance_high, distance_low / 2),
-        )
-        # where the point is hit, a tiny distance keeps the quotient from 0/0
-        high, distance_high = middle, np.where(distance_at_middle == 0, 1e-300, distance_at_middle)
-    return np.asarray(centre + high[:, None] * rays)
+    length = _root_by_false_position(distance_beyond, low=high - ray_lengths[0], high=high)
+    return np.asarray(centre + length[:, None] * rays)
+
+
+def _root_by_false_position(f: Callable[[Array], Array], low: Array, high: Array) -> Array:
+    """Return zeros (n,) of n functions between `low` and `high`, where their signs differ.
+
+    The rule of false position takes the zero of the secant as one end of the next interval. If the
+    other end stays, its value counts half (the Illinois rule), which makes convergence fast.
+
+    Parameters
+    ----------
+    f
+        Arguments (n,) -> value of each function at its argument.
+    """
+    f_low, f_high = f(low), f(high)
+    for _ in range(FALSE_POSITION_ROUNDS):
+        secant_zero = high - f_high * (high - low) / (f_high - f_low)
+        f_zero = f(secant_zero)
+        # the other end: `high` if the zero of f lies between it and that of the secant, else `low`
+        is_crossed = f_zero * f_high < 0
+        low, f_low = np.where(is_crossed, high, low), np.where(is_crossed, f_high, f_low / 2)
+        # where the zero is hit, a tiny value keeps the quotient from 0/0
+        high, f_high = secant_zero, np.where(f_zero == 0, 1e-300, f_zero)
+    return high
 
 
 def images(local_imperfection: LocalImperfection, perfect: Outline) -> list[Array]:
@@ -444,7 +451,7 @@ def images(local_imperfection: LocalImperfection, perfect: Outline) -> list[Arra
     """
     if not (grid := perfect.grid):
         return [local_imperfection.centre]
-    # by a width of the grid in either direction that is glued
+    # an image is one width of the grid to either side, in the directions that are glued
     steps = product(*((-1, 0, 1) if glued else (0,) for glued in grid.glued))
     return [
         local_imperfection.centre + np.multiply(step, np.subtract(grid.high, grid.low))

@@ -59,6 +59,7 @@ def crossed_place(distance: Callable[[Array], Array], starts: Array, ends: Array
     So no place of a segment is inside if the distances at both ends add up to more than its length.
     Other segments are halved, at most `MAX_HALVINGS` times; a graze that is shorter is ignored.
     """
+    # at the start and at the end of each segment
     distance_before, distance_after = distance(starts), distance(ends)
     for _ in range(MAX_HALVINGS):
         may_cross = distance_before + distance_after <= np.linalg.norm(ends - starts, axis=1)
@@ -71,11 +72,10 @@ def crossed_place(distance: Callable[[Array], Array], starts: Array, ends: Array
         distance_of_middle = distance(middle)
         if (distance_of_middle < 0).any():
             return np.asarray(middle[distance_of_middle.argmin()])
+        # all first halves, then all second halves
         starts, ends = np.concatenate([starts, middle]), np.concatenate([middle, ends])
-        distance_before, distance_after = (
-            np.concatenate([distance_before, distance_of_middle]),
-            np.concatenate([distance_of_middle, distance_after]),
-        )
+        distance_before = np.concatenate([distance_before, distance_of_middle])
+        distance_after = np.concatenate([distance_of_middle, distance_after])
     return None
 
 
@@ -109,6 +109,12 @@ class AppliedField:
         Name -> value of the amplitudes of the driven fields.
     lost
         Where the field was not finite since the path began; empty if it was finite everywhere.
+    _B0
+        (cells, points, 3) B at the undeformed places.
+    _values_at_rest
+        B, G and H of the field at rest, at the present places.
+    _fields_at_places
+        The moving fields at the places where they were last evaluated.
     """
 
     def __init__(
@@ -136,12 +142,14 @@ class AppliedField:
         self._values_at_rest = Memo(
             lambda: field_at_rest(self.places), lambda: (r0.x.array, u.x.array)
         )
-        places = self._r0.renew()
-        B, G, H = self._total_field(field_at_rest(places.reshape(-1, 3)), places.reshape(-1, 3))
+        # the field at the undeformed places; nan where it is not differentiable, which
+        # `refuse_unbounded` reports
+        undeformed = self._r0.renew()
+        x = undeformed.reshape(-1, 3)
+        B, G, H = self._total_field(field_at_rest(x), x)
         differentiable = np.isfinite(G).all(axis=(1, 2)) & np.isfinite(H).all(axis=(1, 2, 3))
-        # nan where the field is not differentiable, which `refuse_unbounded` reports
-        self._B0 = np.where(np.reshape(differentiable, (-1, 1)), B, np.nan).reshape(places.shape)
-        refuse_unbounded(self._B0, places, V.mesh.comm, "magnetic.applied")
+        self._B0 = np.where(differentiable.reshape(-1, 1), B, np.nan).reshape(undeformed.shape)
+        refuse_unbounded(self._B0, undeformed, V.mesh.comm, "magnetic.applied")
         self.polynomial.compute_by(
             self._polynomials, lambda: (r0.x.array, u.x.array, *self.mu.values())
         )
@@ -198,21 +206,18 @@ class AppliedField:
         values = np.zeros_like(self.polynomial.values)
         values[..., :3] = self.polynomial.values[..., :3] if at_present_places else 0.0
         shape = values.shape[:2]
+        # columns as in `polynomial`: 0:3 u, 3:6 B at the undeformed place, 6:9 B, 9:18 gradient
         for at_places in self._fields_at_places:
             # a field that does not depend on the amplitudes has no derivative by them
-            if name in at_places.moving_field.names and (
-                not other or other in at_places.moving_field.names
-            ):
-                B, G = (
-                    (at_places.second_derivative(name, other), None)
-                    if other
-                    else at_places.derivative(name)
-                )
-                # columns as in `polynomial`: 0:3 u, 3:6 B at the undeformed place, 6:9 B, 9:18
-                # gradient
+            names = at_places.moving_field.names
+            if name not in names or (other and other not in names):
+                continue
+            if other:
+                values[..., 6:9] += at_places.second_derivative(name, other).reshape(*shape, 3)
+            else:
+                B, G = at_places.derivative(name)
                 values[..., 6:9] += B.reshape(*shape, 3)
-                if G is not None:
-                    values[..., 9:18] += G.reshape(*shape, 9)
+                values[..., 9:18] += G.reshape(*shape, 9)
         return values
 
     @property
@@ -229,23 +234,19 @@ class AppliedField:
         name. Only fields of bodies can be passed through: they have a function `distance` of
         places. Sums of fields list their summands in `parts`.
         """
-        parts_at_rest: list[tuple[FieldInSpace, MovingField]] = [
-            (field_part, MovingField(field_part))
-            for field_part in getattr(self._field_at_rest, "parts", [])
+        # the summands at rest count as fields without motions
+        parts_at_rest = [
+            MovingField(field_part) for field_part in getattr(self._field_at_rest, "parts", [])
         ]
-        for field, moving_field in [
-            *parts_at_rest,
-            *((moving.at_rest, moving) for moving in self._moving_fields),
-        ]:
+        for moving_field in [*parts_at_rest, *self._moving_fields]:
+            field = moving_field.at_rest
             if distance := getattr(field, "distance", None):
                 # the places as seen from the body, which moves by x -> Q x + t
-                relative_places = [
-                    (x - t) @ Q
-                    for x, (Q, t) in (
-                        (x, combined_motion(moving_field.motions, mu)) for x, mu in (start, end)
-                    )
-                ]
-                if crossed_place(distance, *relative_places) is not None:
+                seen_from_body = []
+                for x, mu in (start, end):
+                    Q, t = combined_motion(moving_field.motions, mu)
+                    seen_from_body.append((x - t) @ Q)
+                if crossed_place(distance, *seen_from_body) is not None:
                     description = getattr(field, "nowhere", "is inside a source")
                     return f"a point of the shell {description} between two points of the path"
         return ""
@@ -270,13 +271,10 @@ class AppliedField:
             (field_part, field_part(x[None])[0])
             for field_part in getattr(self._field_at_rest, "parts", [self._field_at_rest])
         ]
-        for field, B in [
-            *values_at_rest,
-            *(
-                (moving.at_rest, moving.field_at(x[None], self.mu).B)
-                for moving in self._moving_fields
-            ),
-        ]:
+        values_of_moving = [
+            (moving.at_rest, moving.field_at(x[None], self.mu).B) for moving in self._moving_fields
+        ]
+        for field, B in [*values_at_rest, *values_of_moving]:
             if not np.isfinite(B).all():
                 description = getattr(
                     field, "nowhere", "is where magnetic.applied has no finite value"
@@ -329,10 +327,11 @@ class FieldAmplitude:
         quadratic energy is differentiated along the change of the Taylor polynomial.
         """
         linear = [self._with_polynomial(t, self.applied.slope(self.name)) for t in self._linear]
-        return linear + [
+        quadratic = [
             self._derivative_along(t, self.applied.slope(self.name, at_present_places=False))
             for t in self._quadratic
         ]
+        return linear + quadratic
 
     def second_derivatives(self, q: Any) -> Sequence[Derivative]:
         """Return d2Pi/dmu dq as terms.
@@ -357,14 +356,11 @@ class FieldAmplitude:
             for names in ((self.name, q.name), (self.name,), (q.name,))
         )
         by_both = [self._derivative_along(t, by_both_change) for t in self._quadratic]
-        return (
-            linear
-            + by_both
-            + [
-                self._derivative_along(self._derivative_along(t, by_first), by_second)
-                for t in self._quadratic
-            ]
-        )
+        by_one_after_other = [
+            self._derivative_along(self._derivative_along(t, by_first), by_second)
+            for t in self._quadratic
+        ]
+        return linear + by_both + by_one_after_other
 
     @property
     def _linear(self) -> list[FormTerm]:

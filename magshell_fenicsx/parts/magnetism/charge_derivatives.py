@@ -53,24 +53,28 @@ def places(points: Points, rows: Ints, nodes: Complex) -> tuple[Complex, Complex
         (n, k, 3) nodes of their cells, with rates as imaginary parts.
     """
     T = np.moveaxis(points.tables, -2, 0)  # shape functions, and their two derivatives
-    # real and imaginary parts side by side, so that a real matrix product interpolates both
-    flat_nodes = (
-        np.ascontiguousarray(nodes.transpose(1, 0, 2)).view(np.float64).reshape(nodes.shape[1], -1)
-    )
-    r, a1, a2 = (
-        np.moveaxis(
-            (table.reshape(-1, table.shape[-1]) @ flat_nodes)
-            .view(np.complex128)
-            .reshape(-1, *nodes.shape[::2]),
-            1,
-            0,
-        ).reshape(len(nodes), *table.shape[:-1], 3)
-        for table in T
-    )
+    r, a1, a2 = _interpolated(T, nodes)
     area_vector = np.cross(a1, a2)
     n = area_vector / np.sqrt(np.sum(area_vector * area_vector, axis=-1, keepdims=True))
     heights = points.t[rows][..., None] * points.heights
     return r, n, r[..., None, :] + heights[..., None] * n[..., None, :]
+
+
+def _interpolated(T: Array, nodes: Complex) -> list[Complex]:
+    """Return the values (n, P, .., 3) of nodal values (n, k, 3), for each table of T.
+
+    A table (P, .., k) has the factors of the k nodes at each point, such as shape functions.
+    """
+    # real and imaginary parts side by side, so that a real matrix product interpolates both
+    flat_nodes = (
+        np.ascontiguousarray(nodes.transpose(1, 0, 2)).view(np.float64).reshape(nodes.shape[1], -1)
+    )
+    values = list[Complex]()
+    for table in T:
+        product = (table.reshape(-1, table.shape[-1]) @ flat_nodes).view(np.complex128)
+        by_point = product.reshape(-1, *nodes.shape[::2])  # (points, n, 3)
+        values.append(np.moveaxis(by_point, 1, 0).reshape(len(nodes), *table.shape[:-1], 3))
+    return values
 
 
 def pair_derivatives(
@@ -98,25 +102,27 @@ def pair_derivatives(
         Points on each pair's first and second cell, and their rows (n,).
     """
     by_left, by_right = (np.zeros_like(points.q) for points, _ in (left, right))
+    left_points, right_points = left[0], right[0]
     # either all pairs of points count, or each left point has right points of its own
-    is_shared = right[0].tables.ndim == 3
-    size = left[0].q[0].size * (right[0].q[0].size if is_shared else right[0].q[0, 0].size)
+    is_shared = right_points.tables.ndim == 3
+    right_charges = right_points.q[0].size if is_shared else right_points.q[0, 0].size
+    charge_pairs = left_points.q[0].size * right_charges  # of one pair of elements
     # derivatives by heights need about four times the memory
-    batch_size, derivatives = (
-        max(1, MAX_CHARGE_PAIRS // (4 * size if heights else size)),
-        _by_heights if heights else _by_charges,
-    )
+    batch_size = max(1, MAX_CHARGE_PAIRS // (4 * charge_pairs if heights else charge_pairs))
+    derivatives = _by_heights if heights else _by_charges
     for first in range(0, len(cells), batch_size):
         batch = slice(first, first + batch_size)
+        # components of places and normals of the left and the right charges
         x, y = (
-            _components(points, rows[batch], nodes[cells[batch, i]], is_shared)
-            for i, (points, rows) in enumerate((left, right))
+            _components(points, rows[batch], nodes[cells[batch, side]], is_shared)
+            for side, (points, rows) in enumerate((left, right))
         )
-        # charges in the shape of the components of places
+        # charges in the shape of a component of places
         q, p = (
-            points.q[rows[batch]].reshape(*z[0][0].shape)
-            for (points, rows), z in ((left, x), (right, y))
+            points.q[rows[batch]].reshape(*places_and_normals[0][0].shape)
+            for (points, rows), places_and_normals in ((left, x), (right, y))
         )
+        # the derivatives of the batch are added to the rows of its elements, on both sides
         for total, (_, rows), derivative in zip(
             (by_left, by_right), (left, right), derivatives(x, y, q, p, weights), strict=True
         ):
@@ -132,17 +138,22 @@ def _by_charges(
     `x` and `y` are components of places and normals of left and right charges. With d = x - y the
     kernel is 1/|d|; its rate along v is -d . d'/|d|³, with the rate d' of d.
     """
-    places_and_rates = [
+    # of each side the components of places, as pairs of value and rate along v
+    left_pairs, right_pairs = (
         [
             (np.ascontiguousarray(values.real), values.imag / COMPLEX_STEP)
-            for values in components[0]
+            for values in places_of_side
         ]
-        for components in (x, y)
-    ]
+        for places_of_side, _ in (x, y)
+    )
+    # components of d and d', each (n, 1 or P, left charges, right charges)
     separation, rate = (
-        [a[i][..., :, None] - b[i][..., None, :] for a, b in zip(*places_and_rates, strict=True)]
+        [
+            a[i][..., :, None] - b[i][..., None, :]
+            for a, b in zip(left_pairs, right_pairs, strict=True)
+        ]
         for i in range(2)
-    )  # (n, 1 or P, left, right)
+    )
     inverse = 1 / np.sqrt(separation[0] ** 2 + separation[1] ** 2 + separation[2] ** 2)
     radial_rate = separation[0] * rate[0] + separation[1] * rate[1] + separation[2] * rate[2]
     kernel = weights.energy * inverse - weights.force * inverse**2 * inverse * radial_rate
@@ -158,14 +169,16 @@ def _by_heights(
     derivative -q p n . d/|d|³. `x` and `y` are components of places and normals of left and right
     charges.
     """
-    d = [a[..., :, None] - b[..., None, :] for a, b in zip(x[0], y[0], strict=True)]
+    (left_places, left_normals), (right_places, right_normals) = x, y
+    d = [a[..., :, None] - b[..., None, :] for a, b in zip(left_places, right_places, strict=True)]
     square = d[0] * d[0] + d[1] * d[1] + d[2] * d[2]
     inverse_cube = 1 / (square * np.sqrt(square))
     by_left_heights, by_right_heights = np.zeros(q.shape, complex), np.zeros(p.shape, complex)
-    for separation, n, m in zip(d, x[1], y[1], strict=True):  # components x, y, z
+    for separation, n, m in zip(d, left_normals, right_normals, strict=True):  # components
         force = inverse_cube * separation
         by_left_heights -= n * (force @ p[..., None])[..., 0]
         by_right_heights += m * (q[..., None, :] @ force)[..., 0, :]
+    # real parts are derivatives of the energy, imaginary parts their rates along v
     by_left, by_right = (
         weights.energy * derivative.real + weights.force * derivative.imag / COMPLEX_STEP
         for derivative in (q * by_left_heights, p * by_right_heights)
@@ -181,7 +194,6 @@ def _components(points: Points, rows: Ints, nodes: Complex, is_shared: bool) -> 
     """
     _, n, x = places(points, rows, nodes)
     shape = len(x), 1 if is_shared else x.shape[1], -1, 3
-    places_and_normals = x.reshape(shape), np.broadcast_to(n[..., None, :], x.shape).reshape(shape)
-    return [places_and_normals[0][..., i] for i in range(3)], [
-        places_and_normals[1][..., i] for i in range(3)
-    ]
+    charge_places = x.reshape(shape)
+    charge_normals = np.broadcast_to(n[..., None, :], x.shape).reshape(shape)
+    return [charge_places[..., i] for i in range(3)], [charge_normals[..., i] for i in range(3)]

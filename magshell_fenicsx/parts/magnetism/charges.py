@@ -232,9 +232,10 @@ class ChargedElements:
         for _ in range(MAX_HALVINGS):
             if not len(box_of_pair):
                 return
-            x = self.box_places(boxes, corners)
-            centre = x[:, 0]
-            radius = np.sqrt(((x - x[:, :1]) ** 2).sum(axis=-1)).max(axis=(1, 2))
+            box_places = self.box_places(boxes, corners)
+            centre = box_places[:, 0]
+            radius = np.sqrt(((box_places - box_places[:, :1]) ** 2).sum(axis=-1)).max(axis=(1, 2))
+            # there are several centres through the thickness, of which the nearest counts
             distance = np.linalg.norm(
                 places[place_of_pair][:, None] - centre[box_of_pair], axis=-1
             ).min(axis=-1)
@@ -243,16 +244,24 @@ class ChargedElements:
                 yield boxes, box_of_pair[is_separated], place_of_pair[is_separated]
             # boxes too near to a place are halved across their longest direction, for this place
             halved, box_of_pair = np.unique(box_of_pair[~is_separated], return_inverse=True)
-            place_of_pair, x = place_of_pair[~is_separated], x[halved]
-            ends = x[:, 1 : 1 + 2 * self.dimension]  # middles of opposite sides
-            sides = np.linalg.norm(ends[:, 1::2] - ends[:, ::2], axis=-1).max(axis=-1)
-            boxes = boxes[halved].halves(sides.argmax(axis=1))
-            box_of_pair, place_of_pair = (
-                np.concatenate([box_of_pair, box_of_pair + len(halved)]),
-                np.tile(place_of_pair, 2),
-            )
+            place_of_pair = place_of_pair[~is_separated]
+            boxes = boxes[halved].halves(_longest_directions(box_places[halved], self.dimension))
+            # a place is paired with both halves: the lower halves come first, then the upper ones
+            box_of_pair = np.concatenate([box_of_pair, box_of_pair + len(halved)])
+            place_of_pair = np.tile(place_of_pair, 2)
         if len(box_of_pair):
             raise TooNear(np.unique(place_of_pair))
+
+
+def _longest_directions(box_places: Array, dimension: int) -> Ints:
+    """Return the number of the coordinate along which each of n boxes is longest.
+
+    `box_places` (n, m, k, 3) are at the points of `_extent_points`: behind the middle come the
+    middles of the `dimension` pairs of opposite sides.
+    """
+    ends = box_places[:, 1 : 1 + 2 * dimension]
+    lengths = np.linalg.norm(ends[:, 1::2] - ends[:, ::2], axis=-1).max(axis=-1)
+    return np.asarray(lengths.argmax(axis=1))
 
 
 class ShellFaces(ChargedElements):
@@ -261,6 +270,15 @@ class ShellFaces(ChargedElements):
     The interior is represented by Gauss layers through the thickness. A uniform remanence has no
     charge inside, so these layers are left out; with `include_uncharged` they are kept, as
     derivatives by the remanence need them.
+
+    Attributes
+    ----------
+    _cells, _sector
+        (count,) the cell of each element, and its number among the sectors of this cell.
+    _sectors
+        Number of sectors of a swept cell; 1 for a triangle.
+    _inside
+        Pairs of the height and the weight of each layer inside; empty if there are none.
     """
 
     def __init__(
@@ -269,18 +287,17 @@ class ShellFaces(ChargedElements):
         """Divide swept cells into sectors, and decide whether layers inside are needed."""
         self.shape = shape
         sectors = SECTORS if shape.swept else 1
-        self._cells, self._sector = (
-            np.repeat(cells, sectors),
-            np.tile(np.arange(sectors), len(cells)),
-        )
+        self._cells = np.repeat(cells, sectors)
+        self._sector = np.tile(np.arange(sectors), len(cells))
         self._sectors, self.count = sectors, sectors * len(cells)
         spread = np.abs(shape.remanence - shape.remanence[:, :1]).max(initial=0.0)
         # a uniform remanence has no charge inside; around an axis only an axial one is uniform
         is_uniform = spread <= 1e-12 * np.abs(shape.remanence).max(initial=0.0)
         is_axial = not shape.swept or not np.abs(shape.remanence[..., :2]).any()
+        is_uncharged = is_uniform and is_axial
         self._inside = (
             []
-            if is_uniform and is_axial and not include_uncharged
+            if is_uncharged and not include_uncharged
             else list(zip(*_interior_layers(), strict=True))
         )
 
@@ -309,44 +326,49 @@ class ShellFaces(ChargedElements):
         the thickness. Newton's method for the foot starts from the nearest point of a grid on each
         element.
         """
-        from scipy.spatial import cKDTree  # takes long to import
-
         is_inside = np.zeros(len(places), dtype=bool)
         if not self.count:
             return is_inside
-        boxes, start = (
-            Boxes.undivided(self.count),
-            np.clip(GRID_OF_SQUARE, BOUNDARY_INSET, 1 - BOUNDARY_INSET),
-        )
-        grid = self._jets(boxes, start)
-        grid_places = grid.r[0].reshape(-1, GRID_POINTS_PER_SIDE, GRID_POINTS_PER_SIDE, 3)
-        diagonals = [
-            grid_places[:, 1:, 1:] - grid_places[:, :-1, :-1],
-            grid_places[:, 1:, :-1] - grid_places[:, :-1, 1:],
-        ]
-        # a place in the shell is within `reach` of a grid point of its box: the longest diagonal of
-        # the grid's squares, and the thickness
-        reach = np.max(
-            [np.linalg.norm(array, axis=-1).max(axis=(1, 2)) for array in diagonals], axis=0
-        )
-        reach = reach + grid.thickness.max(axis=1)
+        boxes = Boxes.undivided(self.count)
+        start = np.clip(GRID_OF_SQUARE, BOUNDARY_INSET, 1 - BOUNDARY_INSET)
+        # pairs of a place and a box near it, with the number of the nearest grid point of the box
+        place, box, point = self._nearest_grid_points(places, self._jets(boxes, start))
+        if len(place):
+            has_foot = self._feet_within(boxes[box], start[point][:, None], places[place][:, None])
+            is_inside[place[has_foot]] = True
+        return is_inside
+
+    def _nearest_grid_points(self, places: Array, grid: SurfaceJets) -> tuple[Ints, Ints, Ints]:
+        """Return pairs of a place and a box that may contain it, with the nearest grid point.
+
+        Parameters
+        ----------
+        places
+            (n, 3) over R.
+        grid
+            Jets at the points of `GRID_OF_SQUARE` in all boxes, one for each element.
+
+        Returns
+        -------
+        place, box, point
+            (pairs,) numbers of the place, of the box, and of the point in the grid of this box.
+        """
+        from scipy.spatial import cKDTree  # takes long to import
+
+        reach = _reach_of_grid(grid)
         candidates = cKDTree(grid.r[0].reshape(-1, 3)).query_ball_point(places, reach.max())
         place = np.repeat(np.arange(len(places)), [len(array) for array in candidates])
         # the tree counts grid points box by box
-        box, point = np.divmod(np.concatenate([*candidates, []]).astype(np.intp), len(start))
+        points_per_box = grid.r[0].shape[1]
+        box, point = np.divmod(np.concatenate([*candidates, []]).astype(np.intp), points_per_box)
         distance_to_point = np.linalg.norm(places[place] - grid.r[0][box, point], axis=-1)
-        # of each pair (place, box) the nearest grid point, where Newton's method starts
+        # sorted by place, then by box, then by distance; points beyond the reach are left out
         order = np.lexsort((distance_to_point, box, place))
         order = order[distance_to_point[order] <= reach[box[order]]]
-        _, nearest = np.unique(
-            place[order] * self.count + box[order], return_index=True
-        )  # the nearest in each box
+        # the first entry of each pair (place, box) has the nearest point
+        _, nearest = np.unique(place[order] * self.count + box[order], return_index=True)
         place, box, point = (array[order][nearest] for array in (place, box, point))
-        if len(place):
-            is_inside[
-                place[self._feet_within(boxes[box], start[point][:, None], places[place][:, None])]
-            ] = True
-        return is_inside
+        return place, box, point
 
     def _feet_within(self, boxes: Boxes, ab: Array, x: Array) -> NDArray[np.bool_]:
         """Return flags (n,): whether place x[i] has a foot in box i within half of the thickness.
@@ -357,11 +379,13 @@ class ShellFaces(ChargedElements):
         for _ in range(NEWTON_STEPS):
             foot = self._jets_at(boxes, ab)
             J = np.stack([foot.r[1], foot.r[2]], axis=-1)
+            # the change of (a, b) along which the tangent plane comes nearest to the place
             step = np.einsum("nmdi,nmi->nmd", np.linalg.pinv(J), x - foot.r[0])
             # the Jacobian is by b of the whole ring, of which an element is one sector
             step[..., 1] *= self._sectors
             ab = np.clip(ab + step, BOUNDARY_INSET**3, 1 - BOUNDARY_INSET**3)
         foot = self._jets_at(boxes, ab)
+        # the distance from the last iterate, along the normal and across it
         d, n = x - foot.r[0], unit(np.cross(foot.r[1], foot.r[2]))
         normal_distance = np.sum(d * n, axis=-1)
         off_normal = np.linalg.norm(d - normal_distance[..., None] * n, axis=-1)
@@ -382,12 +406,14 @@ class ShellFaces(ChargedElements):
         layer inside has -Div Br dV0: derivatives of Br by a and b times the cofactors dX/db x
         dX/deta and dX/deta x dX/da. Br does not vary through the thickness.
         """
+        # (n, m) share of each point in the area of its box; an element is one sector of the ring
         area = np.prod(boxes.size, axis=1)[:, None] * weights / self._sectors
 
         def layers(at: SurfaceJets) -> list[Layer]:
             """Return the layers at the points of jets: both faces, then the ones inside.
 
-            A face has a factor of Br alone, a layer inside of the derivatives of Br alone.
+            A layer has three factors: of Br and of its derivatives by a and b. On a face only the
+            first is not zero, inside only the other two are not.
             """
             layers_of_jets = list[Layer]()
             for eta, sign in ((0.5, 1.0), (-0.5, -1.0)):  # outward normals are opposite
@@ -410,6 +436,13 @@ class EdgeStrips(ChargedElements):
     """Edges of cells as charged strips: coordinates along the edge and through the thickness.
 
     `cells` and `edges` (n,) are the cell and the local number of each edge.
+
+    Attributes
+    ----------
+    _cells, _edges
+        (count,) the cell and the local number of the edge of each element.
+    _sector, _sectors
+        (count,) the number of each element among the sectors of its cell, and how many these are.
     """
 
     def __init__(self, shape: MagnetisedShell, cells: Ints, edges: Ints) -> None:
@@ -437,13 +470,10 @@ class EdgeStrips(ChargedElements):
         edge = self._edges[boxes.elements][:, None]
         if self.shape.swept:
             # edge 1 is the circle a = 1, edge 0 the circle a = 0, which runs backwards
+            a = np.where(edge == 1, 1.0, 0.0) + 0 * s
             b = (self._sector[boxes.elements][:, None] + s) / self._sectors
             tangents = np.where(edge == 1, 1.0, -1.0)[..., None] * np.array([0.0, 1.0])
-            return (
-                np.stack([np.where(edge == 1, 1.0, 0.0) + 0 * s, b], axis=-1),
-                tangents[:, 0],
-                eta - 0.5,
-            )
+            return np.stack([a, b], axis=-1), tangents[:, 0], eta - 0.5
         # around the triangle with the surface on the left: b = 1 backwards, a = 0 backwards, b = 0
         a = np.where(edge == 0, 1 - s, np.where(edge == 2, s, 0.0))
         b = np.where(edge == 0, 1.0, np.where(edge == 1, 1 - s, 0.0))
@@ -491,6 +521,23 @@ class EdgeStrips(ChargedElements):
         return _point_charges(jets, layers, nodal_derivatives)
 
 
+def _reach_of_grid(grid: SurfaceJets) -> Array:
+    """Return the distance (boxes,) from a grid point within which places of the shell lie.
+
+    It is the longest diagonal of the grid's squares, and the thickness, for each box. `grid` are
+    jets at the points of `GRID_OF_SQUARE`.
+    """
+    grid_places = grid.r[0].reshape(-1, GRID_POINTS_PER_SIDE, GRID_POINTS_PER_SIDE, 3)
+    diagonals = [
+        grid_places[:, 1:, 1:] - grid_places[:, :-1, :-1],
+        grid_places[:, 1:, :-1] - grid_places[:, :-1, 1:],
+    ]
+    longest_diagonal = np.max(
+        [np.linalg.norm(array, axis=-1).max(axis=(1, 2)) for array in diagonals], axis=0
+    )
+    return np.asarray(longest_diagonal + grid.thickness.max(axis=1))
+
+
 def heights(faces: ShellFaces) -> Array:
     """Return the heights (layers,) of a shell's charges over the thickness: faces, then inside."""
     return np.array([0.5, -0.5, *(eta for eta, _ in faces._inside)])
@@ -527,13 +574,11 @@ def _point_charges(
 
         B does not depend on the shape, the factors do.
         """
-        return np.stack(
-            [
-                sum(np.sum(c * b, axis=-1) for c, b in zip(C, jets.B, strict=True))
-                for _, C in layers
-            ],
-            axis=2,
-        )
+        charges_of_layers = [
+            sum(np.sum(c * b, axis=-1) for c, b in zip(factors, jets.B, strict=True))
+            for _, factors in layers
+        ]
+        return np.stack(charges_of_layers, axis=2)
 
     q = charges(layers)
     if nodal_derivatives is None:
@@ -544,10 +589,11 @@ def _point_charges(
 
         `on_x` and `on_q` are dJ/dx and dJ/dq by places and sizes of the charges.
         """
-        # the place x = r + height n: its derivatives by r and n
+        # the place of a charge is x = r + height n, so that dJ/dr = dJ/dx, dJ/dn = height dJ/dx
         heights = np.stack([eta * thickness + 0 * jets.r[0][..., :1] for eta, _ in layers], axis=2)
-        by_B = [
-            sum(on_q[:, :, i, None] * C[j] for i, (_, C) in enumerate(layers)) for j in range(3)
+        by_B = [  # by B and its two derivatives
+            sum(on_q[:, :, layer, None] * factors[j] for layer, (_, factors) in enumerate(layers))
+            for j in range(3)
         ]
         jets.add_derivatives(
             nodal_derivatives, on_x.sum(axis=2), (heights * on_x).sum(axis=2), np.stack(by_B)
@@ -568,7 +614,6 @@ def field(families: Sequence[ChargedElements], places: Array) -> Array:
     """
     B = np.zeros_like(places)
     for family in families:
-        rule, weights = cube(GAUSS_POINTS_PER_SIDE, family.dimension)
         for part_of_places in _slices(len(places), family.count):
             try:
                 for boxes, box_of_pair, place_of_pair in family.separated_boxes(
@@ -576,22 +621,29 @@ def field(families: Sequence[ChargedElements], places: Array) -> Array:
                 ):
                     # the charges of a box are computed once, for all places that are paired with it
                     used_boxes, box_of_pair = np.unique(box_of_pair, return_inverse=True)
-                    parts_of_charges = [
-                        family.charges_at(part_of_boxes, rule, weights)
-                        for part_of_boxes in _chunks_of_boxes(boxes[used_boxes], len(weights))
-                    ]
-                    x = np.concatenate([charges.x for charges in parts_of_charges]).reshape(
-                        len(used_boxes), -1, 3
-                    )
-                    q = np.concatenate([charges.q for charges in parts_of_charges]).reshape(
-                        len(used_boxes), -1
-                    )
+                    x, q = _charges_of_boxes(family, boxes[used_boxes])
                     _add_field(
                         B[part_of_places], place_of_pair, places[part_of_places], x, q, box_of_pair
                     )
             except TooNear as error:
                 B[part_of_places][error.numbers] = np.nan
     return B
+
+
+def _charges_of_boxes(family: ChargedElements, boxes: Boxes) -> tuple[Array, Array]:
+    """Return the charges of n boxes by Gauss's rule: places (n, points, 3) and sizes (n, points).
+
+    The points of a box are those of the rule, on each layer through the thickness.
+    """
+    rule, weights = cube(GAUSS_POINTS_PER_SIDE, family.dimension)
+    parts_of_charges = [
+        family.charges_at(part_of_boxes, rule, weights)
+        for part_of_boxes in _chunks_of_boxes(boxes, len(weights))
+    ]
+    count = len(boxes.elements)
+    x = np.concatenate([charges.x for charges in parts_of_charges]).reshape(count, -1, 3)
+    q = np.concatenate([charges.q for charges in parts_of_charges]).reshape(count, -1)
+    return x, q
 
 
 def _add_field(
@@ -609,6 +661,7 @@ def _add_field(
     # each component of places, and of differences, is an array of its own, for speed
     components = np.ascontiguousarray(np.moveaxis(x, -1, 0))
     for pairs in _slices(len(place_of_pair), q.shape[1]):
+        # components of x - x_q, each (pairs, points)
         d = [
             places[place_of_pair[pairs], i, None] - components[i][box_of_pair[pairs]]
             for i in range(3)
@@ -618,6 +671,7 @@ def _add_field(
             4 * np.pi * square_of_distance * np.sqrt(square_of_distance)
         )
         for i in range(3):
+            # the sum over all pairs of a place
             B[:, i] += np.bincount(
                 place_of_pair[pairs], np.einsum("nm,nm->n", q_over_cube, d[i]), len(B)
             )
@@ -637,6 +691,7 @@ def gradient(
         If the place is in the shell's surface.
     """
     value = 0.0
+    # all boxes that are far enough from the place, in chunks; each belongs to one family
     chunks = (
         (family, chunk)
         for family in families
@@ -709,24 +764,24 @@ def triangles(family: ChargedElements, parts: int) -> list[tuple[Array, Array]]:
     two triangles. They share the quadrangle's charge by area; triangles almost without area are
     left out.
     """
+    # parts x parts boxes of each element
     low = np.stack(np.meshgrid(*[np.arange(parts) / parts] * 2, indexing="ij"), axis=-1).reshape(
         -1, 2
     )
     count = len(low)
     boxes = Boxes(
-        np.repeat(np.arange(family.count), count),
-        np.tile(low, (family.count, 1)),
-        np.full((family.count * count, 2), 1 / parts),
+        elements=np.repeat(np.arange(family.count), count),
+        low=np.tile(low, (family.count, 1)),
+        size=np.full((family.count * count, 2), 1 / parts),
     )
-    corners, (rule, weights) = (
-        np.clip(CORNERS_OF_SQUARE, CORNER_INSET, 1 - CORNER_INSET),
-        cube(3, 2),
-    )
+    corners = np.clip(CORNERS_OF_SQUARE, CORNER_INSET, 1 - CORNER_INSET)
+    rule, weights = cube(3, 2)
     triangles_and_charges = []
     for chunk in _chunks_of_boxes(boxes, len(weights)):
         # at the corners only places are wanted: their charges have the weight zero
         x = family.charges_at(chunk, corners, np.zeros(len(corners))).x
         q = family.charges_at(chunk, rule, weights).q.sum(axis=1).ravel()
+        # x is (boxes, corners, layers, 3): a box has one quadrangle on each layer
         quads = np.moveaxis(x, 1, 2).reshape(-1, 4, 3)
         halves = quads[:, [[0, 1, 2], [0, 2, 3]]]
         area = np.linalg.norm(

@@ -89,6 +89,7 @@ class MagnetisedSolid:
         middle = x.mean(axis=1)
         radius = RADIUS_FACTOR * np.linalg.norm(x - middle[:, None], axis=-1).max(axis=1)
         candidates = cKDTree(middle).query_ball_point(places, radius.max())
+        # all pairs (place, cell): one number of each in two arrays of the same length
         place = np.repeat(
             np.arange(len(places)), [len(cells_of_place) for cells_of_place in candidates]
         )
@@ -98,7 +99,8 @@ class MagnetisedSolid:
         place, cell = place[is_near], cell[is_near]
         for first in range(0, len(place), MAX_POINTS_AT_ONCE):
             pairs = slice(first, first + MAX_POINTS_AT_ONCE)
-            is_inside[place[pairs][self._are_in_cells(x[cell[pairs]], places[place[pairs]])]] = True
+            in_cell = self._are_in_cells(nodes=x[cell[pairs]], x=places[place[pairs]])
+            is_inside[place[pairs][in_cell]] = True
         return is_inside
 
     def _are_in_cells(self, nodes: Array, x: Array) -> NDArray[np.bool_]:
@@ -108,6 +110,7 @@ class MagnetisedSolid:
         starts from the nearest node.
         """
         nearest = np.linalg.norm(nodes - x[:, None], axis=-1).argmin(axis=1)
+        # reference coordinates (n, 3) of the places, each in its cell
         reference = self.element.points[nearest]
         for _ in range(NEWTON_STEPS):
             value, *gradients = np.einsum(
@@ -190,13 +193,14 @@ class SolidCharges(ChargedElements):
         given, `add_derivatives` of the result adds to it.
         """
         reference, cells, solid = self.reference(boxes, x), self.cells[boxes.elements], self.shape
-        shape_tables, remanence_tables = (
-            tables(solid.element, reference, 1),
-            tables(solid.remanence_element, reference, 1),
-        )
-        X = np.einsum("dnmk,nki->dnmi", shape_tables[1:], solid.X[cells])
+        # values and derivatives by (a, b, c) at the points: of shape functions, then of fields
+        shape_tables = tables(solid.element, reference, 1)
+        remanence_tables = tables(solid.remanence_element, reference, 1)
+        slopes_of_X = np.einsum("dnmk,nki->dnmi", shape_tables[1:], solid.X[cells])
         remanence = np.einsum("dnmk,nki->dnmi", remanence_tables, solid.remanence[cells])
-        factors = self.remanence_factors(boxes, X, np.prod(boxes.size, axis=1)[:, None] * weights)
+        # a charge is the sum of factors times the remanence and its derivatives
+        weights_in_boxes = np.prod(boxes.size, axis=1)[:, None] * weights
+        factors = self.remanence_factors(boxes, slopes_of_X, weights_in_boxes)
         place = np.einsum("nmk,nki->nmi", shape_tables[0], self._nodes[cells])
         q = np.sum(factors * remanence, axis=(0, -1))
         if nodal_derivatives is None:
@@ -290,14 +294,14 @@ class ChargeLayers(ChargedElements):
         boxes_in_solid = Boxes(
             boxes.elements, np.hstack([boxes.low, zero]), np.hstack([boxes.size, one])
         )
+        # all points at the first height, then all at the second one, and so on
         points = np.concatenate([np.column_stack([x, np.full(len(x), c)]) for c in heights])
-        charges = self._inside.charges_at(
-            boxes_in_solid, points, np.concatenate([w * weights for w in weights_through])
-        )
+        weights_of_points = np.concatenate([w * weights for w in weights_through])
+        charges = self._inside.charges_at(boxes_in_solid, points, weights_of_points)
+        # layers become the last index of the charges
         shape = (len(boxes.elements), GAUSS_LAYERS, len(x))
-        return PointCharges(
-            charges.x.reshape(*shape, 3).swapaxes(1, 2), charges.q.reshape(shape).swapaxes(1, 2)
-        )
+        places = charges.x.reshape(*shape, 3).swapaxes(1, 2)
+        return PointCharges(places, charges.q.reshape(shape).swapaxes(1, 2))
 
 
 def on_surfaces(families: Sequence[ChargedElements]) -> list[ChargedElements]:

@@ -111,6 +111,10 @@ class ElementKind:
         (copies * n,) numbers of the cells, with images.
     number
         (copies * all cells,) row of each cell in `cells`, or -1.
+    _modelled, _edge
+        The parameters `cells` (without images) and `edge`.
+    _rules
+        Position of a rule in `DEGREES` -> its charged points.
     """
 
     def __init__(
@@ -182,9 +186,12 @@ class ElementKind:
 
         The edges run around the triangle with the surface on their left.
         """
-        return [np.stack([1 - s, s], -1), np.stack([0 * s, 1 - s], -1), np.stack([s, 0 * s], -1)][
-            self._edge or 0
+        points_on_edges = [
+            np.stack([1 - s, s], -1),
+            np.stack([0 * s, 1 - s], -1),
+            np.stack([s, 0 * s], -1),
         ]
+        return points_on_edges[self._edge or 0]
 
     def _strip_points(self, which: int) -> tuple[Array, Array, Array, Array]:
         """Return a rule on an edge strip.
@@ -210,16 +217,18 @@ class ElementKind:
         of `Points.q`. Charges of images are modelled ones times 1 or -1, so that their derivatives
         add up. Places are fixed here.
         """
-        count, boxes = len(self._copies.images), Boxes.undivided(self.family.count)
+        boxes = Boxes.undivided(self.family.count)
+        # the sum over all copies, with the factors 1 or -1 of their charges
+        count = len(self._copies.images)
+        by_charges_of_copies = by_charges.reshape(count, -1, *by_charges.shape[1:])
         by_modelled_charges = np.einsum(
-            "c,c...->...",
-            self._copies.charge_factors,
-            by_charges.reshape(count, -1, *by_charges.shape[1:]),
+            "c,c...->...", self._copies.charge_factors, by_charges_of_copies
         )
-        points_and_weights = (
-            self._face_points(which)[1:] if self._edge is None else self._strip_points(which)[2:]
-        )  # coordinates (a, b), or along and across an edge, and their weights
-        charges = self.family.charges_at(boxes, *points_and_weights, nodal_derivatives)
+        if self._edge is None:
+            _, points, weights = self._face_points(which)  # coordinates (a, b)
+        else:
+            _, _, points, weights = self._strip_points(which)  # along and across the edge
+        charges = self.family.charges_at(boxes, points, weights, nodal_derivatives)
         assert charges.add_derivatives
         charges.add_derivatives(
             np.zeros_like(charges.x), by_modelled_charges.reshape(charges.q.shape)
@@ -234,11 +243,12 @@ class ElementKind:
         shape of `Points.q` for the rule `which`. A height is the thickness times a fixed ratio. An
         image whose normals are turned over has opposite heights.
         """
-        X = (
-            self._face_points(which)[0]
-            if self._edge is None
-            else self._points_on_edge(self._strip_points(which)[0])
-        )
+        if self._edge is None:
+            X, _, _ = self._face_points(which)
+        else:
+            s, *_ = self._strip_points(which)
+            X = self._points_on_edge(s)
+        # (copies, cells, P): the sum over the layers of each point
         by_thickness = np.sum(self.rule(which).heights * by_heights, axis=-1).reshape(
             len(self._copies.normal_signs), -1, len(X)
         )
@@ -256,12 +266,12 @@ class ElementKind:
         `eta` (L,) over the thickness.
         """
         T = self._shape.element.tabulate(1, X)[..., 0].transpose(1, 0, 2)
-        t = self._shape.thickness(
-            self._modelled, np.broadcast_to(X, (len(self._modelled), *X.shape))
-        )[0]
-        t = np.concatenate([side * t for side in self._copies.normal_signs])
-        q = np.concatenate([factor * q for factor in self._copies.charge_factors])
-        return Points(T, np.broadcast_to(eta, (len(X), len(eta))), t, q)
+        X_of_cells = np.broadcast_to(X, (len(self._modelled), *X.shape))
+        thickness = self._shape.thickness(self._modelled, X_of_cells)[0]  # without derivatives
+        # where normals are turned over the thickness is negative, so that heights are opposite
+        t_of_copies = np.concatenate([side * thickness for side in self._copies.normal_signs])
+        q_of_copies = np.concatenate([factor * q for factor in self._copies.charge_factors])
+        return Points(T, np.broadcast_to(eta, (len(X), len(eta))), t_of_copies, q_of_copies)
 
 
 class InteractingCharges:
@@ -284,6 +294,22 @@ class InteractingCharges:
         The modelled cells and their images.
     include_uncharged
         Whether elements without a charge are kept, as derivatives by the remanence need them.
+
+    Attributes
+    ----------
+    _kinds
+        The kinds of elements that are charged, faces first.
+    _of_different_parts
+        (copies * cells, copies * cells) whether two cells are in different parts.
+    _acts_by_rule
+        Flags of the same shape: pairs that Gauss's rules or multipoles serve. A cell with itself
+        and adjacent cells are no such pairs.
+    _groups
+        (copies * cells,) group of each cell; cells of different groups act without multipoles.
+    _places, _radii
+        Middles and radii of the undeformed cells.
+    _boxes
+        The latest key of `boxes` with both results for it; None before the first.
     """
 
     def __init__(
@@ -299,28 +325,23 @@ class InteractingCharges:
         include_uncharged: bool = False,
     ) -> None:
         """Collect the charged elements, and find out which pairs of cells act on each other."""
-        self._pairs, self._h, self._singular_pairs, self._shape = (
-            Pairs(comm),
-            shape.h,
-            singular_pairs,
-            shape,
+        self._pairs, self._shape, self._h = Pairs(comm), shape, shape.h
+        self._singular_pairs = singular_pairs
+        # faces first, then the edges with the same local number
+        faces = ElementKind(
+            shape, np.arange(len(shape.r0)), copies, include_uncharged=include_uncharged
         )
-        kinds = [
-            ElementKind(
-                shape, np.arange(len(shape.r0)), copies, include_uncharged=include_uncharged
-            )
-        ]
-        kinds += [
+        kinds = [faces] + [
             ElementKind(shape, cells[edges == edge], copies, edge)
             for edge in range(3)
             if (edges == edge).any()
         ]
         # kinds whose charges are rounding are left out; the coarsest rule, 0, shows that
-        sizes = [element_kind.largest_charge(0) for element_kind in kinds]
+        charges = [element_kind.largest_charge(0) for element_kind in kinds]
         self._kinds = [
             element_kind
-            for element_kind, size in zip(kinds, sizes, strict=True)
-            if include_uncharged or size > CHARGE_TOLERANCE * max(sizes)
+            for element_kind, charge in zip(kinds, charges, strict=True)
+            if include_uncharged or charge > CHARGE_TOLERANCE * max(charges)
         ]
         self._of_different_parts = np.asarray(parts[:, None] != parts)  # pairs of different parts
         # pairs that a Gauss rule or multipoles may serve: not a cell with itself or an adjacent one
@@ -329,15 +350,9 @@ class InteractingCharges:
             self._acts_by_rule[cell] = 1
             self._acts_by_rule[cell, adjacent_cells] = 0
         self._parts = parts
-        assert isinstance(kinds[0].family, ShellFaces)
-        sizes_of_parts = np.bincount(parts, weights=np.tile(_areas(shape.r0), len(copies.images)))
-        number = np.tile(np.arange(len(shape.r0)), len(copies.images))
-        order = np.empty(len(parts), dtype=np.intp)
-        # cells ordered by the area of their part, then by the numbers of part and cell
-        order[np.lexsort([number, parts[number], sizes_of_parts[parts].round(AREA_DIGITS)])] = (
-            np.arange(len(parts))
-        )
-        self._stacked_faces = StackedFaces(shape, kinds[0].family, copies, parts, order, comm)
+        assert isinstance(faces.family, ShellFaces)
+        order = _order_of_cells(shape, parts, len(copies.images))
+        self._stacked_faces = StackedFaces(shape, faces.family, copies, parts, order, comm)
         # only images along the axes map boxes of the octree to boxes; other copies are groups that
         # act on each other without multipoles
         along_axes = all(np.allclose(np.abs(image.Q).max(axis=0), 1) for image in copies.images)
@@ -366,15 +381,13 @@ class InteractingCharges:
         PartsTooNear
             If two parts overlap, or are too near for the size of their cells.
         """
-        least_distances, too_near = (
-            np.array([least_distance(degree) for degree in DEGREES]),
-            least_distance(DEGREE_OF_TOO_NEAR),
-        )
-        has_rule = (
-            self._acts_by_rule[own_cells.start : own_cells.stop] & self.boxes(nodes, own_cells)[1]
-        )
+        least_distances = np.array([least_distance(degree) for degree in DEGREES])
+        too_near = least_distance(DEGREE_OF_TOO_NEAR)
+        own_rows = slice(own_cells.start, own_cells.stop)
+        _, is_too_near_for_multipoles = self.boxes(nodes, own_cells)
+        has_rule = self._acts_by_rule[own_rows] & is_too_near_for_multipoles
         is_stacked = self._stacked_faces.find_stacked(
-            nodes, own_cells, has_rule & self._of_different_parts[own_cells.start : own_cells.stop]
+            nodes, own_cells, has_rule & self._of_different_parts[own_rows]
         )
         has_rule &= ~is_stacked
         limits = PairLimits(self._h, MIN_DISTANCE, ABOVE_TOLERANCE, BESIDE_SINE, too_near)
@@ -401,11 +414,11 @@ class InteractingCharges:
             0, np.ceil(np.log(radii / self._radii) / np.log(RADIUS_RATIO) - 0.5)
         ).astype(np.int64)
         # the boxes follow from this key: steps of each cell on a grid, and its growth
-        key = np.column_stack([self._octree.steps_moved(places), growth_steps])
+        steps = self._octree.steps_moved(places)
+        key = np.column_stack([steps, growth_steps])
         if self._boxes is None or not np.array_equal(key, self._boxes[0]):
-            tree = self._octree.tree(
-                key[:, :3], self._radii * RADIUS_RATIO ** key[:, 3] + self._h / 2
-            )
+            radii_with_thickness = self._radii * RADIUS_RATIO ** key[:, 3] + self._h / 2
+            tree = self._octree.tree(key[:, :3], radii_with_thickness)
             kinds = [(kind.cells, kind.rule(MULTIPOLE_RULE)) for kind in self._kinds]
             self._boxes = key, MultipoleExpansion(tree, kinds, own_cells, self._pairs), tree.near
         return self._boxes[1:]
@@ -552,6 +565,22 @@ class InteractingCharges:
                 nodes, own_cells, is_stacked, moved_nodes, weights, nodal_derivatives
             )
         return nodal_derivatives
+
+
+def _order_of_cells(shape: MagnetisedShell, parts: Ints, copies: int) -> Ints:
+    """Return the position (copies * cells,) of each cell in the order for stacked faces.
+
+    Cells are ordered by the area of their part, then by the number of the part, then by their own
+    number. `parts` (copies * cells,) are the numbers of the parts, `copies` is the number of
+    copies.
+    """
+    areas_of_parts = np.bincount(parts, weights=np.tile(_areas(shape.r0), copies))
+    number = np.tile(np.arange(len(shape.r0)), copies)
+    order = np.empty(len(parts), dtype=np.intp)
+    order[np.lexsort([number, parts[number], areas_of_parts[parts].round(AREA_DIGITS)])] = (
+        np.arange(len(parts))
+    )
+    return order
 
 
 def _areas(r0: Array) -> Array:

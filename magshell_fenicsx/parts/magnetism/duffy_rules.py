@@ -64,33 +64,53 @@ def polar(apex: Array, s: float) -> tuple[Array, Array]:
     """
     corners = CORNERS - apex
     is_inside = min(_spanned_area(corners[i], corners[j]) for i, j in ENDS) > -AREA_TOLERANCE
-    lines = np.array([corners[j] - corners[i] for i, j in ENDS])
+    sides = np.array([corners[j] - corners[i] for i, j in ENDS])
     points, weights = list[Array](), list[Array]()
     v, wv = gauss(RAY_POINTS)
-    for A, B in _sectors(corners, is_inside):
-        bisector = A / np.linalg.norm(A) + B / np.linalg.norm(B)
-        # the side that the sector's middle ray meets first
-        nearest_side = int(np.argmin(_ray_lengths(lines, corners, bisector[None])[0]))
-        direction = lines[nearest_side] / np.linalg.norm(lines[nearest_side])
-        start = corners[ENDS[nearest_side][0]]
-        normal = start - (start @ direction) * direction
-        normal = normal / np.linalg.norm(normal)
-        # mu of a ray: sinh(mu) is the tangent of its angle from the side's normal
-        sector_ends = [np.arcsinh((C @ direction) / (C @ normal)) for C in (A, B)]
-        x, w = gauss(SECTOR_POINTS + int(abs(sector_ends[1] - sector_ends[0])))
-        mu = sector_ends[0] + (sector_ends[1] - sector_ends[0]) * x
-        # rays at the angle atan(sinh(mu)) from the side's normal: dangle = dmu/cosh(mu)
-        rays = (normal[None] + np.sinh(mu)[:, None] * direction) / np.cosh(mu)[:, None]
-        side_distances = _ray_lengths(lines, corners, rays)
-        low = np.zeros(len(x)) if is_inside else side_distances.min(axis=1)
+    for sector in _sectors(corners, is_inside):
+        rays, angle_weights = _rays_of_sector(sector, sides, corners)
+        # a ray is in the triangle from the length `low` to the length `high`
+        side_distances = _ray_lengths(sides, corners, rays)
+        low = np.zeros(len(rays)) if is_inside else side_distances.min(axis=1)
         high = np.where(np.isfinite(side_distances), side_distances, 0.0).max(axis=1)
+        # points on each ray, by Gauss's rule in v with r = s sinh v
         bottom, top = (np.arcsinh(length / s)[:, None] for length in (low, high))
         r = s * np.sinh(bottom + (top - bottom) * v)
-        angle_weights = (abs(sector_ends[1] - sector_ends[0]) * w / np.cosh(mu))[:, None]
         points.append((apex + r[..., None] * rays[:, None]).reshape(-1, 2))
         # r dr dangle, with dr = sqrt(r² + s²) dv
-        weights.append((angle_weights * wv * (top - bottom) * np.sqrt(r**2 + s**2) * r).ravel())
+        weights.append(
+            (angle_weights[:, None] * wv * (top - bottom) * np.sqrt(r**2 + s**2) * r).ravel()
+        )
     return np.concatenate(points), np.concatenate(weights)
+
+
+def _rays_of_sector(
+    sector: tuple[Array, Array], sides: Array, corners: Array
+) -> tuple[Array, Array]:
+    """Return unit vectors (n, 2) along rays of a sector, and the weights (n,) of their angles.
+
+    Parameters
+    ----------
+    sector
+        Vectors along its first and its last ray.
+    sides, corners
+        (3, 2) vectors along the sides of the triangle and to its corners, from the apex.
+    """
+    A, B = sector
+    bisector = A / np.linalg.norm(A) + B / np.linalg.norm(B)
+    # the side that the sector's middle ray meets first, with its direction and its normal
+    nearest_side = int(np.argmin(_ray_lengths(sides, corners, bisector[None])[0]))
+    direction = sides[nearest_side] / np.linalg.norm(sides[nearest_side])
+    start = corners[ENDS[nearest_side][0]]
+    normal = start - (start @ direction) * direction
+    normal = normal / np.linalg.norm(normal)
+    # mu of a ray: sinh(mu) is the tangent of its angle from the side's normal
+    first_mu, last_mu = (np.arcsinh((C @ direction) / (C @ normal)) for C in (A, B))
+    x, w = gauss(SECTOR_POINTS + int(abs(last_mu - first_mu)))
+    mu = first_mu + (last_mu - first_mu) * x
+    rays = (normal[None] + np.sinh(mu)[:, None] * direction) / np.cosh(mu)[:, None]
+    # the angle from the normal is atan(sinh(mu)), so that dangle = dmu/cosh(mu)
+    return rays, np.asarray(abs(last_mu - first_mu) * w / np.cosh(mu))
 
 
 def _sectors(V: Array, is_inside: bool) -> list[tuple[Array, Array]]:
@@ -108,17 +128,17 @@ def _sectors(V: Array, is_inside: bool) -> list[tuple[Array, Array]]:
     return [(V[i], V[j]) for i, j in pairwise(order) if angle[j] - angle[i] > AREA_TOLERANCE]
 
 
-def _ray_lengths(lines: Array, starts: Array, rays: Array) -> Array:
+def _ray_lengths(sides: Array, corners: Array, rays: Array) -> Array:
     """Return the lengths (n, 3) of rays (n, 2) from the origin to the sides of a triangle.
 
-    `lines` (3, 2) are vectors along the sides, `starts` (3, 2) the corners. A length is infinite
-    where a ray does not meet a side.
+    `sides` (3, 2) are vectors along the sides, `corners` (3, 2) those to the corners. A length is
+    infinite where a ray does not meet a side.
     """
-    starts = starts[[i for i, _ in ENDS]]
-    # solves r ray = start + t line, with t in [0, 1] on the side
-    det = rays[:, :1] * lines[:, 1] - rays[:, 1:] * lines[:, 0]
+    starts = corners[[i for i, _ in ENDS]]  # where each side starts
+    # solves r ray = start + t side, with t in [0, 1] on the side
+    det = rays[:, :1] * sides[:, 1] - rays[:, 1:] * sides[:, 0]
     with np.errstate(divide="ignore", invalid="ignore"):
-        r = (starts[:, 0] * lines[:, 1] - starts[:, 1] * lines[:, 0]) / det
+        r = (starts[:, 0] * sides[:, 1] - starts[:, 1] * sides[:, 0]) / det
         t = (starts[:, 0] * rays[:, 1:] - starts[:, 1] * rays[:, :1]) / det
     is_met = (
         (np.abs(det) > AREA_TOLERANCE)
@@ -177,16 +197,16 @@ def continued_across_side(X: Array, sides: tuple[int, int], flip: bool) -> Array
     are outside of its reference triangle. The shared side has the local numbers `sides` in the
     first and the second triangle; `flip` says that it runs the other way in the second one.
     """
-    bary, (i, j), (m, n) = barycentric(X), ENDS[sides[0]], ENDS[sides[1]]
+    bary = barycentric(X)
+    # corners of the shared side: i and j in the first triangle are m and n in the second
+    (i, j), (m, n) = ENDS[sides[0]], ENDS[sides[1]]
     m, n = (n, m) if flip else (m, n)
     continued = np.zeros_like(bary)
-    # the corner off the shared side is mirrored: weight t there becomes t, t, -t
+    # the third corner, 3 - i - j, is mirrored: its weight t becomes t, t, -t in the second triangle
     opposite = bary[:, 3 - i - j]
-    continued[:, m], continued[:, n], continued[:, 3 - m - n] = (
-        bary[:, i] + opposite,
-        bary[:, j] + opposite,
-        -opposite,
-    )
+    continued[:, m] = bary[:, i] + opposite
+    continued[:, n] = bary[:, j] + opposite
+    continued[:, 3 - m - n] = -opposite
     return np.asarray(continued[:, 1:])
 
 
@@ -222,28 +242,32 @@ def strip_rule_seen_from(t: float, eta: float, s: float) -> tuple[Array, Array, 
     # differ, so that no points may come too near each other: the map is linear
     is_beyond = not 0 <= t <= 1
     power, min_scale = (1, 0.1) if is_beyond else (3, 0.02)
-    # (start, end, sign): the first and last distance from t on a segment, and its direction
-    segments = (
-        [(0.0, t, -1.0), (0.0, 1 - t, 1.0)]
-        if not is_beyond
-        else [(-t, 1 - t, 1.0) if t < 0 else (t - 1, t, -1.0)]
-    )
-    rules_of_segments = list[tuple[Array, Array, Array]]()
+    segments = _segments_seen_from(t)
+    along, across, weights = list[Array](), list[Array](), list[Array]()
     # below and above the height eta, with points dense at it
     for reach in (-eta, 1 - eta):
-        for height, weight in zip(
-            eta + reach * x**power, abs(reach) * power * x ** (power - 1) * w, strict=True
-        ):
+        heights = eta + reach * x**power
+        height_weights = abs(reach) * power * x ** (power - 1) * w
+        for height, weight in zip(heights, height_weights, strict=True):
+            # a row of points at this height, dense at t on this scale, by a rule in v
             scale = s * max(abs(height - eta), min_scale)
             for start, end, sign in segments:
                 bottom, top = np.arcsinh(start / scale), np.arcsinh(end / scale)
                 r = bottom + (top - bottom) * v
-                places = t + sign * scale * np.sinh(r)
-                rules_of_segments.append(
-                    (
-                        places,
-                        np.full_like(r, height),
-                        weight * wv * (top - bottom) * scale * np.cosh(r),
-                    )
-                )
-    return tuple(np.concatenate(arrays) for arrays in zip(*rules_of_segments, strict=True))
+                along.append(t + sign * scale * np.sinh(r))
+                across.append(np.full_like(r, height))
+                weights.append(weight * wv * (top - bottom) * scale * np.cosh(r))
+    return np.concatenate(along), np.concatenate(across), np.concatenate(weights)
+
+
+def _segments_seen_from(t: float) -> list[tuple[float, float, float]]:
+    """Return the segments of an edge [0, 1] on both sides of a place t, or on one if t is outside.
+
+    A segment is given by three numbers: the least and the largest distance of its places from t,
+    and the sign of the direction from t to them.
+    """
+    if t < 0:
+        return [(-t, 1 - t, 1.0)]
+    if t > 1:
+        return [(t - 1, t, -1.0)]
+    return [(0.0, t, -1.0), (0.0, 1 - t, 1.0)]

@@ -106,33 +106,28 @@ def field_maps(context: Context, turn: float) -> tuple[FieldMap, ...]:
     `turn` (rad) is the angle about e3 by which this frame is turned from that of the case.
     """
     sections: dict[str, FieldMapSection] = context.sections.get("field_maps") or {}
-    field_units, R = units(context), context.shell.reference
-    unit = unit_of_readings(context)
-    grids = [
-        (
-            section,
-            MapGrid(
-                name,
-                np.array(section.corner) / R,
-                np.array(section.sides) / R,
-                tuple(section.points),
-                unit,
-                section.field,
-            ),
+    tesla_of_remanence, tesla_of_lambda = units(context)
+    R, unit = context.shell.reference, unit_of_readings(context)
+    maps = list[FieldMap]()
+    for name, section in sections.items():
+        grid = MapGrid(
+            name,
+            np.array(section.corner) / R,
+            np.array(section.sides) / R,
+            tuple(section.points),
+            unit,
+            section.field,
         )
-        for name, section in sections.items()
-    ]
-    tesla_of_remanence, tesla_of_lambda = field_units
-    return tuple(
-        FieldMap(
-            grid,
-            grid.places @ rotation(turn).T,
-            total=section.field == "total",
-            own=tesla_of_remanence,
-            applied=tesla_of_lambda,
+        maps.append(
+            FieldMap(
+                grid,
+                grid.places @ rotation(turn).T,
+                total=section.field == "total",
+                own=tesla_of_remanence,
+                applied=tesla_of_lambda,
+            )
         )
-        for section, grid in grids
-    )
+    return tuple(maps)
 
 
 def unit_of_readings(context: Context) -> str:

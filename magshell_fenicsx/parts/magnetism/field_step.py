@@ -101,12 +101,9 @@ class FieldSection(FactorStep):
         from magshell_fenicsx.parts.magnetism.direction import components, directions, field_at
 
         field = step_start.loads.magnetic
-        direction = components(
-            directions(step_start.context.steps, field, step_start.turn)[
-                step_start.step.number - 1  # steps are counted from 1
-            ],
-            field,
-        )
+        all_directions = directions(step_start.context.steps, field, step_start.turn)
+        present_direction = all_directions[step_start.step.number - 1]  # steps count from 1
+        direction = components(present_direction, field)
         return direction, float(direction @ field_at(step_start.mu))
 
     def load_start(self, step_start: StepStart) -> LoadStart:
@@ -207,14 +204,13 @@ class RotationSection(Step):
         from magshell_fenicsx.parts.magnetism import direction  # the solver takes long to import
 
         field, number = step_start.loads.magnetic, step_start.step.number
-        end_directions = direction.directions(step_start.context.steps, field, step_start.turn)[
-            number - 1 : number + 1
-        ]
-        start, end = (direction.components(end, field) for end in end_directions)
-        size, total = (
-            float(start @ direction.field_at(step_start.mu)),
-            acos(float(end_directions[0] @ end_directions[1])),
-        )
+        # unit vectors before and after the step, in space and by components for the amplitudes
+        all_directions = direction.directions(step_start.context.steps, field, step_start.turn)
+        start_vector, end_vector = all_directions[number - 1 : number + 1]
+        start = direction.components(start_vector, field)
+        end = direction.components(end_vector, field)
+        size = float(start @ direction.field_at(step_start.mu))  # signed magnitude of the field
+        total = acos(float(start_vector @ end_vector))
         # the requested points, without the begin of the step
         targets = [float(t) for t in np.linspace(0.0, total, self.points + 1)[1:]]
         drive = Drive(

@@ -267,7 +267,7 @@ class MagneticSection(Section, Ability):
         if self.remanent is None:
             self._one_field()
             return self
-        densities = [self.remanent.flux_density, self.applied.reference]
+        densities = [self.remanent.flux_density, self.applied.reference]  # None where not given
         if self.lambda_m is not None and self.applied.sources:
             raise ValueError(
                 "sources are in tesla: give remanent.flux_density in place of lambda_m"
@@ -359,6 +359,7 @@ class MagneticSection(Section, Ability):
         from magshell_fenicsx.parts.magnetism.sensors import is_read  # it needs this section
 
         shell = context.shell
+        # units and strength of the field
         self.amplitude(shell.youngs_modulus)  # raises if the strength is unknown
         if self.applied.sources and not shell.with_units:
             raise ValueError(
@@ -375,6 +376,7 @@ class MagneticSection(Section, Ability):
             raise ValueError(
                 "magnetic: give lambda_m, or remanent.flux_density and applied.flux_density"
             )
+        # what the energies need of the shell
         if self.interaction != "none":
             context.needs(
                 f"magnetic.interaction: {self.interaction}",
@@ -392,7 +394,7 @@ class MagneticSection(Section, Ability):
             )
         if self.remanent and isinstance(self.remanent.components, UserField):
             context.needs("magnetic.remanent", "a mid-surface", hint="of a solid give formulas")
-        # a shell knows the average alone, a solid has the layers
+        # values of the remanence: a shell knows the average of layers alone, a solid has them all
         layers = self.remanent.layers if self.remanent else None
         if layers and not context.solid and np.linalg.norm(layer_average(layers)) < 1e-9:
             raise ValueError(
@@ -496,18 +498,17 @@ class MagneticSection(Section, Ability):
             )
         for source in placed_sources(context):
             B, *_ = source(places)
-            # finite but too strong; values that are not finite have another message
-            if len(
-                strong_places := places[
-                    np.isfinite(B).all(axis=1) & (np.abs(B) > MAX_FIELD_RATIO).any(axis=1)
-                ]
-            ):
+            is_finite = np.isfinite(B).all(axis=1)
+            is_too_strong = (np.abs(B) > MAX_FIELD_RATIO).any(axis=1)
+            # values that are not finite have another message
+            strong_places = places[is_finite & is_too_strong]
+            if len(strong_places):
                 x, y, z = strong_places[0]
                 raise CaseError(
                     f"{source.key}: its field is above {MAX_FIELD_RATIO:g} times the unit of the "
                     f"field at (x, y, z)/R = ({x:.3g}, {y:.3g}, {z:.3g})"
                 )
-            bad_places = places[~np.isfinite(B).all(axis=1)]
+            bad_places = places[~is_finite]
             if len(bad_places):
                 x, y, z = bad_places[0]
                 raise CaseError(
@@ -518,12 +519,13 @@ class MagneticSection(Section, Ability):
             "remanent": self.remanent and self.remanent.components,
             "applied": self.applied.components,
         }
-        for key, text in (
+        keys_and_formulas = [
             (key, text)
             for key, texts in components.items()
             if isinstance(texts, list)
             for text in texts
-        ):
+        ]
+        for key, text in keys_and_formulas:
             bad_places = places[~(np.abs(formula(text)(*places.T)) <= 1e6)]
             if len(bad_places):
                 x, y, z = bad_places[0]
@@ -543,19 +545,18 @@ class MagneticSection(Section, Ability):
             return None
         # gradient as [component, coordinate, place]; the curl is the skew part, by its norm
         G = np.stack([formula_with_derivatives(text)(places).gradient for text in components])
-        divergence, curl = (
-            np.abs(np.trace(G)),
-            np.linalg.norm(G - G.swapaxes(0, 1), axis=(0, 1)) / np.sqrt(2),
-        )
-        sizes = np.nan_to_num(divergence), np.nan_to_num(curl)
-        largest = [float(values.max()) for values in sizes]
-        if max(largest) <= SOURCE_TOLERANCE * np.nan_to_num(np.abs(G)).max():
+        divergence = np.nan_to_num(np.abs(np.trace(G)))
+        curl = np.nan_to_num(np.linalg.norm(G - G.swapaxes(0, 1), axis=(0, 1)) / np.sqrt(2))
+        largest_divergence, largest_curl = float(divergence.max()), float(curl.max())
+        rounding = SOURCE_TOLERANCE * np.nan_to_num(np.abs(G)).max()
+        if max(largest_divergence, largest_curl) <= rounding:
             return None
-        x, y, z = places[np.argmax(np.maximum(*sizes))]
+        x, y, z = places[np.argmax(np.maximum(divergence, curl))]
         return (
-            f"magnetic.applied.components: on the shell div B is up to {largest[0]:.3g} and curl "
-            f"B up to {largest[1]:.3g} B^a/R, most of it at (x, y, z) = ({x:.3g}, {y:.3g}, "
-            f"{z:.3g}): magnets and currents elsewhere make no such field"
+            "magnetic.applied.components: on the shell div B is up to "
+            f"{largest_divergence:.3g} and curl B up to {largest_curl:.3g} B^a/R, most of it at "
+            f"(x, y, z) = ({x:.3g}, {y:.3g}, {z:.3g}): magnets and currents elsewhere make no "
+            "such field"
         )
 
     def numbers(self, context: Context) -> list[str]:
@@ -572,12 +573,11 @@ class MagneticSection(Section, Ability):
             return []
         # values of sources are over the applied field's reference (T)
         places, unit = outline(context.shell).sample(), 1e3 * abs(self.applied.reference or 1.0)
-        sizes = unit * np.linalg.norm(
-            np.sum([source(places)[0] for source in sources], axis=0), axis=1
-        )
+        B = np.sum([source(places)[0] for source in sources], axis=0)
+        strengths = unit * np.linalg.norm(B, axis=1)
         return [
-            f"field of the sources on the undeformed shell: {sizes.min():.4g} to "
-            f"{sizes.max():.4g} mT"
+            f"field of the sources on the undeformed shell: {strengths.min():.4g} to "
+            f"{strengths.max():.4g} mT"
         ]
 
     def units(self, context: Context, units: CaseSizes) -> CaseSizes:
@@ -586,11 +586,8 @@ class MagneticSection(Section, Ability):
         It is a flux density in mT (`applied`). If sources are the whole field, it is their strength
         in percent of the strength in the case (`strength`).
         """
-        if (
-            isnan(units.E)
-            or self.without_field
-            or not (self.remanent is None or self.remanent.flux_density)
-        ):
+        remanence_is_known = self.remanent is None or bool(self.remanent.flux_density)
+        if isnan(units.E) or self.without_field or not remanence_is_known:
             return units
         if self.applied.has_field_beside_sources:
             return replace(units, applied=1e3 * self.tesla(units.E))

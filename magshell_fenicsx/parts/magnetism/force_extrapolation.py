@@ -76,6 +76,18 @@ class ForceExtrapolation:
         rotations of nodes from the earlier state.
     is_single_rank
         Whether all nodes are on this rank.
+
+    Attributes
+    ----------
+    _points, _distances
+        States of each point, the newest point and state last; the distance to each point from the
+        one before.
+    _D, _rotated_u, _stored
+        D as it was given, the state to which its nodes have been rotated, and the rotated blocks.
+    _products
+        The last states with their products D u.
+    _model
+        The polynomial along the path and the secants (q, y); None until forces are asked for.
     """
 
     def __init__(
@@ -87,7 +99,7 @@ class ForceExtrapolation:
     ) -> None:
         """Begin without states and without a second derivative."""
         self._blocks, self._rotations, self._is_single_rank = blocks, rotations, is_single_rank
-        self._points = list[list[ForceState]]()  # the newest last; of each point several states
+        self._points = list[list[ForceState]]()  # of each point its states; the newest are last
         self._distances = list[float]()  # to each point from the one before
         self._D: InteractionHessian | None = None
         self._stored: SinglePrecisionBlocks | None = None  # of D, turned to `_rotated_u`
@@ -111,10 +123,8 @@ class ForceExtrapolation:
             earlier_points = [
                 point[-STATES_PER_EARLIER_POINT:] for point in self._points[1 - PATH_POINTS :]
             ]
-            self._points, self._distances = (
-                [*earlier_points, [state]],
-                [*self._distances[1 - PATH_POINTS :], distance],
-            )
+            self._points = [*earlier_points, [state]]
+            self._distances = [*self._distances[1 - PATH_POINTS :], distance]
         self._model = None  # made again when forces are asked for
 
     def forces(self, u: Array, D: InteractionHessian, u_of_D: Array) -> Array | None:
@@ -135,9 +145,10 @@ class ForceExtrapolation:
             return None
         if D is not self._D or self._is_new_point(u):
             self._rotate_stiffness(u, D, u_of_D)
-        polynomial, changes = self._model = self._model or self._make_model()
+        self._model = self._model or self._make_model()
+        polynomial, secants = self._model
         forces, s = self._product(u) + polynomial.remainder(u), u - polynomial.base.u
-        for q, y in changes:
+        for q, y in secants:
             forces = forces + (q @ s) * y
         return forces
 
@@ -148,17 +159,13 @@ class ForceExtrapolation:
         """
         if not self._points or self._is_new_point(u):
             return False
-        largest_distance, step_size = (
-            SLOPE_DISTANCE_RATIO * self._distances[-1],
-            float(np.linalg.norm(step)),
-        )
+        largest_distance = SLOPE_DISTANCE_RATIO * self._distances[-1]
+        step_length = float(np.linalg.norm(step))
         for state, next_state in pairwise(self._points[-1]):
             change, distance_to_u = state.u - next_state.u, float(np.linalg.norm(u - state.u))
             distance = float(np.linalg.norm(change))
-            if (
-                max(distance, distance_to_u) < largest_distance
-                and abs(change @ step) > DIRECTION_COSINE * step_size * distance
-            ):
+            are_near = max(distance, distance_to_u) < largest_distance
+            if are_near and abs(change @ step) > DIRECTION_COSINE * step_length * distance:
                 return True
         return False
 
@@ -176,12 +183,11 @@ class ForceExtrapolation:
         D u changes, the products with all stored states are computed again.
         """
         earlier_u = self._rotated_u if D is self._D else None
-        if (
-            earlier_u is not None
+        if earlier_u is not None:
             # twice the vector part of a quaternion is a small angle in rad
-            and 2 * np.abs(self._rotations(u, earlier_u)[:, :3]).max() < ROTATION_TOLERANCE
-        ):
-            return
+            largest_angle = 2 * np.abs(self._rotations(u, earlier_u)[:, :3]).max()
+            if largest_angle < ROTATION_TOLERANCE:
+                return
         rotated = D.rotated_blocks(self._rotations(u, u_of_D))
         if rotated is None and earlier_u is not None:  # D cannot be rotated and is stored already
             return
@@ -204,26 +210,29 @@ class ForceExtrapolation:
         A correction is a pair (q, y). The unit vectors q are changes of u, normal to each other; y
         is the change of forces along q that D and the polynomial do not have.
         """
-        polynomial, changes = PathPolynomial.from_points(self._points), list[tuple[Array, Array]]()
+        polynomial, secants = PathPolynomial.from_points(self._points), list[tuple[Array, Array]]()
+        # pairs of states that follow one another at the same point, the newest first
         pairs = [pair for point in reversed(self._points) for pair in pairwise(reversed(point))]
         for state, older_state in pairs[:MAX_CHANGES]:
             s = state.u - older_state.u
-            y, size = (
+            length = float(np.linalg.norm(s))
+            # the change of the remainder that the polynomial does not have
+            y = (
                 state.remainder
                 - older_state.remainder
                 - polynomial.remainder(state.u)
-                + polynomial.remainder(older_state.u),
-                float(np.linalg.norm(s)),
+                + polynomial.remainder(older_state.u)
             )
             # Gram-Schmidt, twice because of rounding; y changes along with s
             for _ in range(2):
-                for q, y_of_q in changes:
+                for q, y_of_q in secants:
                     projection = float(q @ s)
                     s, y = s - projection * q, y - projection * y_of_q
-            remaining_size = float(np.linalg.norm(s))
-            if remaining_size > MIN_NEW_SHARE * size:
-                changes.append((np.asarray(s / remaining_size), np.asarray(y / remaining_size)))
-        return polynomial, changes
+            # a change that is almost a sum of newer ones is left out
+            remaining_length = float(np.linalg.norm(s))
+            if remaining_length > MIN_NEW_SHARE * length:
+                secants.append((np.asarray(s / remaining_length), np.asarray(y / remaining_length)))
+        return polynomial, secants
 
     def _product(self, u: Array) -> Array:
         """Return this rank's part of D u; the last `STORED_PRODUCTS` products are kept."""
@@ -271,39 +280,38 @@ class PathPolynomial:
             return cls(base, np.zeros_like(base.u), 1.0, np.zeros((0, len(base.forces))))
         direction, distance = base.u - previous.u, float(np.linalg.norm(base.u - previous.u))
         direction = np.asarray(direction / distance)
+
+        def position_and_length(s: Array) -> tuple[float, float]:
+            """Return a change's part along the direction, and its length, both over `distance`."""
+            return float(direction @ s) / distance, float(np.linalg.norm(s)) / distance
+
         # one row of the linear system for each value or slope that the polynomial must have
         rows, values, positions = list[Array](), list[Array](), [0.0]
         powers = np.arange(1.0, MAX_COEFFICIENTS + 1)
         for point in reversed(points):
+            # the value at the last state of the point; that of the newest point is the constant
             last = point[-1]
-            s = last.u - base.u
-            position, size = float(direction @ s) / distance, float(np.linalg.norm(s)) / distance
+            position, length = position_and_length(last.u - base.u)
             if last is not base:
                 separation = min(abs(position - x) for x in positions)
-                is_across = abs(position) < MIN_ALONG_SHARE * size
+                is_across = abs(position) < MIN_ALONG_SHARE * length
                 if is_across or separation < MIN_SEPARATION * max(1.0, abs(position)):
                     continue
                 positions.append(position)
                 rows.append(np.asarray(position**powers))
                 values.append(last.remainder - base.remainder)
+            # the mean slope between the first two states that are near each other along the path
             for state, older_state in pairwise(reversed(point)):
-                change = state.u - older_state.u
-                step, length = (
-                    float(direction @ change) / distance,
-                    float(np.linalg.norm(change)) / distance,
-                )
-                if (
-                    len(rows) < MAX_COEFFICIENTS
-                    and MIN_ALONG_SHARE * length < abs(step)
-                    and length < SLOPE_DISTANCE_RATIO
-                ):
-                    position = float(direction @ (state.u - base.u)) / distance
-                    # the mean slope between two near states as a further equation
+                step, length = position_and_length(state.u - older_state.u)
+                is_slope = MIN_ALONG_SHARE * length < abs(step) and length < SLOPE_DISTANCE_RATIO
+                if len(rows) < MAX_COEFFICIENTS and is_slope:
+                    position, _ = position_and_length(state.u - base.u)
                     rows.append(np.asarray((position**powers - (position - step) ** powers) / step))
                     values.append(np.asarray((state.remainder - older_state.remainder) / step))
                     break
             if len(rows) == MAX_COEFFICIENTS:
                 break
+        # the polynomial has as many coefficients as there are equations
         n = len(rows)
         coefficients = np.linalg.solve(np.array(rows)[:, :n], np.array(values))
         return cls(base, direction, distance, np.asarray(coefficients, dtype=np.float64))

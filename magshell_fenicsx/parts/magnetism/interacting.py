@@ -88,6 +88,22 @@ class InteractionTerm:
     interaction
         Strength, and whether each part acts on itself too.
 
+    Attributes
+    ----------
+    _scale
+        Factor that turns energies of `InteractingCharges` into those over E h R².
+    _cells
+        The cells of all ranks, with the numbers of their nodes.
+    _inputs_of_charges
+        The values by which the charges were made: placement, remanence and perhaps the thickness.
+    _evaluations
+        Nodes, energy and forces at the last states.
+    _latest_hessians
+        Nodes, both second derivatives there (by even and by odd changes) and u; None before the
+        first.
+    _even_term
+        For a term from `antisymmetric`, the term that it was made from; else None.
+
     Raises
     ------
     CaseError
@@ -105,7 +121,7 @@ class InteractionTerm:
         V = u.function_space
         self._comm: MPI.Comm = V.mesh.comm
         self._cells = GlobalCells.gather(V)
-        self._even_term: InteractionTerm | None = None  # of an antisymmetric one the other
+        self._even_term: InteractionTerm | None = None
         unknowns = 3 * V.dofmap.index_map.size_global
         if unknowns > MAX_UNKNOWNS:
             raise CaseError(
@@ -121,7 +137,7 @@ class InteractionTerm:
         )
         self._latest_hessians: (
             tuple[Array, tuple[InteractionHessian, InteractionHessian], Array] | None
-        ) = None  # beside its nodes and u
+        ) = None
 
     @property
     def no_number(self) -> str:
@@ -186,28 +202,27 @@ class InteractionTerm:
         contract is that of `assembly.dense_tangent.DenseTerm`.
         """
         self._nodes()  # earlier results are forgotten here if shape or remanence changed
-        extrapolated = (
-            self._extrapolation.forces(
-                global_values(self._u).ravel(),
-                self._latest_hessians[1][0],  # by even changes
-                self._latest_hessians[2],  # the u at which it was computed
-            )
-            if self._latest_hessians
-            else None
-        )
-        b += factor * (self._evaluated()[1] if extrapolated is None else extrapolated)
+        forces = None
+        if self._latest_hessians:
+            _, (even_hessian, _), u_of_hessians = self._latest_hessians
+            u = global_values(self._u).ravel()
+            forces = self._extrapolation.forces(u, even_hessian, u_of_hessians)
+        if forces is None:
+            _, forces = self._evaluated()
+        b += factor * forces
 
     def extrapolation_holds_along(self, step: Array) -> bool:
         """Return whether extrapolated forces are accurate along a step; collective.
 
-        They are where forces are known at two states near the present one that differ along the
-        step. `step` is a change of all local unknowns, with ghosts.
+        They are accurate if forces are known at two states near the present one, and these states
+        differ along the step. `step` is a change of all local unknowns, with ghosts.
         """
         self._nodes()  # earlier results are forgotten here if shape or remanence changed
         displacement, index_map = global_values(self._u), self._u.function_space.dofmap.index_map
         step_of_rank = step.reshape(-1, 3)[: index_map.size_local]
+        global_step = np.concatenate(self._comm.allgather(step_of_rank))
         return self._extrapolation.extrapolation_holds_along(
-            displacement.ravel(), np.concatenate(self._comm.allgather(step_of_rank)).ravel()
+            displacement.ravel(), global_step.ravel()
         )
 
     def compile_tangent(self) -> None:
@@ -237,12 +252,14 @@ class InteractionTerm:
         at the present state unless `inexact`: then the latest ones are returned, if there are any.
         """
         nodes = self._nodes()
-        if self._latest_hessians is None or not (
-            inexact or np.array_equal(nodes, self._latest_hessians[0])
-        ):
-            self._latest_hessians = None  # the old ones free their memory first
-            self._latest_hessians = nodes, self._hessians_at(nodes), global_values(self._u).ravel()
-        return self._latest_hessians[1]
+        latest = self._latest_hessians
+        # if `inexact`, those at any earlier nodes will do
+        if latest is None or not (inexact or np.array_equal(nodes, latest[0])):
+            latest = self._latest_hessians = None  # the old ones free their memory first
+            latest = nodes, self._hessians_at(nodes), global_values(self._u).ravel()
+            self._latest_hessians = latest
+        _, even_and_odd, _ = latest
+        return even_and_odd
 
     def by_field(
         self, name: str, direction: fem.Function, energy: float, force: float
@@ -269,10 +286,8 @@ class InteractionTerm:
         field_of_model, of_shape = self_field(self._view), name in ("thickness", "r0")
         nodes, rates = self._nodes(), global_values(direction)[self._cells.nodes]
         rates_of_copies = np.concatenate([rates @ image.Q.T for image in self._copies.images])
-        weights, own_cells = (
-            Weights(self._scale * energy, self._scale * force),
-            self._cells.own_range,
-        )
+        weights = Weights(energy=self._scale * energy, force=self._scale * force)
+        own_cells = self._cells.own_range
         own_rows = slice(own_cells.start, own_cells.stop)
         if of_shape:
             nodal_derivatives = self._charges.field_derivatives(
@@ -288,7 +303,18 @@ class InteractionTerm:
             return self._model.r0, by_place + self._at_fixed_charges(direction, energy, force)
         if name != field_of_model.Br.name:
             return None
-        # by the remanence: elements without a charge count too, as another remanence charges them
+        by_remanence = (
+            self._charges_of_all_elements()
+            .field_derivatives(nodes, rates_of_copies, own_cells, weights)
+            .by_remanence
+        )
+        return field_of_model.Br, np.asarray(self._comm.allreduce(by_remanence))[own_rows]
+
+    def _charges_of_all_elements(self) -> InteractingCharges:
+        """Return the charges with those elements that have none; collective.
+
+        Derivatives by the remanence need them, as another remanence would charge them.
+        """
         shape, cells, edges = self._cells_and_charged_edges(include_uncharged=True)
         singular_pairs = SingularPairs(
             shape,
@@ -300,7 +326,7 @@ class InteractionTerm:
             self._copies,
             include_uncharged=True,
         )
-        charges = InteractingCharges(
+        return InteractingCharges(
             shape,
             self._part_of_cells,
             cells,
@@ -310,10 +336,6 @@ class InteractionTerm:
             self._copies,
             include_uncharged=True,
         )
-        by_remanence = charges.field_derivatives(
-            nodes, rates_of_copies, own_cells, weights
-        ).by_remanence
-        return field_of_model.Br, np.asarray(self._comm.allreduce(by_remanence))[own_rows]
 
     def _at_fixed_charges(self, direction: fem.Function, energy: float, force: float) -> Array:
         """Return derivatives (own cells, nodes, 3) by the placement at fixed charges; collective.
@@ -328,8 +350,10 @@ class InteractionTerm:
             D.near_blocks @ v + D.times_far(v[:, None]).ravel()
         )
         nodes = V.dofmap.list[:count]
+        # the number of own cells at each node; nodes of ghost cells alone are not used
         cells_of_node = np.bincount(nodes.ravel(), minlength=len(by_nodes) // 3)
-        return np.asarray((by_nodes.reshape(-1, 3) / np.maximum(cells_of_node, 1)[:, None])[nodes])
+        shares = by_nodes.reshape(-1, 3) / np.maximum(cells_of_node, 1)[:, None]
+        return np.asarray(shares[nodes])
 
     def _hessians_at(self, nodes: Array) -> tuple["InteractionHessian", "InteractionHessian"]:
         """Return the second derivatives by even and odd changes of u; collective.
@@ -348,21 +372,21 @@ class InteractionTerm:
         image_transforms = np.stack([image.Q for image in images])
         local_count = V.dofmap.index_map.size_local + V.dofmap.index_map.num_ghosts
         multipoles, near_cells = self._charges.boxes(nodes, own_cells)
-        has_block, adjacent = (
-            np.zeros((local_count, count), dtype=bool),
-            np.zeros((count, count), dtype=bool),
-        )
+        has_block = np.zeros((local_count, count), dtype=bool)
+        adjacent = np.zeros((count, count), dtype=bool)
         # blocks of nodes of near cells are stored; those of adjacent cells serve extrapolation
         for pattern, row_numbers, pairs in (
             (has_block, row_of, near_cells),
             (adjacent, self._cells.nodes, multipoles.adjacent_cells(own_cells)),
         ):
-            for cell, row in zip(own_cells, pairs, strict=True):
-                columns = np.unique(column_of[np.append(np.flatnonzero(row), cell)] % count)
-                pattern[row_numbers[cell][:, None], columns] = True
-        self._comm.Allreduce(
-            MPI.IN_PLACE, adjacent, MPI.LOR
-        )  # the same blocks on any number of ranks
+            for cell, acts_on_cell in zip(own_cells, pairs, strict=True):
+                partners = np.append(np.flatnonzero(acts_on_cell), cell)
+                # a node of an image stands in the column of the modelled node
+                columns = np.unique(column_of[partners] % count)
+                rows = row_numbers[cell]
+                pattern[rows[:, None], columns] = True
+        # the same blocks on any number of ranks
+        self._comm.Allreduce(MPI.IN_PLACE, adjacent, MPI.LOR)
         stiffness = Stiffness(has_block, self._scale, row_of, column_of, image_transforms)
         try:
             self._charges.evaluate(nodes, own_cells, stiffness)
@@ -398,21 +422,18 @@ class InteractionTerm:
         Both are over E h R²; the gradient includes ghosts. Both are nan if parts overlap. Results
         at the last states are kept, as a point of a path is evaluated more than once.
         """
-        nodes, V = self._nodes(), self._u.function_space
+        nodes, V, own_cells = self._nodes(), self._u.function_space, self._cells.own_range
         for nodes_before, energy, forces in self._evaluations:
             if np.array_equal(nodes, nodes_before):
                 return energy, forces
         try:
-            energy, gradient = self._charges.evaluate(nodes, self._cells.own_range)
+            energy, gradient = self._charges.evaluate(nodes, own_cells)
         except PartsTooNear:  # there is no such equilibrium
-            k = self._cells.nodes.shape[1]
-            energy, gradient = np.nan, np.full((len(self._cells.own_range), k, 3), np.nan)
+            nodes_per_cell = self._cells.nodes.shape[1]
+            energy, gradient = np.nan, np.full((len(own_cells), nodes_per_cell, 3), np.nan)
+        # the gradient by the nodes of each cell is added up at the nodes
         forces = np.zeros_like(self._u.x.array)
-        np.add.at(
-            forces.reshape(-1, 3),
-            V.dofmap.list[: len(self._cells.own_range)],
-            self._scale * gradient,
-        )
+        np.add.at(forces.reshape(-1, 3), V.dofmap.list[: len(own_cells)], self._scale * gradient)
         self._evaluations.appendleft((nodes, self._scale * energy, forces))
         # only forces that are finite on all ranks may be extrapolated
         if self._comm.allreduce(bool(np.isfinite(energy)), MPI.LAND):
@@ -427,19 +448,17 @@ class InteractionTerm:
         forces for extrapolation.
         """
         r0, u = (global_values(f) for f in (self._model.r0, self._u))
-        field_of_model = self_field(self._view)
-        thickness, remanence_of_nodes = (
-            self._model.thickness,
-            field_of_model.Br.x.array.reshape(-1, 3)[field_of_model.Br.function_space.dofmap.list],
-        )
-        inputs: tuple[Array, ...] = (r0, self._cells.gather_values(remanence_of_nodes))
+        # the charges depend on these: placement, remanence, and perhaps the thickness
+        Br, thickness = self_field(self._view).Br, self._model.thickness
+        remanence_of_cells = Br.x.array.reshape(-1, 3)[Br.function_space.dofmap.list]
+        inputs: tuple[Array, ...] = (r0, self._cells.gather_values(remanence_of_cells))
         if thickness is not None:
-            inputs += (
-                self._cells.gather_values(thickness.x.array[thickness.function_space.dofmap.list]),
-            )
-        if len(self._inputs_of_charges) != len(inputs) or not all(
+            thickness_of_cells = thickness.x.array[thickness.function_space.dofmap.list]
+            inputs += (self._cells.gather_values(thickness_of_cells),)
+        are_unchanged = len(self._inputs_of_charges) == len(inputs) and all(
             map(np.array_equal, inputs, self._inputs_of_charges)
-        ):
+        )
+        if not are_unchanged:
             self._inputs_of_charges, self._latest_hessians = inputs, None
             self._evaluations.clear()
             self._extrapolation = ForceExtrapolation(
@@ -464,8 +483,8 @@ class InteractionTerm:
             a1, a2 = np.einsum("dpk,cki->dcpi", T, (r0 + u.reshape(-1, 3))[nodes], optimize=True)
             return np.stack([a1, a2, unit(np.cross(a1, a2))], axis=-1)
 
-        F = np.zeros((len(r0), 3, 3))
         # sum of deformation gradients of all cells at a node; its nearest rotation is returned
+        F = np.zeros((len(r0), 3, 3))
         np.add.at(F, nodes, frames(u) @ np.linalg.inv(frames(u_before)))
         return np.ascontiguousarray(Rotation.from_matrix(polar(F)).as_quat())
 
@@ -497,16 +516,15 @@ class InteractionTerm:
         charge are included.
         """
         field_of_model = self_field(self._view)
-        shape, (cells, edges) = (
-            field_of_model.shape({}),
-            field_of_model.chargeable if include_uncharged else field_of_model.edges,
-        )
+        shape = field_of_model.shape({})  # of this rank's cells
+        cells, edges = field_of_model.chargeable if include_uncharged else field_of_model.edges
         # inputs as gathered by `_nodes`: placement, remanence, and perhaps the thickness factor
-        factor = shape.thickness_factor and (
-            shape.thickness_factor[0],  # its element
-            self._inputs_of_charges[2],
-        )
-        r0, remanence = self._inputs_of_charges[0][self._cells.nodes], self._inputs_of_charges[1]
+        r0_of_nodes, remanence, *thickness_factor = self._inputs_of_charges
+        r0 = r0_of_nodes[self._cells.nodes]
+        factor = None
+        if shape.thickness_factor:
+            element, _ = shape.thickness_factor
+            factor = element, thickness_factor[0]
         all_cells = MagnetisedShell(
             shape.element, r0, 0 * r0, shape.remanence_element, remanence, shape.h, factor
         )
@@ -547,13 +565,14 @@ class InteractionTerm:
         V, corners = self._u.function_space, self._corners
         if len(self._copies.images) == 1:  # the parts are those of the mesh
             return np.asarray(self._cells.gather_values(component_numbers(V)[V.dofmap.list[:, 0]]))
+        # parts are the components of a graph whose links join the first corner of a cell to all
         ones, size = np.ones(corners.size, dtype=np.int8), int(corners.max()) + 1
-        # parts are the components of a graph whose links join corners of a cell
-        graph = coo_array(
-            (ones, (corners[:, :1].repeat(3, axis=1).ravel(), corners.ravel())), (size, size)
-        )
+        first_corners = corners[:, :1].repeat(3, axis=1)
+        graph = coo_array((ones, (first_corners.ravel(), corners.ravel())), (size, size))
         _, part_of_corner = connected_components(graph, directed=False)
-        return np.asarray(np.unique(part_of_corner[corners[:, 0]], return_inverse=True)[1])
+        # numbers without gaps, as not every component has a cell
+        _, part_of_cells = np.unique(part_of_corner[corners[:, 0]], return_inverse=True)
+        return np.asarray(part_of_cells)
 
     @property
     def _view(self) -> ModelView:

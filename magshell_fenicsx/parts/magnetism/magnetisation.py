@@ -115,20 +115,13 @@ def magnetisation(
     CaseError
         If a file of vectors or of a source cannot be read.
     """
-    section, gradient = (
-        magnetic.remanent or RemanentSection.model_construct(),
-        magnetic.applied.gradient,
-    )
+    section = magnetic.remanent or RemanentSection.model_construct()
+    gradient = magnetic.applied.gradient
     field, moving_fields = in_space(context, turn)
     tesla_of_remanence, tesla_of_lambda = units(context)
-    basis = [magnetic.applied.vector(turn)]
-    # Gram-Schmidt: unit vectors that span all directions of a field that is uniform or linear
-    for direction in () if field else to:
-        normal_part = direction.vector(turn) - np.sum(
-            [(direction.vector(turn) @ e) * e for e in basis], axis=0
-        )
-        if np.linalg.norm(normal_part) > EQUALITY_TOLERANCE:
-            basis.append(normal_part / np.linalg.norm(normal_part))
+    # a field in space has one direction and turns as a whole
+    later_directions = [] if field else [direction.vector(turn) for direction in to]
+    basis = _orthonormal_basis(magnetic.applied.vector(turn), later_directions)
     applied, *other_components = (magnetic.applied.uniform * e for e in basis)
     patches = None
     if section.patches and isinstance(context.shell, MeshSurface):
@@ -163,6 +156,19 @@ def magnetisation(
     )
 
 
+def _orthonormal_basis(first: Array, directions: Sequence[Array]) -> list[Array]:
+    """Return unit vectors, normal to each other, that span the unit vector `first` and directions.
+
+    They are found by Gram-Schmidt; `first` is the first of them.
+    """
+    basis = [first]
+    for direction in directions:
+        normal_part = direction - np.sum([(direction @ e) * e for e in basis], axis=0)
+        if np.linalg.norm(normal_part) > EQUALITY_TOLERANCE:
+            basis.append(normal_part / np.linalg.norm(normal_part))
+    return basis
+
+
 def soft_magnet(
     context: Context, turn: float, patch_rims: Mapping[str, InsideRim]
 ) -> SoftMagnet | None:
@@ -176,13 +182,15 @@ def soft_magnet(
     if magnetic is None or magnetic.susceptibility is None:
         return None
     chi, E, remanent = magnetic.susceptibility, context.shell.youngs_modulus, magnetic.remanent
-    patches = dict[str, Array]()
+    # a number or a pattern everywhere, or a value (1,) for each patch of a mesh
     pattern: float | Pattern = float(chi) if isinstance(chi, float | int) else 0.0
+    patches = dict[str, Array]()
     if isinstance(chi, str):
         pattern = FormulaVectors([formula_function(chi)], rotation(turn), 1.0)
     elif isinstance(chi, dict) and isinstance(context.shell, MeshSurface):
         patches = {name: np.array([value]) for name, value in chi.items()}
     elif isinstance(chi, dict):
+        # dimples are the only patches here
         rest_value = np.array([chi.get("rest", 0.0)])
         rims = tuple(
             (inside, np.array([chi[name]]) if name in chi else rest_value)
@@ -190,9 +198,10 @@ def soft_magnet(
         )
         pattern = WithinRims(rims, rest_value) if rims else float(rest_value[0])
     # |Ba| over sqrt(mu_0 E) for lambda_m = 1: a soft energy is quadratic in the field itself
-    scale = (
-        sqrt(MU_0 * E) / remanent.flux_density if remanent and remanent.flux_density and E else 1.0
-    )
+    scale = 1.0
+    if remanent and remanent.flux_density and E:
+        scale = sqrt(MU_0 * E) / remanent.flux_density
+    # T for lambda_m = 1
     tesla = magnetic.tesla(E) if E and magnetic.lambda_m is None else 1.0
     largest = None if magnetic.saturation is None else magnetic.saturation / tesla
     return SoftMagnet(pattern, scale, tesla, remanent is None, patches or None, largest)
@@ -415,8 +424,8 @@ def _reasons_not_axisymmetric(
         if not (meridian and field_is_axisymmetric(field, meridian, smooth=False)):
             yield f"the remanence of {name} differs around e3"
     is_axisymmetric = _axisymmetry_of_formulas(magnetic, outline, vectors.sources)
-    for field_in_words, is_around_e3 in is_axisymmetric.items():
-        if not is_around_e3:
+    for field_in_words, is_field_axisymmetric in is_axisymmetric.items():
+        if not is_field_axisymmetric:
             yield f"{field_in_words} differs around e3"
     G = np.array(magnetic.applied.gradient or np.zeros((3, 3)))
     if np.abs(G - np.diag([G[0, 0], G[0, 0], G[2, 2]])).max() > PARALLEL:
@@ -480,18 +489,16 @@ def adds(context: Context, modelled: Modelled) -> dict[str, Any]:
     `remanence` is the magnetisation alone, as sensors read it. It is left out if the modelled part
     (an axisymmetric meridian, or one side of `modelled.plane`) does not share its symmetry.
     """
-    magnetic, turn, patch_rims = (
-        context.section_of(MagneticSection),
-        modelled.turn,
-        modelled.patch_rims,
-    )
+    magnetic = context.section_of(MagneticSection)
+    turn, patch_rims = modelled.turn, modelled.patch_rims
     assert magnetic
     driven_amplitudes = {name for step in context.steps for name in (step.name, *step.load.drives)}
+    # these are added in any case
     observed: dict[str, Any] = {
         "sensors": sensors(context, turn),
         "field_maps": field_maps(context, turn),
+        "interaction": interaction(context),
     }
-    observed["interaction"] = interaction(context)
     if FieldSection.amplitude in driven_amplitudes:
         to = [step.to for step in _rotations(context)]
         return {"magnetic": magnetisation(magnetic, context, turn, patch_rims, to), **observed}
@@ -513,7 +520,7 @@ def _rotations(context: Context) -> list[RotationSection]:
 def account(context: Context, loads: Loads) -> Account:
     """Return the lines of `magshell check` on the energy of the field and on its sources.
 
-    The second entry of the account lists what is left out, with the reason.
+    Lines in `included` tell what is in the model, those in `left_out` what is not, with the reason.
     """
     magnetic, field, words = context.section_of(MagneticSection), loads.magnetic, list[str]()
     if loads.interaction:
@@ -523,22 +530,18 @@ def account(context: Context, loads: Loads) -> Account:
         ]
     if magnetic is None or field is None:
         reason = "lambda_m is zero" if magnetic else "no magnetic section"
-        return Account(words, [f"magnetic energy: {reason}"])
+        return Account(included=words, left_out=[f"magnetic energy: {reason}"])
     law = "" if field.law == "deformation" else ", remanence that turns and does not stretch"
     if field.soft:
-        susceptibility, remanence_text = (
-            magnetic.susceptibility,
-            "without remanence" if field.soft.alone else "beside the remanence",
-        )
-        susceptibility = (
-            f"{susceptibility:g}" if isinstance(susceptibility, int | float) else susceptibility
-        )
+        remanence_text = "without remanence" if field.soft.alone else "beside the remanence"
+        susceptibility = magnetic.susceptibility
+        if isinstance(susceptibility, int | float):
+            susceptibility = f"{susceptibility:g}"
         law += (
             f", soft magnetism of a sheet with the susceptibility {susceptibility} {remanence_text}"
         )
         law += f", that saturates at {magnetic.saturation:g} T" if magnetic.saturation else ""
     sources = enumerate(magnetic.applied.sources or [])
     words += [f"source {source.name or i}: {source.words()}" for i, source in sources]
-    return Account(
-        [f"magnetic energy ({field.energy}){law}, lambda_m = {strength(context):g}", *words]
-    )
+    energy_text = f"magnetic energy ({field.energy}){law}, lambda_m = {strength(context):g}"
+    return Account(included=[energy_text, *words])

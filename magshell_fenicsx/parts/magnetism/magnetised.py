@@ -126,12 +126,10 @@ class Magnetisation:
         """
         x = r0.x.array.reshape(-1, 3)
         x = x[:: len(x) // PLACES + 1]
+        # the field at the mirror images, reflected back
         images = self.field_at(mu, mirror.image(x)) @ mirror.reflection
-        return float(
-            np.sign(
-                r0.function_space.mesh.comm.allreduce(float(np.sum(images * self.field_at(mu, x))))
-            )
-        )
+        scalar_products = float(np.sum(images * self.field_at(mu, x)))
+        return float(np.sign(r0.function_space.mesh.comm.allreduce(scalar_products)))
 
     def on_cells(self, patches: Mapping[str, NDArray[np.bool_]], cells: int) -> "Magnetisation":
         """Return the magnetisation with patterns of cells in place of values on named patches.

@@ -100,9 +100,10 @@ class MagnetisedShell:
         a, b = ab[..., 0], ab[..., 1]
         if self.swept:
             return a[..., None], np.stack([np.ones_like(a), np.zeros_like(a)], -1)[..., None], b
+        # X = a and Y = (1 - a) b, with their derivatives by a and by b
         ones = np.ones_like(a)
-        slopes = np.stack([np.stack([ones, -b], -1), np.stack([0 * ones, 1 - a], -1)], -2)
-        return np.stack([a, (1 - a) * b], -1), slopes, 0 * a
+        by_a, by_b = np.stack([ones, -b], -1), np.stack([0 * ones, 1 - a], -1)
+        return np.stack([a, (1 - a) * b], -1), np.stack([by_a, by_b], -2), 0 * a
 
     def thickness(self, cells: Ints, X: Array) -> Array:
         """Return the undeformed thickness over R, then its derivatives by X.
@@ -205,61 +206,36 @@ class SurfaceJets:
         """
         X, slopes, b = shape.reference(ab)
         angle = 2 * np.pi * b
-        shape_tables, remanence_tables = (
-            tables(shape.element, X, 2),
-            tables(shape.remanence_element, X, 1),
-        )
-        if shape.swept:
-            full_turn = 2 * np.pi
-            jets = []
-            for nodal in (shape.r0, shape.u):
-                on_meridian = np.einsum("dnmk,nki->dnmi", shape_tables, nodal[cells])
-                at_azimuth_zero = _ring(on_meridian, full_turn)
-                jets.append(np.stack([rotate_about_axis(d, angle) for d in at_azimuth_zero]))
-            B = np.einsum("dnmk,nki->dnmi", remanence_tables, shape.remanence[cells])
-            # components along e_rho and e_theta turn with the azimuth
-            by_azimuth = full_turn * np.stack([-B[0, ..., 1], B[0, ..., 0], 0 * B[0, ..., 0]], -1)
-            fields = np.stack([rotate_about_axis(d, angle) for d in (B[0], B[1], by_azimuth)])
-            thickness = shape.thickness(cells, X)
-            # value, derivative along the meridian, and none around the axis
-            thickness = np.stack([thickness[0], thickness[1], 0 * thickness[0]])
-            r0, u = jets
-            return cls(
-                r0,
-                r0[:3] + u[:3],
-                fields,
-                thickness,
-                shape,
-                cells,
-                shape_tables,
-                remanence_tables,
-                angle,
-                ab,
-            )
-        shape_tables, remanence_tables = (
-            _chain(shape_tables, slopes, ab),
-            _chain(remanence_tables, slopes, ab),
-        )
+        shape_tables = tables(shape.element, X, 2)
+        remanence_tables = tables(shape.remanence_element, X, 1)
+        if not shape.swept:
+            shape_tables = _chain(shape_tables, slopes, ab)
+            remanence_tables = _chain(remanence_tables, slopes, ab)
         r0, u = (
             np.einsum("dnmk,nki->dnmi", shape_tables, nodal[cells]) for nodal in (shape.r0, shape.u)
         )
-        thickness = shape.thickness(cells, X)
-        if len(thickness) > 1:
-            thickness = np.concatenate(
-                [thickness[:1], np.einsum("nmad,dnm->anm", slopes, thickness[1:3])]
-            )
         B = np.einsum("dnmk,nki->dnmi", remanence_tables, shape.remanence[cells])
+        thickness = shape.thickness(cells, X)
+        if shape.swept:
+            # so far these are values on the meridian
+            r0, u = (_swept_jet(on_meridian, angle) for on_meridian in (r0, u))
+            B = _swept_remanence(B, angle)
+            # value, derivative along the meridian, and none around the axis
+            thickness = np.stack([thickness[0], thickness[1], 0 * thickness[0]])
+        elif len(thickness) > 1:
+            by_a_and_b = np.einsum("nmad,dnm->anm", slopes, thickness[1:3])
+            thickness = np.concatenate([thickness[:1], by_a_and_b])
         return cls(
-            r0,
-            r0[:3] + u[:3],
-            B,
-            thickness,
-            shape,
-            cells,
-            shape_tables,
-            remanence_tables,
-            angle,
-            ab,
+            r0=r0,
+            r=r0[:3] + u[:3],
+            B=B,
+            t=thickness,
+            shape=shape,
+            cells=cells,
+            shape_tables=shape_tables,
+            remanence_tables=remanence_tables,
+            angle=angle,
+            ab=ab,
         )
 
     def layer(self, eta: float) -> tuple[Array, Array, Array]:
@@ -321,24 +297,37 @@ class SurfaceJets:
         by_tangents = np.cross(self.r[2], by_area_vector), np.cross(by_area_vector, self.r[1])
         by_jets = np.stack([by_place, *by_tangents])
         if self.shape.swept:
-            # back to azimuth zero, where nodal values have their components
-            by_jets, by_B = (
-                np.stack([rotate_about_axis(d, self.angle, -1.0) for d in derivatives])
-                for derivatives in (by_jets, by_B)
-            )
-            full_turn = 2 * np.pi
-            by_meridian = np.stack([by_jets[0], by_jets[1]])[..., [0, 2]]  # of f and f_s
-            by_meridian[0][..., 0] += full_turn * by_jets[2][..., 1]  # f_theta = (0, U, 0)
-            by_u = np.einsum("dnmk,dnmi->nki", self.shape_tables[:2], by_meridian)
-            by_remanence_jets = np.stack([by_B[0], by_B[1]])
-            by_remanence_jets[0][..., 0] += full_turn * by_B[2][..., 1]
-            by_remanence_jets[0][..., 1] -= full_turn * by_B[2][..., 0]
-            by_remanence = np.einsum("dnmk,dnmi->nki", self.remanence_tables[:2], by_remanence_jets)
+            by_u, by_remanence = self._by_values_on_meridian(by_jets, by_B)
         else:
             by_u = np.einsum("dnmk,dnmi->nki", self.shape_tables[:3], by_jets)
             by_remanence = np.einsum("dnmk,dnmi->nki", self.remanence_tables, by_B)
         np.add.at(nodal_derivatives.by_u, self.cells, by_u)
         np.add.at(nodal_derivatives.by_remanence, self.cells, by_remanence)
+
+    def _by_values_on_meridian(self, by_jets: Array, by_B: Array) -> tuple[Array, Array]:
+        """Return a number's derivatives by nodal displacements and remanences of a meridian.
+
+        `by_jets` and `by_B` (3, n, m, 3) are its derivatives by the jets of the deformed place and
+        of the remanence: by value, by the derivative along the meridian, by that around the axis.
+        """
+        # back to azimuth zero, where nodal values have their components
+        by_jets, by_B = (
+            np.stack([rotate_about_axis(d, self.angle, -1.0) for d in derivatives])
+            for derivatives in (by_jets, by_B)
+        )
+        full_turn = 2 * np.pi
+        # a place f = (U, 0, W) has the derivative (0, U, 0) around the axis, times the full turn
+        by_meridian = np.stack([by_jets[0], by_jets[1]])[
+            ..., [0, 2]
+        ]  # by U and W, and their slopes
+        by_meridian[0][..., 0] += full_turn * by_jets[2][..., 1]
+        by_u = np.einsum("dnmk,dnmi->nki", self.shape_tables[:2], by_meridian)
+        # a remanence (B1, B2, B3) has the derivative (-B2, B1, 0) around the axis
+        by_remanence_jets = np.stack([by_B[0], by_B[1]])
+        by_remanence_jets[0][..., 0] += full_turn * by_B[2][..., 1]
+        by_remanence_jets[0][..., 1] -= full_turn * by_B[2][..., 0]
+        by_remanence = np.einsum("dnmk,dnmi->nki", self.remanence_tables[:2], by_remanence_jets)
+        return by_u, by_remanence
 
     def add_reference_derivatives(
         self,
@@ -405,12 +394,33 @@ def _normals(jet: Array) -> tuple[Array, tuple[Array, Array]]:
     """
     _, a1, a2, a11, a12, a22 = jet
     m = np.cross(a1, a2)
-    size = np.sqrt(np.sum(m * m, axis=-1, keepdims=True))  # np.linalg.norm is not analytic
-    n, slopes = m / size, []
-    for first, second in ((a11, a12), (a12, a22)):
-        change = (np.cross(first, a2) + np.cross(a1, second)) / size
+    length = np.sqrt(np.sum(m * m, axis=-1, keepdims=True))  # np.linalg.norm is not analytic
+    n, slopes = m / length, []
+    # by the first, then by the second coordinate: the derivatives of a1 and of a2
+    for slope_of_a1, slope_of_a2 in ((a11, a12), (a12, a22)):
+        change = (np.cross(slope_of_a1, a2) + np.cross(a1, slope_of_a2)) / length
         slopes.append(change - np.sum(change * n, axis=-1, keepdims=True) * n)
     return n, (slopes[0], slopes[1])
+
+
+def _swept_jet(on_meridian: Array, angle: Array) -> Array:
+    """Return the jet (6, n, m, 3) of an axisymmetric field at azimuths `angle` (n, m).
+
+    `on_meridian` (3, n, m, 2) are its components along e_rho and e_z, with two derivatives.
+    """
+    at_azimuth_zero = _ring(on_meridian, 2 * np.pi)
+    return np.stack([rotate_about_axis(d, angle) for d in at_azimuth_zero])
+
+
+def _swept_remanence(B: Array, angle: Array) -> Array:
+    """Return the jet (3, n, m, 3) of a remanence at azimuths `angle` (n, m).
+
+    B (2, n, m, 3) are its components along e_rho, e_theta and e_z, and their derivatives along the
+    meridian. The first two components turn with the azimuth, so that the derivative around the axis
+    is not zero.
+    """
+    by_azimuth = 2 * np.pi * np.stack([-B[0, ..., 1], B[0, ..., 0], 0 * B[0, ..., 0]], -1)
+    return np.stack([rotate_about_axis(d, angle) for d in (B[0], B[1], by_azimuth)])
 
 
 def _ring(f: Array, ring: float) -> Array:

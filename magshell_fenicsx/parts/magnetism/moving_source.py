@@ -115,11 +115,13 @@ class FieldAtPlaces:
             return self._factor(*factor_names) * self.B
         if factor_names:
             return self._factor(*factor_names) * self._motion_rate(motion_names[0])[0]
-        # C: rate by the motion that is carried out first
+        # two motions, or one twice; C = dB/dmu_i is the rate by the one that is carried out first
         C, slope = self._motion_rate(motion_names[0])
+        # the other motion, with the velocity w = A x + v, changes C like any field, see
+        # `_motion_rate`: dC/dmu_j = A C - (grad C) w
         A, v = self._velocity(motion_names[-1])
-        # dB/dmu = A B - G w, applied to C = dB/dmu_i
-        rate: Array = C @ A.T - np.einsum("nij,nj->ni", slope, self.x @ A.T + v)
+        w = self.x @ A.T + v
+        rate: Array = C @ A.T - np.einsum("nij,nj->ni", slope, w)
         return self._factor() * rate
 
     def _factor(self, *differentiated_by: str) -> float:
@@ -129,14 +131,11 @@ class FieldAtPlaces:
         """
         if len(set(differentiated_by)) < len(differentiated_by):
             return 0.0  # a factor is linear in its amplitude
-        changes_of_factors = self.moving_field.factors.items()
         return float(
             np.prod(
                 [
-                    change_of_factor
-                    if name in differentiated_by
-                    else 1 + change_of_factor * self.mu[name]
-                    for name, change_of_factor in changes_of_factors
+                    change if name in differentiated_by else 1 + change * self.mu[name]
+                    for name, change in self.moving_field.factors.items()
                 ]
             )
         )

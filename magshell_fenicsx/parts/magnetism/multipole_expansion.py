@@ -91,6 +91,22 @@ class MultipoleExpansion:
         The cells of this rank.
     pairs
         Compiled functions.
+
+    Attributes
+    ----------
+    _leaf
+        The finest level of boxes.
+    _own_rows
+        For each kind, a mask of the elements of own cells.
+    _order
+        Numbers of the charges in the order of boxes; the charges are those of all kinds, one after
+        the other.
+    _filled, _first
+        Boxes with charges, and the first charge of each in that order.
+    _middle, _q
+        Middle of the box of each charge, and the charges, in that order.
+    _octants
+        For each level, matrices that move moments to the larger box, and the boxes they serve.
     """
 
     def __init__(
@@ -118,18 +134,12 @@ class MultipoleExpansion:
             SurfacePoints.from_nodes(nodes[cells], points.tables) for cells, points in self._kinds
         ]
         heights = [points.t[..., None] * points.heights for _, points in self._kinds]
-        points_of_kinds = zip(surfaces, heights, strict=True)
-        x = [
-            (surface.r[:, :, None] + heights_of_kind[..., None] * surface.n[:, :, None]).reshape(
-                -1, 3
-            )
-            for surface, heights_of_kind in points_of_kinds
-        ]
-        return PlacedCharges(
-            harmonics((np.concatenate(x)[self._order] - self._middle) / self._leaf.width),
-            surfaces,
-            heights,
-        )
+        x = []  # places of the charges of each kind
+        for surface, heights_of_kind in zip(surfaces, heights, strict=True):
+            x_of_kind = surface.r[:, :, None] + heights_of_kind[..., None] * surface.n[:, :, None]
+            x.append(x_of_kind.reshape(-1, 3))
+        in_boxes = (np.concatenate(x)[self._order] - self._middle) / self._leaf.width
+        return PlacedCharges(harmonics(in_boxes), surfaces, heights)
 
     def add(self, charges: PlacedCharges, *, with_second_derivatives: bool) -> float:
         """Add derivatives of the energy to points' sums, and return the energy of own cells.
@@ -138,49 +148,50 @@ class MultipoleExpansion:
         second ones if `with_second_derivatives`: only their part at one point, L . d2M/du2. See
         `Points.sums` for the sums at points.
         """
-        N, L = derivatives(), self.local_expansions(self._moments(self._q * charges.Y))[..., 0]
-        matrices = (
-            [*N, *(N[i] @ N[j] for i, j in SECOND_DERIVATIVES)] if with_second_derivatives else N
-        )
-        # values at charges: potential, its gradient, and its second derivatives
-        expansion_of_boxes = np.stack([L, *(L @ weighted for weighted in matrices)], axis=-1)
-        values_at_charges = np.empty((len(self._q), expansion_of_boxes.shape[-1]))
-        for box, first, last in zip(
-            self._filled, self._first, [*self._first[1:], len(self._q)], strict=True
-        ):
-            values_at_charges[self._order[first:last]] = (
-                charges.Y[:, first:last].T @ expansion_of_boxes[box]
-            )
-        # from lengths over the width: 1 potential, 3 first, and 6 second derivatives
-        values_at_charges *= (
-            self._leaf.width
-            ** -np.array([1.0] + [2.0] * 3 + [3.0] * 6)[: values_at_charges.shape[1]]
-        )
+        values = self._values_at_charges(charges, with_second_derivatives=with_second_derivatives)
         energy, start = 0.0, 0
-        for (_, points), heights, own_rows in zip(
+        for (_, points), all_heights, own_rows in zip(
             self._kinds, charges.heights, self._own_rows, strict=True
         ):
+            # of the own elements of this kind: charge times potential and its derivatives
             stop = start + points.q.size
-            weighted = (
-                points.q[own_rows, ..., None]
-                * values_at_charges[start:stop].reshape(*points.q.shape, -1)[own_rows]
-            )
-            heights, start, energy = (
-                heights[own_rows, ..., None],
-                stop,
-                energy + weighted[..., 0].sum() / 2,
-            )
+            values_of_kind = values[start:stop].reshape(*points.q.shape, -1)
+            weighted = points.q[own_rows, ..., None] * values_of_kind[own_rows]
+            heights = all_heights[own_rows, ..., None]
+            start = stop
+            energy = energy + weighted[..., 0].sum() / 2
             # first and second derivatives by the charge's place
             f, K = weighted[..., 1:4], weighted[..., 4:]
             # derivatives by places and, times heights, by normals
-            columns = [
-                f,
-                heights * f,
-                *([K, heights * K, heights * heights * K] if with_second_derivatives else []),
-            ]
+            columns = [f, heights * f]
+            if with_second_derivatives:
+                columns += [K, heights * K, heights * heights * K]
             sums = np.concatenate([column.sum(axis=2) for column in columns], axis=-1)
             points.sums[own_rows, :, : sums.shape[-1]] += sums
         return float(energy)
+
+    def _values_at_charges(self, charges: PlacedCharges, *, with_second_derivatives: bool) -> Array:
+        """Return the potential of distant charges at all charges, with its derivatives.
+
+        The columns are the potential, its 3 first derivatives and, `with_second_derivatives`, its 6
+        second ones in the order of `SECOND_DERIVATIVES`. Rows are the charges of all kinds, one
+        kind after the other.
+        """
+        N, L = derivatives(), self.local_expansions(self._moments(self._q * charges.Y))[..., 0]
+        matrices = [*N]
+        if with_second_derivatives:
+            matrices += [N[i] @ N[j] for i, j in SECOND_DERIVATIVES]
+        # expansions of these columns in each box, evaluated at its charges
+        expansion_of_boxes = np.stack([L, *(L @ matrix for matrix in matrices)], axis=-1)
+        values = np.empty((len(self._q), expansion_of_boxes.shape[-1]))
+        for box, first, last in zip(
+            self._filled, self._first, [*self._first[1:], len(self._q)], strict=True
+        ):
+            values[self._order[first:last]] = charges.Y[:, first:last].T @ expansion_of_boxes[box]
+        # expansions take lengths over the width: powers of it for each column
+        powers = -np.array([1.0] + [2.0] * 3 + [3.0] * 6)[: values.shape[1]]
+        values *= self._leaf.width**powers
+        return values
 
     def charge_derivatives(
         self,
@@ -337,8 +348,10 @@ class MultipoleExpansion:
         for (cells, points), heights, surface in zip(
             self._kinds, charges.heights, charges.surfaces, strict=True
         ):
+            # indices: row r, point p, layer l, moment a, node k, component i of a place
             stop, T = start + points.q.size, points.tables
-            slopes_of_kind, start = slopes[:, start:stop].reshape(3, *points.q.shape, COUNT), stop
+            slopes_of_kind = slopes[:, start:stop].reshape(3, *points.q.shape, COUNT)
+            start = stop
             B[cells] += np.einsum(
                 "pk,irpa->raki", T[:, 0], slopes_of_kind.sum(axis=3), optimize=True
             )
@@ -388,9 +401,11 @@ class CellNodes:
         changes = [
             sign ** (i > 0) * np.tensordot(Q, moved, axes=(1, 1)) for i, Q in enumerate(self.turn)
         ]
+        cells = len(self.nodes)
         return np.concatenate(
             [
-                change_of_copy[:, self.nodes].transpose(1, 2, 0, 3).reshape(len(self.nodes), -1, n)
+                # from (3, cells, k, n)
+                change_of_copy[:, self.nodes].transpose(1, 2, 0, 3).reshape(cells, -1, n)
                 for change_of_copy in changes
             ]
         )
@@ -464,11 +479,10 @@ class InteractionHessian:
         of_cell, local_expansions = self.far.local_expansions_of_cells(
             _cellwise_products(self.B, self.cells.changes_of_copies(v, self.sign))
         )
-        return self.scale * self.cells.sum_at_nodes(
-            _cellwise_products(
-                self.B[own_cells].transpose(0, 2, 1), local_expansions[of_cell[own_cells]]
-            )
+        forces_on_cells = _cellwise_products(
+            self.B[own_cells].transpose(0, 2, 1), local_expansions[of_cell[own_cells]]
         )
+        return self.scale * self.cells.sum_at_nodes(forces_on_cells)
 
 
 def _cellwise_products(B: Array, v: Array) -> Array:

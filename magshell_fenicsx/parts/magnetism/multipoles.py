@@ -37,7 +37,7 @@ def harmonics(x: Array) -> Array:
     for m in range(ORDER + 1):
         if m:
             previous, row = place_of(m - 1, m - 1), place_of(m, m)
-            # R_m^m from R_(m-1)^(m-1)
+            # R_m^m from R_(m-1)^(m-1), real part and imaginary part; R_0^0 has no imaginary part
             if m == 1:
                 Y[row], Y[row + 1] = -a / 2, -b / 2
             else:
@@ -64,8 +64,8 @@ def derivatives() -> tuple[Array, Array, Array]:
     for degree, m in product(range(1, ORDER + 1), range(ORDER + 1)):
         if m > degree:
             continue
-        # of R_l^m: (d/dx + i d/dy) gives R_(l-1)^(m+1), (d/dx - i d/dy) -R_(l-1)^(m-1), d/dz
-        # R_(l-1)^m
+        # derivatives of R_l^m: d/dx + i d/dy gives R_(l-1)^(m+1), d/dx - i d/dy gives
+        # -R_(l-1)^(m-1), and d/dz gives R_(l-1)^m
         up, down, unchanged = (
             coefficients.get((degree - 1, n), zero_row) for n in (m + 1, m - 1, m)
         )
@@ -124,17 +124,20 @@ def translations(D: Array) -> Array:
                 irregular[degree, m] -= (
                     ((degree - 1) ** 2 - m * m) / square * irregular[degree - 2, m]
                 )
-    # from Y to all R_l^m, as matrix C
+    # from Y to the conjugates of all R_l^m, as matrix C; keys are (l, m)
     rows, _ = _complex()
     C, keys = np.array(list(rows.values())).conj(), list(rows)
+    # the sum of the module's head over the harmonics of a and of b
     G = np.zeros((len(D), COUNT, COUNT), dtype=np.complex128)
-    for i, (l1, m1) in enumerate(keys):
-        for j, (l2, m2) in enumerate(keys):
-            degree, m = l1 + l2, m1 + m2
-            if degree <= ORDER:
-                G[:, j, i] = (-1) ** l1 * (
-                    irregular[degree, m] if m >= 0 else (-1) ** m * irregular[degree, -m].conj()
-                )
+    for i, (degree_of_a, m_of_a) in enumerate(keys):
+        for j, (degree_of_b, m_of_b) in enumerate(keys):
+            degree, m = degree_of_a + degree_of_b, m_of_a + m_of_b
+            if degree > ORDER:
+                continue
+            harmonic = irregular[degree, abs(m)]
+            if m < 0:
+                harmonic = (-1) ** m * harmonic.conj()
+            G[:, j, i] = (-1) ** degree_of_a * harmonic
     return np.ascontiguousarray((C.T @ G @ C).real)
 
 

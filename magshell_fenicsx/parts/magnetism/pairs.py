@@ -154,6 +154,8 @@ class Stiffness:
         First block of each row, and the column of each block.
     onto
         (cells, k (k + 1)/2, 3, 3) sums of each cell, upper triangle of its nodes.
+    _count
+        Number of blocks of the pattern, without those of images.
     """
 
     def __init__(
@@ -162,14 +164,12 @@ class Stiffness:
         """Number the blocks and set them to zero; parameters are those of the class."""
         self.factor, self.row_of, self.column_of = factor, row_of, column_of
         # blocks are numbered row by row; -1 where there is none
-        block_numbers = np.where(
-            pattern, np.cumsum(pattern, dtype=np.int32).reshape(pattern.shape) - 1, -1
-        ).astype(np.int32)
+        numbers = np.cumsum(pattern, dtype=np.int32).reshape(pattern.shape) - 1
+        block_numbers = np.where(pattern, numbers, -1).astype(np.int32)
         self._count = int(np.count_nonzero(pattern))
         self.columns = np.nonzero(pattern)[1].astype(np.int32)
-        self.starts = np.concatenate([[0], np.cumsum(np.count_nonzero(pattern, axis=1))]).astype(
-            np.int32
-        )
+        blocks_of_rows = np.count_nonzero(pattern, axis=1)
+        self.starts = np.concatenate([[0], np.cumsum(blocks_of_rows)]).astype(np.int32)
         self.shape = 3 * pattern.shape[0], 3 * pattern.shape[1]
         # images have one more set of blocks, so that `matrix` can give it a sign
         image_block_numbers = [block_numbers + self._count] if len(turn) > 1 else []
@@ -183,12 +183,16 @@ class Stiffness:
         """Add the sums of each cell, `onto`, to the blocks of its nodes."""
         k = self.row_of.shape[1]
         a, b = np.triu_indices(k)
-        block = np.zeros((k, k, 3, 3))
+        blocks_of_cell = np.zeros((k, k, 3, 3))
         # own modelled cells; rows of all others are -1
         for cell in np.flatnonzero(self.row_of[:, 0] >= 0):
             sums = self.factor * self.onto[cell]
-            block[b, a], block[a, b] = sums.transpose(0, 2, 1), sums
-            self.blocks[self.where[self.row_of[cell][:, None], self.column_of[cell]]] += block
+            # both triangles of the symmetric matrix of its nodes
+            blocks_of_cell[b, a] = sums.transpose(0, 2, 1)
+            blocks_of_cell[a, b] = sums
+            rows, columns = self.row_of[cell], self.column_of[cell]
+            block_numbers = self.where[rows[:, None], columns]  # (k, k)
+            self.blocks[block_numbers] += blocks_of_cell
 
     def matrix(self, sign: float) -> bsr_array:
         """Return the matrix (3 local nodes, 3 all nodes).
@@ -269,44 +273,30 @@ class Pairs:
         filled_cells, left_rows, right_rows = (
             _filled(rows, padding) for rows in (cells, left[1], right[1])
         )
+        # whether the second cell has the same points for all points of the first one
         is_shared = right[0].tables.ndim == 3
-        (P, L), (M, S), p = left[0].q.shape[1:], right[0].q.shape[-2:], self._pointer
-        on_left, on_right = (
-            [
-                p(point_arguments.tables),
-                p(point_arguments.heights),
-                p(point_arguments.t),
-                p(point_arguments.q),
-            ]
-            for point_arguments in (left[0], right[0])
-        )
-        pair_arguments = [
-            len(filled_cells),
-            counted,
-            padding,
-            p(filled_cells),
-            nodes.shape[1],
-            p(nodes),
-        ]
-        sums = p(right[0].sums) if is_shared else self._ffi.NULL
-        point_arguments = [
-            P,
-            L,
-            *on_left,
-            p(left[0].sums),
-            p(left_rows),
-            M,
-            S,
-            *on_right,
-            sums,
-            p(right_rows),
-            int(is_shared),
-        ]
+        p = self._pointer
+        right_sums = p(right[0].sums) if is_shared else self._ffi.NULL
+        left_arguments = [*self._point_arguments(left[0]), p(left[0].sums), p(left_rows)]
+        right_arguments = [*self._point_arguments(right[0]), right_sums, p(right_rows)]
+        pair_arguments = [len(filled_cells), counted, padding, p(filled_cells)]
         return float(
             self._lib.pairs(
-                *pair_arguments, *point_arguments, p(gradient), *self._matrix(nodes, stiffness)
+                *pair_arguments,
+                nodes.shape[1],
+                p(nodes),
+                *left_arguments,
+                *right_arguments,
+                int(is_shared),
+                p(gradient),
+                *self._matrix(nodes, stiffness),
             )
         )
+
+    def _point_arguments(self, points: "Points") -> list[Any]:
+        """Return the numbers of points and of layers, then pointers to the arrays of `Points`."""
+        arrays = points.tables, points.heights, points.t, points.q
+        return [*points.q.shape[-2:], *(self._pointer(array) for array in arrays)]
 
     def _matrix(self, nodes: Array, stiffness: Stiffness | None) -> list[Any]:
         """Return the arguments of C functions for a stiffness; null pointers for None.
@@ -315,19 +305,17 @@ class Pairs:
         """
         if not stiffness:
             return [0.0, *3 * [self._ffi.NULL], 0, *3 * [self._ffi.NULL], 1]
-        p, block_numbers = self._pointer, stiffness.where
-        cell_blocks, blocks = p(stiffness.onto), p(stiffness.blocks)
-        nodes_of = p(stiffness.row_of), p(stiffness.column_of)
-        turn, modelled = p(stiffness.turn), len(nodes) // len(stiffness.turn)
+        p, modelled_cells = self._pointer, len(nodes) // len(stiffness.turn)
         return [
             stiffness.factor,
-            cell_blocks,
-            blocks,
-            p(block_numbers),
-            block_numbers.shape[1],
-            *nodes_of,
-            turn,
-            modelled,
+            p(stiffness.onto),
+            p(stiffness.blocks),
+            p(stiffness.where),
+            stiffness.where.shape[1],
+            p(stiffness.row_of),
+            p(stiffness.column_of),
+            p(stiffness.turn),
+            modelled_cells,
         ]
 
     def cells(self, arrays: dict[str, Array], **numbers: float) -> Any:

@@ -125,9 +125,8 @@ class SoftObservables(Observables):
             return {}
         at_state, forms = view.model.system.at_state(state), view.model.observed
         # integrals over the modelled part, divided by its volume
-        J = np.array(
-            [at_state.integral(forms[f"induced {axis}"]) for axis in "xyz"]
-        ) / at_state.integral(forms["induced volume"])
+        integrals = np.array([at_state.integral(forms[f"induced {axis}"]) for axis in "xyz"])
+        J = integrals / at_state.integral(forms["induced volume"])
         # on a meridian, components across e3 turn around it: their mean is zero
         if 1 not in view.model.axes:
             J[:2] = 0.0
@@ -189,23 +188,18 @@ class SensorsObservables(Observables):
         amplitudes of the applied field are central differences of fourth order: it is read too, or
         induces a polarisation.
         """
-        from magshell_fenicsx.continuation.system import State
-        from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES
-        from magshell_fenicsx.parts.magnetism.self_field import (
-            DIFFERENCE_STEP,
-            DIFFERENCE_WEIGHTS,
-            self_field,
-        )
+        from magshell_fenicsx.parts.magnetism.self_field import self_field
 
-        matching = [
-            (sensor_of_columns, i)
-            for sensor_of_columns in view.loads.sensors
-            for i, name in enumerate(sensor_of_columns.columns)
+        # the sensor of the column, and the number of the column's component
+        sensors_and_components = [
+            (sensor, i)
+            for sensor in view.loads.sensors
+            for i, name in enumerate(sensor.columns)
             if name == column
         ]
-        if not matching:
+        if not sensors_and_components:
             return None
-        (sensor, i), self_field_of_model = matching[0], self_field(view)
+        (sensor, i), self_field_of_model = sensors_and_components[0], self_field(view)
         # e_i of the case in the model's frame, times the unit: the column is direction . B
         direction = sensor.own * rotation(view.azimuth)[:, i]
         system = view.model.system
@@ -217,52 +211,57 @@ class SensorsObservables(Observables):
                 self_field_of_model.derivatives(state.mu, sensor.place, direction),
                 np.zeros_like(system.u.x.array),
             )
-            size = derivatives.by_u.shape[2]
-            np.add.at(by_u.reshape(-1, size), nodes[: len(derivatives.by_u)], derivatives.by_u)
+            components = derivatives.by_u.shape[2]
+            own_nodes = nodes[: len(derivatives.by_u)]
+            np.add.at(by_u.reshape(-1, components), own_nodes, derivatives.by_u)
             return by_u, derivatives.by_remanence
 
         by_u, by_remanence = at_state.evaluate(nodal_derivatives)
-        by_mu = dict[str, float]()
-        applied = view.loads.magnetic
-        if applied and (sensor.total or applied.soft):
-            # amplitudes of the applied field
-            names = {
-                "lambda_m",
-                *TRANSVERSE_AMPLITUDES,
-                *(name for sensor_of_columns in applied.driven for name in sensor_of_columns.names),
-            }
-            for name, value in ((name, state.mu[name]) for name in sorted(names & state.mu.keys())):
-                size = DIFFERENCE_STEP * (abs(value) or 1.0)
-                moved_states = (
-                    (steps, State(state.u, {**state.mu, name: value + steps * size}))
-                    for steps, _ in DIFFERENCE_WEIGHTS
-                )
-                readings_at_steps = {
-                    steps: self._readings(view, moved_state, [sensor])[0][i]
-                    for steps, moved_state in moved_states
-                }
-                by_mu[name] = float(
-                    sum(w / size * readings_at_steps[steps] for steps, w in DIFFERENCE_WEIGHTS)
-                )
+        by_mu = self._derivatives_by_field(view, state, sensor, i)
         value = float(self._readings(view, state, [sensor])[0][i])
         return Slope(value, at_state.summed(by_u), by_mu, self_field_of_model.Br, by_remanence)
+
+    def _derivatives_by_field(
+        self, view: ModelView, state: "State", sensor: Sensor, component: int
+    ) -> dict[str, float]:
+        """Return the derivatives of a reading by the amplitudes of the applied field; collective.
+
+        They are central differences. `component` is that of the reading, 0 to 2. Empty if the
+        reading does not depend on the applied field.
+        """
+        from magshell_fenicsx.continuation.system import State
+        from magshell_fenicsx.parts.magnetism.magnetised import TRANSVERSE_AMPLITUDES
+        from magshell_fenicsx.parts.magnetism.self_field import DIFFERENCE_STEP, DIFFERENCE_WEIGHTS
+
+        applied = view.loads.magnetic
+        if not (applied and (sensor.total or applied.soft)):
+            return {}
+        names_of_motions = (name for moving_field in applied.driven for name in moving_field.names)
+        names = {"lambda_m", *TRANSVERSE_AMPLITUDES, *names_of_motions}
+        by_mu = dict[str, float]()
+        for name in sorted(names & state.mu.keys()):
+            value = state.mu[name]
+            step = DIFFERENCE_STEP * (abs(value) or 1.0)
+            readings = dict[int, float]()  # by the number of steps
+            for steps, _ in DIFFERENCE_WEIGHTS:
+                moved_state = State(state.u, {**state.mu, name: value + steps * step})
+                readings[steps] = self._readings(view, moved_state, [sensor])[0][component]
+            by_mu[name] = float(
+                sum(weight / step * readings[steps] for steps, weight in DIFFERENCE_WEIGHTS)
+            )
+        return by_mu
 
     def _readings(self, view: ModelView, state: "State", sensors: Sequence[Sensor]) -> Array:
         """Return the readings (sensors, 3) in the frame of the case; collective.
 
         Only sensors of the total field read the applied one.
         """
-        places, reads_total = (
-            np.array([sensor.place for sensor in sensors]),
-            np.array([sensor.total for sensor in sensors]),
-        )
-        own_units, applied_units = (
-            np.array([getattr(sensor, name) for sensor in sensors])[:, None]
-            for name in ("own", "applied")
-        )
-        return field_at(
-            view, state, places, own_units, np.where(reads_total[:, None], applied_units, 0.0)
-        )
+        places = np.array([sensor.place for sensor in sensors])
+        own_units = np.array([sensor.own for sensor in sensors])[:, None]
+        applied_units = np.array([sensor.applied for sensor in sensors])[:, None]
+        reads_total = np.array([sensor.total for sensor in sensors])[:, None]
+        applied_factors = np.where(reads_total, applied_units, 0.0)
+        return field_at(view, state, places, own_units, applied_factors)
 
 
 def field_at(
@@ -291,7 +290,8 @@ def field_at(
         if magnetisation_of(view.loads) is None:
             return np.zeros_like(places)
         field_of_model = self_field(view)
-        return own_factor * field_of_model.B(field_of_model.families(state.mu)[1], state.mu, places)
+        _, charges = field_of_model.families(state.mu)
+        return own_factor * field_of_model.B(charges, state.mu, places)
 
     B, applied_field = (
         view.model.system.at_state(state).evaluate(own_field_there),

@@ -116,15 +116,15 @@ def normal_field(chi: Array, p: Array, s: Array, J: float) -> Array:
     """
     # y = scale |b|²
     scale, normal = (3 * chi / J) ** 2, np.sqrt(p)
-    # bounds: k lies between 0 and 1
+    # bounds of b: k lies between 0 and 1
     lowest = normal / (1 + chi)
     b = lowest
     for _ in range(MAX_NEWTON_STEPS):
         y = scale * (s + b**2)
         k = ratio(y)
-        newton_step = (normal - b * (1 + chi * k)) / (
-            1 + chi * (k + 2 * scale * b**2 * slopes_of_ratio(y, k)[0])
-        )
+        k_y, _ = slopes_of_ratio(y, k)  # dk/dy
+        slope = 1 + chi * (k + 2 * scale * b**2 * k_y)
+        newton_step = (normal - b * (1 + chi * k)) / slope
         b = np.clip(b + newton_step, lowest, normal)
         if np.all(np.abs(newton_step) <= 4e-16 * normal):  # to rounding
             break
@@ -147,7 +147,8 @@ def expand_energy(chi: Array, p: Array, s: Array, J: float) -> Array:
     It is Taylor's polynomial of third order about p = B_n² and s = |B_t|², in the order of
     `ORDERS`; `energy` evaluates it. `chi` is the susceptibility, `J` the saturation.
     """
-    # indices s and p are derivatives by these, k1, k2, T1 and T2 those by y
+    # suffixes _s and _p are derivatives by these; k1, k2, T1 and T2 are first and second ones by y.
+    # kappa = chi k is the susceptibility at this field.
     b, scale = normal_field(chi, p, s, J), (3 * chi / J) ** 2
     y = scale * (s + b**2)
     k = ratio(y)
@@ -155,7 +156,8 @@ def expand_energy(chi: Array, p: Array, s: Array, J: float) -> Array:
     # T(y) = 1/(1 + kappa)², with b_n² = p T
     q = 1 / (1 + chi * k)
     T, T1, T2 = q**2, -2 * chi * k1 * q**3, -2 * chi * k2 * q**3 + 6 * (chi * k1) ** 2 * q**4
-    D = 1 - scale * p * T1  # derivatives of y follow from y = scale (s + p T(y))
+    # derivatives of y follow from y = scale (s + p T(y))
+    D = 1 - scale * p * T1
     y_s, y_p = scale / D, scale * T / D
     D_s, D_p = -scale * p * T2 * y_s, -scale * (T1 + p * T2 * y_p)
     y_ss, y_ps = -y_s * D_s / D, -y_s * D_p / D

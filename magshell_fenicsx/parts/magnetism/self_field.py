@@ -76,6 +76,16 @@ class SelfField:
         Its remanence at nodes.
     edges
         Cells of this rank and their local edges that are charged, or may be at some state.
+    _sight
+        The `view`.
+    _pattern
+        The remanence as a function of places and normals.
+    _is_convected
+        Whether the remanence moves with F and nothing is induced.
+    _interpolation
+        Element of a remanence that is not convected.
+    _owned, _dim
+        Number of this rank's cells, and their dimension: 1 on a meridian.
     """
 
     def __init__(self, view: ModelView) -> None:
@@ -164,8 +174,9 @@ class SelfField:
         `x` (3,) is a place over R and `e` (3,) a direction.
         """
         derivatives_of_families = list[NodalDerivatives]()
-        # uncharged elements have derivatives by the remanence, too. Derivatives by u are taken from
-        # the first run, those by the remanence from the last.
+        # Uncharged elements have derivatives by the remanence, too. A convected remanence takes two
+        # runs: derivatives by u come from the first, without these elements, and those by the
+        # remanence from the second.
         for include_uncharged in (False, True) if self._is_convected else (True,):
             shape, families = self.families(mu, include_uncharged=include_uncharged)
             nodal_derivatives = NodalDerivatives(
@@ -299,11 +310,12 @@ class SelfField:
             for dual in (np.cross(r2, n), np.cross(n, r1))
         )
         along_normal = np.sum(n * J, axis=-1, keepdims=True)
-        # over the thickness stretch, the inverse of the area ratio
+        # where the shell is incompressible, the normal component is divided by the thickness
+        # stretch, which is the inverse of the area ratio
         if np.any(self._incompressible):
-            along_normal = along_normal * (
-                1 + np.asarray(self._incompressible)[..., None] * (area / frame.area[..., None] - 1)
-            )
+            is_incompressible = np.asarray(self._incompressible)[..., None]
+            area_ratio = area / frame.area[..., None]
+            along_normal = along_normal * (1 + is_incompressible * (area_ratio - 1))
         return np.asarray(along_r1 * r0[1] + along_r2 * r0[2] + along_normal * frame.n0)
 
     def _to_material(
@@ -319,6 +331,12 @@ class SelfField:
         r0, u = (
             self._jets(f.x.array.reshape(-1, components)[nodes]) for f in (model.r0, model.system.u)
         )
+
+        def result_at(u_jets: Array) -> Array:
+            """Return the part of the result due to F^-1 J at each interpolation node."""
+            material = self._material(r0, u_jets, mu)
+            return np.asarray(np.sum(nodal_derivatives.by_remanence * material, axis=-1))
+
         # by the value (d = 0) and the derivatives of u at interpolation nodes, component i
         by_jets = np.zeros_like(u)
         for d in range(len(u)):
@@ -326,14 +344,8 @@ class SelfField:
                 for steps, weight in DIFFERENCE_WEIGHTS:
                     u_moved = u.copy()
                     u_moved[d, ..., i] += steps * DIFFERENCE_STEP
-                    by_jets[d, ..., i] += (
-                        weight
-                        / DIFFERENCE_STEP
-                        * np.sum(
-                            nodal_derivatives.by_remanence * self._material(r0, u_moved, mu),
-                            axis=-1,
-                        )
-                    )
+                    by_jets[d, ..., i] += weight / DIFFERENCE_STEP * result_at(u_moved)
+        # brought to the nodes of u by the transposed shape functions
         T = V.element.basix_element.tabulate(1, self._interpolation.points)[..., 0]
         # on a meridian du/dtheta = U e_theta: its component adds to that of U; see `_jets`
         if self._dim == 1:
@@ -344,20 +356,16 @@ class SelfField:
         space_of_Br = self.Br.function_space
         # tables of Br's shape functions, transposed below: from interpolation nodes to nodes of Br
         TB = space_of_Br.element.basix_element.tabulate(0, self._interpolation.points)[0, :, :, 0]
-        Br, by_B = np.array(self.Br.x.array), np.zeros_like(self._nodal_remanence())
+        # by the remanence: the change of the result for one more in each component of Br
+        present_Br, by_Br = np.array(self.Br.x.array), np.zeros_like(self._nodal_remanence())
         for i in range(3):
-            self.Br.x.array[:] = Br
-            value_before = np.sum(
-                nodal_derivatives.by_remanence * self._material(r0, u, mu), axis=-1
-            )
+            self.Br.x.array[:] = present_Br
+            value_before = result_at(u)
             self.Br.x.array.reshape(-1, 3)[:, i] += 1.0
-            change = (
-                np.sum(nodal_derivatives.by_remanence * self._material(r0, u, mu), axis=-1)
-                - value_before
-            )
-            by_B[..., i] = np.einsum("mk,nm->nk", TB, change)
-        self.Br.x.array[:] = Br
-        return NodalDerivatives(by_u, by_B)
+            change = result_at(u) - value_before
+            by_Br[..., i] = np.einsum("mk,nm->nk", TB, change)
+        self.Br.x.array[:] = present_Br
+        return NodalDerivatives(by_u, by_Br)
 
     def _charged_sides(
         self, *, include_all: bool = False
@@ -378,41 +386,46 @@ class SelfField:
             topology.connectivity(dim, dim - 1),
         )
         facets_of_cells = to_facets.array.reshape(-1, dim + 1)
-        cells_of_facet = np.diff(to_cells.offsets)
+        cell_counts = np.diff(to_cells.offsets)  # of each facet
         nodal_remanence = self._nodal_remanence(len(facets_of_cells))
         largest = np.abs(nodal_remanence).max(initial=0.0) or 1.0
         at_edges = self._remanence_at_edges(len(facets_of_cells), nodal_remanence)
-        cells, edges = list[int](), list[int]()
         mirrored_facets = {int(facet) for facet in self._model.mirrored_facets}
-        for cell in range(self._owned):
-            for local_edge, facet in enumerate(facets_of_cells[cell]):
-                if facet in mirrored_facets:
-                    continue
-                if cells_of_facet[facet] == 1:  # at the boundary
-                    cells.append(cell)
-                    edges.append(local_edge)
-                    continue
-                neighbour = next(int(c) for c in to_cells.links(facet) if c != cell)
-                edge_of_neighbour = int(np.flatnonzero(facets_of_cells[neighbour] == facet)[0])
-                jump = np.abs(
-                    at_edges[cell, local_edge] - at_edges[neighbour, edge_of_neighbour]
-                ).max()
-                always = include_all or not self._is_convected
-                if always or jump > JUMP_TOLERANCE * largest:
-                    cells.append(cell)
-                    edges.append(local_edge)
-        charged_sides = np.array(cells, dtype=np.intp), np.array(edges, dtype=np.intp)
+        all_are_charged = include_all or not self._is_convected
+
+        def is_charged(cell: int, local_edge: int) -> bool:
+            facet = facets_of_cells[cell, local_edge]
+            if facet in mirrored_facets:
+                return False
+            if cell_counts[facet] == 1 or all_are_charged:  # one cell: at the boundary
+                return True
+            neighbour = next(int(c) for c in to_cells.links(facet) if c != cell)
+            edge_of_neighbour = int(np.flatnonzero(facets_of_cells[neighbour] == facet)[0])
+            jump = at_edges[cell, local_edge] - at_edges[neighbour, edge_of_neighbour]
+            return bool(np.abs(jump).max() > JUMP_TOLERANCE * largest)
+
+        sides = [
+            (cell, local_edge)
+            for cell in range(self._owned)
+            for local_edge in range(dim + 1)
+            if is_charged(cell, local_edge)
+        ]
+        cells = np.array([cell for cell, _ in sides], dtype=np.intp)
+        edges = np.array([local_edge for _, local_edge in sides], dtype=np.intp)
         if dim == 2:
-            return charged_sides
-        # a pole has no edge; local facets of an interval are its ends
+            return cells, edges
+        # a pole has no edge
+        is_off_axis = np.abs(self._radii_of_ends()[cells, edges]) > AXIS_TOLERANCE
+        return cells[is_off_axis], edges[is_off_axis]
+
+    def _radii_of_ends(self) -> Array:
+        """Return rho (cells, 2) at both ends of a meridian's cells, their local facets."""
+        r0 = self._model.r0
+        V = r0.function_space
         X = np.array([[0.0], [1.0]])
         T = V.element.basix_element.tabulate(0, X)[0, :, :, 0]
-        rho = np.einsum(
-            "mk,nk->nm", T, self._model.r0.x.array.reshape(-1, 2)[V.dofmap.list][..., 0]
-        )
-        is_off_axis = np.abs(rho[charged_sides]) > AXIS_TOLERANCE
-        cells_of_sides, local_edges = charged_sides
-        return cells_of_sides[is_off_axis], local_edges[is_off_axis]
+        nodal_rho = r0.x.array.reshape(-1, 2)[V.dofmap.list][..., 0]
+        return np.asarray(np.einsum("mk,nk->nm", T, nodal_rho))
 
     def _remanence_at_edges(self, count: int, values: Array) -> Array:
         """Return the remanence in the middle of each local edge, (count, edges, 3).
@@ -420,8 +433,8 @@ class SelfField:
         On a meridian, edges are ends of cells. `values` (cells, nodes, 3) are nodal; the first
         `count` cells are taken.
         """
-        middles = np.array([[0.0], [1.0]])
-        if self._dim == 2:
+        middles = np.array([[0.0], [1.0]])  # the two ends of an interval
+        if self._dim == 2:  # the middles of a triangle's sides
             middles = np.array([[0.5, 0.5], [0.0, 0.5], [0.5, 0.0]])
         T = self.Br.function_space.element.basix_element.tabulate(0, middles)[0, :, :, 0]
         return np.asarray(np.einsum("mk,nki->nmi", T, values[:count]))
@@ -433,12 +446,11 @@ class SelfField:
         collective.
         """
         sign = self._image_sign
-        # a field of amplitude zero induces nothing; an amplitude of one has the same symmetry
-        if sign == 0.0 and self._sight.loads.magnetic and self._sight.mirror:
-            amplitudes_shown = {**mu, "lambda_m": mu.get("lambda_m", 0.0) or 1.0}
-            return self._sight.loads.magnetic.sign_of_images(
-                amplitudes_shown, self._sight.model.r0, self._sight.mirror
-            )
+        magnetic, mirror = self._sight.loads.magnetic, self._sight.mirror
+        if sign == 0.0 and magnetic and mirror:
+            # a field of amplitude zero has no sign; an amplitude of one has the same symmetry
+            amplitudes = {**mu, "lambda_m": mu.get("lambda_m", 0.0) or 1.0}
+            return magnetic.sign_of_images(amplitudes, self._sight.model.r0, mirror)
         return sign
 
     def _parity(self) -> float:
@@ -449,12 +461,12 @@ class SelfField:
         if self._sight.mirror is None:
             return 1.0
         x, n = (at_nodes[: self._owned] for at_nodes in self._node_places())
-        # mean product of the remanence at each place with that of its mirror image, mirrored
         S, pattern = self._sight.mirror.reflection, self._pattern
-        images = pattern(self._sight.mirror.image(x), n @ S) @ S
-        return float(
-            np.sign(self._model.system.comm.allreduce(float(np.sum(images * pattern(x, n)))))
-        )
+        # remanence at the mirror images of places, mirrored back; its product with that at the
+        # places themselves is positive where images continue the remanence
+        mirrored_back = pattern(self._sight.mirror.image(x), n @ S) @ S
+        product = float(np.sum(mirrored_back * pattern(x, n)))
+        return float(np.sign(self._model.system.comm.allreduce(product)))
 
 
 def magnetic_moment(view: ModelView, mu: Mapping[str, float]) -> Array:

@@ -78,10 +78,8 @@ class SelfFieldOfSolid(SelfField):
         # charges inside are -Div Br: only a remanence that varies has some
         cells = np.arange(self._owned) if include_uncharged else cells_with_varying_remanence(shape)
         inside = [CellInteriors(shape, cells)] if len(cells) else []
-        return shape, [
-            CellFaces(shape, *(self.chargeable if include_uncharged else self.edges)),
-            *inside,
-        ]
+        cells_and_faces = self.chargeable if include_uncharged else self.edges
+        return shape, [CellFaces(shape, *cells_and_faces), *inside]
 
     def shape(self, mu: Mapping[str, float]) -> MagnetisedSolid:
         """Return the magnetised cells of this rank at the system's displacement."""
@@ -187,10 +185,11 @@ class SelfFieldOfSolid(SelfField):
         for dimensions in ((2, 3), (3, 2)):
             topology.create_connectivity(*dimensions)
         facets_of_cells = topology.connectivity(3, 2).array.reshape(-1, 6)
-        cells_of_facet = np.diff(topology.connectivity(2, 3).offsets)
+        cell_counts = np.diff(topology.connectivity(2, 3).offsets)  # of each facet
         is_charged = np.isin(facets_of_cells, self._model.mirrored_facets, invert=True)
         if not include_all and self._is_convected:
-            is_charged &= (cells_of_facet[facets_of_cells] == 1) | self._jumps(facets_of_cells)
+            is_on_surface = cell_counts[facets_of_cells] == 1
+            is_charged &= is_on_surface | self._jumps(facets_of_cells)
         cells, faces = np.nonzero(is_charged[: self._owned])
         return cells, faces
 
@@ -202,23 +201,24 @@ class SelfFieldOfSolid(SelfField):
         """
         space_of_Br, V = self.Br.function_space, self._model.r0.function_space
         nodal_remanence = self._nodal_remanence(len(facets_of_cells))
+        # places X and remanence B at the samples of all faces of all cells: (faces, samples, 3)
         coordinates = np.broadcast_to(FACE_SAMPLES, (6, *FACE_SAMPLES.shape))
         samples = places_on_faces(np.arange(6), coordinates).reshape(-1, 3)
         T, TB = (
             space.element.basix_element.tabulate(0, samples)[0, :, :, 0]
             for space in (V, space_of_Br)
         )
-        X = np.einsum("mk,nki->nmi", T, self._model.r0.x.array.reshape(-1, 3)[V.dofmap.list])
+        nodal_places = self._model.r0.x.array.reshape(-1, 3)[V.dofmap.list]
+        X = np.einsum("mk,nki->nmi", T, nodal_places).reshape(-1, len(FACE_SAMPLES), 3)
         B = np.einsum("mk,nki->nmi", TB, nodal_remanence).reshape(-1, len(FACE_SAMPLES), 3)
-        X = X.reshape(-1, len(FACE_SAMPLES), 3)
-        # both sides of an inner face have one facet number
-        order = np.argsort(facets_of_cells.ravel(), kind="stable")
-        pairs = np.flatnonzero(np.diff(facets_of_cells.ravel()[order]) == 0)
+        # an inner face is there twice, with one facet number: as a side of both its cells
+        facets = facets_of_cells.ravel()
+        order = np.argsort(facets, kind="stable")
+        pairs = np.flatnonzero(np.diff(facets[order]) == 0)
         sides, sides_of_neighbours = order[pairs], order[pairs + 1]
-        # two cells have their samples of a common face in different orders
-        distances = X[sides][:, :, None] - X[sides_of_neighbours][:, None]
-        # sample places of both sides, matched by distance
-        matching = np.linalg.norm(distances, axis=-1).argmin(axis=2)
+        # two cells have their samples of a common face in different orders: match nearest ones
+        separations = X[sides][:, :, None] - X[sides_of_neighbours][:, None]
+        matching = np.linalg.norm(separations, axis=-1).argmin(axis=2)
         B_of_neighbours = np.take_along_axis(B[sides_of_neighbours], matching[..., None], axis=1)
         largest = np.abs(nodal_remanence).max(initial=0.0) or 1.0
         jump = np.abs(B[sides] - B_of_neighbours).max(axis=(1, 2), initial=0.0)

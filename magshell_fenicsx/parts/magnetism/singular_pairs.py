@@ -136,6 +136,16 @@ class SingularPairs:
     ----------
     neighbours
         For each cell of all copies, the cells with a common corner, itself included.
+    _strips
+        (copies * cells, 3) whether each local edge has a charged strip.
+    _boundary_sides
+        (copies * cells, 3) whether each side belongs to no other cell.
+    _scale
+        Thickness over a typical side of a cell: on this scale rules are dense.
+    _heights
+        Heights of the layers of charges of a cell.
+    _batches
+        The pairs of elements with charges, by kinds.
     """
 
     def __init__(
@@ -157,22 +167,11 @@ class SingularPairs:
         strips[cells, edges] = True
         self._strips = np.tile(strips, (len(copies.images), 1))
         side_lengths = [np.linalg.norm(shape.r0[:, i] - shape.r0[:, j], axis=-1) for i, j in ENDS]
-        # thickness over a typical side: on this scale rules are dense
         self._scale = float(shape.h / np.median(side_lengths))
         self._heights = heights(
             ShellFaces(shape, np.arange(1), include_uncharged=include_uncharged)
         )
-        cells_at_corner: dict[int, list[int]] = {}
-        corner_numbers = [[int(corner) for corner in corners[cell]] for cell in range(len(corners))]
-        for cell, corners_of_cell in enumerate(corner_numbers):
-            for corner in corners_of_cell:
-                cells_at_corner.setdefault(corner, []).append(cell)
-        self.neighbours = [
-            sorted(
-                {neighbour for corner in corners_of_cell for neighbour in cells_at_corner[corner]}
-            )
-            for corners_of_cell in corner_numbers
-        ]
+        self.neighbours = _cells_with_common_corner(corners)
         self._boundary_sides = self._at_boundary()
         # pairs of one kind share their rules
         pairs_of_kinds: dict[PairKind, list[tuple[int, int]]] = {}
@@ -215,10 +214,11 @@ class SingularPairs:
         return at_boundary
 
     def _common_side(self, c: int, edge: int, d: int) -> tuple[int, bool] | None:
-        """Return the local number in cell d of a side of cell c, and whether it runs back there.
+        """Return the local number in cell d of a side of cell c, and `flip` of the module.
 
         None if cell d does not have the side.
         """
+        # the corners of both cells have the same numbers where they coincide
         a, b = (int(self._corners[c, i]) for i in ENDS[edge])
         for side, (i, j) in enumerate(ENDS):
             ends = int(self._corners[d, i]), int(self._corners[d, j])
@@ -241,53 +241,43 @@ class SingularPairs:
         own_corners, other_corners = (
             [int(corner) for corner in self._corners[cell]] for cell in (c, d)
         )
-        boundary_sides = tuple(map(bool, self._boundary_sides[c]))
-        common_sides = [
-            (edge, side_in_other)
-            for edge in range(3)
-            if c != d and (side_in_other := self._common_side(c, edge, d))
-        ]
-        if c == d:
-            yield "faces", boundary_sides, "self"
-        elif common_sides:
-            # two cells have at most one common side
-            edge, (side_of_other, flip) = common_sides[0]
-            yield "faces", boundary_sides, "side", edge, side_of_other, flip
-        else:
-            yield (
-                "faces",
-                boundary_sides,
-                "corner",
-                next(i for i, corner in enumerate(other_corners) if corner in own_corners),
-            )
-        for edge in np.flatnonzero(self._strips[c]):
-            edge = int(edge)
+        yield self._kind_of_faces(c, d)
+        for edge in map(int, np.flatnonzero(self._strips[c])):
+            # the strip of the first cell with the faces of the second
             common_side, ends = self._common_side(c, edge, d), [own_corners[i] for i in ENDS[edge]]
             common_corners = [i for i, corner in enumerate(other_corners) if corner in ends]
             if common_side:
                 yield "strip", edge, "side", *common_side
+            elif common_corners:
+                yield "strip", edge, "corner", common_corners[0]
             else:
-                yield (
-                    ("strip", edge, "corner", common_corners[0])
-                    if common_corners
-                    else ("strip", edge, "apart")
-                )
-            for other_edge in np.flatnonzero(self._strips[d]):
-                other_edge = int(other_edge)
+                yield "strip", edge, "apart"
+            # and with its strips
+            for other_edge in map(int, np.flatnonzero(self._strips[d])):
                 ends_of_other = [other_corners[i] for i in ENDS[other_edge]]
+                common_ends = [i for i in range(2) if ends_of_other[i] in ends]
                 if common_side and common_side[0] == other_edge:
                     yield "strips", edge, "side", other_edge, common_side[1]
-                elif common_ends := [i for i in range(2) if ends_of_other[i] in ends]:
-                    yield (
-                        "strips",
-                        edge,
-                        "end",
-                        other_edge,
-                        common_ends[0],
-                        ends.index(ends_of_other[common_ends[0]]),
-                    )
+                elif common_ends:
+                    end_of_other = common_ends[0]
+                    own_end = ends.index(ends_of_other[end_of_other])
+                    yield "strips", edge, "end", other_edge, end_of_other, own_end
                 else:
                     yield "strips", edge, "apart", other_edge
+
+    def _kind_of_faces(self, c: int, d: int) -> PairKind:
+        """Return the kind "faces" of two adjacent cells c and d, see `_kinds_of_pair`."""
+        boundary_sides = tuple(map(bool, self._boundary_sides[c]))
+        if c == d:
+            return "faces", boundary_sides, "self"
+        for edge in range(3):  # two cells have at most one common side
+            if common_side := self._common_side(c, edge, d):
+                side_of_other, flip = common_side
+                return "faces", boundary_sides, "side", edge, side_of_other, flip
+        own_corners = [int(corner) for corner in self._corners[c]]
+        other_corners = [int(corner) for corner in self._corners[d]]
+        corner_of_other = next(i for i, corner in enumerate(other_corners) if corner in own_corners)
+        return "faces", boundary_sides, "corner", corner_of_other
 
     def _charged_batches(self, kinds: dict[PairKind, list[tuple[int, int]]]) -> Iterator[Batch]:
         """Yield the batches of all kinds, without those whose elements have no charge.
@@ -296,26 +286,20 @@ class SingularPairs:
         first. Kinds are sorted by their text, so that sums have the same order in each run.
         """
         batches = []
-        for kind, pairs in sorted(kinds.items(), key=lambda batch: str(batch[0])):
-            order = sorted(pairs, key=lambda pair: pair[0] not in self._own)
-            batches.append(
-                self._batch(
-                    kind, np.array(order, dtype=np.int64), sum(c in self._own for c, _ in pairs)
-                )
-            )
-        largest = max(
-            (
-                float(np.abs(q).max(initial=0.0))
-                for batch in batches
-                for q in (batch.left.q, batch.right.q)
-            ),
-            default=0,
-        )
-        for batch in batches:
-            if self._include_uncharged or all(
-                np.abs(q).max(initial=0.0) > CHARGE_TOLERANCE * largest
-                for q in (batch.left.q, batch.right.q)
-            ):
+        for kind, pairs in sorted(kinds.items(), key=lambda kind_and_pairs: str(kind_and_pairs[0])):
+            own_first = sorted(pairs, key=lambda pair: pair[0] not in self._own)
+            own_count = sum(c in self._own for c, _ in pairs)
+            batches.append(self._batch(kind, np.array(own_first, dtype=np.int64), own_count))
+
+        # the largest charges on the first and on the second elements of each batch
+        charges_of_batches = [
+            [float(np.abs(q).max(initial=0.0)) for q in (batch.left.q, batch.right.q)]
+            for batch in batches
+        ]
+        largest = max((charge for charges in charges_of_batches for charge in charges), default=0)
+        for batch, charges in zip(batches, charges_of_batches, strict=True):
+            is_charged = all(charge > CHARGE_TOLERANCE * largest for charge in charges)
+            if self._include_uncharged or is_charged:
                 yield batch
 
     def _batch(self, kind: PairKind, pairs: Ints, own_pairs: int) -> Batch:
@@ -324,73 +308,99 @@ class SingularPairs:
         The first cells of the first `own_pairs` pairs are on this rank.
         """
         first, second, is_shared = self._rules_of_pair(kind)
-        on_strips = kind[0] == "strips"
         # local edges of the strips, see `_kinds_of_pair`; None for faces
-        left = self._points(pairs[:, 0], first, kind[1] if kind[0] != "faces" else None)
-        right = self._points(pairs[:, 1], second, kind[3] if on_strips else None)
-        T, heights_of_points, t, q = right  # shape functions, heights, thickness, charges
-        # each point of the first element has points of its own on the second
-        if not is_shared:
-            points_of_first = len(first.weights)
-            T = T.reshape(points_of_first, -1, *T.shape[1:])
-            heights_of_points, t, q = (
-                heights_of_points.reshape(points_of_first, -1, heights_of_points.shape[-1]),
-                t.reshape(len(t), points_of_first, -1),
-                q.reshape(len(q), points_of_first, -1, heights_of_points.shape[-1]),
-            )
+        edge = kind[1] if kind[0] != "faces" else None
+        other_edge = kind[3] if kind[0] == "strips" else None
+        # shape functions, heights, thickness and charges at the points of the first elements
+        T, layers, t, q = self._points(pairs[:, 0], first, edge)
         weight = 1.0 if kind[0] == "strip" else 0.5  # pairs of equal elements occur in both orders
-        left_points = Points(left[0], left[1], left[2], weight * left[3])
-        sides = (
-            (first, kind[1] if kind[0] != "faces" else None, weight),
-            (second, kind[3] if on_strips else None, 1.0),
+        left = Points(T, layers, t, weight * q)
+        # and of the second ones
+        T, layers, t, q = self._points(pairs[:, 1], second, other_edge)
+        if not is_shared:  # each point of the first element has points of its own on the second
+            P, L = len(first.weights), layers.shape[-1]
+            T = T.reshape(P, -1, *T.shape[1:])
+            layers = layers.reshape(P, -1, L)
+            t = t.reshape(len(t), P, -1)
+            q = q.reshape(len(q), P, -1, L)
+        return Batch(
+            pairs=pairs,
+            own=own_pairs,
+            left=left,
+            right=Points(T, layers, t, q),
+            charges_of_left=(first, edge, weight),
+            charges_of_right=(second, other_edge, 1.0),
         )
-        return Batch(pairs, own_pairs, left_points, Points(T, heights_of_points, t, q), *sides)
 
     def _rules_of_pair(self, kind: PairKind) -> tuple[Places, Places, bool]:
         """Return the points of both elements of a kind of pairs, and whether they are shared.
 
         If true, the second element has the same points for all points of the first one. Otherwise
-        it has others for each, one group after the other. Indices of `kind` are as in
-        `_kinds_of_pair`.
+        it has others for each, one group after the other. `kind` is one of `_kinds_of_pair`.
         """
-        s = self._scale
         if kind[0] == "faces":
-            first = Places(*rule_along_sides(kind[1], s))
-            if kind[2] == "corner":
-                return first, Places(*at_corner(kind[3])), True
-            # pole of the polar rule: the point itself, or its continuation into the neighbour
-            apex = (
-                first.X if kind[2] == "self" else continued_across_side(first.X, kind[3:5], kind[5])
-            )
-            return first, self._padded([polar(point, s) for point in apex]), False
-        # a strip is the first element: t along it, eta across it
+            return self._rules_of_faces(kind)
+        second, is_shared = (
+            self._rule_of_faces_at_strip(kind)
+            if kind[0] == "strip"
+            else self._rule_of_strip_at_strip(kind)
+        )
+        return Places.of_strip(kind[1], *strip()), second, is_shared
+
+    def _rules_of_faces(self, kind: PairKind) -> tuple[Places, Places, bool]:
+        """Return `_rules_of_pair` for the faces of two cells."""
+        _, boundary_sides, touch, *position = kind
+        first = Places(*rule_along_sides(boundary_sides, self._scale))
+        if touch == "corner":
+            (corner_of_other,) = position
+            return first, Places(*at_corner(corner_of_other)), True
+        # pole of the polar rule: the point itself, or its continuation into the neighbour
+        poles = first.X
+        if touch == "side":
+            side, side_of_other, flip = position
+            poles = continued_across_side(first.X, (side, side_of_other), flip)
+        return first, self._padded([polar(pole, self._scale) for pole in poles]), False
+
+    def _rule_of_faces_at_strip(self, kind: PairKind) -> tuple[Places, bool]:
+        """Return the points on the faces of a cell for a strip, and whether they are shared."""
+        _, _, touch, *position = kind
+        if touch == "corner":
+            (corner_of_other,) = position
+            return Places(*at_corner(corner_of_other)), True
+        if touch == "apart":
+            return Places(*_quadrature(REGULAR_DEGREE)), True
+        # the pole of each polar rule is the strip's point on the common side
+        side_of_other, flip = position
+        t, _, _ = strip()
+        poles = on_edge(side_of_other, 1 - t if flip else t)
+        return self._padded([polar(pole, STRIP_SCALE * self._scale) for pole in poles]), False
+
+    def _rule_of_strip_at_strip(self, kind: PairKind) -> tuple[Places, bool]:
+        """Return the points on the strip of `other_edge` for a strip, and whether they are shared.
+
+        A point of the first strip is at t along it and at eta across it. `positions` are the places
+        of these points along the other edge.
+        """
+        _, _, touch, other_edge, *position = kind
         t, eta, w = strip()
-        first = Places.of_strip(kind[1], t, eta, w)
-        if kind[0] == "strip":
-            if kind[2] == "corner":
-                return first, Places(*at_corner(kind[3])), True
-            if kind[2] == "apart":
-                return first, Places(*_quadrature(REGULAR_DEGREE)), True
-            # the pole of each polar rule is the strip's point on the common side
-            foot = on_edge(kind[3], 1 - t if kind[4] else t)
-            return first, self._padded([polar(point, STRIP_SCALE * s) for point in foot]), False
-        if kind[2] in ("side", "end"):
-            positions = 1 - t if kind[4] else t
-            # continue the other edge beyond the common end, as far as the place is from it
-            if kind[2] == "end":
-                positions = (1 - t if kind[5] else t) * (-1 if kind[4] == 0 else 1) + kind[4]
-            strips = [
-                strip_rule_seen_from(float(position), float(height), s)
-                for position, height in zip(positions, eta, strict=True)
-            ]
-            return (
-                first,
-                Places.of_strip(
-                    kind[3], *(np.concatenate(point) for point in zip(*strips, strict=True))
-                ),
-                False,
-            )
-        return first, Places.of_strip(kind[3], t, eta, w), True
+        if touch == "apart":
+            return Places.of_strip(other_edge, t, eta, w), True
+        if touch == "side":
+            (flip,) = position
+            positions = 1 - t if flip else t
+        else:
+            # on the continuation of the other edge beyond the common end, as far from this end as
+            # the point itself
+            end_of_other, own_end = position
+            distance_from_end = 1 - t if own_end else t
+            positions = distance_from_end * (-1 if end_of_other == 0 else 1) + end_of_other
+        rules = [
+            strip_rule_seen_from(float(position), float(height), self._scale)
+            for position, height in zip(positions, eta, strict=True)
+        ]
+        # one rule after the other: places along and across the strip, and weights
+        along, across, weights = (np.concatenate(values) for values in zip(*rules, strict=True))
+        return Places.of_strip(other_edge, along, across, weights), False
 
     def _padded(self, rules: list[tuple[Array, Array]]) -> Places:
         """Return rules as one, one after the other.
@@ -425,7 +435,9 @@ class SingularPairs:
             layers = np.broadcast_to(self._heights, (len(X), len(self._heights)))
         else:
             assert edge is not None
-            q, layers = (self._on_strips[edge][cells] @ basis.T)[..., None], points.at[:, 1:] - 0.5
+            # a strip has one layer; its height is the coordinate across it, from -1/2 to 1/2
+            q = (self._on_strips[edge][cells] @ basis.T)[..., None]
+            layers = points.at[:, 1:] - 0.5
         return (
             T,
             np.ascontiguousarray(layers),
@@ -499,47 +511,42 @@ class SingularPairs:
         and a change v of the nodes. `moved_nodes` (cells, k, 3) are the nodes of all copies, with v
         times a small step as imaginary part.
         """
-        on_faces, on_strips = (
-            np.zeros_like(self._on_faces),
-            [np.zeros_like(charges_of_edge) for charges_of_edge in self._on_strips],
-        )
+        # derivatives by the charges at the nodes of faces and strips
+        on_faces = np.zeros_like(self._on_faces)
+        on_strips = [np.zeros_like(charges_of_edge) for charges_of_edge in self._on_strips]
         for batch in self._batches:
             # pairs whose first cell is on this rank
             pairs = batch.pairs[: batch.own]
             rows = np.arange(len(pairs))
-            sides = zip((0, 1), (batch.charges_of_left, batch.charges_of_right), strict=True)
             by_charges_of_both = pair_derivatives(
                 moved_nodes, pairs, (batch.left, rows), (batch.right, rows), weights
             )
             if nodal_derivatives.by_thickness is not None:
                 self._by_heights(batch, pairs, moved_nodes, weights, nodal_derivatives)
             # derivatives by charges of both elements, brought to the nodes of their charges
-            for side, (points, edge, factor) in sides:
+            for side, charges in enumerate((batch.charges_of_left, batch.charges_of_right)):
+                points, edge, factor = charges
                 copy, cells = np.divmod(pairs[:, side], len(self._shape.r0))
+                charge_factors = self._copies.charge_factors[copy][:, None, None]
                 by_charges = by_charges_of_both[side][: len(pairs)].reshape(
                     len(pairs), len(points.weights), -1
                 )
-                by_charges = (
-                    factor
-                    * points.weights[:, None]
-                    * self._copies.charge_factors[copy][:, None, None]
-                    * by_charges
-                )
+                by_charges = factor * points.weights[:, None] * charge_factors * by_charges
+                basis = _basis(points)
                 if edge is None:
-                    np.add.at(
-                        on_faces,
-                        cells,
-                        np.einsum("mj,nml->njl", _basis(points), by_charges, optimize=True),
-                    )
+                    by_nodes = np.einsum("mj,nml->njl", basis, by_charges, optimize=True)
+                    np.add.at(on_faces, cells, by_nodes)
                 else:
-                    np.add.at(on_strips[edge], cells, by_charges[..., 0] @ _basis(points))
+                    np.add.at(on_strips[edge], cells, by_charges[..., 0] @ basis)
         # from derivatives by charges to those by nodal values
-        for cells_of_chunk, charges in self._face_charges(nodal_derivatives):
-            assert charges.add_derivatives
-            charges.add_derivatives(np.zeros_like(charges.x), on_faces[cells_of_chunk])
-        for edge, cells, charges in self._strip_charges(nodal_derivatives):
-            assert charges.add_derivatives
-            charges.add_derivatives(np.zeros_like(charges.x), on_strips[edge][cells][..., None])
+        for cells_of_chunk, face_charges in self._face_charges(nodal_derivatives):
+            assert face_charges.add_derivatives
+            face_charges.add_derivatives(np.zeros_like(face_charges.x), on_faces[cells_of_chunk])
+        for edge, cells, strip_charges in self._strip_charges(nodal_derivatives):
+            assert strip_charges.add_derivatives
+            strip_charges.add_derivatives(
+                np.zeros_like(strip_charges.x), on_strips[edge][cells][..., None]
+            )
 
     def _by_heights(
         self,
@@ -566,6 +573,22 @@ class SingularPairs:
                 heights * by_heights[side][: len(pairs)].reshape(shape), axis=-1
             )
             self._shape.add_thickness_derivatives(cells, places.X, by_thickness, nodal_derivatives)
+
+
+def _cells_with_common_corner(corners: Ints) -> list[list[int]]:
+    """Return for each cell the cells with a common corner, itself included, in ascending order.
+
+    `corners` (cells, 3) are the numbers of the cells' corners.
+    """
+    corner_numbers = [[int(corner) for corner in corners[cell]] for cell in range(len(corners))]
+    cells_at_corner: dict[int, list[int]] = {}
+    for cell, corners_of_cell in enumerate(corner_numbers):
+        for corner in corners_of_cell:
+            cells_at_corner.setdefault(corner, []).append(cell)
+    return [
+        sorted({neighbour for corner in corners_of_cell for neighbour in cells_at_corner[corner]})
+        for corners_of_cell in corner_numbers
+    ]
 
 
 def _basis(points: Places) -> Array:

@@ -121,9 +121,8 @@ class SourceStep(LoadStep):
                 f"{key}.source: {self.source}: magnetic.applied.sources has no such source; "
                 f"allowed: {', '.join(names) or 'none'}"
             )
-        if context.is_programme and FieldSection.amplitude not in context.driven_before(
-            step.number
-        ):
+        is_programme, field_amplitude = context.is_programme, FieldSection.amplitude
+        if is_programme and field_amplitude not in context.driven_before(step.number):
             raise ValueError(
                 f"{key}.kind: source needs the field of its source: a step of kind: field before it"
             )
@@ -175,7 +174,8 @@ def source_size(loads: "Loads", name: str) -> float:
             return field.factors[name]
         for motion in field.motions:
             if motion.name == name:
-                return float(np.linalg.norm(motion.turn if motion.turns else motion.shift))
+                way = motion.turn if motion.turns else motion.shift
+                return float(np.linalg.norm(way))
     raise KeyError(name)
 
 

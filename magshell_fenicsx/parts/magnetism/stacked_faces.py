@@ -131,13 +131,14 @@ def graded_at(free_sides: FreeSides, s: float) -> tuple[Array, Array]:
         (apex,) = (CORNERS[i] for i in range(3) if i not in sides[0])
     elif len(sides) == 2:
         apex = CORNERS[[i for i in range(3) if not all(i in side for side in sides)]].mean(axis=0)
+    # coordinates and weights: a from a side to the apex, dense at the side, and b along the side
     (a, wa), (b, wb) = graded(ROWS_AT_EDGE, s), gauss(POINTS_ALONG_ROWS)
     points, weights = list[Array](), list[Array]()
-    # a triangle between each free side and the apex
+    # a triangle between each free side and the apex: X = (1 - a) (place on the side) + a apex
     for i, j in sides:
         A, B = CORNERS[i], CORNERS[j]
-        side = (1 - a)[:, None, None] * (A + b[:, None] * (B - A))
-        points.append((side + a[:, None, None] * apex).reshape(-1, 2))
+        from_side = (1 - a)[:, None, None] * (A + b[:, None] * (B - A))
+        points.append((from_side + a[:, None, None] * apex).reshape(-1, 2))
         area = (B - A)[0] * (apex - A)[1] - (B - A)[1] * (apex - A)[0]
         weights.append(area * np.outer(wa * (1 - a), wb).ravel())
     return np.concatenate(points), np.concatenate(weights)
@@ -175,7 +176,18 @@ class StackedFaces:
     parts
         (copies * cells,) part of each cell.
     order
-        (copies * cells,) rank of each cell: the first cell of a pair has the lower one.
+        (copies * cells,) number of each cell: the first cell of a pair has the lower one.
+
+    Attributes
+    ----------
+    _kinds
+        The kinds of first cells: which of their sides are free.
+    _kind
+        (copies * cells,) position in `_kinds` of each cell's kind.
+    _border
+        (12, k) shape functions at the places `BORDER`.
+    _pairs
+        The functions in C.
     """
 
     def __init__(
@@ -221,9 +233,9 @@ class StackedFaces:
             - radius[first_cell]
             - radius[second]
         )
-        is_candidate = (ball_distance < h + STACKED_DISTANCE * pair_size) & (
-            np.abs(np.sum(normal[first_cell] * normal[second], axis=-1)) > MIN_COSINE
-        )
+        cosine = np.abs(np.sum(normal[first_cell] * normal[second], axis=-1))
+        may_be_near = ball_distance < h + STACKED_DISTANCE * pair_size
+        is_candidate = may_be_near & (cosine > MIN_COSINE)
         if not is_candidate.any():
             return is_stacked
         first, second, first_cell, pair_size = (
@@ -231,15 +243,18 @@ class StackedFaces:
         )
         # twelve places on the sides of each cell stand for it
         border = np.einsum("mk,nki->nmi", self._border, nodes)
-        from_second, from_first = (
-            corner_distances(border[a], nodes[b, :3])
-            for a, b in ((first_cell, second), (second, first_cell))
+        # distance, and its part along the normal, of the first cell's border from the second cell;
+        # then of the second cell's border from the first cell
+        distance_of_first, height_of_first = corner_distances(border[first_cell], nodes[second, :3])
+        distance_of_second, height_of_second = corner_distances(
+            border[second], nodes[first_cell, :3]
         )
-        # from the borders of one cell or of the other, whichever is nearer
-        distance, height = np.where(from_second[0] < from_first[0], from_second, from_first)
-        is_stacked[first, second] = (distance - h < STACKED_DISTANCE * pair_size) & (
-            height > OVERLAP_DISTANCE * h
-        )
+        # those of the border that is nearer count
+        first_is_nearer = distance_of_first < distance_of_second
+        distance = np.where(first_is_nearer, distance_of_first, distance_of_second)
+        height = np.where(first_is_nearer, height_of_first, height_of_second)
+        is_near = distance - h < STACKED_DISTANCE * pair_size
+        is_stacked[first, second] = is_near & (height > OVERLAP_DISTANCE * h)
         return is_stacked
 
     def add(
@@ -253,17 +268,17 @@ class StackedFaces:
         """Return the energy of stacked pairs with own cells, and add derivatives.
 
         Of a pair with one own cell it is half the energy, since two ranks count the pair. It is nan
-        if two cells overlap.
-        Derivatives are added to `gradient` (cells, k, 3) and `stiffness`.
+        if two cells overlap. Derivatives are added to `gradient` (cells, k, 3) and `stiffness`.
         """
         pairs, is_own_pair = self._ordered(own_cells, is_stacked)
         energy, kinds_of_first_cells = 0.0, self._kind[pairs[:, 0]]
-        for kind, counted_share in product(np.unique(kinds_of_first_cells), (0.5, 1.0)):
-            pairs_of_kind = pairs[
-                (kinds_of_first_cells == kind) & (is_own_pair == (counted_share == 1.0))
-            ]
+        # first the pairs with one own cell, then those with two
+        for kind, both_are_own in product(np.unique(kinds_of_first_cells), (False, True)):
+            is_of_kind = kinds_of_first_cells == kind
+            counted_pairs = pairs[is_of_kind & (is_own_pair == both_are_own)]
+            counted_share = 1.0 if both_are_own else 0.5
             energy += counted_share * self._pairs.add_stacked(
-                self._structs[kind], nodes, pairs_of_kind, gradient, stiffness
+                self._structs[kind], nodes, counted_pairs, gradient, stiffness
             )
         return energy
 
@@ -283,11 +298,9 @@ class StackedFaces:
         copies, `moved_nodes` the same with v times a small step as imaginary part. `is_stacked` is
         that of `find_stacked`.
         """
-        on_charges, first_row, basis = (
-            np.zeros_like(self._nodal_charges),
-            np.zeros(1, dtype=np.int64),
-            coefficients_of_nodes(CHARGE_ELEMENT),
-        )
+        on_charges = np.zeros_like(self._nodal_charges)  # derivatives by nodal charges
+        row = np.zeros(1, dtype=np.int64)  # of the only pair, in its charged points
+        basis = coefficients_of_nodes(CHARGE_ELEMENT)
         for first_cell, second_cell in self._ordered(own_cells, is_stacked)[0]:
             first_points, first_weights = self._rules_of_kinds[self._kind[first_cell]]
             rule = self._pairs.visible_points(
@@ -299,28 +312,15 @@ class StackedFaces:
             )
             if rule is None:  # overlapping cells have no energy
                 continue
-            X, w, *layer_shifts = rule  # places, weights, inward and shift
-            places, rule_sizes = (first_points, X.reshape(-1, 2)), (len(first_points), w.shape[1])
-            (t, q), (t_of_second, q_of_second) = (
-                self._thickness_and_charges(cell, points)
-                for cell, points in zip((first_cell, second_cell), places, strict=True)
-            )
+            X, w, inward, shift = rule
+            places = first_points, X.reshape(-1, 2)
+            t, q = self._thickness_and_charges(first_cell, first_points)
             # the charges of the near face are in three layers
-            layers, layer_factors, heights_of_layers = self._extrapolated_layers(t, *layer_shifts)
+            layers, layer_factors, heights_of_layers = self._extrapolated_layers(t, inward, shift)
             q = first_weights[:, None] * np.einsum("pls,ps->pl", layer_factors, q)
             left = Points(self._tabulated(first_points), layers, t[None], q[None])
-            q_of_second = w.reshape(1, *rule_sizes, 1) * q_of_second.reshape(1, *rule_sizes, -1)
-            tables = self._tabulated(places[1]).reshape(*rule_sizes, 3, -1)
-            right = Points(
-                tables,
-                np.broadcast_to(self._heights, q_of_second.shape[1:]),
-                t_of_second.reshape(1, *rule_sizes),
-                q_of_second,
-            )
-            pairs, sides = (
-                np.array([[first_cell, second_cell]]),
-                ((left, first_row), (right, first_row)),
-            )
+            right = self._visible_charges(second_cell, X, w)
+            pairs, sides = np.array([[first_cell, second_cell]]), ((left, row), (right, row))
             by_charges = pair_derivatives(moved_nodes, pairs, *sides, weights)
             on_heights = (
                 None
@@ -333,25 +333,23 @@ class StackedFaces:
                 if cell not in own_cells:
                     continue
                 copy, modelled_cell = divmod(cell, len(self._shape.r0))
-                # side 0, the first cell: from charges of its layers back to those of its faces
-                by_nodal_charges, heights_of_side = (
-                    by_charges[side].reshape(len(points), -1),
-                    self._heights if side else heights_of_layers,
+                by_charges_at_points = by_charges[side].reshape(len(points), -1)
+                heights_of_side = self._heights
+                # the first cell: from charges of its layers back to those of its faces
+                if side == 0:
+                    by_charges_at_points = np.einsum(
+                        "pls,pl->ps", layer_factors, by_charges_at_points
+                    )
+                    heights_of_side = heights_of_layers
+                by_charges_at_points = (
+                    self._copies.charge_factors[copy] * weight[:, None] * by_charges_at_points
                 )
-                by_nodal_charges = (
-                    by_nodal_charges
-                    if side
-                    else np.einsum("pls,pl->ps", layer_factors, by_nodal_charges)
-                )
-                by_nodal_charges = (
-                    self._copies.charge_factors[copy] * weight[:, None] * by_nodal_charges
-                )
-                on_charges[modelled_cell] += (
-                    monomials(points, CHARGE_DEGREE) @ basis
-                ).T @ by_nodal_charges
+                shape_functions = monomials(points, CHARGE_DEGREE) @ basis
+                on_charges[modelled_cell] += shape_functions.T @ by_charges_at_points
                 if on_heights:
+                    by_heights = on_heights[side].reshape(len(points), -1)
                     by_thickness = self._copies.normal_signs[copy] * np.sum(
-                        on_heights[side].reshape(len(points), -1) * heights_of_side, axis=-1
+                        by_heights * heights_of_side, axis=-1
                     )
                     self._shape.add_thickness_derivatives(
                         np.array([modelled_cell]), points, by_thickness[None], nodal_derivatives
@@ -360,6 +358,17 @@ class StackedFaces:
         charges = self._faces.charges_at(*self._nodes_of_charges, nodal_derivatives)
         assert charges.add_derivatives
         charges.add_derivatives(np.zeros_like(charges.x), on_charges)
+
+    def _visible_charges(self, cell: int, X: Array, w: Array) -> Points:
+        """Return the charged points of a second cell, as seen from P points of the first cell.
+
+        X (P, M, 2) and w (P, M) are the places and weights of these points.
+        """
+        t, q = self._thickness_and_charges(cell, X.reshape(-1, 2))
+        q = w.reshape(1, *w.shape, 1) * q.reshape(1, *w.shape, -1)
+        tables = self._tabulated(X.reshape(-1, 2)).reshape(*w.shape, 3, -1)
+        layers = np.broadcast_to(self._heights, q.shape[1:])
+        return Points(tables, layers, t.reshape(1, *w.shape), q)
 
     def _extrapolated_layers(
         self, t: Array, inward: Array, shift: Array
@@ -386,34 +395,28 @@ class StackedFaces:
         heights_of_layers
             (n, L) the part of the heights that grows with the thickness.
         """
-        # two layers more than the cell has: the near face's charges take its place and these
+        # the charges of the near face go into three layers: one in the place of that face, and two
+        # that follow the S layers of the cell
         S, n = len(self._heights), np.arange(len(t))
         # number of the face that is near the other cell: 0 outer, 1 inner
         near_face = np.where(inward * t < 0, 0, 1)
         layer_factors = np.broadcast_to(np.eye(S + 2, S), (len(t), S + 2, S)).copy()
         layer_factors[n, near_face] = 0.0
-        heights_of_layers, depths = (
-            np.pad(np.tile(self._heights, (len(t), 1)), ((0, 0), (0, 2))),
-            np.zeros((len(t), S + 2)),
-        )
-        for j in range(3):
-            # the first in place of the near face itself, two more after all others
+        heights_of_layers = np.pad(np.tile(self._heights, (len(t), 1)), ((0, 0), (0, 2)))
+        depths = np.zeros((len(t), S + 2))
+        for j, weight in enumerate(EXTRAPOLATION_WEIGHTS):
             layer = np.full_like(near_face, S - 1 + j) if j else near_face
-            layer_factors[n, layer, near_face], heights_of_layers[n, layer] = (
-                EXTRAPOLATION_WEIGHTS[j],
-                self._heights[near_face],
-            )
+            layer_factors[n, layer, near_face] = weight
+            heights_of_layers[n, layer] = self._heights[near_face]
+            # below the near face
             depths[n, layer] = (j + 1) * LAYER_DEPTH * self._shape.h
-        return (
-            heights_of_layers + (inward / t)[:, None] * (shift[:, None] + depths),
-            layer_factors,
-            heights_of_layers,
-        )
+        shifted_heights = heights_of_layers + (inward / t)[:, None] * (shift[:, None] + depths)
+        return shifted_heights, layer_factors, heights_of_layers
 
     def _ordered(
         self, own_cells: range, is_stacked: NDArray[np.bool_]
     ) -> tuple[Ints, NDArray[np.bool_]]:
-        """Return the stacked pairs (n, 2), each once, and a mask of pairs of own cells only."""
+        """Return the stacked pairs (n, 2), each once, and a mask of those with two own cells."""
         # rows of `is_stacked` are own cells: pairs of two own cells are there in both orders
         first, second = np.nonzero(is_stacked)
         first = first + own_cells.start
@@ -461,17 +464,16 @@ class StackedFaces:
             "gauss": np.concatenate(rules),
         }
         struct_numbers = {
-            "k": shared_arrays["shape"].shape[1],
+            "k": shared_arrays["shape"].shape[1],  # nodes of a cell
             "degree": self._shape.element.degree,
             "of_charges": CHARGE_DEGREE,
-        }
-        struct_numbers |= {
-            "S": len(self._heights),
+            "S": len(self._heights),  # layers
             "h": self._shape.h,
             "depth": LAYER_DEPTH,
             "least": MIN_LAYER_DISTANCE,
             "inside": OVERLAP_DISTANCE,
         }
+        # the rule on the first cell, with the shape functions T at its points X
         structs = list[object]()
         for X, w in self._rules_of_kinds:
             arrays = shared_arrays | {

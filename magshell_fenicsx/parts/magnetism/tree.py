@@ -94,29 +94,36 @@ class Octree:
         The cells of this rank.
     acts_on_itself
         Whether a part acts on itself, too.
+
+    Attributes
+    ----------
+    _size, _origin
+        Width over R and lower corner (3,) of the root box, which holds all cells.
+    _depth
+        How often boxes are halved from the root to the finest level.
+    _kinds
+        (cells, 2) part and group of each cell.
+    _translations
+        Entries of translation matrices, by the offset of their boxes.
     """
 
     def __init__(
         self, places: Array, parts: Ints, groups: Ints, own_cells: range, *, acts_on_itself: bool
     ) -> None:
         """Choose the size of the finest boxes; parameters are those of the class."""
-        self._places, self._own_cells, self._acts_on_itself, self._kinds = (
-            places,
-            own_cells,
-            acts_on_itself,
-            np.column_stack([parts, groups]),
-        )
+        self._places, self._own_cells, self._acts_on_itself = places, own_cells, acts_on_itself
+        self._kinds = np.column_stack([parts, groups])
         lowest, highest = places.min(axis=0), places.max(axis=0)
-        # all cells at one place would have a box without size
+        # if all cells are at one place, any width will do
         self._size = float((highest - lowest).max()) * ROOT_BOX_FACTOR or 1.0
-        self._origin = (
-            lowest + highest - self._size
-        ) / 2  # so a mirror plane of the shell is one of the boxes, too
+        # the box is central, so that mirror planes of the shell halve it
+        self._origin = (lowest + highest - self._size) / 2
         self._depth = 0
-        # until boxes hold about `CELLS_PER_BOX` cells each
-        while self._depth < MAX_DEPTH and len(places) > CELLS_PER_BOX * len(
-            np.unique(self._keys(places), axis=0)
-        ):
+        # halve boxes until they hold about `CELLS_PER_BOX` cells each
+        while self._depth < MAX_DEPTH:
+            filled_boxes = np.unique(self._keys(places), axis=0)  # at this depth
+            if len(places) <= CELLS_PER_BOX * len(filled_boxes):
+                break
             self._depth += 1
         self._translations: dict[tuple[int, ...], Array] = {}
 
@@ -235,18 +242,11 @@ class Octree:
         if new_offsets:
             # each row of a matrix begins with its entries that are not zero
             is_nonzero = np.arange(COUNT) < ends()[:, None]
-            self._translations.update(
-                zip(
-                    new_offsets,
-                    translations(np.array(new_offsets, dtype=np.float64))[:, is_nonzero],
-                    strict=True,
-                )
-            )
-        return (
-            np.stack([self._translations[offset] for offset in offsets])
-            if offsets
-            else np.zeros((0, ends().sum()))
-        )
+            matrices = translations(np.array(new_offsets, dtype=np.float64))
+            self._translations.update(zip(new_offsets, matrices[:, is_nonzero], strict=True))
+        if not offsets:
+            return np.zeros((0, ends().sum()))
+        return np.stack([self._translations[offset] for offset in offsets])
 
 
 def _children(pairs: Ints, parent: Ints, parents: int) -> Ints:
@@ -258,21 +258,21 @@ def _children(pairs: Ints, parent: Ints, parents: int) -> Ints:
     # children sorted by parent, so that each parent has one slice
     order, child_counts = np.argsort(parent, kind="stable"), np.bincount(parent, minlength=parents)
     first_of_parent = np.concatenate([[0], np.cumsum(child_counts)])
-    child_counts_of_pairs = child_counts[pairs]
-    children_of_pair = child_counts_of_pairs.prod(axis=1)
-    parent_pair = np.repeat(np.arange(len(pairs)), children_of_pair)
-    # number of a pair of children among those of its pair of parents
-    number_in_pair = np.arange(len(parent_pair)) - np.repeat(
-        np.cumsum(children_of_pair) - children_of_pair, children_of_pair
-    )
+    # each pair of parents has the product of both numbers of children as pairs of children
+    counts_of_both = child_counts[pairs]
+    pair_counts = counts_of_both.prod(axis=1)
+    # for each pair of children: number of its pair of parents, and its number among that pair's
+    parent_pair = np.repeat(np.arange(len(pairs)), pair_counts)
+    pairs_before = np.cumsum(pair_counts) - pair_counts
+    number = np.arange(len(parent_pair)) - np.repeat(pairs_before, pair_counts)
     # the second child runs fastest
-    first_child, second_child = (
-        number_in_pair // child_counts_of_pairs[parent_pair, 1],
-        number_in_pair % child_counts_of_pairs[parent_pair, 1],
-    )
+    second_count = counts_of_both[parent_pair, 1]
+    first_child, second_child = number // second_count, number % second_count
+    # from numbers among the children of a parent to numbers of boxes
+    first_parent, second_parent = pairs[parent_pair].T
     return np.column_stack(
         [
-            order[first_of_parent[pairs[parent_pair, 0]] + first_child],
-            order[first_of_parent[pairs[parent_pair, 1]] + second_child],
+            order[first_of_parent[first_parent] + first_child],
+            order[first_of_parent[second_parent] + second_child],
         ]
     )

@@ -151,6 +151,7 @@ def curve(history: History, time: Value, level: Value, start: float) -> Curve:
         return lambda t, before: float(function(*np.array([t, 0.0, 0.0]).reshape(3, 1))[0])
     if isinstance(history, RampHistory):
         duration, end_value = time(history.over), level(history.to)
+        # a straight line, and then the value at its end
         return lambda t, before: float(start + (end_value - start) * min(t / duration, 1.0))
     if isinstance(history, StepHistory):
         jump_time, end_value = time(history.at), level(history.to)
@@ -179,10 +180,12 @@ def _interpolation(times: Sequence[float], values: Sequence[float]) -> Curve:
     """
 
     def interpolated(t: float, before: bool) -> float:
-        # the row after t; at a jump with `before` the first of its two rows
+        # the first row after t; with `before` the first row at t or after it
         row = int(np.searchsorted(times, t, side="left" if before else "right"))
-        if row in (0, len(times)):
-            return values[min(row, len(values) - 1)]
+        if row == 0:
+            return values[0]
+        if row == len(times):
+            return values[-1]
         t0, t1 = times[row - 1 : row + 1]
         return values[row - 1] + (values[row] - values[row - 1]) * (t - t0) / (t1 - t0)
 
@@ -276,6 +279,7 @@ class ViscousMaterial(Ability):
         ValueError
             With the key and what is needed.
         """
+        # key below `shell` -> value as in the case
         times = {f"relaxation.{i}.time": branch.time for i, branch in enumerate(self.branches)}
         moduli = {
             f"relaxation.{i}.modulus": branch.modulus for i, branch in enumerate(self.branches)

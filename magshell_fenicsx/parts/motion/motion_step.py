@@ -120,11 +120,9 @@ class TimeSection(Step):
         if self.search:
             raise ValueError("search: is for steps that end in equilibrium")
         for key, value in (("duration", self.duration), ("step", self.step), ("drag", self.drag)):
-            number = (  # a step that is not given is not checked
-                in_units("1/second" if key == "drag" else "second")(value)
-                if value is not None
-                else 1.0
-            )
+            if value is None:  # not given
+                continue
+            number = in_units("1/second" if key == "drag" else "second")(value)
             if number < 0 or (number == 0 and key != "drag"):
                 raise ValueError(f"{key}: {value}: must be positive")
         for name, history in self.history.items():
@@ -133,7 +131,8 @@ class TimeSection(Step):
                 raise ValueError(
                     f"history.{name}: the times of a table must not fall, nor be negative"
                 )
-            # a jump may be at the begin, but no ramp or wave has no length; formulas have no times
+            # a jump may be at time zero, but the length of a ramp and the period of a wave are
+            # positive; a formula has no times
             jumps, least_time = getattr(history, "kind", "") == "step", min(times, default=1.0)
             if not isinstance(history, list) and (
                 least_time < 0 or (least_time == 0 and not jumps)
@@ -179,20 +178,21 @@ class TimeSection(Step):
             for ability in context.abilities
             if (in_time := ability.in_time(context, driven_amplitudes))
         }
-        # the part that has the field says why it cannot follow a history; without it there is none
-        if "field" in self.history and (
-            refusal := load_in_time["field"].refused if "field" in load_in_time else NO_FIELD
-        ):
+        # the section of the field says why it cannot follow a history; without one there is none
+        refusal = load_in_time["field"].refused if "field" in load_in_time else NO_FIELD
+        if "field" in self.history and refusal:
             raise ValueError(f"{key}.history.field: {refusal}")
+        # times with units need a case that has units
         for time_key, text in self.with_units():
             if context.time_unit is None or not context.shell.with_units:
                 raise ValueError(
                     f"{key}.{time_key}: {text}: a time with a unit needs shell.density, "
                     "youngs_modulus and lengths"
                 )
+        # loads that may have a history: of steps, and of sections without a step. The amplitude of
+        # the field is named `field` here; the angle and the time follow from steps of their own
         loads = {case_step.name: case_step.load for case_step in context.steps}
         section_amplitudes = _factors_of_sections(context)
-        # the field goes by its own name; the angle and the time follow from steps of their own
         allowed = {"field", "pressure", *section_amplitudes, *loads} - {"lambda_m", "angle", "time"}
         for name, history in self.history.items():
             if name not in allowed:
@@ -204,6 +204,7 @@ class TimeSection(Step):
             jumps = getattr(history, "kind", "") == "step" or len(set(times)) < len(times)
             if jumps and name in loads and not loads[name].jumps:
                 raise ValueError(f"{key}.history.{name}: a support cannot jump")
+            # values must have a unit that the load knows
             for level in levels_of(history):
                 try:
                     level_in(context, name, level)
@@ -220,10 +221,9 @@ class TimeSection(Step):
 
         def keeps(mirror: Mirror) -> bool:
             """Return whether the initial velocity is mirror symmetric at sampled places."""
-            S, x = mirror.reflection, outline.sample()
-            return equal_to_rounding(
-                initial_velocity(length * x) @ S, initial_velocity(length * mirror.image(x))
-            )
+            x = outline.sample()
+            mirrored_velocity = initial_velocity(length * x) @ mirror.reflection
+            return equal_to_rounding(mirrored_velocity, initial_velocity(length * mirror.image(x)))
 
         is_axisymmetric = outline.meridian and vector_is_axisymmetric(
             self.velocity, outline.meridian, length
@@ -257,10 +257,10 @@ def _factors_of_sections(context: Context) -> set[str]:
     )
 
     # kinds of steps that sections of the case put before the steps of its load
-    steps = [STEPS[kind] for kind in KINDS_BEFORE_LOAD]
+    step_kinds = [STEPS[kind] for kind in KINDS_BEFORE_LOAD]
     return {
         step_kind.amplitude
-        for step_kind in steps
+        for step_kind in step_kinds
         if issubclass(step_kind, FactorStep) and step_kind.asked_for(context)
     }
 
@@ -284,6 +284,6 @@ def level_in(context: Context, name: str, level: Level) -> float:
 
     if not isinstance(level, str):
         return level
-    # the class of the load's step knows its units, of the case's step or of the kind that has it
+    # units are known to the kind of the load's step: of the step that the case has, else by name
     step_kind = next((type(step.load) for step in context.steps if step.name == name), None)
     return (step_kind or step_class(name)).level(level, context)

@@ -44,7 +44,8 @@ def natural(context: Context, turn: float, patch_rims: Mapping[str, InsideRim]) 
     section = context.section_of(NaturalSection)
     if section is None:
         return None
-    Q, R = rotation(turn), context.shell.reference  # Q: from the case's frame to the model's
+    # Q turns the case's frame into the model's
+    Q, R = rotation(turn), context.shell.reference
 
     def varying(
         value: object, components_of: Callable[[object], list[float | str]], factor: float
@@ -60,39 +61,43 @@ def natural(context: Context, turn: float, patch_rims: Mapping[str, InsideRim]) 
         """
         if value is None:
             return None
+        # a function of a program
         if isinstance(value, UserField):
+            is_stretch = components_of is _stretches
             return value.mapped(
-                lambda numbers: (
-                    factor * _three_numbers(numbers, stretch=components_of is _stretches)
-                )
+                lambda numbers: factor * _three_numbers(numbers, stretch=is_stretch)
             )
-        if not isinstance(value, dict):  # one value for the whole shell
+        # one value for the whole shell, perhaps by formulas
+        if not isinstance(value, dict):
             components_of_value = components_of(value)
             if any(isinstance(v, str) for v in components_of_value):
-                return FormulaVectors(
-                    [formula_function(v) for v in components_of_value], Q, R, factor
-                )
+                functions = [formula_function(v) for v in components_of_value]
+                return FormulaVectors(functions, frame=Q, length=R, factor=factor)
             return factor * np.array(components_of_value, dtype=float)
+        # a value for each patch
         vectors = {
             name: factor * np.array(components_of(patch_value), dtype=float)
             for name, patch_value in value.items()
         }
         if isinstance(context.shell, MeshSurface):
-            return vectors  # its mesh knows the cells of a patch; else patches are of dimples
-        vector_elsewhere = vectors.get("rest", np.zeros(3))
-        return WithinRims(
-            tuple(
-                (is_inside, vectors.get(name, vector_elsewhere))
-                for name, is_inside in patch_rims.items()
-            ),
-            vector_elsewhere,
-        )
+            return vectors  # its mesh knows the cells of each patch
+        return _within_rims(vectors, patch_rims)
 
-    curvature, stretch = (
-        varying(section.curvature, _curvatures, R),
-        varying(section.stretch, _stretches, 1.0),
+    curvature = varying(section.curvature, _curvatures, factor=R)
+    stretch = varying(section.stretch, _stretches, factor=1.0)
+    return Natural(curvature, stretch, along=frame(context, turn))
+
+
+def _within_rims(vectors: Mapping[str, Array], patch_rims: Mapping[str, InsideRim]) -> WithinRims:
+    """Return a pattern with the vector of each dimple within its rim, and one elsewhere.
+
+    The vector elsewhere is that of "rest", by default zero. Dimples that are not named have it too.
+    """
+    vector_elsewhere = vectors.get("rest", np.zeros(3))
+    vectors_of_rims = tuple(
+        (is_inside, vectors.get(name, vector_elsewhere)) for name, is_inside in patch_rims.items()
     )
-    return Natural(curvature, stretch, frame(context, turn))
+    return WithinRims(vectors_of_rims, vector_elsewhere)
 
 
 def frame(context: Context, turn: float) -> Pattern:
@@ -129,13 +134,13 @@ def is_anisotropic(context: Context) -> bool:
     """Return whether curvature or stretch depends on the direction, so that the frame matters."""
     section = context.section_of(NaturalSection)
     assert section
+    # the two values, or those of their patches: a list has components along t1 and t2
     values = [section.curvature, section.stretch]
     patch_values = [
         v for value in values for v in (value.values() if isinstance(value, dict) else [value])
     ]
-    return any(isinstance(v, list) for v in patch_values) or any(
-        field.size > 1 for field in section.user_fields
-    )
+    has_list = any(isinstance(v, list) for v in patch_values)
+    return has_list or any(field.size > 1 for field in section.user_fields)
 
 
 def not_axisymmetric_because(context: Context, outline: Outline) -> str | None:
@@ -147,6 +152,7 @@ def not_axisymmetric_because(context: Context, outline: Outline) -> str | None:
     section = context.section_of(NaturalSection)
     assert section
     direction, R = first_direction(context), context.shell.reference
+    # a twist
     curvature = components(section.curvature)
     patch_curvatures = section.curvature.values() if isinstance(section.curvature, dict) else []
     if any(
@@ -154,7 +160,7 @@ def not_axisymmetric_because(context: Context, outline: Outline) -> str | None:
         for c in map(components, [curvature, *patch_curvatures])
     ):
         return "the natural curvature twists: k12 is not zero"
-    # the part of e3 in the surface is along the meridians too
+    # a direction that is not along the meridians, as the part of e3 in the surface is
     is_vertical = [v == 0 for v in direction] == [True, True, False]
     if is_anisotropic(context) and direction != MERIDIAN and not is_vertical:
         return "the natural shape is not along the meridians"
@@ -169,7 +175,8 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
     """Return whether a plane mirrors the natural shape onto itself.
 
     It is decided by values at samples of the surface; patches are taken to be their own images.
-    A reflection keeps k11, k22 and the stretches, and changes the sign of the twist k12.
+    A reflection keeps k11, k22 and the stretches, and changes the sign of the twist k12. Where the
+    frame matters, its first direction must also be mirrored onto itself, or onto its opposite.
     """
     section = context.section_of(NaturalSection)
     assert section
@@ -188,35 +195,29 @@ def mirrored(context: Context, outline: Outline, mirror: Mirror) -> bool:
             and (np.abs(values - sign * values_of_image) <= EQUALITY_TOLERANCE * size).all()
         )
 
-    twists = [c[2] for c in _components_of_patches(section.curvature) if len(c) == 3]
-    even_components = [
-        v
-        for c in (
-            *_components_of_patches(section.curvature),
-            *_components_of_patches(section.stretch),
-        )
-        for v in c[:2]  # of a curvature without the twist
-    ]
+    # components that keep their sign: the first two of curvature and stretch; and the twists
+    curvatures = _components_of_patches(section.curvature)
+    stretches = _components_of_patches(section.stretch)
+    even_components = [v for c in (*curvatures, *stretches) for v in c[:2]]
+    twists = [c[2] for c in curvatures if len(c) == 3]
     if not (
         all(is_mirrored(v) for v in even_components) and all(is_mirrored(v, -1.0) for v in twists)
     ):
         return False
     if not is_anisotropic(context):
         return True
-    if direction == MERIDIAN:  # the plane contains the axis, or is normal to it
+    # meridians are mirrored by a plane that contains the axis, or is normal to it
+    if direction == MERIDIAN:
         return mirror.through_e3 or bool(np.hypot(*mirror.normal[:2]) == 0)
+    # a direction by numbers or formulas: t1 and -t1 are the same frame, as tensors have it
     directions, directions_at_images = (
         np.stack([formula_function(v)(*(R * p).T) for v in direction], -1)
         for p in (x, mirror.image(x))
     )
-    # t1 and -t1 are the same frame, as tensors have it
+    mirrored_directions = directions @ mirror.reflection
+    tolerance = EQUALITY_TOLERANCE * np.abs(directions).max()
     return any(
-        bool(
-            (
-                np.abs(directions @ mirror.reflection - sign * directions_at_images)
-                <= EQUALITY_TOLERANCE * np.abs(directions).max()
-            ).all()
-        )
+        bool((np.abs(mirrored_directions - sign * directions_at_images) <= tolerance).all())
         for sign in (1, -1)
     )
 
@@ -280,7 +281,10 @@ def natural_constraints(context: Context, outline: Outline) -> list[SymmetryCons
 
 
 def account(context: Context, loads: Loads) -> Account:
-    """Return the line of `magshell check` on the natural shape: what grows."""
+    """Return the line of `magshell check` on the natural shape: what grows.
+
+    A case without a natural shape has a line of what is left out.
+    """
     if not loads.natural:
         return Account(left_out=["natural shape: as drawn"])
     names = " and ".join(name.removeprefix("natural_") for name in loads.natural.amplitudes)

@@ -42,8 +42,9 @@ def per_length(value: Any) -> Any:
     Formulas such as "5/x" are left as they are.
     """
     matched = _PER_LENGTH.fullmatch(value) if isinstance(value, str) else None
+    # the unit below a stroke, as in 5/m, or with the power -1
     unit = matched and (matched["below"] or matched["power"])
-    if not matched or unit in PLACE:  # 5/x is a formula of the place, no unit
+    if not matched or unit in PLACE:  # in 5/x, x is a coordinate and no unit
         return value
     return in_units("1/metre")(f"{matched['number']} {unit}**-1")
 
@@ -92,12 +93,15 @@ def _components(
 
     def read(value: Any) -> Any:
         """Return the checked curvature or stretch."""
+        # a function of a program
         if isinstance(value, UserField):
             if value.size not in (1, numbers):
                 raise ValueError(f"a function of {value.size} numbers; allowed are 1 and {numbers}")
             return value
+        # one value for the whole shell
         if not isinstance(value, dict):
             return value if value is None else checked_list(value)
+        # a value for each patch
         if not value:
             raise ValueError("a mapping names at least one patch")
         _refuse_formulas_of_patches(value)
@@ -227,13 +231,9 @@ def components(value: Any) -> list[float | str]:
 
     Empty for values by patch, and for functions of a program.
     """
-    return (
-        value
-        if isinstance(value, list)
-        else [value]
-        if isinstance(value, float | int | str)
-        else []
-    )
+    if isinstance(value, list):
+        return value
+    return [value] if isinstance(value, float | int | str) else []
 
 
 class GrowthSection(LoadStep):

@@ -23,9 +23,9 @@ that a program gives on its mesh. a0 and b0 are metric and curvature of the unde
 and t the stretches of surface and thickness less one, mu_s the amplitude of the stretch.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import ufl
@@ -113,18 +113,13 @@ class Natural:
         MeshError
             If a named patch does not exist.
         """
-        values = {"curvature": self.curvature, "stretch": self.stretch}
-        by_cell = {
-            key: by_patch(value, patches, cells, f"natural.{key}")
-            for key, value in values.items()
-            if isinstance(value, Mapping)
-        }
-        varying = {key: value for key, value in values.items() if isinstance(value, UserField)}
-        return replace(
-            self,
-            **by_cell,
-            **{key: pattern_of(value) for key, value in varying.items() if pattern_of},
-        )
+        replaced = dict[str, Any]()
+        for key, value in (("curvature", self.curvature), ("stretch", self.stretch)):
+            if isinstance(value, Mapping):
+                replaced[key] = by_patch(value, patches, cells, f"natural.{key}")
+            elif isinstance(value, UserField) and pattern_of:
+                replaced[key] = pattern_of(value)
+        return replace(self, **replaced)
 
     def tensors_at(self, r0: Array, n0: Array) -> tuple[Array, Array, Array]:
         """Return T and kappa (..., 3, 3) in space, and t (...), at undeformed places.
@@ -138,20 +133,20 @@ class Natural:
             If a tensor that depends on the direction has no frame at some place.
         """
         stretch, curvature = (_values(value, r0, n0) for value in (self.stretch, self.curvature))
-        t1, t2 = self._frame(
-            r0, n0, (stretch[..., 0] != stretch[..., 1]) | _is_anisotropic(curvature)
-        )
+        needs_frame = (stretch[..., 0] != stretch[..., 1]) | _is_anisotropic(curvature)
+        t1, t2 = self._frame(r0, n0, needs_frame)
         return _tensor(stretch[..., :2], t1, t2), _tensor(curvature, t1, t2), stretch[..., 2]
 
     def in_frame(self, forces: Array, r0: Array, n0: Array) -> Array:
         """Return derivatives (..., 3) of an energy by kappa_11, kappa_22, kappa_12 in the frame.
 
-        `forces` (..., 6) are derivatives by the six numbers of kappa in the field. By the chain
-        rule each is multiplied by the derivative of the field by a component in the frame: a unit
-        tensor. Places and normals are (..., 3).
+        `forces` (..., 6) are derivatives by the six numbers of kappa in the field. The chain rule
+        multiplies them by the derivatives of these numbers by a component in the frame. Those are
+        the numbers of the tensor with this component 1 and the others 0. Places and normals are
+        (..., 3).
         """
-        # nowhere needed: where there is no frame, its vectors and the derivatives are zero
-        t1, t2 = self._frame(r0, n0, np.zeros(r0.shape[:-1], dtype=bool))
+        # no place needs the frame: where there is none, its vectors and the derivatives are zero
+        t1, t2 = self._frame(r0, n0, needed=np.zeros(r0.shape[:-1], dtype=bool))
         unit_tensors = (
             _tensor(np.broadcast_to(e, r0.shape), t1, t2)[..., *FIELD] for e in np.eye(3)
         )
@@ -163,17 +158,15 @@ class Natural:
     def formulas(self) -> FormulaGroup | None:
         """The formulas of stretch and curvature in one group; None without any.
 
-        Both groups have the same frame and length, so that the first one lends them to all.
+        A `FormulaGroup` has functions, and the frame and the unit of length of their places. Those
+        of stretch and curvature are the same, and are taken from the first group.
         """
         groups = (getattr(value, "formulas", None) for value in (self.stretch, self.curvature))
-        known_groups = [value for value in groups if value]
-        return (
-            replace(
-                known_groups[0], functions=[f for group in known_groups for f in group.functions]
-            )
-            if known_groups
-            else None
-        )
+        known_groups = [group for group in groups if group]
+        if not known_groups:
+            return None
+        functions = [f for group in known_groups for f in group.functions]
+        return replace(known_groups[0], functions=functions)
 
     def _frame(self, r0: Array, n0: Array, needed: NDArray[np.bool_]) -> tuple[Array, Array]:
         """Return the unit vectors t1 and t2 (cells, nodes, 3) of the frame in the surface.
@@ -191,11 +184,12 @@ class Natural:
             If the frame does not exist at a place where it is needed.
         """
         along = self.along(r0, n0)
-        # its part in the surface
+        # its part in the surface, without the part along the normal
         along = along - np.einsum("...i,...i->...", along, n0)[..., None] * n0
         length = np.linalg.norm(along, axis=-1, keepdims=True)
-        # not (length > NORMAL): also where it is no number
-        if (has_no_direction := needed & ~(length[..., 0] > NORMAL)).any():
+        # `~ >` and not `<=`: a length that is no number has no direction either
+        has_no_direction = needed & ~(length[..., 0] > NORMAL)
+        if has_no_direction.any():
             x, y, z = r0[has_no_direction][0]
             raise MeshError(
                 f"natural.along: has no direction in the surface at (x, y, z)/R = ({x:.3g}, "
@@ -235,7 +229,8 @@ def natural_field(natural: Natural, cells: CellGeometry, V: fem.FunctionSpace) -
         On every rank, if a number is not finite, a stretch is out of bounds, or the frame has no
         direction.
     """
-    # kept, so that all ranks raise together: one that raised alone would leave the others waiting
+    # values at the nodes; the message of an error is kept, so that all ranks raise together: a rank
+    # that raised alone would leave the others waiting
     message, element = None, V.element.basix_element
     r0, n0, _ = cells.evaluate(element.points)
     try:
@@ -251,7 +246,7 @@ def natural_field(natural: Natural, cells: CellGeometry, V: fem.FunctionSpace) -
         Q, "natural", lambda r: natural_field(natural, cell_geometry(r), r.function_space)
     )
     values = _numbers(T, kappa, t)
-    # only formulas vary between the nodes; all else is exact there
+    # polynomials of the cells have all values exactly, but for formulas: these are projected
     if any(getattr(value, "by_formula", False) for value in (natural.stretch, natural.curvature)):
         fitted_numbers = project_formula(
             lambda x, n: _numbers(*natural.tensors_at(x, n)),
@@ -283,7 +278,7 @@ def _refuse_unfit(natural: Natural, r0: Array, n0: Array) -> None:
     MeshError
         With the first such place.
     """
-    # values of a stretch are less one
+    # `Natural` has stretches less one
     stretch, curvature = 1 + _values(natural.stretch, r0, n0), _values(natural.curvature, r0, n0)
     is_valid = {
         f"stretch: is not within {SMALLEST:g} to {LARGEST:g}": (stretch >= SMALLEST)
@@ -359,15 +354,15 @@ class Shape:
         mu is the amplitude of the stretch. `first` and `points` are those of `volume`.
         """
         numbers = at_quadrature(self.field, points)
+        # T from the numbers 6 to 11 of the field, see `_numbers`; both halves of it are set
         T = np.empty((*numbers.shape[:2], 3, 3))
-        # numbers 6 to 11 of the field are those of T, see `_numbers`; both halves are set
         T[..., *FIELD] = T[..., *FIELD[::-1]] = numbers[..., 6:12]
+        # mixed components (2, 2) of T in the surface, a0^-1 times the covariant ones: their trace
+        # and determinant are those of the tensor
         tangents = np.moveaxis(first, 0, -2)
-        # mixed components of T in the surface, whose determinant is that of the tensor
-        mixed = np.linalg.solve(
-            tangents @ np.swapaxes(tangents, -1, -2), tangents @ T @ np.swapaxes(tangents, -1, -2)
-        )
-        # (1 + mu trace + mu^2 det) (1 + mu t), for the 2 x 2 tensor T
+        transposed = np.swapaxes(tangents, -1, -2)
+        mixed = np.linalg.solve(tangents @ transposed, tangents @ T @ transposed)
+        # coefficients of (1 + mu trace + mu^2 det) (1 + mu t)
         t, trace, det = numbers[..., 12], np.trace(mixed, axis1=-2, axis2=-1), np.linalg.det(mixed)
         return np.array([np.ones_like(t), trace + t, det + trace * t, det * t])
 
@@ -381,12 +376,19 @@ class Shape:
         field, amplitudes
             The values of `parameters` at the point: of an amplitude that stays zero there is none.
         """
-        remaining_amplitudes = list(amplitudes)
-        curvature_factor, stretch_factor = (
-            remaining_amplitudes.pop(0) if p is not None else None
-            for p in (self.curvature, self.stretch)
-        )
+        curvature_factor, stretch_factor = _factors(self, amplitudes)
         return _forms(r0, field, curvature_factor, stretch_factor)
+
+
+def _factors(shape: Shape, amplitudes: Sequence[Expr]) -> tuple[Expr | None, Expr | None]:
+    """Return the factors of curvature and stretch; None for one whose amplitude stays zero.
+
+    `amplitudes` are those of the two that vary: curvature first.
+    """
+    has_curvature, has_stretch = shape.curvature is not None, shape.stretch is not None
+    curvature_factor = amplitudes[0] if has_curvature else None
+    stretch_factor = amplitudes[-1] if has_stretch else None
+    return curvature_factor, stretch_factor
 
 
 def _forms(
@@ -405,14 +407,16 @@ def _forms(
         The numbers of the natural shape, see `_numbers`.
     """
     a0, up, n0 = kin.metric(r0), kin.inverse_metric(r0), kin.normal(r0)
-    # the field has kappa from number 0, T from 6, and t as 12
+    # the field has kappa from number 0 on, T from 6 on, and t as 12
     kappa = (
         ufl.zero((2, 2)) if curvature_factor is None else curvature_factor * covariant(r0, field, 0)
     )
     if stretch_factor is None:  # metric and thickness are the undeformed ones
         return Forms(ufl.zero((2, 2)), kappa, a0, up, ufl.as_ufl(1), ufl.as_ufl(1))
+    # curvature b0 of the undeformed surface
     b12 = ufl.dot(n0, r0.r12)
     b0 = ufl.as_matrix([[ufl.dot(n0, r0.r11), b12], [b12, ufl.dot(n0, r0.r22)]])
+    # stretches s = 1 + t of the thickness and U of the surface, whose components are mixed
     t = stretch_factor * field[12]
     U_less_1 = stretch_factor * ufl.dot(up, covariant(r0, field, 6))
     U = ufl.Identity(2) + U_less_1
@@ -446,11 +450,13 @@ def grown(density: Density, shape: Shape) -> Density:
         """Return the density; the last arguments are the values of the shape's parameters."""
         own_count = len(arguments) - len(shape.parameters)
         density_arguments, (field, *amplitudes) = arguments[:own_count], arguments[own_count:]
-        r0 = density_arguments[0]
-        if isinstance(r0, Jet):  # of a point; of an edge it is a pair, one jet for each side
+        r0 = density_arguments[0]  # the first argument is the undeformed placement
+        if isinstance(r0, Jet):  # of a point
             return density.function(*density_arguments, natural=shape.forms(r0, field, *amplitudes))
+        # of an edge: pairs of jets and of fields, one for each side
         forms_of_sides = tuple(
-            shape.forms(j, side, *amplitudes) for j, side in zip(r0, field, strict=True)
+            shape.forms(r0_of_side, field_of_side, *amplitudes)
+            for r0_of_side, field_of_side in zip(r0, field, strict=True)
         )
         return density.function(*density_arguments, natural=forms_of_sides)
 
@@ -527,11 +533,13 @@ def body_shape(
         As `natural_field`, or if the body has no such patch.
     """
     natural = natural.on_cells(body.patches, len(body.layer_bounds))
+    # at the nodes of each cell: normals, heights z, and the numbers of the shell; the body has its
+    # heights as parts of its thickness, from the inner face
     _, normals = body_positions_and_normals(V)
-    # heights of the body are parts of its thickness, from the inner face
     Z = fem.functionspace(V.mesh, ("Lagrange", V.element.basix_element.degree, (1,)))
     z = body.at_nodes(Z, (body.heights - MIDSURFACE_HEIGHT) * body.thickness)[Z.dofmap.list]
     shell_field = natural_field(natural, body_cell_geometry(V), V)
+    # all of them in one field
     Q = fem.functionspace(V.mesh, ("DG", V.element.basix_element.degree, (HEIGHT_AT + 1,)))
     field = fem.Function(Q, name="natural")
     rows = field.x.array.reshape(-1, HEIGHT_AT + 1)
@@ -547,25 +555,19 @@ def growth_in_body(shape: Shape, field: Expr, *amplitudes: Expr) -> Expr:
     thickness. `field` is that of `body_shape`. `amplitudes` are curvature and stretch, without one
     that stays zero.
     """
-    remaining_amplitudes = list(amplitudes)
-    curvature_factor, stretch_factor = (
-        remaining_amplitudes.pop(0) if p is not None else None
-        for p in (shape.curvature, shape.stretch)
-    )
+    curvature_factor, stretch_factor = _factors(shape, amplitudes)
     n, z = ufl.as_vector([field[NORMAL_AT + i] for i in range(3)]), field[HEIGHT_AT]
     n = n / ufl.sqrt(ufl.dot(n, n))  # interpolation between nodes shortens it
     normal_projection = ufl.outer(n, n)
     P = ufl.Identity(3) - normal_projection  # projects onto the surface
+    # the field has kappa from number 0 on, T from 6 on, and t as 12
     thickness_stretch, U = 1, P
     if stretch_factor is not None:
-        thickness_stretch, U = (
-            1 + stretch_factor * field[12],
-            P + stretch_factor * ufl.dot(P, ufl.dot(_tensor_in_space(field, 6), P)),
-        )
+        T_in_surface = ufl.dot(P, ufl.dot(_tensor_in_space(field, 6), P))
+        thickness_stretch, U = 1 + stretch_factor * field[12], P + stretch_factor * T_in_surface
     if curvature_factor is not None:
-        U = U - thickness_stretch * z * curvature_factor * ufl.dot(
-            P, ufl.dot(_tensor_in_space(field, 0), U)
-        )
+        kappa_U = ufl.dot(P, ufl.dot(_tensor_in_space(field, 0), U))
+        U = U - thickness_stretch * z * curvature_factor * kappa_U  # now (1 - s z kappa) U
     return U + thickness_stretch * normal_projection
 
 

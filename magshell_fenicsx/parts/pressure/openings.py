@@ -35,17 +35,15 @@ def moving_edges(
     Parameters
     ----------
     edges
-        Name of each edge -> its sides of cells, in any labels. Two names may share sides.
+        Name of each edge -> its sides of cells, known by labels such as the numbers of facets. Two
+        edges may share sides.
     conditions
         Name of an edge -> its support; an edge without one is free.
     """
-    closed_sides = set[Hashable]().union(
-        *(
-            edges[name]
-            for name, condition in conditions.items()
-            if name in edges and is_closed(condition)
-        )
-    )
+    closed_edges = [
+        name for name, condition in conditions.items() if name in edges and is_closed(condition)
+    ]
+    closed_sides = set[Hashable]().union(*(edges[name] for name in closed_edges))
     return [name for name, sides in edges.items() if sides - closed_sides]
 
 
@@ -78,11 +76,11 @@ def without_potential(
         condition = conditions.get(name, "free")
         if not isinstance(condition, HeldComponents):
             return False
-        axes = list(condition.components)  # held: with two of them it moves along the third
-        # else it moves in its own plane, if the held coordinate is the same at all its places
-        return len(axes) == 2 or bool(
-            np.ptp(places(name)[:, axes], axis=0).max() < PLANARITY_TOLERANCE
-        )
+        axes = list(condition.components)  # that are held
+        if len(axes) == 2:  # it moves along the third axis
+            return True
+        # it moves in its own plane if the held coordinate is the same at all its places
+        return bool(np.ptp(places(name)[:, axes], axis=0).max() < PLANARITY_TOLERANCE)
 
     return tuple(name for name in names if not has_potential(name))
 
@@ -112,14 +110,15 @@ def edge_openings(
     def places(name: str) -> Array:
         """Return the places (n, 3) of an edge, from all ranks."""
         dofs = fem.locate_dofs_topological(V, dim, edges[name])
-        by_rank = r0.x.array.reshape(-1, 3)[dofs if nodes is None else dofs[nodes[dofs]]]
-        return np.concatenate(comm.allgather(by_rank))
+        if nodes is not None:  # on the edges' line alone
+            dofs = dofs[nodes[dofs]]
+        own_places = r0.x.array.reshape(-1, 3)[dofs]
+        return np.concatenate(comm.allgather(own_places))
 
-    # a facet is an edge's side of a cell; an edge moves if it does on any rank
-    by_rank = comm.allgather(
-        moving_edges({name: set(map(int, facets)) for name, facets in edges.items()}, conditions)
-    )
-    names = [name for name in edges if any(name in rank for rank in by_rank)]
+    # the sides of an edge are its facets; an edge moves if it does on any rank
+    sides = {name: set(map(int, facets)) for name, facets in edges.items()}
+    moving_on_ranks = comm.allgather(moving_edges(sides, conditions))
+    names = [name for name in edges if any(name in moving for moving in moving_on_ranks)]
     return names, without_potential(names, conditions, places)
 
 
@@ -181,11 +180,9 @@ def side_of(end: str, sides: Mapping[str, float]) -> float:
     sides
         Name of a shell -> 1 from outside, -1 from inside.
     """
-    return (
-        next((side for shell, side in sides.items() if end.startswith(f"{shell}_")), 0.0)
-        if sides
-        else 1.0
-    )
+    if not sides:
+        return 1.0
+    return next((side for shell, side in sides.items() if end.startswith(f"{shell}_")), 0.0)
 
 
 def ring_openings(

@@ -113,14 +113,12 @@ class PressureSection(PathStep):
         # `open`: no change of volume is conjugate to the pressure, so none can be prescribed
         if step_start.open and "control" not in self.model_fields_set:
             course = replace(course, drive=replace(course.drive, control="arc"))
-        if (
-            step_start.context.shell.rubber is not None and course.drive.first < 0
-        ):  # blown up far beyond p_c
+        # a pressure from inside blows up rubber
+        if step_start.context.shell.rubber is not None and course.drive.first < 0:
             # E h/R, the size of such pressures, is about 1/h times p_c
             finer = partial(_longer, INFLATION_STEP_FACTOR / step_start.h)
-            course = replace(
-                course, drive=replace(course.drive, scale=1 / step_start.h), finer=finer
-            )
+            drive = replace(course.drive, scale=1 / step_start.h)
+            course = replace(course, drive=drive, finer=finer)
         return course
 
     def on_perfect(self, *, last: bool) -> Step:
@@ -193,17 +191,14 @@ def account(context: Context, loads: "Loads") -> Account:
     """Return the line of `magshell check` on a live pressure, or on its absence."""
     if not loads.pressure:
         return Account(left_out=["pressure: not loaded by it (the volume is only reported)"])
+    if context.solid:
+        return Account(["live pressure on the outer face"])
+    # empty if all of the shell is pressed from outside
     faces = ", ".join(
         f"{name} from {'outside' if side > 0 else 'inside'}"
         for name, side in loads.pressed_sides.items()
     )
-    return Account(
-        [
-            "live pressure on the outer face"
-            if context.solid
-            else f"live pressure{faces and f' on {faces}'}"
-        ]
-    )
+    return Account([f"live pressure{faces and f' on {faces}'}"])
 
 
 @dataclass(frozen=True)
@@ -268,7 +263,7 @@ class EnclosedGas:
         content = (ambient - pressure) * (volume + change)
 
         def conjugate(p: float) -> tuple[float, float]:
-            # the volume's change at p, and its derivative
+            # `unit` times the change of volume since the shell was undeformed, and its derivative
             return unit * (content / (ambient - p) - volume), unit * content / (ambient - p) ** 2
 
         return conjugate
@@ -282,12 +277,12 @@ class EnclosedGas:
         """
         conjugate, slope = self.law()(p)
         initial_volume = self._volume()
-        pressure_below_ambient = (
-            (conjugate / self.unit + initial_volume) / slope * self.unit
-        )  # ambient - p
-        # (a - p0)/(a - p)
-        share = (pressure_below_ambient + p - self.pressure) / pressure_below_ambient
-        return share, -(self.unit * initial_volume + self.conjugate) / pressure_below_ambient
+        # a - p: by the law it is the volume V at p over the derivative of V by p
+        pressure_of_gas = (conjugate / self.unit + initial_volume) / slope * self.unit
+        # (a - p0)/(a - p), and -(V0 + dV)/(a - p) in the unit of the conjugate
+        by_conjugate = (pressure_of_gas + p - self.pressure) / pressure_of_gas
+        by_pressure = -(self.unit * initial_volume + self.conjugate) / pressure_of_gas
+        return by_conjugate, by_pressure
 
     def _volume(self) -> float:
         """Return the volume of the gas under the undeformed shell, over R^3."""

@@ -149,30 +149,28 @@ class BoundarySection(Section, Ability):
     ) -> list[SymmetryConstraint]:
         """Return the symmetry that the supports of a shell preserve.
 
-        A loaded half does not see rigid motions across its mirror plane. So without a support
-        against all motions the whole shell is needed, but for frequencies of a shell without loads,
-        where free rigid motions are allowed.
+        A loaded half does not see rigid motions across its mirror plane. So a shell without a
+        support against all motions must be modelled as a whole. An exception is a shell without
+        loads, of which frequencies alone are computed: its free rigid motions are allowed.
         """
         constraints = list[SymmetryConstraint]()
         for name, condition in self.conditions().items():
+            # why the support is not axisymmetric about e3; None if it is
             reason = None
             if isinstance(condition, HeldSection):
-                # x and y are held both, or neither, around e3
+                # an axisymmetric support holds both x and y, or neither, and stands on the axis
                 one_sided = len({0, 1} & set(condition.components)) == 1
                 is_off_axis = tilted(np.array(context.points.get(name, [0.0, 0.0, 1.0])))
-                asymmetry = (
-                    "is held along x or y alone"
-                    if one_sided
-                    else "is held off the axis"
-                    if is_off_axis
-                    else None
-                )
-                reason = asymmetry and f"boundary.{name}: {asymmetry}"
+                if one_sided:
+                    reason = f"boundary.{name}: is held along x or y alone"
+                elif is_off_axis:
+                    reason = f"boundary.{name}: is held off the axis"
             constraints.append(
                 SymmetryConstraint(reason, mirrors=partial(self._mirrored, context, name))
             )
-        at_rest = not context.steps and context.sections.get("frequencies") is not None
-        if not at_rest and not self.fixes:  # a meridian asks for itself whether it is held
+        frequencies_alone = not context.steps and context.sections.get("frequencies") is not None
+        # then no plane is a mirror (a meridian does not ask: it checks itself whether it is held)
+        if not frequencies_alone and not self.fixes:
             constraints.append(SymmetryConstraint(mirrors=no_plane))
         return constraints
 
@@ -182,25 +180,19 @@ class BoundarySection(Section, Ability):
         A held point must lie on the plane.
         """
         conditions = self.conditions()
-        condition, condition_of_image = (
-            conditions[name],
-            conditions.get(mirror.image_of_edge(name), "free"),
-        )
+        condition = conditions[name]
+        condition_of_image = conditions.get(mirror.image_of_edge(name), "free")
+        # the reflection must map the held directions onto themselves
         if isinstance(condition, HeldSection):
-            # the reflection must map the held directions onto themselves
-            held_projection, S = (
-                np.diag([float(i in condition.components) for i in range(3)]),
-                mirror.reflection,
-            )
+            S = mirror.reflection
+            held_projection = np.diag([float(i in condition.components) for i in range(3)])
             if np.abs(S @ held_projection @ S - held_projection).max() > PARALLEL:
                 return False
-        place = context.points.get(name)
-        distance_of_point = (
-            0.0
-            if place is None
-            else float(mirror.signed_distance(np.array(place) / context.shell.reference))
-        )
-        return abs(distance_of_point) < ROUNDING and condition == condition_of_image
+        # distance of a point; an edge or a patch has none
+        place, distance = context.points.get(name), 0.0
+        if place is not None:
+            distance = float(mirror.signed_distance(np.array(place) / context.shell.reference))
+        return abs(distance) < ROUNDING and condition == condition_of_image
 
 
 def refuse_taken(points: Iterable[str]) -> None:

@@ -185,16 +185,17 @@ def motion(move: MoveSection, name: str, R: float, turn: float = 0.0) -> RigidMo
     turn
         Angle of the model's frame about e3 (rad).
     """
-    Q, rotation_section, zero = rotation(turn), move.rotation, np.zeros(3)  # Q: case to model
+    # Q turns the frame of the case into that of the model
+    Q, rotation_section, zero = rotation(turn), move.rotation, np.zeros(3)
     shift = Q @ (np.array(move.translation) / R) if move.translation else zero
     if rotation_section is None:
-        return RigidMotion(name, shift, zero, zero)
+        return RigidMotion(name, shift, turn=zero, centre=zero)
     axis = np.array(rotation_section.axis) / np.linalg.norm(rotation_section.axis)
     return RigidMotion(
         name,
         shift,
-        radians(rotation_section.angle) * (Q @ axis),
-        Q @ (np.array(rotation_section.point) / R),
+        turn=radians(rotation_section.angle) * (Q @ axis),
+        centre=Q @ (np.array(rotation_section.point) / R),
     )
 
 
@@ -225,11 +226,11 @@ def mirrored(load: EdgeSection, R: float, mirror: Mirror) -> bool:
     """
     # the name of the amplitude is not compared
     motions = {name: motion(move, "", R) for move in load.moves for name in move.supports}
-    return all(
-        mirror.image_of_edge(name) in motions
-        and _is_image(move, motions[mirror.image_of_edge(name)], mirror)
-        for name, move in motions.items()
-    )
+    for name, rigid_motion in motions.items():
+        image = motions.get(mirror.image_of_edge(name))
+        if image is None or not _is_image(rigid_motion, image, mirror):
+            return False
+    return True
 
 
 def _is_image(first: RigidMotion, second: RigidMotion, mirror: Mirror) -> bool:
@@ -238,12 +239,13 @@ def _is_image(first: RigidMotion, second: RigidMotion, mirror: Mirror) -> bool:
     A mirrored rotation runs the other way about the mirrored axis. Its centre may be any point of
     that axis.
     """
-    # unit vector of the axis; zero without a rotation
-    S, axis = mirror.reflection, second.turn / (np.linalg.norm(second.turn) or 1.0)
+    S, largest = mirror.reflection, max(np.abs([first.shift, first.turn]).max(), ROUNDING)
+    # a rotation vector changes its sign beside its reflection, as the rotation runs the other way
+    has_shift = np.abs(S @ first.shift - second.shift).max() < ROUNDING * largest
+    has_turn = np.abs(S @ first.turn + second.turn).max() < ROUNDING * largest
+    # way between the centres, whose part across the axis must be zero; the axis is a unit vector,
+    # or zero without a rotation
+    axis = second.turn / (np.linalg.norm(second.turn) or 1.0)
     offset = mirror.image(first.centre) - second.centre
-    size = max(np.abs([first.shift, first.turn]).max(), ROUNDING)
-    return bool(
-        np.abs(S @ first.shift - second.shift).max() < ROUNDING * size
-        and np.abs(S @ first.turn + second.turn).max() < ROUNDING * size
-        and (not second.turns or np.abs(offset - (offset @ axis) * axis).max() < ROUNDING)
-    )
+    has_axis = not second.turns or np.abs(offset - (offset @ axis) * axis).max() < ROUNDING
+    return bool(has_shift and has_turn and has_axis)

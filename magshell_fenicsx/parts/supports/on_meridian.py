@@ -118,9 +118,11 @@ class Supports:
         )
         places = r0.x.array.reshape(-1, 2)
         for cells in self.meridian.bodies:
-            rho, z, ones = np.zeros((3, len(places)))  # zero on other bodies
+            # 1, rho and z at the nodes of this body, and zero on other bodies
+            rho, z, ones = np.zeros((3, len(places)))
             nodes = r0.function_space.dofmap.list[cells]
-            ones[nodes], (rho[nodes], z[nodes]) = 1.0, np.moveaxis(places[nodes], -1, 0)
+            ones[nodes] = 1.0
+            rho[nodes], z[nodes] = np.moveaxis(places[nodes], -1, 0)
             zero = 0.0 * ones
             axial_motions.append(np.column_stack([zero, ones]).ravel())
             torsional_waves.append(np.column_stack([rho, rho, zero]).ravel())
@@ -141,10 +143,11 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Support
     MeshError
         If an end with a plane of symmetry does not lie in one.
     """
-    # `facets` has the same three lists
+    # lists of facets for the three kinds of conditions; `facets` has the same three lists
     horizontal, axial, mirror = facets = [list[Facets]() for _ in range(3)]
     named_ends: dict[str, tuple[Facets, tuple[int, ...]]] = {}
     for name, condition in conditions.items():
+        # the facets of the name, and the components x, y, z that are held there
         end = meridian.ends[name] if name in meridian.ends else meridian.facets_at(name)
         components = set(condition.components) if isinstance(condition, HeldComponents) else set()
         if condition in ("clamped", "simply supported"):
@@ -157,12 +160,10 @@ def supports(meridian: Meridian, conditions: Mapping[str, Condition]) -> Support
             horizontal.append(end)
         if AXIAL in components:
             axial.append(end)
-        # of (U, W): U is held only where x and y both are
-        held_in_plane = tuple(
-            i for i, part in enumerate((HORIZONTAL, {AXIAL})) if components >= part
-        )
-        if held_in_plane:
-            named_ends[name] = end, held_in_plane
+        # the components of (U, W) that are held: 0, U, where x and y both are; 1, W, where z is
+        held_of_U_W = tuple(i for i, part in enumerate((HORIZONTAL, {AXIAL})) if components >= part)
+        if held_of_U_W:
+            named_ends[name] = end, held_of_U_W
     facets_by_kind = [np.unique(np.concatenate([np.empty(0, np.int32), *f])) for f in facets]
     return Supports(
         meridian.axis, facets_by_kind[0], facets_by_kind[1], facets_by_kind[2], named_ends, meridian
@@ -178,10 +179,8 @@ def _refuse_slanting(meridian: Meridian, name: str) -> None:
         If the meridian at the end is not nearly parallel to e3.
     """
     # the direction of the meridian at its end, from two points on it
-    s, offset = (
-        meridian.parameter(name),
-        PLANARITY_TOLERANCE if meridian.begins(name) else -PLANARITY_TOLERANCE,
-    )
+    s = meridian.parameter(name)
+    offset = PLANARITY_TOLERANCE if meridian.begins(name) else -PLANARITY_TOLERANCE  # inwards
     (rho, z), (rho_near, z_near) = meridian.section(np.array([s, s + offset]))
     if abs(z_near - z) < MIN_CROSSING_COSINE * np.hypot(rho_near - rho, z_near - z):
         raise MeshError(no_mirror(name))

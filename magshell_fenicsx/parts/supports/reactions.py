@@ -78,25 +78,24 @@ def reactions(
     """
     system, comm = model.system, model.system.comm
     R, shares = system.forces(state.u, state.mu), _shares(model)  # R: the residual
-    axes = system.u.function_space.dofmap.index_map_bs
+    axes = system.u.function_space.dofmap.index_map_bs  # components at a node
+    # present places (nodes, 3) of this rank's nodes
     r = vectors_in_space(
         model.r0.x.array[: system.size] + system.with_ghosts(state.u, state.mu)[: system.size], axes
     )
     by_support: dict[str, Reaction] = {}
     for name, support in model.supports.items():
+        # the point of the moment: the middle of the support, with its image if it is its own
         dofs = support.dofs[support.dofs < system.size]
-        box = _box(
-            r[np.unique(dofs // axes)],
-            mirror if mirror and mirror.image_of_edge(name) == name else None,
-            comm,
-        )
-        point = box.mean(axis=0)
+        is_own_image = mirror is not None and mirror.image_of_edge(name) == name
+        held_nodes = np.unique(dofs // axes)
+        point = _box(r[held_nodes], mirror if is_own_image else None, comm).mean(axis=0)
+        # forces (nodes, 3), and their moment about the point
         F, arm = vectors_in_space(shares[name] * R, axes), r - point
         M = np.cross(arm, F).sum(axis=0)
         if support.edge:  # the name of the energy that holds the edge's normal
-            M = M - np.cross(
-                arm, vectors_in_space(system.forces(state.u, state.mu, support.edge), axes)
-            ).sum(axis=0)
+            gradient = vectors_in_space(system.forces(state.u, state.mu, support.edge), axes)
+            M = M - np.cross(arm, gradient).sum(axis=0)
         force, moment = comm.allreduce(np.array([F.sum(axis=0), M]))
         if axes == 2:  # a meridian: around the axis all but the force along it cancels
             force, moment, point = force * [0.0, 0.0, 1.0], 0 * moment, point * [0.0, 0.0, 1.0]
@@ -125,31 +124,33 @@ def weights(model: "ModelBase", name: str, direction: Array, mirror: Mirror | No
     """
     if mirror and name in mirror.removed_edges:  # its force is the image of the modelled edge's
         name, direction = mirror.removed_edges[name], mirror.reflection @ direction
-    elif mirror and mirror.image_of_edge(name) == name:
+    elif mirror and mirror.image_of_edge(name) == name:  # both halves of the support
         direction = mirror.sum_over_images(direction)
     system = model.system
-    axes = system.u.function_space.dofmap.index_map_bs
-    components = (
-        direction if axes == 3 else np.array([0.0, direction[2]])
-    )  # around the axis only that along it is left
+    axes = system.u.function_space.dofmap.index_map_bs  # components at a node
+    # on a meridian the force along the axis is left; all else cancels around it
+    components = direction if axes == 3 else np.array([0.0, direction[2]])
     return np.asarray(_shares(model)[name] * np.tile(components, system.size // axes))
 
 
 def _shares(model: "ModelBase") -> dict[str, Array]:
     """Return each support's share in the force at each of this rank's unknowns.
 
-    A share is between 0 and 1, in an array of this rank's unknowns. A point has the force of its
-    node alone, edges and patches share it equally, and a mirror plane has what is left.
+    A share is between 0 and 1, in an array of this rank's unknowns. A point has the whole force of
+    its node. Edges and patches share the force of any other node equally. A mirror plane has what
+    is left.
     """
-    size = model.system.size
+    size = model.system.size  # number of unknowns
     shares = {name: np.zeros(size) for name in model.supports}
     is_unassigned = np.ones(size, dtype=bool)
     for kind in PRECEDENCE:
         names = [name for name, support in model.supports.items() if support.kind == kind]
+        # 1 at the unknowns that a support holds, if none of an earlier kind holds them
         for name in names:
             dofs = model.supports[name].dofs
             shares[name][dofs[dofs < size]] = 1.0
-            shares[name] *= is_unassigned  # unknowns of an earlier kind are taken
+            shares[name] *= is_unassigned
+        # equal shares of all supports of this kind
         number_of_holders = sum((shares[name] for name in names), np.zeros(size))
         for name in names:
             shares[name] /= np.maximum(number_of_holders, 1.0)
@@ -160,14 +161,14 @@ def _shares(model: "ModelBase") -> dict[str, Array]:
 def _of_whole(half: Mapping[str, Reaction], mirror: Mirror) -> dict[str, Reaction]:
     """Return the reactions of the whole shell from those of a half.
 
-    Supports on edges that are not modelled get the images of those that are.
+    Supports on edges that are not modelled get the images of those that are. A support that is its
+    own image gets the sum over both halves.
     """
     reactions_of_whole, S = dict(half), mirror.reflection
     for removed_edge, modelled_edge in mirror.removed_edges.items():
         if modelled_edge in half:
-            reactions_of_whole[removed_edge] = half[modelled_edge].image(
-                S, mirror.image(half[modelled_edge].point)
-            )
+            reaction = half[modelled_edge]
+            reactions_of_whole[removed_edge] = reaction.image(S, mirror.image(reaction.point))
     for name, reaction in half.items():
         if mirror.image_of_edge(name) == name:
             reactions_of_whole[name] = reaction.of_both_halves(mirror)

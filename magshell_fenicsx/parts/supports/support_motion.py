@@ -43,9 +43,9 @@ class Support:
     turn
         The rotation in that term, if a motion turns the edge.
     kind
-        Whether it is a point, a part (an edge or a patch), or a mirror plane, in the direction of
-        its normal alone. Of the supports that hold a component, those that come first in
-        `PRECEDENCE` have its force.
+        Whether it is a point, a part (an edge or a patch), or a mirror plane, which holds the
+        direction of its normal alone. Where several supports hold a component, those whose kind
+        comes first in `PRECEDENCE` have its force.
     """
 
     dofs: NDArray[np.int32]
@@ -97,8 +97,8 @@ def moving(
     """
     motions_of_supports = {name: motions_of(loads, name) for name in supports}
     bodies = [
-        RigidBody(motions_of_supports[name], s.dofs, s.edge, s.turn)
-        for name, s in supports.items()
+        RigidBody(motions_of_supports[name], support.dofs, support.edge, support.turn)
+        for name, support in supports.items()
         if motions_of_supports[name]
     ]
     return PrescribedMotion(r0, bodies, edge_pressure) if bodies else None
@@ -148,14 +148,15 @@ def pressed_edges(
         A point (3,) of all planes of symmetry, where lids have their tip; None if they have none.
     """
     comm, x = r0.function_space.mesh.comm, r0.x.array.reshape(-1, 3)
+    # the edges that move alike: equal motions have equal keys, with the bytes of their arrays
     edges_by_motion = dict[tuple[object, ...], list[str]]()
     for name in curves:
         if motions := motions_of(loads, name):
-            # arrays by their bytes: equal motions have equal keys
             motion_key = tuple(
                 (m.name, *(part.tobytes() for part in (m.shift, m.turn, m.centre))) for m in motions
             )
             edges_by_motion.setdefault(motion_key, []).append(name)
+    # the corners of cells on planes of symmetry, of all ranks
     corners_on_planes = np.concatenate(
         [np.empty(0, np.int64), *(curves[name].corners.ravel() for name in planes)]
     )
@@ -163,13 +164,12 @@ def pressed_edges(
     lids = []
     for names in edges_by_motion.values():
         curves_of_lid = [curves[name] for name in names]
-        open_corners = end_corners(curves_of_lid, comm)
-        # else the edges leave a gap, and no lid closes them
-        if not len(open_corners) or (
-            closing is not None and np.isin(open_corners, all_corners_on_planes).all()
-        ):
+        open_corners = end_corners(curves_of_lid, comm)  # at which the edges end
+        is_closed = not len(open_corners)
+        ends_on_planes = closing is not None and np.isin(open_corners, all_corners_on_planes).all()
+        # other edges leave a gap, which no lid closes
+        if is_closed or ends_on_planes:
             origin = np.zeros(3) if closing is None else closing
             lids.append(Lid.cone(curves_of_lid, x, motions_of(loads, names[0]), origin, comm))
-    return EdgePressure(
-        PRESSURE, unit, lids, [curves[name] for names in edges_by_motion.values() for name in names]
-    )
+    moving_edges = [name for names in edges_by_motion.values() for name in names]
+    return EdgePressure(PRESSURE, unit, lids, [curves[name] for name in moving_edges])

@@ -66,12 +66,13 @@ def held_on(
     """
     V.mesh.topology.create_connectivity(dim, V.mesh.topology.dim)
     conditions = []
-    # dofs of a component have the numbers of V: the node times the block size, plus the component
     for space in (V.sub(i) for i in axes):
         dofs = fem.locate_dofs_topological(space, dim, entities)
-        conditions.append(
-            fem.dirichletbc(0.0, dofs if nodes is None else dofs[nodes[dofs // V.dofmap.bs]], space)
-        )
+        if nodes is not None:
+            # the number of a dof is that of its node times the block size, plus the component
+            node_of_dof = dofs // V.dofmap.bs
+            dofs = dofs[nodes[node_of_dof]]
+        conditions.append(fem.dirichletbc(0.0, dofs, space))
     return conditions
 
 
@@ -96,11 +97,9 @@ def held_at_vertex(
     nodes_at_vertex = fem.locate_dofs_geometrical(
         V, lambda y: np.linalg.norm(y.T - x, axis=1) < 1e-9
     )
-    nodes_at_vertex = (
-        nodes_at_vertex
-        if cells_at_vertex is None
-        else nodes_at_vertex[np.isin(nodes_at_vertex, V.dofmap.list[cells_at_vertex])]
-    )
+    if cells_at_vertex is not None:
+        nodes_of_cells = V.dofmap.list[cells_at_vertex]
+        nodes_at_vertex = nodes_at_vertex[np.isin(nodes_at_vertex, nodes_of_cells)]
     # a node has three unknowns
     return [fem.dirichletbc(0.0, 3 * nodes_at_vertex + np.int32(i), V.sub(i)) for i in axes]
 
@@ -139,32 +138,46 @@ def refuse_unknown(
                 f"{edge_names}"
             )
 
+    # supports
     for name, condition in conditions.items():
-        # points can be held, but for the pole, where the program reads; patches be held or clamped
-        allowed = set(edges)
-        allowed |= set(points) - {"pole"} if isinstance(condition, HeldComponents) else set()
-        allowed |= (
-            set(patches)
-            if isinstance(condition, HeldComponents) or condition == "clamped"
-            else set()
-        )
+        allowed = _names_that_can_have(condition, edges, points, patches)
         if name not in allowed:
             refuse_joined(f"boundary.{name}", name)
             allowed_names = ", ".join(sorted(allowed)) or "none"
             raise MeshError(f"boundary.{name}: the surface has no such edge, only {allowed_names}")
+    # dead loads on edges
     for load in loads.all_dead:
         edge = getattr(load, "edge", None)
         if edge is not None and edge not in edges:
             refuse_joined(f"loading.loads: edge: {edge}", edge)
             allowed_names = ", ".join(sorted(edges)) or "none"
             raise MeshError(f"loading.loads: edge: {edge}: the surface has only {allowed_names}")
+    # terms of a program on edges
     for term in loads.user_terms:
         if term.on is not None and term.on not in edges:
-            allowed_names, key = (
-                ", ".join(sorted(edges)) or "none",
-                term.key or f"terms: {term.name}: on",
-            )
+            allowed_names = ", ".join(sorted(edges)) or "none"
+            key = term.key or f"terms: {term.name}: on"
             raise MeshError(f"{key}: {term.on}: the surface has no such edge, only {allowed_names}")
+
+
+def _names_that_can_have(
+    condition: Condition,
+    edges: Collection[str],
+    points: Collection[str],
+    patches: Collection[str],
+) -> set[str]:
+    """Return the names of the edges, points and patches that a support can have.
+
+    An edge can have any support. A point can have held components, but for the pole, which is a
+    name of the program's own. A patch can have held components, or be clamped.
+    """
+    names = set(edges)
+    holds_components = isinstance(condition, HeldComponents)
+    if holds_components:
+        names |= set(points) - {"pole"}
+    if holds_components or condition == "clamped":
+        names |= set(patches)
+    return names
 
 
 def no_mirror(name: str) -> str:
@@ -201,24 +214,28 @@ def plane_of(r0: fem.Function, facets: NDArray[np.int32], name: str) -> Mirror:
     centre = places.mean(axis=0)
     # axes of the places, from the largest to the smallest extent: the last is normal to a plane
     _, spread, axes = np.linalg.svd(places - centre, full_matrices=False)
-    # of a solid, the face itself shows its plane, and the thickness stands at right angles
+    # directions that must be normal to the plane: of an edge its conormals, of a solid's face the
+    # normal of the face itself
     conormals = _conormals(r0, facets) if on_edge else axes[2:]
-    if spread[1] > PLANARITY_TOLERANCE * spread[0]:
-        candidates = [axes[2]]
-    else:  # a straight edge lies in many planes: those of the axes, and through e3, are exact
+    # candidates for the normal of the plane
+    is_straight = spread[1] <= PLANARITY_TOLERANCE * spread[0]
+    candidates = [axes[2]]
+    if is_straight:
+        # a straight edge lies in many planes. First come those with an exact normal: along an
+        # axis, or, for a plane through e3, at right angles to the way from e3 to the centre. The
+        # last normal is the sum of the conormals without its part along the edge.
         upright = np.array([-centre[1], centre[0], 0.0])
         fitted_normal = conormals.sum(axis=0) @ (np.eye(3) - np.outer(axes[0], axes[0]))
         candidates = [*np.eye(3), *([upright] if upright.any() else []), fitted_normal]
+    # the first plane that contains the places and is crossed at right angles
     for normal in candidates:
         plane = Mirror.with_normal(normal, float(normal @ centre))
-        # weighted with the lengths of the edges of cells, which the conormals have
+        # the mean is weighted with the lengths of the edges of cells, as conormals are so long
         mean_cosine = (
             np.abs(conormals @ plane.normal).sum() / np.linalg.norm(conormals, axis=1).sum()
         )
-        if (
-            np.ptp(plane.signed_distance(places)) < PLANARITY_TOLERANCE
-            and mean_cosine > MIN_CROSSING_COSINE
-        ):
+        contains_places = np.ptp(plane.signed_distance(places)) < PLANARITY_TOLERANCE
+        if contains_places and mean_cosine > MIN_CROSSING_COSINE:
             return plane
     raise MeshError(no_mirror(name))
 
@@ -230,40 +247,38 @@ def put_in_plane(r0: fem.Function, facets: NDArray[np.int32]) -> None:
     changed. Nodes stay where they are if the vertices do not define a plane, or are far from it.
     """
     V, domain = r0.function_space, r0.function_space.mesh
+    # the vertices of the edge on all ranks
     ends = (
         mesh.entities_to_geometry(domain, 1, facets) if len(facets) else np.empty(0, dtype=np.int32)
     )
     vertices = np.concatenate(domain.comm.allgather(domain.geometry.x[ends.ravel()]))
+    # their plane: its normal is the axis of the smallest extent
     centre = vertices.mean(axis=0)
     _, spread, axes = np.linalg.svd(vertices - centre, full_matrices=False)
-    # vertices on a straight line, or off any plane
-    if (
-        spread[1] <= PLANARITY_TOLERANCE * spread[0]
-        or np.ptp(vertices @ axes[2]) > PLANARITY_TOLERANCE
-    ):
+    normal = axes[2]
+    is_straight = spread[1] <= PLANARITY_TOLERANCE * spread[0]
+    if is_straight or np.ptp(vertices @ normal) > PLANARITY_TOLERANCE:
         return
+    # the nodes of the edge, moved along the normal
     dofs, x = fem.locate_dofs_topological(V, 1, facets), r0.x.array.reshape(-1, 3)
-    distance_from_plane = (x[dofs] - centre) @ axes[2]
-    if (
-        domain.comm.allreduce(np.abs(distance_from_plane).max(initial=0.0), MPI.MAX)
-        < MAX_OFFSET_FROM_PLANE
-    ):
-        x[dofs] -= np.outer(distance_from_plane, axes[2])
+    distance_from_plane = (x[dofs] - centre) @ normal
+    largest_distance = domain.comm.allreduce(np.abs(distance_from_plane).max(initial=0.0), MPI.MAX)
+    if largest_distance < MAX_OFFSET_FROM_PLANE:
+        x[dofs] -= np.outer(distance_from_plane, normal)
     r0.x.scatter_forward()
 
 
 def closing_point(planes: Sequence[Mirror]) -> Array | None:
     """Return a point (3,) that lies on all planes of symmetry, from which volumes are measured.
 
-    The origin without planes; None if the planes have no common point.
+    Without planes it is the origin. It is None if the planes have no common point.
     """
     if not planes:
         return np.zeros(3)
     normals, offsets = np.array([p.normal for p in planes]), np.array([p.offset for p in planes])
     point = np.linalg.lstsq(normals, offsets, rcond=PLANARITY_TOLERANCE)[0]
-    return (
-        np.asarray(point) if np.abs(normals @ point - offsets).max() < PLANARITY_TOLERANCE else None
-    )
+    is_on_planes = np.abs(normals @ point - offsets).max() < PLANARITY_TOLERANCE
+    return np.asarray(point) if is_on_planes else None
 
 
 def _conormals(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
@@ -277,18 +292,23 @@ def _conormals(r0: fem.Function, facets: NDArray[np.int32]) -> Array:
     for dims in ((1, 2), (2, 1)):
         topology.create_connectivity(*dims)
     corners, conormals = basix.geometry(basix.CellType.triangle), []
-    for facet in facets[facets < topology.index_map(1).size_local]:
+    own_facets = facets[facets < topology.index_map(1).size_local]
+    for facet in own_facets:
+        # the first cell beside the facet, and the number of the facet among the cell's sides
         cell = topology.connectivity(1, 2).links(facet)[0]
         side = int(np.flatnonzero(topology.connectivity(2, 1).links(cell) == facet)[0])
         # a side of the reference triangle has the number of the opposite corner
         ends = np.delete(corners, side, axis=0)
-        # tangents a (2, 3) of the surface at the middle of the side
-        # (both derivatives, one point, all shape functions, scalar)
-        table = V.element.basix_element.tabulate(1, ends.mean(axis=0)[None])[1:, 0, :, 0]
-        a = table @ r0.x.array.reshape(-1, 3)[V.dofmap.list[cell]]
-        tangent, outward = (ends[1] - ends[0]) @ a, (ends.mean(axis=0) - corners[side]) @ a
-        outward -= (outward @ tangent) / (tangent @ tangent) * tangent
-        conormals.append(np.linalg.norm(tangent) * outward / np.linalg.norm(outward))
+        middle = ends.mean(axis=0)
+        # tangents (2, 3) of the surface at the middle of the side, from the table (derivatives,
+        # points, shape functions, components) of the element
+        derivatives = V.element.basix_element.tabulate(1, middle[None])[1:, 0, :, 0]
+        tangents = derivatives @ r0.x.array.reshape(-1, 3)[V.dofmap.list[cell]]
+        # vectors in space: along the side, and from the opposite corner to its middle
+        along_side, outward = (ends[1] - ends[0]) @ tangents, (middle - corners[side]) @ tangents
+        # without its part along the side, the second is the conormal
+        outward -= (outward @ along_side) / (along_side @ along_side) * along_side
+        conormals.append(np.linalg.norm(along_side) * outward / np.linalg.norm(outward))
     return np.concatenate(V.mesh.comm.allgather(np.reshape(conormals, (-1, 3))))
 
 
@@ -306,23 +326,21 @@ def free_motion(system: FiniteElementSystem, r0: fem.Function, amplitudes: Ampli
         motions = _unresisted_motions(system, x, amplitudes, nodes_of_piece)
         if not len(motions):
             continue
+        # mean displacement of the first motion, and centre of the piece
         node_count = system.comm.allreduce(int(nodes_of_piece.sum()))
-        # mean displacement of the first motion, whose length over all nodes is one; of a pure
-        # translation it would be (1/nodes)^(1/2)
         shift = system.comm.allreduce(motions[0].reshape(-1, 3).sum(axis=0)) / node_count
-        is_translation = np.linalg.norm(shift) > 0.5 * np.sqrt(1 / node_count)
         centre = system.comm.allreduce(x[nodes_of_piece].sum(axis=0)) / node_count
-        direction = (
-            ", ".join(f"{c + 0.0:.2g}" for c in np.round(shift / np.linalg.norm(shift), 3))
-            if is_translation
-            else ""
-        )
-        location = (
-            ""
-            if len(pieces_of_shell) == 1
-            else f"; this is its piece around {place_text(centre)}, over R"
-        )
-        return NOT_HELD + (f"move along ({direction})" if is_translation else "turn") + location
+        # the length of the motion over all nodes is one: a pure translation has the mean
+        # (1/nodes)^(1/2), and a turn about the centre has the mean zero
+        movement = "turn"
+        if np.linalg.norm(shift) > 0.5 * np.sqrt(1 / node_count):
+            direction = np.round(shift / np.linalg.norm(shift), 3)
+            components = ", ".join(f"{c + 0.0:.2g}" for c in direction)  # + 0.0 makes -0 a 0
+            movement = f"move along ({components})"
+        location = ""
+        if len(pieces_of_shell) > 1:
+            location = f"; this is its piece around {place_text(centre)}, over R"
+        return NOT_HELD + movement + location
     return ""
 
 
@@ -345,10 +363,8 @@ def _nodes_of_pieces(system: FiniteElementSystem, r0: fem.Function) -> list[NDAr
     """
     # the first nodes of a rank are its own; each has three unknowns
     piece_of_node = component_numbers(r0.function_space)[: system.size // 3]
-    return [
-        piece_of_node == n
-        for n in range(1 + system.comm.allreduce(int(piece_of_node.max(initial=0)), MPI.MAX))
-    ]
+    last_piece = system.comm.allreduce(int(piece_of_node.max(initial=0)), MPI.MAX)
+    return [piece_of_node == n for n in range(1 + last_piece)]
 
 
 def _unresisted_motions(
@@ -367,9 +383,10 @@ def _unresisted_motions(
     """
     node_count = system.comm.allreduce(int(nodes_of_piece.sum()))
     centre = system.comm.allreduce(x[nodes_of_piece].sum(axis=0)) / node_count
+    # rigid motions: translations along three axes, and rotations about them
     motions = np.zeros((6, *x.shape))
     for i, axis in enumerate(np.eye(3)):
-        motions[i, :, i] = nodes_of_piece  # one along the axis
+        motions[i, :, i] = nodes_of_piece  # 1 at the nodes of the piece, else 0
         motions[3 + i] = np.cross(axis, x - centre) * nodes_of_piece[:, None]
     return unresisted(
         motions.reshape(6, -1),
@@ -401,14 +418,16 @@ def unresisted(
     Array
         (n, unknowns) combinations of length one, n at most k, the one of the lowest energy first.
     """
-    # the part of each motion that supports stop; its null combinations are free
-    # its squares are summed over ranks as products, whose eigenvectors are the combinations
+    # combinations of motions that no support stops: the stopped parts of the motions have the
+    # matrix of products (k, k), summed over ranks, and the combinations are its null vectors
     stopped = rigid - np.array([zero_at_supports(motion) for motion in rigid])
     _, squares, combinations = np.linalg.svd(comm.allreduce(stopped @ stopped.T))
-    free_motions = combinations[squares < FREE_MOTION_TOLERANCE * max(squares.max(), 1.0)] @ rigid
+    is_free = squares < FREE_MOTION_TOLERANCE * max(squares.max(), 1.0)
+    free_motions = combinations[is_free] @ rigid
     if not len(free_motions):
         return np.asarray(free_motions)
-    free_motions /= np.sqrt(comm.allreduce((free_motions**2).sum(axis=1)))[:, None]
+    free_motions /= _lengths(free_motions, comm)
+    # energies of pairs of these motions
     K = symmetric_part(tangent())
     product, energies = K.createVecLeft(), []
     for motion in free_motions:
@@ -416,15 +435,23 @@ def unresisted(
         displacement.array[:] = motion
         K.mult(displacement, product)
         energies.append(comm.allreduce(free_motions @ product.array))
-    # what rounding leaves of an energy is a part of this, however stiff other shells are
+    # energies by the sums of magnitudes in the rows of K: the rounding of an energy is a small
+    # part of this bound
     bounds = comm.allreduce((free_motions * _sums_of_rows(K)) @ free_motions.T)
-    # eigenvalues of the energies over these bounds, for combinations whose bound is one
+    # eigenvalues of the energies over these bounds, for combinations whose bound is one: a motion
+    # whose energy is only rounding is not resisted
     to_unit_bounds = np.linalg.inv(np.linalg.cholesky(bounds))
     values, vectors = np.linalg.eigh(to_unit_bounds @ np.array(energies) @ to_unit_bounds.T)
     unresisted_motions = vectors.T[values < ENERGY_TOLERANCE] @ to_unit_bounds @ free_motions
-    return np.asarray(
-        unresisted_motions / np.sqrt(comm.allreduce((unresisted_motions**2).sum(axis=1)))[:, None]
-    )
+    return np.asarray(unresisted_motions / _lengths(unresisted_motions, comm))
+
+
+def _lengths(motions: Array, comm: MPI.Comm) -> Array:
+    """Return the lengths (n, 1) of motions (n, unknowns of this rank), over all ranks.
+
+    Collective.
+    """
+    return np.asarray(np.sqrt(comm.allreduce((motions**2).sum(axis=1)))[:, None])
 
 
 def _sums_of_rows(K: PETSc.Mat) -> Array:
@@ -462,32 +489,31 @@ def supports(
     """
     V = r0.function_space
     is_in_middle = in_middle(body, V)
-    constraints: list[Constraint] = []
-    planes: list[Mirror] = []
-    named_supports: dict[str, Support] = {}
-    supports_on_planes: dict[str, Support] = {}
+    constraints, planes = list[Constraint](), list[Mirror]()
+    named_supports, supports_on_planes = dict[str, Support](), dict[str, Support]()
     for name, condition in conditions.items():
-        components = (
-            condition.components if isinstance(condition, HeldComponents) else ALL_COMPONENTS
-        )
         if condition in ("free", "symmetry"):
             continue
-        # clamped is the whole thickness; else the mid-surface alone, so that the edge can turn
-        nodes = None if condition == "clamped" else is_in_middle
+        # a plane: the face moves in it only
         if condition == "plane":
             planes.append(plane := plane_of(r0, body.faces[name], name))
             constraints.append(support_along(V, 2, body.faces[name], plane.normal))
-            # all components, as of a plane along no axis each has a part of the reaction
+            # the support has all components: the reaction of an oblique plane has each of them
             supports_on_planes[name] = Support.from_conditions(
                 held_on(V, 2, body.faces[name], ALL_COMPONENTS), kind="plane"
             )
             continue
+        # clamped or held components: of an edge, a patch or a point
+        components = (
+            condition.components if isinstance(condition, HeldComponents) else ALL_COMPONENTS
+        )
+        # clamped is the whole thickness; else the mid-surface alone, so that the edge can turn
+        nodes = None if condition == "clamped" else is_in_middle
         if name in body.faces:
             conditions_of_part = held_on(V, 2, body.faces[name], components, nodes)
-        elif name in body.patches:
-            conditions_of_part = held_on(  # a patch has the cells (dimension 3) of a solid
-                V, 3, np.flatnonzero(body.patches[name]).astype(np.int32), components, nodes
-            )
+        elif name in body.patches:  # it has cells (dimension 3) of the solid
+            cells_of_patch = np.flatnonzero(body.patches[name]).astype(np.int32)
+            conditions_of_part = held_on(V, 3, cells_of_patch, components, nodes)
         else:
             conditions_of_part = held_at_vertex(V, body.points[name], components)
         constraints += conditions_of_part

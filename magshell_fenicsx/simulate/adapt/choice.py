@@ -89,9 +89,9 @@ def equidistributed(
         (reduction / expected_ratio) ** (1 / order), 1 / LARGEST_CHANGE, LARGEST_CHANGE
     )
     change = 2 ** (np.round(STEPS * np.log2(change)) / STEPS)
-    return Sampled(centres, np.maximum([old(x) for x in centres] * change, least_ratio)), float(
-        np.mean(change**-2)
-    )
+    sizes = np.maximum([old(x) for x in centres] * change, least_ratio)
+    factor_of_cells = float(np.mean(change**-2))
+    return Sampled(centres, sizes), factor_of_cells
 
 
 def _smoothed(centres: Array, wish: Array) -> Array:

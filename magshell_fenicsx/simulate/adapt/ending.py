@@ -68,19 +68,15 @@ def carry(source: Scene, target: Scene, u: Vector) -> Vector:
         On every rank, if a node of `target` is more than a tenth of a cell outside all cells of its
         shell in `source`, or if one of several shells has no chart.
     """
-    fields, comm, nodes_in_chart, values = (
-        CellFields.of_scene(source),
-        target.comm,
-        _chart(target),
-        values_of_all_cells(source, u),
-    )
+    comm, fields = target.comm, CellFields.of_scene(source)
+    nodes_in_chart, values = _chart(target), values_of_all_cells(source, u)
     if nodes_in_chart.shape[1] > target.model.V.mesh.topology.dim:  # they are positions in space
         raise NotCarried("a mesh file has no chart")
-    # farthest: distance in cells and coordinates of the node that is farthest from all cells
-    transferred, farthest = np.zeros((len(nodes_in_chart), values.shape[2])), (0.0, list[float]())
-    owned_cells = source.model.V.mesh.topology.index_map(
-        source.model.V.mesh.topology.dim
-    ).size_local
+    transferred = np.zeros((len(nodes_in_chart), values.shape[2]))
+    # distance in cells and coordinates of the node that is farthest from all cells
+    farthest = 0.0, list[float]()
+    topology = source.model.V.mesh.topology
+    owned_cells = topology.index_map(topology.dim).size_local
     # each of several shells has its own chart
     for cells_here, nodes_of_shell in zip(
         cells_of_shells(source), nodes_of_shells(target), strict=True
@@ -88,21 +84,13 @@ def carry(source: Scene, target: Scene, u: Vector) -> Vector:
         is_source_cell = np.concatenate(
             source.model.system.comm.allgather(cells_here[:owned_cells])
         )
-        cells, reference_points, distances = fields.subset(is_source_cell).places(
-            nodes_in_chart[nodes_of_shell]
-        )
-        # numbers of cells in the subset become numbers among all cells
-        transferred[nodes_of_shell] = fields.evaluate(
-            values, np.flatnonzero(is_source_cell)[cells], reference_points
-        )
+        points = nodes_in_chart[nodes_of_shell]
+        cells_in_subset, xi, distances = fields.subset(is_source_cell).places(points)
+        cells = np.flatnonzero(is_source_cell)[cells_in_subset]  # numbers among all cells
+        transferred[nodes_of_shell] = fields.evaluate(values, cells, xi)
         if nodes_of_shell.any():
-            farthest = max(
-                farthest,
-                (
-                    float(distances.max()),
-                    nodes_in_chart[nodes_of_shell][np.argmax(distances)].tolist(),
-                ),
-            )
+            farthest_here = float(distances.max()), points[np.argmax(distances)].tolist()
+            farthest = max(farthest, farthest_here)
     largest_distance, place = max(comm.allgather(farthest))
     if largest_distance > MAX_DISTANCE_IN_CELLS:
         raise NotCarried(
@@ -143,11 +131,16 @@ class CellFields:
         (cells, nodes, 1 or 2), nodes of the map from the reference cell to the chart.
     element
         Lagrange element of this map.
+
+    Attributes
+    ----------
+    _tree_of_centres
+        Search tree of the cells' centres.
     """
 
     def __init__(self, nodes: Array, element: basix.finite_element.FiniteElement) -> None:
         self.nodes, self._element = nodes, element
-        self._near = scipy.spatial.cKDTree(self.centres)
+        self._tree_of_centres = scipy.spatial.cKDTree(self.centres)
 
     @classmethod
     def of_scene(cls, scene: Scene) -> "CellFields":
@@ -160,11 +153,10 @@ class CellFields:
             nodes = np.concatenate(scene.comm.allgather(own_nodes))
         else:
             chart_places = chart(scene)
-            # gathered as if it were a displacement, which may have more components
-            nodes = values_of_all_cells(
-                scene,
-                np.pad(chart_places, ((0, 0), (0, V.dofmap.bs - chart_places.shape[1]))).ravel(),
-            )[..., : chart_places.shape[1]]
+            # gathered like a displacement, with zeros for the components that the chart has not
+            count = chart_places.shape[1]
+            padded_places = np.pad(chart_places, ((0, 0), (0, V.dofmap.bs - count)))
+            nodes = values_of_all_cells(scene, padded_places.ravel())[..., :count]
         return cls(nodes, scene.model.V.element.basix_element)
 
     def subset(self, cells: NDArray[np.bool_]) -> "CellFields":
@@ -217,7 +209,7 @@ class CellFields:
             (n,), the distances from the cells, in cells; zero inside.
         """
         candidate_count = min(CANDIDATES, len(self.nodes))
-        candidates = self._near.query(x, candidate_count)[1].reshape(len(x), candidate_count)
+        candidates = self._nearest_cells(x, candidate_count)
         distances_if_straight = np.stack(
             [_distance_to_cell(self._as_if_straight(x, cells)) for cells in candidates.T]
         )
@@ -227,16 +219,14 @@ class CellFields:
         accepted_distance = INSIDE_TOLERANCE
         # a large cell may have a distant centre
         while len(far_points := np.flatnonzero(distances > accepted_distance)):
-            candidates = self._near.query(x[far_points], candidate_count)[1].reshape(
-                len(far_points), candidate_count
-            )
-            for cells_tried in candidates.T:
+            # one candidate of each far point after the other, the nearest centre first
+            for cells_tried in self._nearest_cells(x[far_points], candidate_count).T:
                 xi_tried, distances_tried = self._in_cells(x[far_points], cells_tried)
-                improved_points = far_points[distances_tried < distances[far_points]]
-                cells[improved_points], xi[improved_points], distances[improved_points] = (
-                    array[distances_tried < distances[far_points]]
-                    for array in (cells_tried, xi_tried, distances_tried)
-                )
+                is_nearer = distances_tried < distances[far_points]
+                improved_points = far_points[is_nearer]
+                cells[improved_points] = cells_tried[is_nearer]
+                xi[improved_points] = xi_tried[is_nearer]
+                distances[improved_points] = distances_tried[is_nearer]
             if candidate_count == len(self.nodes):
                 break
             # the wider search is for points that would be refused; on a curved edge others remain
@@ -245,6 +235,11 @@ class CellFields:
             )
             candidate_count = min(WIDER * candidate_count, len(self.nodes))
         return cells, xi, np.where(distances > INSIDE_TOLERANCE, distances, 0.0)
+
+    def _nearest_cells(self, x: Array, count: int) -> NDArray[np.int64]:
+        """Return (n, count), the cells whose centres are the nearest to points (n, 1 or 2)."""
+        _, cells = self._tree_of_centres.query(x, count)
+        return np.asarray(cells.reshape(len(x), count))
 
     def _in_cells(self, x: Array, cells: NDArray[np.int64]) -> tuple[Array, Array]:
         """Return positions of points in the reference cells of given cells, and distances.
@@ -261,22 +256,22 @@ class CellFields:
         """
         xi = self._as_if_straight(x, cells)
         distances = np.full(len(x), np.inf)
-        near_cells = np.flatnonzero(_distance_to_cell(xi) < NEAR_CELL_DISTANCE)
-        if not len(near_cells):
+        near_points = np.flatnonzero(_distance_to_cell(xi) < NEAR_CELL_DISTANCE)
+        if not len(near_points):
             return xi, distances
-        x, nodes, reference_points = x[near_cells], self.nodes[cells[near_cells]], xi[near_cells]
+        # from here on of these points and their cells alone
+        x, nodes = x[near_points], self.nodes[cells[near_points]]
+        reference_points = xi[near_points]
         for _ in range(NEWTON_STEPS):
             table = self.table(1, reference_points)  # [0]: values, [1:]: first derivatives
             residuals = x - np.einsum("np,npd->nd", table[0], nodes)
-            step = _solve(np.einsum("jnp,npd->ndj", table[1:], nodes), residuals)
+            derivatives_of_map = np.einsum("jnp,npd->ndj", table[1:], nodes)
+            step = _solve(derivatives_of_map, residuals)
             reference_points = reference_points + step
-        xi[near_cells], distances[near_cells] = (
-            reference_points,
-            np.where(
-                np.abs(step).max(axis=1) < INSIDE_TOLERANCE,  # the last step: it has converged
-                _distance_to_cell(reference_points),
-                np.inf,
-            ),
+        has_converged = np.abs(step).max(axis=1) < INSIDE_TOLERANCE  # by the last step
+        xi[near_points] = reference_points
+        distances[near_points] = np.where(
+            has_converged, _distance_to_cell(reference_points), np.inf
         )
         return xi, distances
 
@@ -436,11 +431,9 @@ class History:
             for record in self._departures(scene)
             if record.step == located_in_last_step[0].step
         ]
-        return _instability(
-            departures[0]
-            if departures
-            else located_in_last_step[-1 if until == "bifurcation" else 0]
-        )
+        if departures:
+            return _instability(departures[0])
+        return _instability(located_in_last_step[-1 if until == "bifurcation" else 0])
 
     @property
     def handed_over(self) -> bool:
@@ -496,9 +489,9 @@ def by_path(scene: Scene) -> Ending:
 
 
 def from_near(scene: Scene, source: Scene, neighbour: Ending) -> Ending:
-    """Return the end of a scene, by Newton's method from the end on another mesh, else by the path.
+    """Return the end of a scene, by Newton's method from the end on another mesh; collective.
 
-    Collective.
+    Where that fails, the whole path is computed.
 
     Parameters
     ----------
@@ -568,12 +561,8 @@ def _equilibrium(scene: Scene, guess: State, neighbour: Ending) -> Ending | None
     The equilibrium has the load of the end on the other mesh, or its conjugate displacement where
     this was held.
     """
-    newton, system, name, held_value = (
-        scene.newton,
-        scene.newton.system,
-        neighbour.name,
-        neighbour.held,
-    )
+    newton, system = scene.newton, scene.newton.system
+    name, held_value = neighbour.name, neighbour.held
     row: ConstraintRow = (
         PrescribedLoad(name, guess.mu[name])
         if held_value is None
@@ -595,12 +584,9 @@ def at_target(scene: Scene, record: Record) -> Ending:
     At the end of a branch, which has no target, the conjugate counts as held. With held conjugates
     of other amplitudes the end is of the kind "held".
     """
-    system, state, step = (
-        scene.newton.system,
-        record.point.state,
-        scene.problem.programme[record.step - 1].load,
-    )
-    target = step.target
+    system, state = scene.newton.system, record.point.state
+    load = scene.problem.programme[record.step - 1].load
+    target = load.target  # a pair: what it prescribes, and the value
     # a field that turns by an angle does its work through the component across
     name = "lambda_across" if record.amplitude == "angle" else record.amplitude
     by_conjugate = target is None or target[0].quantity == "conjugate"
@@ -610,7 +596,7 @@ def at_target(scene: Scene, record: Record) -> Ending:
         else None
     )
     kind: Literal["target", "held"] = (
-        "held" if any(law != "load" for law in step.hold.values()) else "target"
+        "held" if any(law != "load" for law in load.hold.values()) else "target"
     )
     return Ending(
         kind, name, _value(system, state, name, held_value), state, record.point.du, held_value

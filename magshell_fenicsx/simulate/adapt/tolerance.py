@@ -126,6 +126,23 @@ class _TangentEnergy:
         Its cells on all ranks.
     u
         Displacement about which strains are linearised, unknowns of this rank.
+
+    Attributes
+    ----------
+    _table, _weights
+        Shape functions with two derivatives at the quadrature points, and weights of these.
+    _a, _normal
+        Deformed tangent vectors a_i, and the deformed unit normal.
+    _raise
+        Inverse of the undeformed metric, which raises indices.
+    _strain
+        Membrane strain (metric - undeformed metric)/2.
+    _gamma
+        Christoffel symbols G^k_ij, with the indices i, j, k.
+    _law
+        The material at the points: membrane stress and bending energy.
+    _area
+        Undeformed area over that of the reference cell.
     """
 
     def __init__(self, scene: Scene, cells: CellFields, u: Vector) -> None:
@@ -134,42 +151,25 @@ class _TangentEnergy:
         # indices of arrays: n cells, q points, p nodes; i, j, k of the reference cell, c of space
         points, self._weights = basix.make_quadrature(basix.CellType.triangle, 2 * model.degree)
         self._table = cells.table(2, points)
-        r0 = self._derivatives(model.r0.x.array[: model.system.size])  # first and second ones
-        first_derivatives, second_derivatives = (
-            undeformed_part + displacement_part
-            for undeformed_part, displacement_part in zip(r0, self._derivatives(u), strict=True)
-        )
+        r0 = model.r0.x.array[: model.system.size]
+        # r,_i and r,_ij of the undeformed place, and of the deformed one
+        undeformed_tangents, undeformed_second = self._derivatives(r0)
+        u_1, u_2 = self._derivatives(u)
+        tangents, second_derivatives = undeformed_tangents + u_1, undeformed_second + u_2
         metric0, metric = (
-            np.einsum("...ic,...jc->...ij", undeformed_part, undeformed_part)
-            for undeformed_part in (r0[0], first_derivatives)
+            np.einsum("...ic,...jc->...ij", a, a) for a in (undeformed_tangents, tangents)
         )
-        normal = np.cross(first_derivatives[..., 0, :], first_derivatives[..., 1, :])
+        normal = np.cross(tangents[..., 0, :], tangents[..., 1, :])
         self._normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
-        # tangent vectors, the inverse metric that raises indices, and the membrane strain
-        self._a, self._raise, self._strain = (
-            first_derivatives,
-            np.linalg.inv(metric0),
-            (metric - metric0) / 2,
-        )
-        places = np.einsum(
-            "qp,npc->nqc",
-            self._table[0],
-            values_of_all_cells(scene, model.r0.x.array[: model.system.size]),
-        )
-        a1, a2 = r0[0][..., 0, :], r0[0][..., 1, :]
-        material_directions = None
-        if (material_field := getattr(model, "cell_materials", None)) is not None:
-            # four numbers of the material of each cell
-            directions_here = material_field.x.array.reshape(-1, 4)[
-                : material_field.function_space.dofmap.index_map.size_local
-            ]
-            material_directions = np.concatenate(scene.comm.allgather(directions_here))
-        self._law = scene.problem.material.law_in(material_directions).at_point(
-            places, a1, a2, np.cross(a1, a2)
-        )
-        self._gamma = np.einsum(
-            "...ijc,...kc->...ijk", second_derivatives, np.linalg.solve(metric, first_derivatives)
-        )
+        self._a, self._raise = tangents, np.linalg.inv(metric0)
+        self._strain = (metric - metric0) / 2
+        places = np.einsum("qp,npc->nqc", self._table[0], values_of_all_cells(scene, r0))
+        a1, a2 = undeformed_tangents[..., 0, :], undeformed_tangents[..., 1, :]
+        material = scene.problem.material.law_in(_materials_of_all_cells(scene))
+        self._law = material.at_point(places, a1, a2, np.cross(a1, a2))
+        # a^k, with a^k . a_i = 1 for i = k, else 0
+        dual_vectors = np.linalg.solve(metric, tangents)
+        self._gamma = np.einsum("...ijc,...kc->...ijk", second_derivatives, dual_vectors)
         self._area = np.sqrt(np.linalg.det(metric0))
 
     def __call__(self, v: Vector) -> Array:
@@ -187,7 +187,7 @@ class _TangentEnergy:
             "...ijk,...kc->...ijc", self._gamma, first_derivatives
         )
         K = np.einsum("...c,...ijc->...ij", self._normal, covariant_derivative)
-        E, K = ((S + np.swapaxes(S, -1, -2)) / 2 for S in (E, K))
+        E, K = ((S + np.swapaxes(S, -1, -2)) / 2 for S in (E, K))  # their symmetric parts
         # the derivative of the stress along E, by a complex step
         membrane_second_derivative = (
             work(law.stress(self._strain + 1j * STEP * E, self._raise), E).imag / STEP
@@ -212,6 +212,18 @@ class _TangentEnergy:
             axis=-3,
         )
         return np.stack([by_order[1], by_order[2]], axis=-2), second
+
+
+def _materials_of_all_cells(scene: Scene) -> Array | None:
+    """Return four numbers of the material of each cell of all ranks, (cells, 4); collective.
+
+    None where all cells have one material.
+    """
+    field = getattr(scene.model, "cell_materials", None)
+    if field is None:
+        return None
+    own_count = field.function_space.dofmap.index_map.size_local
+    return np.concatenate(scene.comm.allgather(field.x.array.reshape(-1, 4)[:own_count]))
 
 
 def adapted_solid(problem: Problem, comm: MPI.Comm, say: Say, doing: Say) -> Adapted:
@@ -485,11 +497,9 @@ def _remeshed(
     """
     scene, degree = coarse_solution[0], choice.degree
     order = 2 * degree - 2  # of convergence of an energy
-    if (
-        scene.problem.axisymmetric
-        or scene.problem.mesh_file
-        or isinstance(scene.problem.shape, Grid)
-    ):
+    problem = scene.problem
+    is_uniform = problem.axisymmetric or problem.mesh_file or isinstance(problem.shape, Grid)
+    if is_uniform:
         refinement_factor = np.clip(reduction, 1e-3, 1e3) ** (-1 / order)
         if reduction < 1 and not scene.problem.axisymmetric:
             refinement_factor = max(refinement_factor, LINES)
@@ -499,6 +509,7 @@ def _remeshed(
     if reduction > 1 and scene.cells <= MIN_CELLS_TO_COARSEN:
         return None
     centres, shares = indicators(coarse_solution, fine_solution)
+    # sizes of elements over the surface, and the expected ratio of the numbers of cells
     size, expected_ratio = equidistributed(
         scene.problem.size, centres, shares, order, reduction, scene.problem.material.h
     )

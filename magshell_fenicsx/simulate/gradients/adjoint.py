@@ -243,9 +243,10 @@ def adjoint_of_instability(
     phi_by_load = dot(  # phi . R_mu
         system.comm, fold.left_null_vector, system.load(fold.state.u, fold.state.mu, fold.name)
     )
-    left_null_vector = np.asarray(-fold.left_null_vector / phi_by_load)
-    rows = stage.device.rates(left_null_vector) if stage.device else {}
-    w = stage.device.displacement(left_null_vector) if stage.device else left_null_vector
+    # -phi/(phi . R_mu); with held conjugates it consists of w and multipliers of the rows
+    multipliers = np.asarray(-fold.left_null_vector / phi_by_load)
+    rows = stage.device.rates(multipliers) if stage.device else {}
+    w = stage.device.displacement(multipliers) if stage.device else multipliers
     place = AdjointState(stage.leave(fold.state), np.array(w), rows)
     gas = with_gas(held_at(scene, record, record.point.state))
     return with_begins(
@@ -257,8 +258,11 @@ def _of_wave(scene: Scene, record: Record) -> Adjoint:
     """Return the adjoint of the amplitude at which waves around a meridian are neutral; collective.
 
     Q(phi) is the second variation of the neutral wave phi, and dQ/dmu = Q_mu + w . R_mu its total
-    derivative along the path, with the solution w of K w = -Q_u. In dJ/dp = -(Q_p + w . R_p) /
-    (dQ/dmu) both the energy Q and the multiplier w so have the factor -1/(dQ/dmu).
+    derivative along the path, with the solution w of K w = -Q_u. The derivative of J is
+
+        dJ/dp = -(Q_p + w . R_p)/(dQ/dmu).
+
+    So in the adjoint the energy Q has the factor -1/(dQ/dmu), and w is multiplied by it.
 
     Raises
     ------
@@ -573,12 +577,13 @@ def _terms_of_held(
         If a conjugate at the place differs from that of the state before.
     """
     system, c, by_mu = scene.model.system, dict[str, float](), dict[str, float]()
-    for name, row in rows.items():
+    for name, multiplier in rows.items():
         law = step.load.hold[name]
         if isinstance(law, Gas):
             gas = enclosed_gas(scene, law.gas, state_before)
+            # derivatives of the gas's conjugate by conjugate and amplitude at the state before
             potential_factor, rate_by_amplitude = gas.by_begin(state.mu[name])
-            c[name], by_mu[name] = -row * potential_factor, row * rate_by_amplitude
+            c[name], by_mu[name] = -multiplier * potential_factor, multiplier * rate_by_amplitude
             continue
         # the equation is Pi_mu(state) - Pi_mu(state before) = 0, if the step holds this value
         potential = system.potential(state.u, state.mu, name)
@@ -589,7 +594,7 @@ def _terms_of_held(
                 f"{step.key}.hold.{name}: no gradient, as it is not held from the last point "
                 "before the step"
             )
-        c[name] = -row
+        c[name] = -multiplier
     return c, by_mu
 
 
@@ -611,7 +616,7 @@ def by_load(adjoint: Adjoint, name: str) -> float:
             continue
         u, mu = place.state.u, place.state.mu
         total += dot(system.comm, place.w, system.load(u, mu, name, constrained=False))
-        # without a factor c the potential, an integral, is not computed
+        # c Pi_mu; without c the potential, an integral, is not computed
         total += place.energy and place.energy * system.potential(u, mu, name)
         total += sum(
             factor_in_J * system.curvature(u, mu, i, name)
@@ -672,9 +677,8 @@ def solved(
         else None
     )
     extended_state = device.enter(state) if device else state
-    factors = (scene.newton.for_system(device) if device else scene.newton).factor_at(
-        extended_state
-    )
+    newton = scene.newton.for_system(device) if device else scene.newton
+    factors = newton.factor_at(extended_state)
     # J_x: dJ/du, and dJ/dmu of the unknown amplitudes
     by_unknowns = functional.by_u
     if device:
@@ -688,9 +692,10 @@ def solved(
     multipliers = (  # a symmetric K is its own transpose
         factors.solve_transposed(-by_unknowns) if factors.skewed else factors.solve(-by_unknowns)
     )
-    return np.array(device.displacement(multipliers) if device else multipliers), device.rates(
-        multipliers
-    ) if device else {}
+    # they consist of those of the residual and those of the rows
+    w = np.array(device.displacement(multipliers) if device else multipliers)
+    rows = device.rates(multipliers) if device else {}
+    return w, rows
 
 
 def mixed(scene: Scene, state: State, functional: Functional, name: str) -> float:

@@ -278,6 +278,8 @@ def _shares(adjoint: Adjoint, number: int, place: AdjointState, name: str) -> li
     scene, c, mu = adjoint.scene, place.conjugates, place.state.mu
     # whether the residual counts at this place, on any rank; c may add to w, see `_contracted`
     has_multipliers = scene.comm.allreduce(bool(place.w.any())) or any(c.values())
+    # a term of Pi is multiplied by its amplitude, if it has one: the factor. The derivative by this
+    # amplitude, which c multiplies, is the term without the factor
     terms_with_factors = [
         (term, factor_of(term.amplitude, mu)) for term in _terms(scene, place.state, name)
     ]
@@ -290,15 +292,16 @@ def _shares(adjoint: Adjoint, number: int, place: AdjointState, name: str) -> li
         for term, factor in terms_with_factors
     ]
     shares += _of_parameters(scene, place, name)
-    # a held load is a fixed multiple of its unit, which depends on the size of the shell
+    # a held conjugate is a fixed multiple of its unit, which depends on the size of the shell
     for held_amplitude in place.rows.keys() & scene.model.load_sizes.keys() - place.follows:
-        share = (
+        weight_of_size = (
             -c[held_amplitude]
             * scene.model.system.potential(place.state.u, mu, held_amplitude)
             / scene.model.load_size[held_amplitude]
         )
         shares += [
-            WeightedTerm(term, share, 0.0) for term in scene.model.size_terms(held_amplitude)
+            WeightedTerm(term, weight_of_size, 0.0)
+            for term in scene.model.size_terms(held_amplitude)
         ]
     if not number:  # energies that J itself contains are those at its own state, the first place
         shares += [
@@ -329,9 +332,10 @@ def _known_gradient(
         field.
     """
     factor = factor_of(term.amplitude, place.state.mu)
-    return term.by_field(
-        name, w, place.energy * factor + place.conjugates.get(term.amplitude or "", 0.0), factor
-    )
+    # the weights of the term's energy, and of its residual along w
+    energy_weight = place.energy * factor + place.conjugates.get(term.amplitude or "", 0.0)
+    residual_weight = factor
+    return term.by_field(name, w, energy_weight, residual_weight)
 
 
 def _transferred(adjoint: Adjoint, other: Scene) -> Adjoint:
@@ -442,8 +446,9 @@ def _basis_at(
 ) -> tuple[int, Array] | None:
     """Return the cell nearest to a place of the surface, with its basis functions' values there.
 
-    Places are projected on the plane of a cell's corners; a cell is the nearer, the less they lie
-    outside of its corners and off its plane. Collective: all ranks but the nearest one get None.
+    The place is projected on the plane of each cell's corners. The distance of a cell is the sum of
+    two lengths: how far the projection is outside of the corners, in cells, and how far the place
+    is off the plane. Collective: all ranks but the one with the nearest cell get None.
 
     Parameters
     ----------
@@ -463,25 +468,27 @@ def _basis_at(
     sides = np.stack(
         [corner_place - origin for corner_place in other_corners], axis=-1
     )  # (cells, components, dimension)
+    # coordinates of the projection along the sides, by least squares
     barycentric = np.einsum("cdi,ci->cd", np.linalg.pinv(sides), x - origin)
     distance_outside = np.maximum(  # in cells
         0.0, np.maximum(-barycentric.min(axis=1), barycentric.sum(axis=1) - 1)
     )
-    distances = distance_outside + np.linalg.norm(
-        np.einsum("cid,cd->ci", sides, barycentric) - (x - origin), axis=1
-    )
+    projected_offset = np.einsum("cid,cd->ci", sides, barycentric)
+    distance_off_plane = np.linalg.norm(projected_offset - (x - origin), axis=1)
+    distances = distance_outside + distance_off_plane
     least_of_ranks = comm.allgather(float(distances.min(initial=np.inf)))
     if comm.rank != int(np.argmin(least_of_ranks)):
         return None
     nearest = int(distances.argmin())
+    # the table is (derivative, point, basis function, component)
     return nearest, element.tabulate(0, barycentric[nearest][None])[0, 0, :, 0]
 
 
 def _contracted(scene: Scene, place: AdjointState) -> fem.Function:
     """Return the vector along which residuals are taken, with the motion of supports; collective.
 
-    It is w of the place. If mu_i moves supports, c_i dPi/dmu_i is the residual along the rate of
-    their motion, times c_i: this rate is added to w.
+    It is w of the place plus, for each amplitude mu_i that moves supports, c_i times the rate of
+    this motion. For such an amplitude dPi/dmu_i is the residual along that rate.
     """
     model, system = scene.model, scene.model.system
     direction = fem.Function(model.V)
@@ -598,9 +605,9 @@ def _perfect(scene: Scene, places: Array, normals: Array) -> tuple[Array, Array]
         normals_at_nodes = model.at_nodes(outward)[: len(normals)]
         normals = np.where(np.isfinite(normals_at_nodes), normals_at_nodes, normals)
     w0 = getattr(coordinates, "w0", None)
-    return places if w0 is None else places - model.at_nodes(w0)[
-        : len(places), :, None
-    ] * normals, normals
+    if w0 is not None:
+        places = places - model.at_nodes(w0)[: len(places), :, None] * normals
+    return places, normals
 
 
 FIELDS = {
@@ -622,12 +629,9 @@ def mass(scene: Scene) -> Adjoint:
 
     def thickness_ratio(scene_there: Scene) -> tuple[float, list[tuple[FormTerm, float]]]:
         """Return the ratio in a scene, and its terms with factors for derivatives by fields."""
-        thickness_factor, thickness_integral, log, u = (
-            scene_there.model.thickness,
-            scene_there.model.over_area(),
-            scene_there.model.kernels,
-            scene_there.model.u,
-        )
+        thickness_factor = scene_there.model.thickness
+        area_integral = scene_there.model.over_area()
+        log, u = scene_there.model.kernels, scene_there.model.u
         if thickness_factor is None:  # a uniform thickness is h
             return 1.0, []
         density_ratio = (
@@ -635,14 +639,12 @@ def mass(scene: Scene) -> Adjoint:
             if scene_there.model.cell_materials is None
             else scene_there.model.cell_materials[2]  # the density of each cell
         )
-        terms = (
-            # the field has one component, [0]
-            FormTerm("mass", thickness_integral(density_ratio * thickness_factor[0]), u, log),
-            FormTerm("area", thickness_integral(density_ratio * 1.0), u, log),
-        )
-        value, area = (scene.comm.allreduce(term.energy()) for term in terms)
-        # derivatives of the quotient by its numerator and its denominator
-        return value / area, [(terms[0], 1 / area), (terms[1], -value / area**2)]
+        # the mass, and the mass with the thickness h; the field has one component, [0]
+        numerator = FormTerm("mass", area_integral(density_ratio * thickness_factor[0]), u, log)
+        denominator = FormTerm("area", area_integral(density_ratio * 1.0), u, log)
+        a, b = (scene.comm.allreduce(term.energy()) for term in (numerator, denominator))
+        # the derivatives of a/b by a and by b
+        return a / b, [(numerator, 1 / b), (denominator, -a / b**2)]
 
     value, forms = thickness_ratio(scene)
     undisplaced = AdjointState(state, 0.0 * state.u)
@@ -681,19 +683,23 @@ def density(scene: Scene, gradient: FieldGradient) -> Array:
     )
     fem.assemble_vector(area.x.array, form)
     _added(area)
-    shares = np.einsum("cnk,nv->cvk", gradient.forces, hat.tabulate(0, nodes)[0, :, :, 0])
+    # indices: c cell, n node, v vertex of the cell, k component
+    hats_at_field_nodes = hat.tabulate(0, nodes)[0, :, :, 0]
+    # sum(f H_v), first over the nodes of each cell
+    sums_in_cells = np.einsum("cnk,nv->cvk", gradient.forces, hats_at_field_nodes)
     density_at_vertices = []
-    for forces_of_component in np.moveaxis(shares, -1, 0):
+    for sums_of_component in np.moveaxis(sums_in_cells, -1, 0):
         g = fem.Function(H)
-        np.add.at(g.x.array, H.dofmap.list[:count], forces_of_component)
+        # then over the cells at each vertex
+        np.add.at(g.x.array, H.dofmap.list[:count], sums_of_component)
         _added(g)
         # J is that of the whole shell, of which the model may be one of several equal parts
         density_at_vertices.append(g.x.array / area.x.array / scene.model.multiplicity)
     in_cells = np.stack(density_at_vertices, axis=-1)[H.dofmap.list[:count]]
     hats_at_nodes = hat.tabulate(0, V.element.basix_element.points)[0, :, :, 0]
     node_map = V.dofmap.index_map
-    values = np.zeros((node_map.size_local + node_map.num_ghosts, shares.shape[-1]))
-    # linear in each cell, so that nodes of two cells agree
+    values = np.zeros((node_map.size_local + node_map.num_ghosts, sums_in_cells.shape[-1]))
+    # from the vertices to the nodes; linear in each cell, so that two cells agree at their nodes
     values[V.dofmap.list[:count]] = np.einsum("nv,cvk->cnk", hats_at_nodes, in_cells)
     return values
 

@@ -122,6 +122,7 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
         first_place, contracted_sum = adjoint.places[0], 0.0
         # in reverse: `state` after the loop is that of the first place, the state of J
         for place in reversed(adjoint.places):
+            # the state in the scene at this value, with the loads there
             own_amplitudes = {  # results and unknowns, which p does not scale
                 *place.rows,
                 *adjoint.left_loads,
@@ -137,11 +138,11 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
             state = scene_at_value.model.system.with_moved_supports(state)
             if scene_at_value is not scene:
                 expand_contact(scene, scene_at_value, place.state)
-            contracted_sum += _residual_at(scene, scene_at_value, place, state) + (
-                0.0
-                if adjoint.by_itself and place is first_place
-                else _own_value(scene_at_value, place, state)
-            )
+            residual = _residual_at(scene, scene_at_value, place, state)
+            # at the first place `by_itself` gives J, if there is this function
+            is_by_itself = adjoint.by_itself and place is first_place
+            own_value = 0.0 if is_by_itself else _own_value(scene_at_value, place, state)
+            contracted_sum += residual + own_value
         if adjoint.by_itself:
             contracted_sum += adjoint.by_itself(scene_at_value, state)
         terms = [
@@ -159,10 +160,13 @@ def by_number(adjoint: Adjoint, key: str, others: dict[float, Scene] | None = No
 def _slope(f: Callable[[float], float], value: float, size: float) -> float:
     """Return df/dp at a value, by a difference between values that are allowed.
 
-    At fixed displacements the values may be far more curved in p than the derivative is large: a
-    natural stretch e changes the energy by about E h R^2 e^2, and the derivative may be 1e-4 of
-    that. Then the error of a difference of second order, by the third derivative, is too large. So
-    where three values are not nearly on a line, the difference is of fourth order.
+    A difference of second order, from one value at each side, is taken where three values are
+    nearly on a line. Otherwise the difference is of fourth order. Where values on one side are not
+    allowed, all are taken from the other side.
+
+    The reason is the error of a second-order difference, which goes as the third derivative. At
+    fixed displacements this may be large beside the derivative: a natural stretch e changes the
+    energy by about E h R^2 e^2, and the derivative may be 1e-4 of that.
 
     Parameters
     ----------
@@ -188,7 +192,8 @@ def _slope(f: Callable[[float], float], value: float, size: float) -> float:
 
     try:
         low, high = (value_at(value + node * step) for node in BOTH)
-        if abs(low - 2 * value_at(value) + high) <= STRAIGHT * abs(high - low):
+        is_straight = abs(low - 2 * value_at(value) + high) <= STRAIGHT * abs(high - low)
+        if is_straight:
             return difference(BOTH)
     except CaseError:  # a value that is not allowed; one side may be
         pass

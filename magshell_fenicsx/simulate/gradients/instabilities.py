@@ -102,8 +102,9 @@ def refuse_moving(scene: Scene, end: Record, result: str | Target) -> None:
     LostResult
         If the path ends at an instability, and the result is not its amplitude.
     """
-    # a target shape has no column
-    column = in_units(scene, end.point.state, result)[0] if isinstance(result, str) else ""
+    column = ""  # of a target shape
+    if isinstance(result, str):
+        column, _ = in_units(scene, end.point.state, result)  # the one without unit
     is_load = end.amplitude in FOLDS.values() and column in (
         end.amplitude,
         quantities.amplitude(end.amplitude).column,
@@ -168,19 +169,19 @@ def instabilities(
     ascending = sorted(
         located(on_path(scene, records), amplitude), key=lambda r: load(r, amplitude)
     )
-    by_name = list[tuple[str, Adjoint]]()
-    for record in [
+    near_lowest = [
         r for r in ascending if load(r, amplitude) <= MAX_LOAD_RATIO * load(ascending[0], amplitude)
-    ][:max_count]:
+    ]
+    by_name = list[tuple[str, Adjoint]]()
+    for record in near_lowest[:max_count]:
         name = record.mode or record.label
         try:
-            by_name.append(
-                (name, as_asked(adjoint_of_instability(scene, record, begins=begins), result))
-            )
+            adjoint = adjoint_of_instability(scene, record, begins=begins)
+            by_name.append((name, as_asked(adjoint, result)))
         except CaseError as e:  # a higher one without a gradient is left out
             if not by_name:
                 raise LostResult(str(e)) from None
     if not by_name:
         raise LostResult(f"the path has no instability in {amplitude}")
-    # again: the adjoint has the exact value, the record that of its point
+    # sorted again: an adjoint has the exact amplitude, a record that of a point near by
     return sorted(by_name, key=lambda each: abs(each[1].value))

@@ -95,9 +95,15 @@ def of_widths(
     domain = model.V.mesh
     vertices = fem.Function(fem.functionspace(domain, ("Lagrange", 1, (3,))), name="x")
     vertices.interpolate(lambda places: places)
-    jet, (volume, side) = kin.jet(vertices, domain), (ufl.CellVolume(domain), ufl.FacetArea(domain))
-    *_, length = kin.conormal(jet, kin.facet_covector(domain))  # ratio of lengths of an edge
-    moved_measures = {volume: volume * kin.area_ratio(jet), side: side * length}
+    jet = kin.jet(vertices, domain)
+    # area of a cell and length of an edge: each is replaced by itself times its ratio as a function
+    # of the vertices, which is 1 where they are now
+    cell_area, edge_length = ufl.CellVolume(domain), ufl.FacetArea(domain)
+    *_, length_ratio = kin.conormal(jet, kin.facet_covector(domain))
+    moved_measures = {
+        cell_area: cell_area * kin.area_ratio(jet),
+        edge_length: edge_length * length_ratio,
+    }
     widened_terms = list[WeightedTerm]()
     for share in shares:
         form = share.term.form
@@ -129,7 +135,7 @@ def of_normals(adjoint: Adjoint, place: AdjointState, *, first: bool) -> Array |
     model, mu, conjugates = adjoint.scene.model, place.state.mu, place.conjugates
     if not model.midsurface:  # on the axis of a meridian they stay
         return 0.0
-    # point, and the weights of the deflections of u and of w there
+    # name of a point, weight of u . n there, and weight of w . n there
     deflected_points = (
         [(point, factor, 0.0) for point, factor in adjoint.deflections.items()] if first else []
     )
@@ -143,12 +149,9 @@ def of_normals(adjoint: Adjoint, place: AdjointState, *, first: bool) -> Array |
         displacement = weight_of_u * model.displacement(
             place.state.u, point
         ) + weight_of_w * model.displacement(place.w, point)
-        location = (
-            model.midsurface.points[point],
-            displacement,
-            model.midsurface.cells_of_point(point),
-        )
-        gradient = gradient + by_vertex_normal(model.r0, *location)
+        vertex, cells = model.midsurface.points[point], model.midsurface.cells_of_point(point)
+        # by the placement, of displacement . n at this vertex
+        gradient = gradient + by_vertex_normal(model.r0, vertex, displacement, cells)
     return gradient
 
 
@@ -181,10 +184,8 @@ def rates(
     placement = fem.Function(broken_space(V))  # each cell has nodes of its own
     nodes = placement.x.array.reshape(-1, V.dofmap.bs)  # a view
     coordinates = model.r0.x.array.reshape(-1, V.dofmap.bs)[V.dofmap.list]
-    node_dofs, dofs = (
-        placement.function_space.dofmap.list,
-        field.function_space.dofmap.list[: len(normals)],
-    )
+    node_dofs = placement.function_space.dofmap.list
+    field_dofs = field.function_space.dofmap.list[: len(normals)]
     for node_number in range(coordinates.shape[1]):
         values = list[Array]()
         # central difference, in cells that share no nodes
@@ -194,8 +195,9 @@ def rates(
                 sign * step * normals[:, node_number][:, model.axes]
             )
             nodes[node_dofs] = moved_coordinates
+            moved_field = field.rebuild(placement)
             values.append(
-                field.rebuild(placement).x.array.reshape(-1, field.function_space.dofmap.bs)[dofs]
+                moved_field.x.array.reshape(-1, field.function_space.dofmap.bs)[field_dofs]
             )
         forward, backward = values
         yield np.asarray((forward - backward) / (2 * step))

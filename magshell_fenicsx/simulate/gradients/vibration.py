@@ -151,9 +151,10 @@ def vibrations(
         raise LostResult(
             f"{result}: a sector has the modes of its own planes alone: take symmetry: half or none"
         )
-    number = int(result.partition("_")[2])
+    number = int(result.partition("_")[2])  # of the first vibration that is asked for
+    # modes are computed again with one more, until the last group is certain to be complete
     count = number + max_count
-    while True:  # with more and more modes, until the last group has none beyond them
+    while True:
         count += 1
         try:
             modes = ShellModes(scene.model).vibrations(
@@ -163,15 +164,16 @@ def vibrations(
             raise LostResult(f"no frequencies here: {e}") from None
         if number > len(modes):
             raise LostResult(f"the model has {len(modes)} vibrations")
+        # the group with that number, and higher ones
         groups = [group for group in _groups(modes) if group.numbers[-1] >= number]
-        groups_near_lowest = [
+        groups_within_ratio = [
             group
             for group in groups
             if group.value <= max(max_ratio, 1 + DEGENERACY_TOLERANCE) * groups[0].value
         ][:max_count]
-        # the last group is complete: a higher mode is not in it, or the model has no more modes
-        if groups_near_lowest[-1].numbers[-1] < len(modes) or len(modes) < count:
-            return groups_near_lowest
+        # complete: the highest mode is not in the last group, or the model has no more modes
+        if groups_within_ratio[-1].numbers[-1] < len(modes) or len(modes) < count:
+            return groups_within_ratio
 
 
 def _groups(modes: Sequence[ShellMode]) -> list[Vibration]:
@@ -388,11 +390,9 @@ def _slopes(
         raise CaseError(
             f"{mode.label}: the vibration leaves the symmetry of the model: take symmetry: none"
         )
-    step, by_u, by_mu = (
-        system.step_along(phi, largest_step),
-        np.zeros(system.size),
-        dict.fromkeys(held_names, 0.0),
-    )
+    step = system.step_along(phi, largest_step)
+    by_u, by_mu = np.zeros(system.size), dict.fromkeys(held_names, 0.0)
+    # a state at each multiple (offset) of the step, and its weight in the difference quotient
     for offset, weight in DIFFERENCE_WEIGHTS.items():
         u, difference_factor = state.u + offset * step * phi, weight / step
         K = symmetric_part(system.tangent(u, state.mu))

@@ -110,9 +110,9 @@ def turns(context: Context, turn: float = 0.0) -> tuple[RigidMotion, ...]:
             end = step.load.to.vector(turn)
             axis = np.cross(start, end)
             angle = acos(float(start @ end))
-            rotations.append(
-                RigidMotion(turn_name(step), zero, angle * axis / np.linalg.norm(axis), zero)
-            )
+            rotation_vector = angle * axis / np.linalg.norm(axis)
+            # no shift, about the origin
+            rotations.append(RigidMotion(turn_name(step), zero, rotation_vector, zero))
             start = end
     return tuple(rotations)
 
@@ -190,12 +190,8 @@ def _moving_source(
     Q
         Rotation (3, 3) from the frame of the case to that of the model.
     """
-    spins, moves, factors, zero = (
-        list[RigidMotion](),
-        list[RigidMotion](),
-        dict[str, float](),
-        np.zeros(3),
-    )
+    spins, moves, factors = list[RigidMotion](), list[RigidMotion](), dict[str, float]()
+    zero = np.zeros(3)
     rotation_of = {motion.name: motion for motion in rotations}
     loads = {step.name: step.load for step in steps if isinstance(step.load, SourceStep)}
     steps_of_source = {
@@ -206,7 +202,8 @@ def _moving_source(
             moves.append(rotation_of[turn_name(step)])
         if step.name not in steps_of_source:
             continue
-        steps_of_source.remove(step.name)  # later steps of one amplitude go on with the same motion
+        # later steps of the same amplitude continue this motion, which is added once
+        steps_of_source.remove(step.name)
         load, name = loads[step.name], step.name
         if load.turn:
             axis = np.array(load.turn.axis) / np.linalg.norm(load.turn.axis)
@@ -215,13 +212,15 @@ def _moving_source(
             )
         elif load.strength is not None:
             factors[name] = load.strength - 1  # the change of the factor, from one
+        elif load.move:
+            shift = np.array(load.move) / source.length
+            moves.append(RigidMotion(name, Q @ shift, zero, zero))
         else:
-            end = np.array(load.move or load.to) / source.length
-            # where all motions before this step have taken the source
-            begin = apply_motions(
-                moves, dict.fromkeys((m.name for m in moves), 1.0), source.position[None]
-            ).x[0]
-            moves.append(RigidMotion(name, Q @ end - (begin if load.to else zero), zero, zero))
+            # from where all motions before this step have taken the source, in full
+            full_motions = dict.fromkeys((motion.name for motion in moves), 1.0)
+            begin = apply_motions(moves, full_motions, source.position[None]).x[0]
+            end = np.array(load.to) / source.length
+            moves.append(RigidMotion(name, Q @ end - begin, zero, zero))
     return MovingField(source, [*spins, *moves], factors)
 
 
@@ -239,9 +238,14 @@ def values(context: Context) -> list[Callable[[Array], Array]]:
     mus += [{**mus[0], name: mu} for name in names for mu in (HALFWAY, 1.0)]
 
     def field_at(mu: dict[str, float]) -> Callable[[Array], Array]:
-        return lambda x: np.asarray(
-            field_at_rest(x)[0]
-            + sum((field.field_at(x, mu).value[0] for field in moving_fields), np.zeros(3))
-        )
+        """Return the function of places that gives B for amplitudes mu."""
+
+        def B_at(x: Array) -> Array:
+            # [0]: B without its derivatives
+            B = field_at_rest(x)[0]
+            moving = (field.field_at(x, mu).value[0] for field in moving_fields)
+            return np.asarray(B + sum(moving, np.zeros(3)))
+
+        return B_at
 
     return [field_at(mu) for mu in mus]

@@ -67,18 +67,18 @@ class GridSection(FileKeys, SourceSection):
             """Return B at places x (n, 3) with its first and second derivatives."""
 
             def derivative(*axes_of_derivative: int) -> Array:
-                """Return B (n, 3), differentiated once for each number of an axis given."""
-                return np.asarray(
-                    spline(x, nu=np.bincount(axes_of_derivative, minlength=3))
-                    if axes_of_derivative
-                    else spline(x)
-                )
+                """Return dB (n, 3) by one or more places; their axes are given by number."""
+                orders = np.bincount(axes_of_derivative, minlength=3)  # along each axis
+                return np.asarray(spline(x, nu=orders))
 
-            B, G = derivative(), np.stack([derivative(j) for j in range(3)], axis=-1)
+            B = np.asarray(spline(x))
+            G = np.stack([derivative(j) for j in range(3)], axis=-1)
             H = np.empty((len(x), 3, 3, 3))
             # second derivatives are symmetric in the last two axes
             for j, k in combinations_with_replacement(range(3), 2):
-                H[:, :, j, k] = H[:, :, k, j] = derivative(j, k)
+                second_derivative = derivative(j, k)
+                H[:, :, j, k] = second_derivative
+                H[:, :, k, j] = second_derivative
             return B, G, H
 
         low, high = (np.array([axis[end] for axis in axes]) for end in (0, -1))
@@ -133,11 +133,11 @@ def _gridded(x: Array, B: Array) -> tuple[list[Array], Array]:
         raise TableError(
             f"has {' x '.join(map(str, shape))} places: a cubic spline needs four along each axis"
         )
+    # nan where no row has its place; scattered places have far more nodes of a grid than rows
     values_on_grid = np.full((len(x), 3), np.nan)
-    # rows without a node of their own leave nan at others
-    if len(x) == prod(shape):  # scattered places have far more places along the axes than rows
-        grid_numbers = tuple(_nearest(axis, x[:, i]) for i, axis in enumerate(axes))
+    if len(x) == prod(shape):
         # each row goes to the node of the grid nearest to its place
+        grid_numbers = tuple(_nearest(axis, x[:, i]) for i, axis in enumerate(axes))
         values_on_grid[np.ravel_multi_index(grid_numbers, shape)] = B
     if not np.isfinite(values_on_grid).all():
         raise TableError(
@@ -161,8 +161,8 @@ def _table_rows(file: Path, files: Files) -> tuple[Array, Array]:
             f"has no column {', '.join(missing)}; needed are {', '.join((*PLACES, *FIELD))}"
         )
     axes = [columns[name] for name in PLACES]
-    on_axes = file.suffix == ".npz" and columns["Bx"].ndim == 3 and {a.ndim for a in axes} == {1}
     # .npz arrays may hold the places along each axis alone, and B on the whole grid
+    on_axes = file.suffix == ".npz" and columns["Bx"].ndim == 3 and {a.ndim for a in axes} == {1}
     if on_axes and columns["Bx"].size == prod(a.size for a in axes):
         columns |= dict(zip(PLACES, np.meshgrid(*axes, indexing="ij"), strict=True))
     rows = [columns[name].ravel() * _size(units[name], name) for name in (*PLACES, *FIELD)]

@@ -82,16 +82,16 @@ class SourceSection(Section):
     @property
     def axes(self) -> Array:
         """Axes of the source as columns (3, 3), in the frame of the case."""
+        # sines and cosines of the three angles
         (sp, cp), (sa, ca), (ss, cs) = (
             (np.sin(t), np.cos(t))
             for t in np.radians([self.axis.polar, self.axis.azimuth, self.spin])
         )
         # rotations by spin about z, then by polar about y, then by azimuth about z
-        about_z = np.array([[ca, -sa, 0.0], [sa, ca, 0.0], [0.0, 0.0, 1.0]])
-        about_y = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
-        return np.asarray(
-            about_z @ about_y @ np.array([[cs, -ss, 0.0], [ss, cs, 0.0], [0.0, 0.0, 1.0]])
-        )
+        by_spin = np.array([[cs, -ss, 0.0], [ss, cs, 0.0], [0.0, 0.0, 1.0]])
+        by_polar = np.array([[cp, 0.0, sp], [0.0, 1.0, 0.0], [-sp, 0.0, cp]])
+        by_azimuth = np.array([[ca, -sa, 0.0], [sa, ca, 0.0], [0.0, 0.0, 1.0]])
+        return np.asarray(by_azimuth @ by_polar @ by_spin)
 
     def words(self) -> str:
         """Return the source in words, for the account of what is built."""
@@ -167,10 +167,9 @@ def to_box(outside_by: Array) -> Array:
     `outside_by` (n, m) is how far places are beyond the faces in each direction, negative within
     them.
     """
-    return np.asarray(
-        np.linalg.norm(np.maximum(outside_by, 0.0), axis=1)
-        + np.minimum(outside_by.max(axis=1), 0.0)
-    )
+    distance_outside = np.linalg.norm(np.maximum(outside_by, 0.0), axis=1)
+    minus_depth_inside = np.minimum(outside_by.max(axis=1), 0.0)
+    return np.asarray(distance_outside + minus_depth_inside)
 
 
 @dataclass(frozen=True)
@@ -309,9 +308,10 @@ class Harmonic:
 def stencil() -> tuple[Array, Array, Array]:
     """Return the points of `Harmonic` and the weights that give derivatives of values there.
 
-    Values of B at the points and its derivatives at 0 are known for gradients of harmonic
-    polynomials. All of these of degree l are sums of the powers (a . x)^l of null vectors a. So the
-    weights are those that are right for these powers up to `DEGREE`, of least squares.
+    B is the gradient of a harmonic function. The harmonic polynomials of degree l are sums of
+    powers (a . x)^l, where a are null vectors: a . a = 0. So weights that are exact for the
+    gradients of these powers, up to the degree `DEGREE`, are exact for all such polynomials. Of
+    these weights the least ones are taken.
 
     Returns
     -------
@@ -325,10 +325,11 @@ def stencil() -> tuple[Array, Array, Array]:
         np.array([*product((-1.0, 1.0), repeat=3)]) / np.sqrt(3),
     )
     points = np.vstack([np.zeros((1, 3)), axes, diagonals])
+    # for the gradient of each power: its values at the points, and its derivatives at 0
     values, first, second = list[Array](), list[Array](), list[Array]()
     for degree in range(1, DEGREE + 1):
+        # 2 l + 1 null vectors, as many as there are harmonic polynomials
         for t in 2 * np.pi * np.arange(2 * degree + 1) / (2 * degree + 1):
-            # null vector: a . a = 0, so that powers of a . x are harmonic
             a = np.array([np.cos(t), np.sin(t), 1j])
             # the gradient is l (a . x)^(l - 1) a; points with a . x = 0 make 0^0 a case of its own
             power = np.ones(len(points)) if degree == 1 else (points @ a) ** (degree - 1)
