@@ -372,6 +372,7 @@ def _magnetic_vectors(magnetic: MagneticSection, context: Context) -> _MagneticV
     if applied.has_field_beside_sources and not formulas and strength(context):
         vectors.append(applied.vector())
     remanent = remanent or RemanentSection.model_construct()
+    assert not isinstance(remanent.components, UserField)  # has no symmetry, see the caller
     patterns = {
         name: remanence
         for name, remanence in zip(remanent.patches or {}, remanences, strict=False)
