@@ -207,7 +207,7 @@ def random_places(
     z_bounds = cos(radians(polar[1])), cos(radians(polar[0]))
     max_cosine = cos(radians(distance))
     for _ in range(MAX_STARTS):
-        places = np.empty((0, 3))
+        places: Array = np.empty((0, 3))
         for _ in range(count):
             place = _place_with_room(rng, places, z_bounds, max_cosine)
             if place is None:

@@ -137,7 +137,9 @@ def _in_units(rows: Sequence[Row], load: str) -> tuple[list[Row], str]:
     # the column of the load in units if the rows have it, else the one without
     column_names = {name for row in rows for name in row}
     load_quantity = shown_quantity(amplitude(load).column, column_names)
-    rows_in_units = [{**row, "load": row.get(load_quantity.name, row["load"])} for row in rows]
+    rows_in_units: list[Row] = [
+        {**row, "load": row.get(load_quantity.name, row["load"])} for row in rows
+    ]
     return rows_in_units, load_quantity.label
 
 

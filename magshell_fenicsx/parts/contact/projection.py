@@ -461,10 +461,16 @@ def nearest_places(
     )
     # the first `count` rows have results
     X, free_directions, distance, direction = (array[:count] for array in floats)
-    point, pair, is_above = point[:count], pair[:count], is_above[:count]
     side = np.zeros(count, dtype=np.int64)
-    return pair, Projections(
-        point, cell[pair], X, free_directions, distance, side, direction, is_above
+    return pair[:count], Projections(
+        point[:count],
+        cell[pair[:count]],
+        X,
+        free_directions,
+        distance,
+        side,
+        direction,
+        is_above[:count],
     )
 
 

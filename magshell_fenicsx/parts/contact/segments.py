@@ -532,7 +532,7 @@ class Segments:
             np.einsum("na,nai->ni", third_side, corners[:, 1:] - corners[:, :1]), axis=1
         )
         rounded_share = np.exp2(np.round(np.log2(self._corner_offset / side_length)))
-        return np.minimum(rounded_share, 1 / 64)
+        return np.asarray(np.minimum(rounded_share, 1 / 64))
 
     def _points_by_rule(
         self, triangles: Triangles, X: Array, weights: Array, divisions: int

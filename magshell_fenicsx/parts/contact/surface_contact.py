@@ -600,7 +600,7 @@ class SurfaceContact(ContactTerm):
         closing_of_places = -np.einsum("nki,nki->n", slopes, motion[nodes])
         closing = np.bincount(
             joined_places.group, joined_places.weight * closing_of_places, len(joined_places.first)
-        )
+        ).astype(np.float64)
         return SampleRates.sum_over_points(
             count=len(self._points.weight),
             point=places.point[joined_places.first],

@@ -162,7 +162,7 @@ class Natural:
         of stretch and curvature are the same, and are taken from the first group.
         """
         groups = (getattr(value, "formulas", None) for value in (self.stretch, self.curvature))
-        known_groups = [group for group in groups if group]
+        known_groups: list[FormulaGroup] = [group for group in groups if group]
         if not known_groups:
             return None
         functions = [f for group in known_groups for f in group.functions]

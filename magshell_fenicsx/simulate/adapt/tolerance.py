@@ -223,7 +223,8 @@ def _materials_of_all_cells(scene: Scene) -> Array | None:
     if field is None:
         return None
     own_count = field.function_space.dofmap.index_map.size_local
-    return np.concatenate(scene.comm.allgather(field.x.array.reshape(-1, 4)[:own_count]))
+    own_materials = field.x.array.reshape(-1, 4)[:own_count]
+    return np.asarray(np.concatenate(scene.comm.allgather(own_materials)))
 
 
 def adapted_solid(problem: Problem, comm: MPI.Comm, say: Say, doing: Say) -> Adapted:
