@@ -610,8 +610,8 @@ def _displacement(line: Line, pole: str, lines: Sequence[Line]) -> Markup:
     if force_axes and varied_amplitude.column != "force":
         return Markup("{}, {}").format(_amount(force_axes[0], line, lines), at_pole)
     # at the load, if that is not at the pole
-    is_elsewhere = line["w_over_h"] != line["w_pole_over_h"]
-    if varied_amplitude.conjugate == "w_over_h" and is_elsewhere:
+    is_at_load = varied_amplitude.conjugate == "w_over_h"
+    if is_at_load and line["w_over_h"] != line["w_pole_over_h"]:
         return Markup("{} {}").format(
             _amount(shown_quantity("w_over_h", line), line, lines), varied_amplitude.place
         )

@@ -255,9 +255,10 @@ def put_in_plane(r0: fem.Function, facets: NDArray[np.int32]) -> None:
     # their plane: its normal is the axis of the smallest extent
     centre = vertices.mean(axis=0)
     _, spread, axes = np.linalg.svd(vertices - centre, full_matrices=False)
+    if spread[1] <= PLANARITY_TOLERANCE * spread[0]:  # vertices on a straight line
+        return
     normal = axes[2]
-    is_straight = spread[1] <= PLANARITY_TOLERANCE * spread[0]
-    if is_straight or np.ptp(vertices @ normal) > PLANARITY_TOLERANCE:
+    if np.ptp(vertices @ normal) > PLANARITY_TOLERANCE:
         return
     # the nodes of the edge, moved along the normal
     dofs, x = fem.locate_dofs_topological(V, 1, facets), r0.x.array.reshape(-1, 3)
