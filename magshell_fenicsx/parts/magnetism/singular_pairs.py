@@ -180,7 +180,6 @@ class SingularPairs:
                 if c in own_cells or d in own_cells:
                     for kind in self._kinds_of_pair(c, d):
                         pairs_of_kinds.setdefault(kind, []).append((c, d))
-        self._largest_charge = 0.0
         self._batches = list(self._charged_batches(pairs_of_kinds))
 
     def add(self, nodes: Array, gradient: Array, stiffness: Stiffness | None = None) -> float:
