@@ -4,6 +4,7 @@ import csv
 import gc
 import inspect
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -37,6 +38,11 @@ def magshell(*arguments: str | Path | float, ranks: int = 0) -> subprocess.Compl
     if done.exception and not isinstance(done.exception, SystemExit):
         raise done.exception
     return subprocess.CompletedProcess(words, done.exit_code, done.stdout, done.stderr)
+
+
+def importing_environment() -> dict[str, str]:
+    """Return the environment of a Python process that imports what this one can."""
+    return {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
 
 
 def mpirun(ranks: int) -> list[str]:

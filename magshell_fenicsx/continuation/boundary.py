@@ -282,10 +282,10 @@ class Boundary:
             )
             for i in changed_families
         }
-        found = [(i, point) for i, point in located.items() if point]
+        events = [(i, point) for i, point in located.items() if point]
         # in the order of p, with the counts just before each point
         counts = [low.unstable_of(i) for i in families]
-        for i, point in sorted(found, key=lambda entry: abs(entry[1].p - low.p)):
+        for i, point in sorted(events, key=lambda event: abs(event[1].p - low.p)):
             if i == self.m == 0:  # a mode of the model, on a boundary of the model
                 yield "meeting", replace(point, met=i)
             else:

@@ -508,8 +508,8 @@ def _named_vertices(
         distance = np.linalg.norm(corners[:, :3] - x[:3], axis=1)
         nearest = corners[np.argmin(distance)]
         if distance.min() > POINT_TOLERANCE * np.ptp(corners[:, :3], axis=0).max():
-            here, there = np.asarray(x[:3] / scale), np.asarray(nearest[:3] / scale)
-            text, nearest_text = distinguishable_texts(here, there)
+            place, nearest_place = np.asarray(x[:3] / scale), np.asarray(nearest[:3] / scale)
+            text, nearest_text = distinguishable_texts(place, nearest_place)
             raise MeshError(
                 f"points.{name}: ({text}) in the file's coordinates is no vertex of the mesh; "
                 f"the nearest is ({nearest_text})"

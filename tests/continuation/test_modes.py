@@ -1,12 +1,11 @@
 """The eigenpair nearest to zero, and the lowest ones, of matrices whose spectra are known."""
 
-import os
 import subprocess
 import sys
 
 import numpy as np
 import pytest
-from command import mpirun
+from command import importing_environment, mpirun
 from mpi4py import MPI
 from petsc4py import PETSc
 from toys import matrix, pitchfork, snap_through
@@ -181,7 +180,7 @@ def shared() -> None:
 @pytest.mark.slow
 def test_same_on_any_number_of_ranks() -> None:
     """Value and vector, but for its sign, though the start depends on the rows of each rank."""
-    found, env = [], {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    found, env = [], importing_environment()
     for ranks in (1, 2):
         command = [*mpirun(ranks), sys.executable, __file__]
         done = subprocess.run(command, capture_output=True, text=True, check=False, env=env)

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from command import magshell
+from command import importing_environment, magshell
 
 import magshell_fenicsx as ms
 from magshell_fenicsx.case.planner import make_problem
@@ -157,7 +157,7 @@ def test_files_that_are_refused(tmp_path: Path) -> None:
     """Each by one message of a user's error; VTK prints nothing beside it."""
     for name, make in MADE.items():
         make(tmp_path / name)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment = importing_environment()
     command = [sys.executable, __file__, str(tmp_path)]
     done = subprocess.run(
         command, capture_output=True, text=True, check=False, timeout=200, env=environment

@@ -1,6 +1,5 @@
 """An error of rank 0 is one of all ranks: none waits for a rank that has left."""
 
-import os
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
@@ -10,6 +9,7 @@ from typing import Any
 from unittest.mock import patch
 
 import pytest
+from command import importing_environment
 from conftest import CASES
 from many import sweep
 from mpi4py import MPI
@@ -133,7 +133,7 @@ OF_SCENES = (reads, meshes)
 def test_every_rank_gets_what_the_first_does(asked: str, tmp_path: Path) -> None:
     """Where a rank would wait for ever, a timeout ends the test."""
     launcher = ["mpirun", "--map-by", ":OVERSUBSCRIBE", "-n", "2", sys.executable]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment = importing_environment()
     done = subprocess.run(
         [*launcher, __file__, asked, str(tmp_path)],
         capture_output=True,

@@ -35,6 +35,7 @@ from magshell_fenicsx.parts.contact.projection import (
     ProjectionLimits,
     Projections,
     UndeformedPairs,
+    have_farther_places,
     jets,
     near_spheres,
     nearest_places,
@@ -233,14 +234,14 @@ class ClosestPointSearch:
             )
             pairs = chunk[has_shrunk.any(axis=(1, 2))]
             # all nodes of the cells of the other pairs: whether two are close now, and were apart
-            own, other = i[pairs], j[pairs]
-            own_nodes, other_nodes = nodes[own, :, None], nodes[other, None, :]
-            margin = spacing * (radii[own] + radii[other])[:, None, None]
-            is_close = _distances_of_nodes(r, own_nodes, other_nodes) < reach + margin
-            margin = spacing * (undeformed_radii[own] + undeformed_radii[other])[:, None, None]
-            thickness = self.half_thickness[own_nodes] + self.half_thickness[other_nodes]
+            first, second = i[pairs], j[pairs]
+            first_nodes, second_nodes = nodes[first, :, None], nodes[second, None, :]
+            margin = spacing * (radii[first] + radii[second])[:, None, None]
+            is_close = _distances_of_nodes(r, first_nodes, second_nodes) < reach + margin
+            margin = spacing * (undeformed_radii[first] + undeformed_radii[second])[:, None, None]
+            thickness = self.half_thickness[first_nodes] + self.half_thickness[second_nodes]
             least_separation = SELF_CONTACT_DISTANCE * thickness - margin
-            was_apart = _distances_of_nodes(self._r0, own_nodes, other_nodes) > least_separation
+            was_apart = _distances_of_nodes(self._r0, first_nodes, second_nodes) > least_separation
             is_folded[pairs] = (is_close & was_apart).any(axis=(1, 2))
         return is_folded
 
@@ -499,8 +500,10 @@ class ClosestPointSearch:
         one by `JoinedPlaces`. The result is in the order of points, directions and distances.
         """
         # in the order of points, then of cells, so that a point's place in a cell can be looked up
-        keys = places.point * len(self._cells.nodes) + places.cell
-        places = places.select(np.argsort(keys, kind="stable"))
+        cell_count = len(self._cells.nodes)
+        keys = places.point * cell_count + places.cell
+        order = np.argsort(keys, kind="stable")
+        places, keys = places.select(order), keys[order]
         # a place on a side counts unless the surface goes on across the side to a nearer one;
         # barycentric coordinate k is zero on side k
         on_sides = np.column_stack([1 - places.X.sum(axis=1), places.X]) == 0.0
@@ -508,7 +511,17 @@ class ClosestPointSearch:
         for side in range(3):
             neighbour = self._cells.neighbours[places.cell, side]
             is_on_side = on_sides[:, side] & (neighbour >= 0)
-            is_nearest &= ~is_on_side | self._are_nearest_across(points, places, neighbour)
+            is_no_nearer_across = have_farther_places(
+                keys,
+                places.point * cell_count + neighbour,
+                places.distance,
+                DISTANCE_TOLERANCE * self._h,
+            )
+            # or the surface is folded at the side: the neighbour is material around the point,
+            # which is not searched
+            key_of_cells = points.cell[places.point] * cell_count + neighbour
+            is_folded = places.is_above & self._are_near_in_surface(key_of_cells)
+            is_nearest &= ~is_on_side | is_no_nearer_across | is_folded
         places = places.select(is_nearest)
         if not len(places.point):
             return places
@@ -517,33 +530,6 @@ class ClosestPointSearch:
         first = places.firsts
         least_distance = np.repeat(places.distance[first], np.diff([*first, len(places.point)]))
         return places.select(places.distance < least_distance + DISTANCE_TOLERANCE * self._h)
-
-    def _are_nearest_across(
-        self, points: ContactPoints, places: Projections, neighbour: Longs
-    ) -> Flags:
-        """Return flags (n,): whether places on a side are no farther than those across the side.
-
-        The point must have a place in the neighbour that is not nearer. Or the surface is folded at
-        the side, and the neighbour is material around the point, which is not searched.
-
-        Parameters
-        ----------
-        places
-            In the order of points and cells.
-        neighbour
-            (n,) the cell across the side of each place. Of places without one the flag has no
-            meaning.
-        """
-        cell_count = len(self._cells.nodes)
-        keys = places.point * cell_count + places.cell
-        # the row of the point's place in the neighbour, if that is listed; else any row
-        neighbour_key = places.point * cell_count + neighbour
-        row = np.minimum(np.searchsorted(keys, neighbour_key), max(len(keys) - 1, 0))
-        is_listed = keys[row] == neighbour_key
-        is_nearer = places.distance[row] < places.distance - DISTANCE_TOLERANCE * self._h
-        key_of_cells = points.cell[places.point] * cell_count + neighbour
-        is_folded = places.is_above & self._are_near_in_surface(key_of_cells)
-        return np.asarray((is_listed & ~is_nearer) | is_folded)
 
     def are_left_to_edges(
         self, points: ContactPoints, places: Projections, normals: Array

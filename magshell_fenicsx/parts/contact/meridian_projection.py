@@ -19,6 +19,7 @@ from magshell_fenicsx.parts.contact.projection import (
     CELL_RADIUS_FACTOR,
     LEBESGUE_FACTOR,
     SELF_CONTACT_DISTANCE,
+    have_farther_places,
     near_along_surface,
 )
 from magshell_fenicsx.parts.contact.quadrature_rules import EDGE_OFFSET, line_rule
@@ -515,39 +516,24 @@ class MeridianCurves:
             is_distinct = material.are_distinct(places, shape, is_above)
             places, is_above = places.select(is_distinct), is_above[is_distinct]
         # a place at an end counts if the cell beyond has one that is no nearer, or is not searched
+        keys = places.point * len(self.nodes) + places.cell
         is_nearest: Flags = np.ones(len(places.point), dtype=bool)
         for end, X in enumerate((0.0, 1.0)):
             neighbour = self.neighbours[places.cell, end]
             is_at_end = (places.X == X) & (neighbour >= 0)
-            is_nearest &= (
-                ~is_at_end
-                | self._are_nearest_beyond(places, neighbour)
-                | self._are_folded(places, neighbour, is_above, material)
+            is_no_nearer_beyond = have_farther_places(
+                keys,
+                places.point * len(self.nodes) + neighbour,
+                places.distance,
+                DISTANCE_TOLERANCE * self._h,
             )
+            is_folded = self._are_folded(places, neighbour, is_above, material)
+            is_nearest &= ~is_at_end | is_no_nearer_beyond | is_folded
         places = places.select(is_nearest)
         places = places.select(np.lexsort((places.distance, places.point)))
         if not len(places.point):
             return places
         return places.select(self._are_nearest_of_sides(places, x, nodal))
-
-    def _are_nearest_beyond(self, places: MeridianProjections, neighbour: Longs) -> Flags:
-        """Return flags (n,): whether points have a place in another cell that is not nearer.
-
-        Parameters
-        ----------
-        places
-            In the order of points and cells.
-        neighbour
-            (n,) the other cell: that beyond an end of each place's cell, -1 for none.
-        """
-        cell_count = len(self.nodes)
-        keys = places.point * cell_count + places.cell
-        # the row of the point's place in the other cell, if that is listed; else any row
-        neighbour_key = places.point * cell_count + neighbour
-        row = np.minimum(np.searchsorted(keys, neighbour_key), max(len(keys) - 1, 0))
-        is_listed = keys[row] == neighbour_key
-        is_nearer = places.distance[row] < places.distance - DISTANCE_TOLERANCE * self._h
-        return np.asarray(is_listed & ~is_nearer)
 
     def _are_nearest_of_sides(self, places: MeridianProjections, x: Array, nodal: Array) -> Flags:
         """Return flags (n,): the nearest place of each point, and the nearest on its other side.

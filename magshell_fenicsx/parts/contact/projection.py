@@ -309,6 +309,28 @@ class Projections:
         )
 
 
+def have_farther_places(
+    keys: Longs, other_keys: Longs, distance: Array, tolerance: float
+) -> NDArray[np.bool_]:
+    """Return flags (n,): whether a point's place in another cell is listed, and is not nearer.
+
+    Parameters
+    ----------
+    keys
+        (n,) number of the point and the cell of each place, ascending.
+    other_keys
+        (n,) the same of each place's point and the other cell.
+    distance
+        (n,) distances of the places from their points.
+    tolerance
+        A place that is nearer by less is not nearer.
+    """
+    # the row of the point's place in the other cell, if that is listed; else any row
+    row = np.minimum(np.searchsorted(keys, other_keys), max(len(keys) - 1, 0))
+    is_nearer = distance[row] < distance - tolerance
+    return np.asarray((keys[row] == other_keys) & ~is_nearer)
+
+
 @dataclass(frozen=True)
 class UndeformedPairs:
     """Undeformed places, to find out which pairs of points and places are the same material.

@@ -282,6 +282,8 @@ class _MagneticVectors:
         Fields of sources, functions like `fields`; they are smooth.
     patterns
         Patch -> its remanence, if that is a pattern in the frame of the patch.
+    by_points
+        The remanence as vectors at points in space; None without a file. It is in `fields` too.
     kind
         Kind of the section `remanent`: "radial", "tangential" or another.
     is_beside_surface
@@ -293,6 +295,7 @@ class _MagneticVectors:
     fields: Sequence[Callable[[Array], Array]]
     sources: Sequence[Callable[[Array], Array]]
     patterns: Mapping[str, PosedPattern]
+    by_points: ControlledPattern | None
     kind: str
     is_beside_surface: bool
 
@@ -381,9 +384,9 @@ def _magnetic_vectors(magnetic: MagneticSection, context: Context) -> _MagneticV
     G = np.array(applied.gradient or np.zeros((3, 3)))
     fields: list[Callable[[Array], Array]] = [lambda x: np.asarray(x @ G.T)] if G.any() else []
     fields += [vector_function(texts) for texts in (remanent.components, formulas) if texts]
-    if remanent.file:
-        by_place = by_points(remanent)
-        fields.append(lambda x: by_place(x, x))
+    pattern_by_points = by_points(remanent) if remanent.file else None
+    if pattern_by_points:
+        fields.append(partial(_at_places, pattern_by_points))
     fields += [partial(_at_places, pattern) for pattern in _varying_patterns(patterns).values()]
     rotates_as_whole = turns(context)  # then the rotation is a part of the field at each place
     rotations = [] if rotates_as_whole else _rotations(context)
@@ -393,6 +396,7 @@ def _magnetic_vectors(magnetic: MagneticSection, context: Context) -> _MagneticV
         fields=fields,
         sources=values(context) if applied.sources or rotates_as_whole else [],
         patterns=patterns,
+        by_points=pattern_by_points,
         kind=remanent.kind,
         is_beside_surface=bool(formulas),
     )
@@ -413,8 +417,7 @@ def _reasons_not_axisymmetric(
     """Yield why remanence and field are not axisymmetric about e3, in words for the user."""
     if any(tilted(v) for v in vectors.vectors):
         yield "a field is not along e3"
-    remanent = magnetic.remanent
-    if remanent and remanent.file and not by_points(remanent).controls.is_axisymmetric:
+    if vectors.by_points and not vectors.by_points.controls.is_axisymmetric:
         yield "the remanence is given at points in space"
     for name, pattern in _varying_patterns(vectors.patterns).items():
         meridian = outline.meridian
